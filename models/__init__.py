@@ -1,0 +1,1 @@
+"""What exists: prescriptions, glasses, cameras, sites and their files. NumPy only, no Warp."""

@@ -1,0 +1,271 @@
+"""A telescope: its surfaces in the order light meets them, its pupil, and what field and wavelengths it covers.
+
+Telescope frame: right-handed, origin at the vertex of the primary, +z along the optical axis towards the sky.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from .errors import DomainError, PrescriptionError, unknown_name
+from .glass import ConstantIndex, Medium
+from .surface import Interaction, Matrix, Surface, Vector, move_frame
+from .units import metres, radians
+
+VACUUM = ConstantIndex(1.0)
+
+
+def rotation_matrix(tilt: Any) -> np.ndarray:
+    """Return Rx @ Ry @ Rz, shape (3, 3), of three angles (rx, ry, rz) [rad].
+
+    This is the order of a Zemax coordinate break: about x, then about the new y, then about the new z.
+    """
+    rx, ry, rz = radians(tilt, "tilt")
+    cx, cy, cz = np.cos((rx, ry, rz))
+    sx, sy, sz = np.sin((rx, ry, rz))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_x @ about_y @ about_z
+
+
+@dataclass(frozen=True)
+class Telescope:
+    """An unfolded optical prescription.
+
+    Parameters
+    ----------
+    name, source, version, description : str
+        What the prescription is and where its figures come from.
+    surfaces : tuple of Surface
+        Surfaces in the order that light meets them.
+    stop_z : float
+        Height of the plane of the entrance pupil [m], telescope frame; pupil coordinates are given in this plane.
+    pupil_diameter : float
+        Outer diameter of the entrance pupil [m].
+    pupil_obscuration : float
+        Inner over outer diameter of the entrance pupil.
+    launch_distance : float
+        Distance from the origin, against the light, of the plane that rays start from [m].
+    reference_sphere_radius : float
+        Radius of the sphere that the wavefront is measured on [m].
+    field_radius : float
+        Radius of the field of view [rad].
+    field_limit : float
+        Largest field angle that the model can be asked for [rad].
+    wavelength_range : tuple of float, shape (2,)
+        Vacuum wavelengths covered [m].
+    default_wavelength : float
+        Wavelength used where none is given [m].
+    band : tuple of float, shape (2,), optional
+        Edges of the pass band [m]; the wavelength range where not given.
+    medium_before : ConstantIndex or Sellmeier
+        Medium in front of the first surface.
+    groups : mapping of str to tuple of str
+        Names of surfaces that move together.
+    group_frames : mapping of str to (vertex, rotation), optional
+        Frame of each group: its pivot [m] and axes. By default that of its first surface.
+    camera : str, optional
+        Name of the camera at the focus.
+    """
+
+    name: str
+    surfaces: tuple[Surface, ...]
+    stop_z: float
+    pupil_diameter: float
+    pupil_obscuration: float
+    launch_distance: float
+    reference_sphere_radius: float
+    field_radius: float
+    field_limit: float
+    wavelength_range: tuple[float, float]
+    default_wavelength: float
+    source: str = ""
+    version: str = ""
+    description: str = ""
+    band: tuple[float, float] | None = None
+    medium_before: Medium = VACUUM
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict, hash=False)
+    group_frames: Mapping[str, tuple[Vector, Matrix]] = field(default_factory=dict, hash=False)
+    camera: str | None = None
+
+    def __post_init__(self) -> None:
+        names = [s.name for s in self.surfaces]
+        if not names:
+            raise PrescriptionError("surfaces = []: expected at least one surface")
+        for repeated in {n for n in names if names.count(n) > 1}:
+            raise PrescriptionError(f"surface name {repeated!r} occurs more than once: expected unique names")
+        medium = self.medium_before
+        for surface in self.surfaces:
+            if surface.interaction == Interaction.MIRROR and surface.medium_after != medium:
+                raise PrescriptionError(f"surface {surface.name!r}: expected a mirror to stay in the medium before it")
+            medium = surface.medium_after
+        for group, members in self.groups.items():
+            if group in names:
+                raise PrescriptionError(f"group {group!r} has the name of a surface: expected another name")
+            if not members:
+                raise PrescriptionError(f"group {group!r} = []: expected the names of its surfaces")
+            for member in members:
+                if member not in names:
+                    raise PrescriptionError(f"group {group!r}: {unknown_name('surface', member, names)}")
+        for key in ("pupil_diameter", "launch_distance", "reference_sphere_radius", "field_radius", "field_limit"):
+            if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
+                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
+        if not np.isfinite(self.stop_z):
+            raise PrescriptionError(f"stop_z = {self.stop_z!r}: expected a finite number")
+        if not 0 <= self.pupil_obscuration < 1:
+            raise PrescriptionError(f"pupil_obscuration = {self.pupil_obscuration!r}: expected 0 <= value < 1")
+        low, high = self.wavelength_range
+        if not 0 < low < high < np.inf:
+            raise PrescriptionError(f"wavelength_range = {self.wavelength_range!r}: expected 0 < shortest < longest")
+        if self.band is None:
+            object.__setattr__(self, "band", (low, high))
+        for key, values in (("default_wavelength", (self.default_wavelength,)), ("band", self.band or ())):
+            if not all(low <= v <= high for v in values):
+                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected within the wavelength range")
+        frames = {g: self.group_frames.get(g) or self._surface_frame(m[0]) for g, m in self.groups.items()}
+        object.__setattr__(self, "groups", MappingProxyType({g: tuple(m) for g, m in self.groups.items()}))
+        object.__setattr__(self, "group_frames", MappingProxyType(frames))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A mapping proxy cannot be pickled: hand over plain dictionaries.
+        plain = {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in self._fields().items()}
+        return _rebuild, (plain,)
+
+    def _fields(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    def _surface_frame(self, name: str) -> tuple[Vector, Matrix]:
+        surface = next(s for s in self.surfaces if s.name == name)
+        return surface.vertex, surface.rotation
+
+    @cached_property
+    def surface_names(self) -> tuple[str, ...]:
+        """Names of the surfaces in the order that light meets them."""
+        return tuple(s.name for s in self.surfaces)
+
+    def surface(self, name: str) -> Surface:
+        """Return the surface of that name.
+
+        Raises
+        ------
+        UnknownNameError
+            If no surface has the name.
+        """
+        for surface in self.surfaces:
+            if surface.name == name:
+                return surface
+        raise unknown_name(f"surface of {self.name}", name, self.surface_names)
+
+    def perturbed(
+        self,
+        name: str,
+        *,
+        shift: Any = (0.0, 0.0, 0.0),
+        tilt: Any = (0.0, 0.0, 0.0),
+        about: Any = None,
+    ) -> Telescope:
+        """Return the telescope with one surface, or a group of surfaces, rotated and then shifted.
+
+        The rotation is Rx @ Ry @ Rz in the axes of the surface (or group) itself, the order of a Zemax coordinate
+        break. Decentre and tilt do not commute: here the rotation comes first, about a point that does not move, and
+        the shift second, along the axes of the telescope.
+
+        Parameters
+        ----------
+        name : str
+            Name of a surface or a group.
+        shift : array or Quantity, shape (3,)
+            Displacement [m] in the telescope frame.
+        tilt : array or Quantity, shape (3,)
+            Angles (rx, ry, rz) [rad].
+        about : array or Quantity, shape (3,), optional
+            Fixed point of the rotation [m], telescope frame; the vertex of the surface, or for a group that of its
+            first surface, by default.
+
+        Returns
+        -------
+        Telescope
+            A new telescope; this one stays as it is.
+
+        Raises
+        ------
+        UnknownNameError
+            If no surface or group has the name.
+        DomainError
+            If `shift`, `tilt` or `about` is not three finite numbers.
+        """
+        if name in self.groups:
+            members = set(self.groups[name])
+            pivot, axes = self.group_frames[name]
+        elif name in self.surface_names:
+            members = {name}
+            pivot, axes = self._surface_frame(name)
+        else:
+            raise unknown_name("surface or group", name, (*self.surface_names, *self.groups))
+        dr, angles = metres(shift, "shift"), radians(tilt, "tilt")
+        centre = metres(pivot if about is None else about, "about")
+        for label, value in (("shift", dr), ("tilt", angles), ("about", centre)):
+            if value.shape != (3,) or not np.all(np.isfinite(value)):
+                raise DomainError(f"{label} = {value.tolist()}: expected three finite numbers")
+        rotation = np.eye(3)
+        if np.any(angles):
+            frame = np.array(axes)
+            rotation = frame @ rotation_matrix(angles) @ frame.T
+        surfaces = tuple(
+            s.moved(rotation=rotation, about=centre, shift=dr) if s.name in members else s for s in self.surfaces
+        )
+        frames = dict(self.group_frames)
+        if name in self.groups:
+            # Groups within the moved group go along; moving one surface alone leaves its group's pivot where it was.
+            for group, inner in self.groups.items():
+                if members.issuperset(inner):
+                    frames[group] = move_frame(*frames[group], rotation=rotation, about=centre, shift=dr)
+        return replace(self, surfaces=surfaces, group_frames=frames)
+
+    def check_wavelength(self, wavelength: Any) -> np.ndarray:
+        """Return the wavelength [m] as a float64 array.
+
+        Raises
+        ------
+        DomainError
+            If it lies outside `wavelength_range`.
+        """
+        w = metres(wavelength, "wavelength")
+        low, high = self.wavelength_range
+        bad = ~((w >= low) & (w <= high))
+        if np.any(bad):
+            raise DomainError(
+                f"wavelength = {np.atleast_1d(w)[np.atleast_1d(bad)][0] * 1e9:.6g} nm: "
+                f"expected {low * 1e9:.6g} to {high * 1e9:.6g} nm for {self.name}"
+            )
+        return w
+
+    def check_field(self, tx: Any, ty: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the field angles [rad] as float64 arrays.
+
+        Raises
+        ------
+        DomainError
+            If ``hypot(tx, ty)`` exceeds `field_limit`.
+        """
+        x, y = np.broadcast_arrays(radians(tx, "tx"), radians(ty, "ty"))
+        # Rounding of a limit that was converted from degrees must not exclude the limit itself.
+        bad = ~(np.hypot(x, y) <= self.field_limit * (1 + 1e-12))
+        if np.any(bad):
+            worst = np.rad2deg([np.atleast_1d(v)[np.atleast_1d(bad)][0] for v in (x, y)])
+            raise DomainError(
+                f"field = ({worst[0]:.6g}, {worst[1]:.6g}) deg: "
+                f"expected within {np.rad2deg(self.field_limit):.6g} deg of the axis for {self.name}"
+            )
+        return x, y
+
+
+def _rebuild(fields: dict[str, Any]) -> Telescope:
+    return Telescope(**fields)

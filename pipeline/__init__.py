@@ -1,0 +1,1 @@
+"""Products: star fields, shapes, PCA models, correlations, reports and the command line."""

@@ -1,0 +1,282 @@
+"""What a run is made of: one YAML file, checked on load, with every default written out when it is resolved.
+
+Every problem is one line that names the file, the key, its value and what was expected.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from ..models.errors import ConfigError, PachonError, PrescriptionError
+from ..models.yaml_reader import as_number, read_yaml
+
+
+def _number(value: Any) -> Any:
+    # YAML 1.1 reads 1e-9, without a point, as text; whoever wrote it means a number.
+    number = as_number(value) if isinstance(value, str) else None
+    return value if number is None else number
+
+
+Real = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False, gt=0)]
+NotNegative = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Whole = Annotated[int, Field(strict=True, ge=0)]
+Switch = Annotated[bool, Field(strict=True)]
+BandName = Literal["u", "g", "r", "i", "z", "y"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StarsConfig(_Section):
+    """How many stars stand on a CCD, and how bright they are."""
+
+    truth: Count = Field(100, description="noise-free PSFs on each CCD, where no observed star is")
+    observed: Count = Field(40, description="observed stars on each CCD")
+    snr_min: Positive = Field(30.0, description="faintest star by its signal-to-noise ratio")
+
+
+class FocalPlaneConfig(_Section):
+    """Heights of the CCD surfaces (Jee & Tyson 2011, Table 1)."""
+
+    budget: Literal["simulated", "specification", "flat"] = Field(
+        "simulated", description="column of Table 1 that the heights are drawn from, or flat"
+    )
+    global_: Switch = Field(True, alias="global", description="figure of the whole focal plane")
+    raft: Switch = Field(True, description="height of each raft")
+    ccd: Switch = Field(True, description="height of each CCD")
+    tilt: Switch = Field(True, description="tilt of each CCD")
+    potato_chip: Switch = Field(True, description="waves within each CCD")
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the terms that are switched on."""
+        names = ("global", "raft", "ccd", "tilt", "potato_chip")
+        return tuple(n for n in names if getattr(self, "global_" if n == "global" else n))
+
+
+class AtmosphereConfig(_Section):
+    """Turbulence and refraction above the telescope."""
+
+    enabled: Switch = Field(True, description="false for the optics alone")
+    site: str = Field("cerro_pachon", description="bundled site, or path of a site file")
+    r0_m: Positive | None = Field(None, description="Fried parameter at 500 nm at the zenith [m]")
+    outer_scale_m: Positive | None = Field(None, description="outer scale [m]")
+    exposure_s: Positive = Field(15.0, description="exposure time [s]")
+    time_step_s: Positive = Field(0.05, description="time step of the moving screens [s]")
+    screen_size: Annotated[int, Field(strict=True, ge=16)] = Field(8192, description="samples on a side of a screen")
+    screen_length_m: Positive = Field(1300.0, description="side of a screen [m]")
+    ground_lift_m: NotNegative = Field(0.0, description="height given to a layer on the ground [m]")
+    zenith_angle_deg: Annotated[float, BeforeValidator(_number), Field(strict=True, ge=0, le=80)] = Field(
+        0.0, description="angle of the telescope from the zenith [deg]"
+    )
+    parallactic_angle_deg: Real = Field(0.0, description="direction of the zenith from +x towards +y [deg]")
+
+
+class PsfConfig(_Section):
+    """How point-spread functions are made."""
+
+    engine: Literal["fast", "wave"] = Field("fast", description="fast (geometric and filters) or wave (Fourier optics)")
+    n_pupil: Count = Field(334, description="points across which the fast engine samples the pupil")
+    pixel_um: Positive | None = Field(None, description="pixel [um]")
+    stamp: Annotated[int, Field(strict=True, ge=7)] = Field(31, description="pixels on a side of a stamp, odd")
+    diffusion_pixels: NotNegative = Field(0.4, description="rms of the charge diffusion [CCD pixels of 10 um]")
+
+
+class ReconstructionConfig(_Section):
+    """How the PSF is measured and modelled."""
+
+    components: Count = Field(20, description="principal components kept on each CCD")
+    order: Whole = Field(3, description="order of the polynomials fitted to the observed stars")
+    truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
+    weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")
+
+
+class Configuration(_Section):
+    """All that decides what a run computes; nothing else does."""
+
+    band: BandName | None = Field(None, description="filter: u, g, r, i, z or y")
+    telescope: str | None = Field(None, description="bundled model (pachon info lists them), or path of a prescription")
+    ccds: tuple[str, ...] | None = Field(None, description="CCDs to compute")
+    seed: Whole = Field(1, description="seed of all random numbers")
+    wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
+    stars: StarsConfig = StarsConfig()
+    focal_plane: FocalPlaneConfig = FocalPlaneConfig()
+    atmosphere: AtmosphereConfig = AtmosphereConfig()
+    psf: PsfConfig = PsfConfig()
+    reconstruction: ReconstructionConfig = ReconstructionConfig()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the configuration as plain lists, mappings and numbers, keys as in the file."""
+        return self.model_dump(mode="json", by_alias=True)
+
+
+def load_configuration(path: Path) -> Configuration:
+    """Read a configuration file; what it leaves out is left open, for :func:`~pachon.pipeline.setup.resolve`.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
+    """
+    try:
+        top = read_yaml(path)
+    except PrescriptionError as error:
+        raise ConfigError(str(error)) from None
+    content = {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
+    if isinstance(content.get("ccds"), str):
+        content["ccds"] = [content["ccds"]]
+    return _validated(content, str(path))
+
+
+def with_options(config: Configuration, **options: Any) -> Configuration:
+    """Return the configuration with command line options in place of its values; None leaves a value as it is.
+
+    Parameters
+    ----------
+    config : Configuration
+        What the file says.
+    **options : object
+        Values by dotted key, dots written as two underscores: ``stars__truth=50``.
+    """
+    content = config.model_dump(by_alias=True)
+    for dotted, value in options.items():
+        if value is None:
+            continue
+        *sections, key = dotted.split("__")
+        target = content
+        for section in sections:
+            target = target[section]
+        target[key] = value
+    return _validated(content, "command line")
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Return one ``key: old -> new`` for each key in which two resolved configurations differ."""
+    before, after = dict(_flat(old)), dict(_flat(new))
+    keys = [*before, *(k for k in after if k not in before)]
+    return [
+        f"{k}: {_shown(before.get(k))} -> {_shown(after.get(k))}" for k in keys if before.get(k) != after.get(k)
+    ]
+
+
+def digest(content: Any) -> str:
+    """Return the SHA-256 of a value written as canonical JSON, in hexadecimal."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def to_yaml(config: Configuration, heading: Sequence[str] = ()) -> str:
+    """Return the configuration as a YAML file with a comment to each key."""
+    lines = [f"# {line}" for line in heading]
+    sections = {name: field for name, field in type(config).model_fields.items() if _is_section(config, name)}
+    lines += _yaml_lines(config, [n for n in type(config).model_fields if n not in sections], "")
+    for name in sections:
+        section = getattr(config, name)
+        lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"{name}:"]
+        lines += _yaml_lines(section, list(type(section).model_fields), "  ")
+    return "\n".join(lines) + "\n"
+
+
+def _is_section(config: Configuration, name: str) -> bool:
+    return isinstance(getattr(config, name), _Section)
+
+
+def _yaml_lines(section: _Section, names: list[str], indent: str) -> list[str]:
+    lines = []
+    for name in names:
+        field = type(section).model_fields[name]
+        value = getattr(section, name)
+        value = list(value) if isinstance(value, tuple) else value
+        text = yaml.safe_dump(value, default_flow_style=True, width=2**20, allow_unicode=True)
+        entry = f"{indent}{field.alias or name}: {text.removesuffix('...\n').strip()}"
+        if len(entry) > 60:
+            lines += [f"{indent}# {field.description}", entry]
+        else:
+            lines.append(f"{entry:<34}  # {field.description}")
+    return lines
+
+
+def _flat(content: dict[str, Any], place: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{place}{key}.")
+        else:
+            yield f"{place}{key}", value
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _validated(content: dict[str, Any], source: str) -> Configuration:
+    try:
+        return Configuration.model_validate(content)
+    except ValidationError as error:
+        raise _first_problem(error, source) from None
+
+
+_EXPECTED = {
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "string_type": "a text",
+    "tuple_type": "a list",
+    "model_type": "a mapping of keys to values",
+    "model_attributes_type": "a mapping of keys to values",
+    "none_required": "nothing",
+}
+_LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
+
+
+def _first_problem(error: ValidationError, source: str) -> PachonError:
+    """Return the first problem as one line: file, key, value, what was expected."""
+    # A misspelt key is the likelier cause of what else is wrong, so it goes first.
+    problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
+    problem = problems[0]
+    # Members of an optional type are no keys of the file.
+    key = _dotted(problem["loc"])
+    kind, context = problem["type"], problem.get("ctx", {})
+    if kind == "extra_forbidden":
+        known = _known_keys(problem["loc"][:-1])
+        near = get_close_matches(str(problem["loc"][-1]), known, n=2, cutoff=0.6)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
+        return ConfigError(f"{source}: unknown key {key} = {_shown(problem['input'])}: {hint}")
+    if kind == "literal_error":
+        expected = "one of " + str(context["expected"]).replace(" or ", ", ").replace("'", "")
+    elif kind in _LIMITS:
+        name, word = _LIMITS[kind]
+        expected = f"a number {word} {context[name]:g}"
+    else:
+        expected = _EXPECTED.get(kind, problem["msg"])
+    return ConfigError(f"{source}: {key} = {_shown(problem['input'])}: expected {expected}")
+
+
+def _dotted(location: tuple[int | str, ...]) -> str:
+    parts: list[str] = []
+    for part in location:
+        if isinstance(part, int):
+            parts[-1] += f"[{part}]"
+        else:
+            parts.append(part)
+    return ".".join(parts)
+
+
+def _known_keys(location: tuple[int | str, ...]) -> list[str]:
+    model: Any = Configuration
+    for part in location:
+        model = model.model_fields[part].annotation
+    return [field.alias or name for name, field in model.model_fields.items()]

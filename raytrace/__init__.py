@@ -1,0 +1,1 @@
+"""Where rays go: sources of rays, trace kernels, launching, detector surfaces, meshes."""

@@ -1,0 +1,81 @@
+"""The last step of a ray: from the nominal focal surface to the CCD surface at its own height."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..models.focal_plane import FocalPlane
+from ..models.surface import Surface
+
+#: Newton steps to a CCD surface. Heights are tens of micrometres and slopes below 1e-3, so each step gains three
+#: digits: the third leaves less than 1e-14 m.
+STEPS = 3
+
+
+@dataclass(frozen=True)
+class Landing:
+    """Where rays meet the CCD surfaces.
+
+    Attributes
+    ----------
+    position : ndarray, shape [n, 3]
+        Points on the CCD surfaces (on the nominal surface in a gap), telescope frame [m].
+    path : ndarray, shape [n]
+        Optical path from the nominal surface [m]; negative where the CCD stands in front of it.
+    ccd : ndarray of int32, shape [n]
+        Index of the CCD, -1 in a gap.
+    """
+
+    position: np.ndarray
+    path: np.ndarray
+    ccd: np.ndarray
+
+
+def land_on_ccds(
+    detector: Surface,
+    focal_plane: FocalPlane,
+    position: np.ndarray,
+    direction: np.ndarray,
+    *,
+    index: float = 1.0,
+) -> Landing:
+    """Carry rays from the nominal detector surface to the CCD surfaces.
+
+    Heights are measured along the z axis of the detector's own frame, which is the telescope's +z unless the
+    detector was tilted; positions on the CCDs are that frame's x and y.
+
+    Parameters
+    ----------
+    detector : Surface
+        The nominal detector.
+    focal_plane : FocalPlane
+        Heights of the CCDs above it.
+    position, direction : ndarray, shape [n, 3]
+        Rays at the nominal detector, telescope frame [m].
+    index : float
+        Refractive index before the detector.
+
+    Returns
+    -------
+    Landing
+    """
+    p = detector.to_local(position)
+    d = direction @ detector.matrix
+    x, y = p[:, 0].copy(), p[:, 1].copy()
+    ccd = focal_plane.ccd_at(x, y)
+    on_ccd = ccd >= 0
+    t = np.zeros(len(p))
+    for _ in range(STEPS):
+        # The CCD of the first crossing is kept, so a ray near an edge cannot jump to and fro between two tiles.
+        height = focal_plane.height_on(ccd, x, y)
+        slope_x, slope_y = focal_plane.gradient_on(ccd, x, y)
+        rate = d[:, 2] - slope_x * d[:, 0] - slope_y * d[:, 1]
+        t = np.where(on_ccd, t + (height - (p[:, 2] + t * d[:, 2])) / rate, 0.0)
+        x = p[:, 0] + t * d[:, 0]
+        y = p[:, 1] + t * d[:, 1]
+    # A ray that slips over the edge on its last micrometres has left the CCD.
+    ccd = np.where(focal_plane.ccd_at(x, y) == ccd, ccd, -1).astype(np.int32)
+    t = np.where(ccd >= 0, t, 0.0)
+    return Landing(position + t[:, None] * direction, index * t, ccd)

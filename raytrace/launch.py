@@ -1,0 +1,107 @@
+"""Start Warp quietly and run its kernels over slices, one slice a thread."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR
+
+#: Compiler flags of every kernel module: full-width SIMD where the processor has it.
+CPU_COMPILER_FLAGS = "-march=native" + (
+    " -mprefer-vector-width=512" if platform.machine().lower() in ("x86_64", "amd64") else ""
+)
+#: Options that a forward-only kernel module sets with ``wp.set_module_options``.
+FORWARD_OPTIONS = {"enable_backward": False, "cpu_compiler_flags": CPU_COMPILER_FLAGS}
+
+_loaded: set[tuple[str, str]] = set()
+_start = threading.Lock()
+_started: list[bool] = []
+
+
+def start_warp() -> None:
+    """Initialise Warp once, without its banner and its warning that there is no CUDA driver.
+
+    The warning comes from native code, past every Python setting, so standard error is turned away for that moment.
+    """
+    with _start:
+        if _started:
+            return
+        sys.stderr.flush()
+        kept = os.dup(2)
+        void = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(void, 2)
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(void)
+        _started.append(True)
+
+
+def thread_count(threads: int | None) -> int:
+    """Return the number of threads to use: the given number, or the processors this process may run on."""
+    if threads is not None:
+        return max(1, int(threads))
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
+    """Load the module of a kernel; a compilation, once per machine and version, is announced on standard error."""
+    start_warp()
+    key = (kernel.module.name, device)
+    if key in _loaded:
+        return
+    block = 1 if device == "cpu" else 256
+    if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
+        print(f"compiling {kernel.module.name.rpartition('.')[2]} for this machine (once)", file=sys.stderr, flush=True)
+    wp.load_module(kernel.module, device=device, block_dim=block)
+    _loaded.add(key)
+
+
+def launch(
+    kernel: wp.Kernel, count: int, inputs: list[Any], *, threads: int | None = None, device: str = "cpu"
+) -> None:
+    """Run a kernel over ``count`` items, cut into one contiguous slice per thread.
+
+    The kernel's first argument is the index of the first item of its slice (``first: wp.int32``); item ``i`` is
+    ``first + wp.tid()``. An item writes only to its own outputs, so the result does not depend on the slices.
+
+    Parameters
+    ----------
+    kernel : wp.Kernel
+        Kernel whose first argument is ``first``.
+    count : int
+        Number of items.
+    inputs : list
+        Remaining arguments, outputs included.
+    threads : int, optional
+        Number of threads; all processors by default.
+    device : str
+        Warp device; only ``"cpu"`` is cut into slices.
+    """
+    if count == 0:
+        return
+    load_kernels(kernel, device)
+    slices = min(thread_count(threads), count) if device == "cpu" else 1
+    bounds = [count * i // slices for i in range(slices + 1)]
+
+    def run(first: int, last: int) -> None:
+        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], device=device)
+
+    if slices == 1:
+        run(0, count)
+        return
+    with ThreadPoolExecutor(slices) as pool:
+        for job in [pool.submit(run, bounds[i], bounds[i + 1]) for i in range(slices)]:
+            job.result()

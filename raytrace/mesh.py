@@ -1,0 +1,86 @@
+"""Trace rays to a triangle mesh, such as the tiles of a focal plane or a measured surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from ..models.surface import Surface
+from .launch import launch, start_warp
+from .mesh_kernels import first_facet
+
+#: Rays are started this far in front of the nominal surface [m] and followed for twice as far: heights of a focal
+#: plane are micrometres, and single precision resolves 0.1 nm over this distance.
+REACH = 1.0e-3
+
+
+@dataclass(frozen=True)
+class MeshLanding:
+    """Where rays meet a mesh.
+
+    Attributes
+    ----------
+    position : ndarray, shape [n, 3]
+        Points on the facets, telescope frame [m]; NaN where no facet is met.
+    path : ndarray, shape [n]
+        Distance from the given points along the rays [m].
+    facet : ndarray of int32, shape [n]
+        Index of the facet, -1 where none is met.
+    """
+
+    position: np.ndarray
+    path: np.ndarray
+    facet: np.ndarray
+
+
+def land_on_mesh(
+    detector: Surface,
+    mesh: trimesh.Trimesh,
+    position: np.ndarray,
+    direction: np.ndarray,
+    *,
+    threads: int | None = None,
+) -> MeshLanding:
+    """Carry rays from the nominal detector surface to a mesh given in the detector's own frame.
+
+    ``wp.Mesh`` works in single precision, so it is asked only *which* facet a ray meets; the crossing with the plane
+    of that facet is then computed in double precision.
+
+    Parameters
+    ----------
+    detector : Surface
+        The nominal detector, whose frame the mesh is in.
+    mesh : trimesh.Trimesh
+        Facets [m], within 1 mm of the detector's plane (``FocalPlane.to_mesh()``).
+    position, direction : ndarray, shape [n, 3]
+        Rays at the nominal detector, telescope frame [m].
+    threads : int, optional
+        Number of threads.
+
+    Returns
+    -------
+    MeshLanding
+    """
+    start_warp()
+    p = detector.to_local(position)
+    d = direction @ detector.matrix
+    start = p - (REACH / np.abs(d[:, 2]))[:, None] * d
+
+    def vectors(values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.vec3, device="cpu")
+
+    facets = wp.array(np.ascontiguousarray(mesh.faces, dtype=np.int32).ravel(), dtype=wp.int32, device="cpu")
+    found = wp.Mesh(points=vectors(mesh.vertices), indices=facets)
+    facet = wp.empty(len(p), dtype=wp.int32, device="cpu")
+    reach = float(2 * REACH / np.abs(d[:, 2]).min(initial=1.0))
+    launch(first_facet, len(p), [found.id, vectors(start), vectors(d), reach, facet], threads=threads)
+
+    index = facet.numpy()
+    corners = np.asarray(mesh.triangles, dtype=np.float64)[index]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    path = np.einsum("ij,ij->i", normal, corners[:, 0] - p) / np.einsum("ij,ij->i", normal, d)
+    path = np.where(index >= 0, path, np.nan)
+    return MeshLanding(position + path[:, None] * direction, path, index)

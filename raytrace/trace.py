@@ -1,0 +1,166 @@
+"""Trace rays through a telescope, to its last surface or to every one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, overload
+
+import numpy as np
+import warp as wp
+
+from ..models.errors import ConfigError
+from ..models.focal_plane import FocalPlane
+from ..models.telescope import Telescope
+from .detector import land_on_ccds
+from .launch import launch
+from .packed import pack_surfaces, refractive_indices
+from .packet import lane_flags, lanes, packet_count, to_packets
+from .rays import Rays, RayStatus
+from .trace_kernels import trace_rays
+
+
+@dataclass(frozen=True)
+class TraceResult:
+    """Rays at one surface, in the telescope frame.
+
+    Attributes
+    ----------
+    surface : str
+        Name of the surface.
+    position : ndarray, shape [n, 3]
+        Where the rays meet the surface [m].
+    direction : ndarray, shape [n, 3]
+        Unit directions after the surface.
+    path_length : ndarray, shape [n]
+        Optical path from the start of the ray [m].
+    status : ndarray of int32, shape [n]
+        A :class:`~pachon.raytrace.rays.RayStatus` each.
+    ccd : ndarray of int32, shape [n], or None
+        Index of the CCD landed on, -1 in a gap; only after a trace to a focal plane of CCDs.
+    """
+
+    surface: str
+    position: np.ndarray
+    direction: np.ndarray
+    path_length: np.ndarray
+    status: np.ndarray
+    ccd: np.ndarray | None = None
+
+    @property
+    def vignetted(self) -> np.ndarray:
+        """Rays that do not contribute light: any status but OK, shape [n] bool."""
+        return self.status != RayStatus.OK
+
+
+@overload
+def trace(
+    telescope: Telescope,
+    rays: Rays,
+    surfaces: Literal["last"] = "last",
+    *,
+    focal_plane: FocalPlane | None = None,
+    threads: int | None = None,
+) -> TraceResult: ...
+
+
+@overload
+def trace(
+    telescope: Telescope,
+    rays: Rays,
+    surfaces: Literal["all"],
+    *,
+    focal_plane: FocalPlane | None = None,
+    threads: int | None = None,
+) -> list[TraceResult]: ...
+
+
+def trace(
+    telescope: Telescope,
+    rays: Rays,
+    surfaces: str = "last",
+    *,
+    focal_plane: FocalPlane | None = None,
+    threads: int | None = None,
+) -> TraceResult | list[TraceResult]:
+    """Trace rays sequentially through all surfaces of a telescope.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    rays : Rays
+        Rays of one wavelength, from :func:`~pachon.raytrace.rays.launch_rays` for example.
+    surfaces : {"last", "all"}
+        What to return: the last surface, or a list with one result per surface.
+    focal_plane : FocalPlane, optional
+        CCD surfaces, heights measured from the last surface along its z axis. The rays then end on the CCDs, and a
+        ray that lands between two of them has status GAP (or keeps its worse one) and ``ccd`` -1.
+    threads : int, optional
+        Number of threads; all processors by default. The result does not depend on it.
+
+    Returns
+    -------
+    TraceResult or list of TraceResult
+
+    Raises
+    ------
+    ConfigError
+        If ``surfaces`` is neither "last" nor "all".
+    DomainError
+        If the telescope does not cover the wavelength.
+    """
+    if surfaces not in ("last", "all"):
+        raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
+    n = len(rays)
+    every = len(telescope.surfaces) if surfaces == "all" else 1
+    packed = pack_surfaces(telescope)
+    indices = wp.array(refractive_indices(telescope, rays.wavelength), dtype=wp.float64, device="cpu")
+    count = packet_count(n)
+
+    def inputs(values: np.ndarray) -> wp.array:
+        return wp.array(to_packets(values), dtype=lanes, device="cpu", copy=False)
+
+    position = wp.empty((every, 3, count), dtype=lanes, device="cpu")
+    direction = wp.empty((every, 3, count), dtype=lanes, device="cpu")
+    path = wp.empty((every, count), dtype=lanes, device="cpu")
+    status = wp.empty((every, count), dtype=lane_flags, device="cpu")
+    launch(
+        trace_rays,
+        count,
+        [
+            packed,
+            indices,
+            inputs(rays.position.T),
+            inputs(rays.direction.T),
+            inputs(rays.path_length),
+            position,
+            direction,
+            path,
+            status,
+        ],
+        threads=threads,
+    )
+    names = telescope.surface_names if surfaces == "all" else telescope.surface_names[-1:]
+    positions = position.numpy().reshape(every, 3, -1)[:, :, :n]
+    directions = direction.numpy().reshape(every, 3, -1)[:, :, :n]
+    paths = path.numpy().reshape(every, -1)[:, :n]
+    statuses = status.numpy().reshape(every, -1)[:, :n]
+    # Transposed views, not copies: the rays stay in structure-of-arrays order.
+    results = [
+        TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i]) for i, name in enumerate(names)
+    ]
+    if focal_plane is not None:
+        last = results[-1]
+        index = float(refractive_indices(telescope, rays.wavelength)[-1])
+        landing = land_on_ccds(
+            telescope.surfaces[-1], focal_plane, last.position, last.direction, index=index
+        )
+        results[-1] = TraceResult(
+            last.surface,
+            landing.position,
+            last.direction,
+            last.path_length + landing.path,
+            np.where((last.status == RayStatus.OK) & (landing.ccd < 0), np.int32(RayStatus.GAP), last.status),
+            landing.ccd,
+        )
+    return results if surfaces == "all" else results[0]

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+from astropy import units as u
+
+from pachon.models.errors import DomainError
+from pachon.pipeline.correlation import EXACT_LIMIT, shear_correlation
+
+ARCMIN = np.pi / 180.0 / 60.0
+BINS = {"min_sep": 1.0 * ARCMIN, "max_sep": 60.0 * ARCMIN, "n_bins": 8}
+
+
+def catalogue(count=300, seed=0):
+    """Smooth ellipticity field with a mean and noise over one degree."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0.0, 60.0 * ARCMIN, (2, count))
+    e1 = 0.02 + 0.01 * np.sin(x / (9 * ARCMIN)) + rng.normal(0.0, 0.003, count)
+    e2 = -0.01 + 0.01 * np.cos((x + 2 * y) / (15 * ARCMIN)) + rng.normal(0.0, 0.003, count)
+    return x, y, e1, e2
+
+
+def test_brute_force_pair_counting():
+    x, y, e1, e2 = catalogue()
+    c = shear_correlation(x, y, e1, e2, **BINS)
+    edges = np.geomspace(BINS["min_sep"], BINS["max_sep"], 9)
+    e = e1 + 1j * e2
+    i, j = np.triu_indices(len(x), 1)
+    dx, dy = x[j] - x[i], y[j] - y[i]
+    bins = np.digitize(np.hypot(dx, dy), edges) - 1
+    phase = np.exp(-4j * np.arctan2(dy, dx))
+    for b in range(8):
+        here = bins == b
+        a, d = e[i[here]], e[j[here]]
+        # The same pairs in another order: rounding of sums of up to 1e4 terms.
+        assert c.n_pairs[b] == here.sum()
+        assert c.xi_plus[b] == pytest.approx((a * d.conj()).real.mean(), rel=1e-10, abs=1e-16)
+        assert c.xi_minus[b] == pytest.approx((a * d * phase[here]).real.mean(), rel=1e-10, abs=1e-16)
+        assert c.r[b] == pytest.approx(np.hypot(dx, dy)[here].mean(), rel=1e-10)
+    assert c.n_stars == 300
+    np.testing.assert_allclose(c.r_arcmin, c.r / ARCMIN, rtol=1e-14)
+
+
+def test_constant_field():
+    x, y, _, _ = catalogue()
+    c = shear_correlation(x, y, np.full(300, 0.03), np.full(300, -0.04), **BINS)
+    np.testing.assert_allclose(c.xi_plus, 0.05**2, rtol=1e-12)  # rounding
+    flat = shear_correlation(x, y, np.full(300, 0.03), np.full(300, -0.04), subtract_mean=True, **BINS)
+    np.testing.assert_allclose(flat.xi_plus, 0.0, atol=1e-30)
+
+
+def test_tangential_pattern_and_flips():
+    # Ellipses around the origin: e = -|e| exp(2 i phi). At a pair opposite through the origin both point across the line that
+    # joins them, so xi- is positive; with y mirrored but e2 not, the pattern is no longer one of a scalar potential.
+    angle = np.linspace(0.0, 2 * np.pi, 40, endpoint=False) + 0.1
+    x, y = 10 * ARCMIN * np.cos(angle), 10 * ARCMIN * np.sin(angle)
+    e1, e2 = -0.1 * np.cos(2 * angle), -0.1 * np.sin(2 * angle)
+    options = {"min_sep": 19.9 * ARCMIN, "max_sep": 20.1 * ARCMIN, "n_bins": 1}
+    c = shear_correlation(x, y, e1, e2, **options)
+    assert c.n_pairs[0] == 20  # the diameters
+    assert c.xi_minus[0] == pytest.approx(0.01, rel=1e-12)
+    assert c.xi_plus[0] == pytest.approx(0.01, rel=1e-12)
+    mirrored = shear_correlation(x, -y, e1, -e2, **options)
+    assert mirrored.xi_minus[0] == pytest.approx(0.01, rel=1e-12)
+    wrong = shear_correlation(x, -y, e1, e2, **options)
+    # Re(e e' exp(-4 i phi)) with phi -> -phi: the mean of 0.01 cos(8 angle) over the twenty directions vanishes.
+    assert wrong.xi_minus[0] == pytest.approx(0.0, abs=1e-12)
+    assert wrong.xi_plus[0] == pytest.approx(0.01, rel=1e-12)
+
+
+def test_unusable_stars_are_dropped():
+    x, y, e1, e2 = catalogue()
+    e1[7], e2[20], x[33] = np.nan, np.nan, np.nan
+    keep = np.isfinite(e1 + e2 + x)
+    c = shear_correlation(x, y, e1, e2, **BINS)
+    d = shear_correlation(x[keep], y[keep], e1[keep], e2[keep], **BINS)
+    assert c.n_stars == 297
+    assert c.xi_plus.tobytes() == d.xi_plus.tobytes()
+
+
+def test_empty_bins_are_nan():
+    c = shear_correlation([0.0, ARCMIN], [0.0, 0.0], [0.1, 0.1], [0.0, 0.0], min_sep=0.5 * ARCMIN, max_sep=50 * ARCMIN)
+    assert (c.n_pairs == 0).sum() == 19
+    for values in (c.xi_plus, c.xi_minus, c.error_plus, c.error_minus):
+        assert np.isnan(values).sum() == 19
+    assert np.all(np.isfinite(c.r))
+
+
+def test_shot_noise_error():
+    # Pure noise: the scatter of xi over many fields is what the error bar claims, where pairs share few stars.
+    results = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform(0.0, 60 * ARCMIN, (2, 100))
+        e1, e2 = rng.normal(0.0, 0.02, (2, 100))
+        results.append(shear_correlation(x, y, e1, e2, min_sep=10 * ARCMIN, max_sep=60 * ARCMIN, n_bins=1))
+    scatter = np.std([c.xi_plus[0] for c in results])
+    claimed = np.mean([c.error_plus[0] for c in results])
+    assert scatter / claimed == pytest.approx(1.0, abs=0.2)  # 200 fields: 5 % each, four sigma
+
+
+def test_cells_agree_with_pairs():
+    x, y, e1, e2 = catalogue(3000)
+    pairs = shear_correlation(x, y, e1, e2, **BINS)
+    cells = shear_correlation(x, y, e1, e2, exact=False, **BINS)
+    # bin_slop = 0.1 blurs bins of 0.5 in ln r by 5 %; the field changes by its own size over about a bin.
+    np.testing.assert_allclose(cells.xi_plus, pairs.xi_plus, atol=2e-6)
+    assert EXACT_LIMIT >= 189 * 40  # the observed stars of the whole focal plane are counted pair by pair
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_same_bytes_again(exact):
+    x, y, e1, e2 = catalogue(2000)
+    first = shear_correlation(x, y, e1, e2, exact=exact, **BINS)
+    second = shear_correlation(x, y, e1, e2, exact=exact, **BINS)
+    assert first.xi_plus.tobytes() == second.xi_plus.tobytes()
+    assert first.xi_minus.tobytes() == second.xi_minus.tobytes()
+
+
+def test_quantities():
+    x, y, e1, e2 = catalogue()
+    c = shear_correlation(x, y, e1, e2, **BINS)
+    q = shear_correlation(
+        x * u.rad, y * u.rad, e1, e2, min_sep=1.0 * u.arcmin, max_sep=60.0 * u.arcmin, n_bins=BINS["n_bins"]
+    )
+    np.testing.assert_allclose(q.xi_plus, c.xi_plus, rtol=1e-9)  # bin edges differ by rounding
+
+
+def test_bad_arguments():
+    x, y, e1, e2 = catalogue(10)
+    with pytest.raises(DomainError, match="shapes"):
+        shear_correlation(x, y[:5], e1, e2, **BINS)
+    with pytest.raises(DomainError, match="shapes"):
+        shear_correlation(0.0, 0.0, 0.0, 0.0, **BINS)
+    with pytest.raises(DomainError, match="e1, e2"):
+        shear_correlation(x, y, ["a"] * 10, e2, **BINS)
+    with pytest.raises(DomainError, match="0 of 10 stars"):
+        shear_correlation(x, y, e1 * np.nan, e2, **BINS)
+    for low, high in ((0.0, 1.0), (2.0, 1.0), (np.nan, 1.0), (1.0, np.inf)):
+        with pytest.raises(DomainError, match="min_sep"):
+            shear_correlation(x, y, e1, e2, min_sep=low, max_sep=high)
+    with pytest.raises(DomainError, match="n_bins"):
+        shear_correlation(x, y, e1, e2, min_sep=0.1, max_sep=1.0, n_bins=0)

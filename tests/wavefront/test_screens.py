@@ -1,0 +1,275 @@
+"""Phase screens against von Karman theory, mode by mode and as random fields.
+
+With ``fixed_modulus`` the modes carry their exact mean power, so what is measured on such a screen has no noise: it is
+the expectation of what Gaussian screens show.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from pachon.models.errors import DomainError, UnknownNameError
+from pachon.models.random_streams import stream
+from pachon.wavefront.screens import STENCILS, evaluate, phase_screen, stencil_gain
+from pachon.wavefront.turbulence import path_spectrum, path_variance, structure_function
+
+R0, L0 = 0.16, 25.0
+CUTOFF = 1.0 / R0
+LOW, HIGH = (0.0, CUTOFF), (CUTOFF, math.inf)
+SIZE, LENGTH = 2048, 327.68
+PIXEL = LENGTH / SIZE
+FINE_SIZE, FINE_PIXEL = 2048, 0.02
+RADIANS_PER_METRE = 2.0 * math.pi / 500e-9
+
+
+def screen(band, seed=1, **options):
+    grid = {"size": SIZE, "length": LENGTH} if band == LOW else {"size": FINE_SIZE, "length": FINE_SIZE * FINE_PIXEL}
+    defaults = {"r0": R0, "outer_scale": L0, "band": band, "threads": 2}
+    return phase_screen(stream(seed, "test"), **(defaults | grid | options))
+
+
+def power(field):
+    """Return the power of each mode [m^2] and its wavenumbers per pixel, brute force by NumPy's own FFT."""
+    spectrum = np.fft.fft2(field.astype(np.float64)) / field.size
+    k = 2.0 * math.pi * np.fft.fftfreq(field.shape[0])
+    return np.abs(spectrum) ** 2, k, k[:, np.newaxis]
+
+
+def structure_along(field, pixel, separations, direction):
+    """Structure function at any separation from the modes alone: sum of 2 |a|^2 (1 - cos k b)."""
+    mode_power, kx, ky = power(field)
+    return np.array(
+        [
+            2.0 * np.sum(mode_power * (1.0 - np.cos((kx * direction[0] + ky * direction[1]) * b / pixel)))
+            for b in separations
+        ]
+    )
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (math.sqrt(0.5), math.sqrt(0.5))])
+def test_expected_structure_function_of_both_scales(direction):
+    """Low and high screens together follow theory from two fine pixels and two coarse pixels to the outer scale."""
+    b = np.array([0.04, 0.1, 0.16, 0.32, 0.64, 1.3, 2.6, 5.0, 10.0, 25.0])
+    low = structure_along(screen(LOW, fixed_modulus=True), PIXEL, b, direction)
+    high = structure_along(screen(HIGH, fixed_modulus=True), FINE_PIXEL, b, direction)
+    ratio = (low + high) / structure_function(b, R0, L0)
+    # The project's requirement is 3 %; beyond the fine Nyquist limit 2 % are missing at two fine pixels, and at
+    # coarser separations the sum over modes is the integral to 0.5 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.03)
+    np.testing.assert_allclose(ratio[b >= 0.32], 1.0, atol=0.005)
+
+
+def test_random_screens_follow_theory():
+    """Gaussian screens, averaged: measured by differences of samples, from two pixels to the outer scale."""
+    lags = np.array([2, 8, 32, 156])  # 0.32 m to 24.96 m
+    count = 40
+    measured = np.zeros((count, len(lags)))
+    for seed in range(count):
+        field = screen(LOW, seed=seed)
+        for n, lag in enumerate(lags):
+            along_x = field - np.roll(field, -lag, axis=1)
+            along_y = field - np.roll(field, -lag, axis=0)
+            measured[seed, n] = 0.5 * (np.mean(along_x**2, dtype=np.float64) + np.mean(along_y**2, dtype=np.float64))
+    high = structure_along(screen(HIGH, fixed_modulus=True), FINE_PIXEL, lags * PIXEL, (1.0, 0.0))
+    ratio = (measured.mean(axis=0) + high) / structure_function(lags * PIXEL, R0, L0)
+    scatter = measured.std(axis=0) / math.sqrt(count) / structure_function(lags * PIXEL, R0, L0)
+    # The requirement is 3 %. The average's own scatter stays below a third of that.
+    assert np.all(scatter < 0.01)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.03)
+
+
+def test_long_exposure_coherence_of_random_screens():
+    """The mean of exp(i k dpsi) over Gaussian screens is exp(-D/2): the modes add up to a Gaussian field."""
+    lags = np.array([1, 2, 3, 4, 6, 8]) * 4  # fine pixels: 0.08 m to 0.64 m
+    pixel, size = 0.08, 1024
+    mean_low, mean_high = np.zeros(len(lags)), np.zeros(len(lags))
+    wavenumber = np.float32(RADIANS_PER_METRE)
+    count = 8
+    for seed in range(count):
+        low = wavenumber * screen(LOW, seed=seed, size=size, length=size * pixel)
+        high = wavenumber * screen(HIGH, seed=seed, size=1024, length=1024 * FINE_PIXEL)
+        for n, lag in enumerate(lags):
+            for axis in (0, 1):
+                # Differences there and back have opposite signs, so the mean over the whole period is real.
+                mean_low[n] += np.mean(np.cos(np.roll(low, -lag // 4, axis=axis) - low)) / (2 * count)
+                mean_high[n] += np.mean(np.cos(np.roll(high, -lag, axis=axis) - high)) / (2 * count)
+    expected = np.exp(-0.5 * RADIANS_PER_METRE**2 * structure_function(lags * FINE_PIXEL, R0, L0))
+    # Low and high screens are independent, so their means multiply. Statistical error: about 2e-3.
+    np.testing.assert_allclose(mean_low * mean_high, expected, atol=0.01)
+
+
+def test_power_is_split_without_loss_or_overlap():
+    variance = path_variance(R0, L0)
+    for cutoff in (0.6 * CUTOFF, CUTOFF, 1.4 * CUTOFF):
+        low = screen(LOW, band=(0.0, cutoff), fixed_modulus=True)
+        high = phase_screen(
+            stream(1, "test"),
+            size=FINE_SIZE,
+            length=FINE_SIZE * FINE_PIXEL,
+            r0=R0,
+            outer_scale=L0,
+            band=(cutoff, math.inf),
+            fixed_modulus=True,
+        )
+        total = np.mean(low.astype(float) ** 2) + np.mean(high.astype(float) ** 2)
+        # The screen of 328 m lacks its mean: 0.265 (L0/L)^2 = 0.15 % of the variance.
+        assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4)
+
+
+@pytest.mark.parametrize("band", [LOW, HIGH])
+def test_modes_stay_in_their_band_with_their_power(band):
+    field = screen(band, fixed_modulus=True)
+    pixel = PIXEL if band == LOW else FINE_PIXEL
+    mode_power, kx, ky = power(field)
+    wavenumber = np.hypot(kx, ky) / pixel
+    edge = 1e-9
+    inside = (wavenumber > band[0] + edge) & (wavenumber < band[1] - edge)
+    inside &= (np.abs(kx) < math.pi - edge) & (np.abs(ky) < math.pi - edge)
+    expected = path_spectrum(wavenumber / (2.0 * math.pi), R0, L0) / (field.shape[0] * pixel) ** 2
+    # float32 rounding noise of the transform: 1e-6 of the largest amplitude, 1e-5 of most modes' own.
+    floor = 1e-12 * mode_power.max()
+    np.testing.assert_allclose(mode_power[inside], expected[inside], rtol=2e-3, atol=floor)
+    assert mode_power[~inside].max() < floor
+
+
+def test_gaussian_modes_have_the_exponential_distribution_of_power():
+    mode_power, kx, ky = power(screen(LOW))
+    wavenumber = np.hypot(kx, ky) / PIXEL
+    chosen = (wavenumber > 0.5) & (wavenumber < 0.99 * CUTOFF) & (kx > 0)
+    ratio = mode_power[chosen] / (path_spectrum(wavenumber[chosen] / (2.0 * math.pi), R0, L0) / LENGTH**2)
+    # |a|^2 of a complex Gaussian: mean 1, mean square 2, exp(-1) beyond the mean; 160 000 modes give 0.3 to 1 %.
+    assert ratio.mean() == pytest.approx(1.0, abs=0.01)
+    assert np.mean(ratio**2) == pytest.approx(2.0, abs=0.05)
+    assert np.mean(ratio > 1.0) == pytest.approx(math.exp(-1.0), abs=0.005)
+
+
+def bilinear_gradient_power(field):
+    """Mean squared gradient [per pixel^2] of the bilinear patches over all positions: exact integral over each."""
+
+    def mean_square(difference, axis):
+        following = np.roll(difference, -1, axis=axis)
+        return np.mean(difference**2 + difference * following + following**2) / 3.0
+
+    field = field.astype(np.float64)
+    along_x, along_y = np.roll(field, -1, axis=1) - field, np.roll(field, -1, axis=0) - field
+    return mean_square(along_x, 0) + mean_square(along_y, 1)
+
+
+@pytest.mark.parametrize("centre", [0.2, 1.0, 3.0, 6.0])
+def test_gradient_stencil_keeps_the_gradient_variance_of_every_ring_of_modes(centre):
+    ring = (centre - 0.05, centre + 0.05)
+    exact, kx, ky = power(screen(LOW, band=ring))
+    expected = np.sum(exact * (kx**2 + ky**2))
+    gradient = bilinear_gradient_power(screen(LOW, band=ring, stencil="gradient"))
+    # float32 screens: 1e-6.
+    assert gradient == pytest.approx(expected, rel=1e-5)
+    plain = bilinear_gradient_power(screen(LOW, band=ring))
+    assert plain < expected
+
+
+def test_gradient_stencil_at_random_places():
+    """The four-point gradient as a ray tracer reads it, restated, has the variance of the true gradient."""
+    field = screen(LOW, stencil="gradient").astype(np.float64)
+    exact, kx, ky = power(screen(LOW))
+    place = stream(5, "places").random((2, 400_000)) * SIZE
+    i, j = place.astype(int)
+    u, v = place - np.array([i, j])
+    right, up = (i + 1) % SIZE, (j + 1) % SIZE
+    slope_x = (1 - v) * (field[j, right] - field[j, i]) + v * (field[up, right] - field[up, i])
+    slope_y = (1 - u) * (field[up, i] - field[j, i]) + u * (field[up, right] - field[j, right])
+    # 400 000 samples: 0.3 % of scatter.
+    assert np.mean(slope_x**2) == pytest.approx(np.sum(exact * kx**2), rel=0.01)
+    assert np.mean(slope_y**2) == pytest.approx(np.sum(exact * ky**2), rel=0.01)
+
+
+def test_bilinear_stencil_keeps_the_variance():
+    place = stream(6, "places").random((2, 400_000)) * SIZE * PIXEL
+    high_place = place * FINE_PIXEL / PIXEL
+    for band, pixel, where in ((LOW, PIXEL, place), (HIGH, FINE_PIXEL, high_place)):
+        exact = np.sum(power(screen(band))[0])
+        read = evaluate(screen(band, stencil="bilinear"), pixel, *where, "bilinear")
+        # 400 000 places: 0.5 % of scatter where neighbours are correlated.
+        assert np.mean(read**2) == pytest.approx(exact, rel=0.02)
+
+
+def test_spline_goes_through_the_samples_and_through_the_sum_of_modes_between():
+    size, length = 256, 40.96
+    options = {"size": size, "length": length}
+    samples, spline = screen(LOW, **options), screen(LOW, stencil="spline", **options)
+    pixel = length / size
+    index = np.arange(size) * pixel
+    at_samples = evaluate(spline, pixel, index, np.full(size, 7 * pixel), "spline")
+    rms = samples.std()
+    np.testing.assert_allclose(at_samples, samples[7], atol=2e-6 * rms)  # float32
+    spectrum = np.fft.fft2(samples.astype(np.float64)) / size**2
+    k = 2.0 * math.pi * np.fft.fftfreq(size, pixel)
+    x, y = stream(7, "places").random((2, 200)) * length * 3.0 - length  # beyond the side too: periodic
+    exact = np.einsum("ab,na,nb->n", spectrum, np.exp(1j * np.outer(y, k)), np.exp(1j * np.outer(x, k))).real
+    # Modes reach 1 rad per pixel, where a cubic spline's error is 2e-3 of the mode; most power lies far below.
+    assert np.sqrt(np.mean((evaluate(spline, pixel, x, y, "spline") - exact) ** 2)) < 2e-4 * rms
+
+
+@pytest.mark.parametrize("band", [LOW, HIGH])
+def test_stencils_share_their_modes(band):
+    options = {"size": 256, "length": 40.96 if band == LOW else 5.12, "band": band}
+    plain = np.fft.fft2(screen(LOW, **options).astype(np.float64))
+    k = 2.0 * math.pi * np.fft.fftfreq(256)
+    for stencil in STENCILS:
+        amplified = np.fft.fft2(screen(LOW, stencil=stencil, **options).astype(np.float64))
+        expected = plain * stencil_gain(k[np.newaxis, :], k[:, np.newaxis], stencil)
+        # float32 noise of the transform.
+        np.testing.assert_allclose(amplified, expected, atol=3e-6 * np.abs(amplified).max())
+
+
+def test_number_of_samples_does_not_change_the_field():
+    coarse, fine = screen(LOW, size=1024), screen(LOW, size=2048)
+    # float32 rounding of two transforms.
+    np.testing.assert_allclose(fine[::2, ::2], coarse, atol=3e-6 * coarse.std())
+
+
+def test_threads_change_no_byte():
+    reference = screen(LOW, threads=1).tobytes()
+    for threads in (2, 3, 7):
+        assert screen(LOW, threads=threads).tobytes() == reference
+
+
+def test_streams_decide_the_screen():
+    first = screen(LOW, seed=1, size=1024)
+    np.testing.assert_array_equal(first, screen(LOW, seed=1, size=1024))
+    other = screen(LOW, seed=2, size=1024)
+    # 13 outer scales on a side: independent screens correlate by some 0.05.
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.2
+
+
+def test_amplitude_goes_with_the_root_of_the_weight_and_the_power_of_r0():
+    # Tolerances: float32.
+    whole = screen(LOW, size=1024)
+    np.testing.assert_allclose(screen(LOW, size=1024, weight=0.25), 0.5 * whole, rtol=1e-5, atol=1e-6 * whole.std())
+    worse = screen(LOW, size=1024, r0=0.08)
+    np.testing.assert_allclose(worse, 2.0 ** (5 / 6) * whole, rtol=1e-5, atol=5e-6 * whole.std())
+
+
+def test_mean_is_zero_and_output_is_written_in_place():
+    out = np.empty((512, 512), dtype=np.float32)
+    field = screen(LOW, size=512, length=81.92, out=out)
+    assert field is out
+    assert abs(np.mean(field, dtype=np.float64)) < 1e-7 * field.std()  # float32
+
+
+@pytest.mark.parametrize("size", [4, 5, 63, 100])
+def test_any_number_of_samples(size):
+    field = phase_screen(stream(1, "odd"), size=size, length=1.0, r0=R0, outer_scale=L0)
+    assert field.shape == (size, size)
+    assert np.all(np.isfinite(field))
+    assert field.std() > 0.0
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(DomainError, match="size = 2"):
+        screen(LOW, size=2)
+    with pytest.raises(DomainError, match=r"length = -1\.0"):
+        screen(LOW, length=-1.0)
+    with pytest.raises(DomainError, match="r0 = 0"):
+        screen(LOW, r0=0)
+    with pytest.raises(UnknownNameError, match="unknown stencil 'splin': did you mean spline"):
+        screen(LOW, stencil="splin")

@@ -1,0 +1,1 @@
+"""Phase: optical path differences, Zernikes, phase screens, the atmosphere, PSF engines."""

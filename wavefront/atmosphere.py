@@ -1,0 +1,397 @@
+"""The atmosphere over one exposure: frozen layers of turbulence, each on two scales, blown across the pupil.
+
+Every layer has a *low* screen, which holds exactly the modes with wavenumber ``|k| <= cutoff`` on a large coarse grid,
+and a *high* screen with the modes ``|k| > cutoff`` on a small fine grid; both are periodic. Power is neither counted
+twice nor missing (below the Nyquist limit of the fine grid), and the low screen alone is what geometric optics may see.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..models.errors import DomainError, unknown_name
+from ..models.random_streams import stream
+from ..models.site import Site, load_site
+from ..models.units import metres, radians
+from .screens import evaluate, phase_screen
+from .turbulence import require_positive
+
+_cache_lock = threading.Lock()
+_SCALES = ("low", "high")
+
+
+@dataclass(frozen=True, eq=False)
+class Atmosphere:
+    """Layers of frozen turbulence during one exposure; make one with :meth:`from_site`.
+
+    Light of a star in field direction ``(tx, ty)`` (slopes of its travel) that meets the pupil at ``p`` at time ``t``
+    crosses a layer at the screen coordinates ``p - altitude * (tx, ty) - velocity * t + offset``, modulo the side of
+    each screen.
+
+    Attributes
+    ----------
+    altitudes : ndarray
+        Distances of the layers from the telescope along the line of sight [m], shape [n_layer].
+    weights : ndarray
+        Fractions of the turbulence, of sum 1, shape [n_layer].
+    velocities : ndarray
+        Wind in the telescope's x-y plane [m/s], shape [n_layer, 2]: the screens move this way.
+    offsets : ndarray
+        Screen coordinates over the pupil's centre at time 0 [m], shape [n_layer, 2].
+    r0 : float
+        Fried parameter at 500 nm along the line of sight [m].
+    outer_scale : float
+        Outer scale [m].
+    exposure : float
+        Length of the exposure [s].
+    times : ndarray
+        Middles of the time steps [s], shape [n_time].
+    cutoff : float
+        Wavenumber that divides the low from the high modes [rad/m].
+    screen_size, screen_length : int, float
+        Samples on a side of a low screen, and its side [m].
+    fine_size, fine_pixel : int, float
+        Samples on a side of a high screen, and their distance [m].
+    seed, epoch : int
+        Seed of the run and number of the exposure: each epoch has its own winds and screens.
+    fixed_modulus : bool
+        Whether modes have a fixed modulus and a random phase in place of a Gaussian amplitude.
+    """
+
+    altitudes: np.ndarray
+    weights: np.ndarray
+    velocities: np.ndarray
+    offsets: np.ndarray
+    r0: float
+    outer_scale: float
+    exposure: float
+    times: np.ndarray
+    cutoff: float
+    screen_size: int
+    screen_length: float
+    fine_size: int
+    fine_pixel: float
+    seed: int
+    epoch: int
+    fixed_modulus: bool = False
+    _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def from_site(
+        cls,
+        site: str | Site,
+        seed: int,
+        *,
+        r0: float | None = None,
+        outer_scale: float | None = None,
+        exposure: float = 15.0,
+        time_step: float = 0.05,
+        screen_size: int = 8192,
+        screen_length: float = 1300.0,
+        cutoff: float | None = None,
+        fine_size: int = 2048,
+        fine_pixel: float = 0.02,
+        epoch: int = 0,
+        altitudes: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+        wind_speeds: ArrayLike | None = None,
+        wind_directions: ArrayLike | None = None,
+        ground_lift: float = 0.0,
+        zenith_angle: float = 0.0,
+        fixed_modulus: bool = False,
+    ) -> Atmosphere:
+        """Return the atmosphere of a site for one exposure.
+
+        Parameters
+        ----------
+        site : str or Site
+            Bundled site, path of a site file, or site.
+        seed : int
+            Seed of the run, not negative: it fixes wind directions, offsets and screens.
+        r0 : float or Quantity, optional
+            Fried parameter at 500 nm at the zenith [m]; the site's by default.
+        outer_scale : float or Quantity, optional
+            Outer scale [m]; the site's by default. Screens miss the modes longer than their own side.
+        exposure, time_step : float
+            Length of the exposure and of a time step [s]; the step is shortened to divide the exposure evenly.
+        screen_size, screen_length : int, float
+            Samples on a side of a low screen, and its side [m].
+        cutoff : float, optional
+            Wavenumber that divides the low from the high modes [rad/m]; one over the Fried parameter by default.
+        fine_size, fine_pixel : int, float
+            Samples on a side of a high screen, and their distance [m].
+        epoch : int
+            Number of the exposure, not negative.
+        altitudes, weights, wind_speeds : array_like, optional
+            Layers in place of the site's: heights above the telescope [m], relative turbulence, wind [m/s].
+        wind_directions : array_like, optional
+            Directions that the wind blows to, from +x towards +y [rad]; random by default.
+        ground_lift : float
+            Height given to a layer at exactly 0 [m]: at 0 neighbouring stars see one and the same ground layer.
+        zenith_angle : float or Quantity
+            Angle of the line of sight from the zenith [rad]: it takes the layers farther by its secant and makes the
+            Fried parameter smaller by its cosine to the 3/5.
+        fixed_modulus : bool
+            Give modes a fixed modulus and a random phase only (Jee & Tyson 2011, eq. 2); not a Gaussian field.
+
+        Raises
+        ------
+        DomainError
+            If an argument is outside its range.
+        UnknownNameError
+            If there is no such site.
+        """
+        if not isinstance(site, Site):
+            site = load_site(site)
+        if not (isinstance(seed, int | np.integer) and seed >= 0):
+            raise DomainError(f"seed = {seed!r}: expected a whole number from 0")
+        if not (isinstance(epoch, int | np.integer) and epoch >= 0):
+            raise DomainError(f"epoch = {epoch!r}: expected a whole number from 0")
+        zenith = float(radians(zenith_angle, "zenith_angle"))
+        if not 0.0 <= zenith <= math.radians(80.0):
+            raise DomainError(f"zenith_angle = {zenith!r} rad: expected 0 to {math.radians(80.0):.4f} rad (80 degrees)")
+        fried = require_positive(float(metres(site.r0 if r0 is None else r0, "r0")), "r0", "metres")
+        fried *= math.cos(zenith) ** 0.6
+        outer = site.outer_scale if outer_scale is None else outer_scale
+        outer = require_positive(float(metres(outer, "outer_scale")), "outer_scale", "metres")
+        height, fraction, speed, direction = _layers(
+            site, altitudes, weights, wind_speeds, wind_directions, seed, epoch
+        )
+        if not (math.isfinite(ground_lift) and ground_lift >= 0.0):
+            raise DomainError(f"ground_lift = {ground_lift!r}: expected a height of 0 m or more")
+        height = np.where(height == 0.0, ground_lift, height) / math.cos(zenith)
+        exposure = require_positive(exposure, "exposure", "seconds")
+        steps = max(1, math.ceil(exposure / require_positive(time_step, "time_step", "seconds") - 1e-9))
+        length = require_positive(screen_length, "screen_length", "metres")
+        offsets = np.array([stream(seed, "atmosphere", epoch, n, "offset").random(2) for n in range(len(height))])
+        atmosphere = cls(
+            altitudes=height,
+            weights=fraction,
+            velocities=speed[:, np.newaxis] * np.stack([np.cos(direction), np.sin(direction)], axis=1),
+            offsets=offsets * length,
+            r0=fried,
+            outer_scale=outer,
+            exposure=exposure,
+            times=(np.arange(steps) + 0.5) * (exposure / steps),
+            cutoff=require_positive(1.0 / fried if cutoff is None else cutoff, "cutoff", "radians per metre"),
+            screen_size=_size(screen_size, "screen_size"),
+            screen_length=length,
+            fine_size=_size(fine_size, "fine_size"),
+            fine_pixel=require_positive(fine_pixel, "fine_pixel", "metres"),
+            seed=int(seed),
+            epoch=int(epoch),
+            fixed_modulus=bool(fixed_modulus),
+        )
+        atmosphere._check_cutoff()
+        for array in (
+            atmosphere.altitudes,
+            atmosphere.weights,
+            atmosphere.velocities,
+            atmosphere.offsets,
+            atmosphere.times,
+        ):
+            array.setflags(write=False)
+        return atmosphere
+
+    @property
+    def screen_pixel(self) -> float:
+        """Distance of the samples of a low screen [m]."""
+        return self.screen_length / self.screen_size
+
+    @property
+    def fine_length(self) -> float:
+        """Side of a high screen [m]."""
+        return self.fine_size * self.fine_pixel
+
+    @property
+    def layer_count(self) -> int:
+        """Number of layers."""
+        return len(self.altitudes)
+
+    def _check_cutoff(self) -> None:
+        """Refuse a cut-off that one of the two grids cannot hold."""
+        grids = {
+            "low": (self.screen_length, math.pi / self.screen_pixel),
+            "high": (self.fine_length, math.pi / self.fine_pixel),
+        }
+        for scale, (length, nyquist) in grids.items():
+            lowest = 2.0 * math.pi / length
+            if not lowest < self.cutoff < nyquist:
+                raise DomainError(
+                    f"cutoff = {self.cutoff:.6g} rad/m: expected between the lowest mode and the Nyquist limit of the"
+                    f" {scale} screens, {lowest:.4g} to {nyquist:.4g} rad/m"
+                )
+
+    def low_screen(
+        self, layer: int, stencil: str = "gradient", *, threads: int | None = None, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the low screen of a layer: the modes at and below the cut-off.
+
+        Parameters
+        ----------
+        layer : int
+            Index of the layer.
+        stencil : str
+            How it will be read, one of :data:`pachon.wavefront.screens.STENCILS`; the modes are the same for all.
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+        out : ndarray, optional
+            Where to write the screen: float32, shape [screen_size, screen_size].
+
+        Returns
+        -------
+        ndarray
+            Path [m], float32, shape [screen_size, screen_size], ``[y, x]``.
+        """
+        return self._screen(layer, "low", stencil, threads, out)
+
+    def high_screen(
+        self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the high screen of a layer: the modes above the cut-off.
+
+        Arguments are those of :meth:`low_screen`; the screen has shape [fine_size, fine_size].
+        """
+        return self._screen(layer, "high", stencil, threads, out)
+
+    def _screen(self, layer: int, scale: str, stencil: str, threads: int | None, out: np.ndarray | None) -> np.ndarray:
+        if not 0 <= layer < self.layer_count:
+            raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
+        low = scale == "low"
+        return phase_screen(
+            stream(self.seed, "atmosphere", self.epoch, layer, scale),
+            size=self.screen_size if low else self.fine_size,
+            length=self.screen_length if low else self.fine_length,
+            r0=self.r0,
+            outer_scale=self.outer_scale,
+            band=(0.0, self.cutoff) if low else (self.cutoff, math.inf),
+            weight=float(self.weights[layer]),
+            stencil=stencil,
+            fixed_modulus=self.fixed_modulus,
+            threads=threads,
+            out=out,
+        )
+
+    def low_gradient_screens(self, threads: int | None = None) -> np.ndarray:
+        """Return the low screens of all layers for reading gradients, made once and kept.
+
+        Parameters
+        ----------
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+
+        Returns
+        -------
+        ndarray
+            Path [m], float32, shape [n_layer, screen_size, screen_size], not writable.
+        """
+        with _cache_lock:
+            if "gradient" not in self._cache:
+                screens = np.empty((self.layer_count, self.screen_size, self.screen_size), dtype=np.float32)
+                for layer in range(self.layer_count):
+                    self.low_screen(layer, "gradient", threads=threads, out=screens[layer])
+                screens.setflags(write=False)
+                self._cache["gradient"] = screens
+            return self._cache["gradient"]
+
+    def release(self) -> None:
+        """Forget the kept screens; they come back, byte for byte, when next asked for."""
+        with _cache_lock:
+            self._cache.clear()
+
+    def screen_coordinates(
+        self, x: ArrayLike, y: ArrayLike, layer: int, *, field: tuple[float, float] = (0.0, 0.0), time: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return where light that meets the pupil at ``(x, y)`` crosses a layer.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Pupil coordinates [m].
+        layer : int
+            Index of the layer.
+        field : tuple of float
+            Slopes ``(tx, ty)`` of the light's travel [rad].
+        time : float
+            Time since the start of the exposure [s].
+
+        Returns
+        -------
+        tuple of ndarray
+            Screen coordinates x and y [m], not yet taken modulo the side.
+        """
+        shift = self.offsets[layer] - self.altitudes[layer] * np.asarray(field) - self.velocities[layer] * time
+        return np.asarray(x, dtype=np.float64) + shift[0], np.asarray(y, dtype=np.float64) + shift[1]
+
+    def path(
+        self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low", stencil: str = "spline"
+    ) -> np.ndarray:
+        """Return the path through one screen at screen coordinates, by plain NumPy.
+
+        The screen is made anew at every call: this is the reference for the engines, not a tool for production.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Screen coordinates [m].
+        layer : int
+            Index of the layer.
+        scale : str
+            ``"low"`` or ``"high"``.
+        stencil : str
+            Stencil of the screen: ``"spline"`` interpolates by cubic B-spline, the others bilinearly.
+
+        Returns
+        -------
+        ndarray
+            Path [m], float64, shape of ``x``.
+        """
+        if scale not in _SCALES:
+            raise unknown_name("scale", scale, _SCALES)
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        pixel = self.screen_pixel if scale == "low" else self.fine_pixel
+        return evaluate(self._screen(layer, scale, stencil, None, None), pixel, x, y, stencil)
+
+
+def _size(value: int, name: str) -> int:
+    if not (isinstance(value, int | np.integer) and value >= 4):
+        raise DomainError(f"{name} = {value!r}: expected a whole number of at least 4 samples")
+    return int(value)
+
+
+def _layers(
+    site: Site,
+    altitudes: ArrayLike | None,
+    weights: ArrayLike | None,
+    wind_speeds: ArrayLike | None,
+    wind_directions: ArrayLike | None,
+    seed: int,
+    epoch: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return heights [m], weights of sum 1, wind speeds [m/s] and directions [rad] of the layers, checked."""
+    height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
+    count = len(height)
+    if wind_directions is None:
+        wind_directions = [2.0 * math.pi * stream(seed, "atmosphere", epoch, n, "wind").random() for n in range(count)]
+    given = {
+        "altitudes": height,
+        "weights": np.array(site.weights if weights is None else weights, dtype=np.float64),
+        "wind_speeds": np.array(site.wind_speeds if wind_speeds is None else wind_speeds, dtype=np.float64),
+        "wind_directions": np.array(wind_directions, dtype=np.float64),
+    }
+    for name, values in given.items():
+        if values.shape != (count,) or count == 0:
+            raise DomainError(f"{name} of shape {values.shape}: expected one number for each of the {count} layers")
+        low = -math.inf if name == "wind_directions" else 0.0
+        if not np.all(np.isfinite(values) & (values >= low)):
+            raise DomainError(f"{name} = {values.tolist()}: expected finite numbers{' from 0' if low == 0.0 else ''}")
+    total = float(given["weights"].sum())
+    if total <= 0.0:
+        raise DomainError(f"weights = {given['weights'].tolist()}: expected at least one above 0")
+    return height, given["weights"] / total, given["wind_speeds"], given["wind_directions"]

@@ -1,0 +1,178 @@
+"""Kernels of the fast PSF engine: rays through the frozen layers onto a fine grid, and the filters in frequency."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ..raytrace.launch import FORWARD_OPTIONS
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+#: Pupil points in one packet.
+LANES = 16
+
+samples = wp.types.vector(LANES, wp.float32)
+sample_offsets = wp.types.vector(LANES, wp.int32)
+
+
+@wp.func
+def corner_of(position: wp.float64, size: wp.int32):
+    """Take a screen coordinate [pixels] modulo the screen; return its sample and the fraction of a pixel beyond it."""
+    # float64: a fraction of a pixel after a kilometre of wind would lose its digits in float32.
+    wrapped = position - wp.float64(size) * wp.floor(position / wp.float64(size))
+    corner = wp.int32(wrapped)
+    return corner % size, wp.float32(wrapped - wp.float64(corner))
+
+
+@wp.func
+def patch_corners(
+    screens: wp.array2d(dtype=wp.float32),
+    layer: wp.int32,
+    size: wp.int32,
+    corner_x: wp.int32,
+    corner_y: wp.int32,
+    column: sample_offsets,
+    row: sample_offsets,
+    reach: wp.int32,
+):
+    """Read the four corners of the patch under every lane: (0, 0), (1, 0), (0, 1), (1, 1) in (x, y)."""
+    c00 = samples()
+    c10 = samples()
+    c01 = samples()
+    c11 = samples()
+    if corner_x + reach < size and corner_y + reach < size:
+        base = corner_y * size + corner_x
+        for i in range(LANES):
+            at = base + row[i] * size + column[i]
+            c00[i] = screens[layer, at]
+            c10[i] = screens[layer, at + 1]
+            c01[i] = screens[layer, at + size]
+            c11[i] = screens[layer, at + size + 1]
+    else:
+        for i in range(LANES):
+            x0 = (corner_x + column[i]) % size
+            y0 = (corner_y + row[i]) % size
+            x1 = (x0 + 1) % size
+            y1 = (y0 + 1) % size
+            c00[i] = screens[layer, y0 * size + x0]
+            c10[i] = screens[layer, y0 * size + x1]
+            c01[i] = screens[layer, y1 * size + x0]
+            c11[i] = screens[layer, y1 * size + x1]
+    return c00, c10, c01, c11
+
+
+@wp.kernel
+def deposit_rays(
+    first: wp.int32,
+    screens: wp.array2d(dtype=wp.float32),
+    screen_size: wp.int32,
+    n_layer: wp.int32,
+    n_time: wp.int32,
+    start: wp.array3d(dtype=wp.float64),
+    step: wp.array2d(dtype=wp.float64),
+    columns: wp.array(dtype=sample_offsets),
+    rows: wp.array(dtype=sample_offsets),
+    reach: wp.int32,
+    cells_per_slope: wp.array2d(dtype=wp.float32),
+    displacement: wp.array4d(dtype=samples),
+    weight: wp.array3d(dtype=samples),
+    grid_size: wp.int32,
+    slope: wp.array3d(dtype=samples),
+    image: wp.array2d(dtype=wp.float32),
+):
+    """Deposit all rays of one star, at every wavelength, on its fine grid.
+
+    The pupil points lie on the lattice of the screens, so at one time all of them share one fraction of a pixel and
+    differ in whole samples only.
+
+    Arguments: screens [layer, y * size + x] [m]; start [star, layer, 2] screen coordinates of the first lattice point at the
+    first time [pixels]; step [layer, 2] [pixels per time step]; columns, rows [packet] lattice points [pixels]; reach: the
+    largest of them, plus one; cells_per_slope [star, 4]: Jacobian, row by row, over the screen pixel and the cell;
+    displacement [star, wave, packet, 2] by the optics [cells]; weight [star, wave, packet]; slope [star, packet, 2]: room
+    for the differences of path across a pixel [m]; image [star, (wave * size + y) * size + x], the origin at size / 2.
+    """
+    star = first + wp.tid()
+    n_packet = columns.shape[0]
+    n_wave = weight.shape[1]
+    xx = cells_per_slope[star, 0]
+    xy = cells_per_slope[star, 1]
+    yx = cells_per_slope[star, 2]
+    yy = cells_per_slope[star, 3]
+    origin = wp.float32(grid_size // 2) + wp.float32(0.5)
+    for t in range(n_time):
+        for packet in range(n_packet):
+            slope[star, packet, 0] = samples()
+            slope[star, packet, 1] = samples()
+        for layer in range(n_layer):
+            time = wp.float64(t)
+            corner_x, fraction_x = corner_of(start[star, layer, 0] + time * step[layer, 0], screen_size)
+            corner_y, fraction_y = corner_of(start[star, layer, 1] + time * step[layer, 1], screen_size)
+            for packet in range(n_packet):
+                c00, c10, c01, c11 = patch_corners(
+                    screens, layer, screen_size, corner_x, corner_y, columns[packet], rows[packet], reach
+                )
+                twist = (c11 - c01) - (c10 - c00)
+                slope[star, packet, 0] = slope[star, packet, 0] + ((c10 - c00) + twist * fraction_y)
+                slope[star, packet, 1] = slope[star, packet, 1] + ((c01 - c00) + twist * fraction_x)
+        for packet in range(n_packet):
+            slope_x = slope[star, packet, 0]
+            slope_y = slope[star, packet, 1]
+            x = slope_x * xx + slope_y * xy
+            y = slope_x * yx + slope_y * yy
+            for wave in range(n_wave):
+                cell_x = x + displacement[star, wave, packet, 0]
+                cell_y = y + displacement[star, wave, packet, 1]
+                light = weight[star, wave, packet]
+                for i in range(LANES):
+                    column = wp.int32(wp.floor(cell_x[i] + origin))
+                    row = wp.int32(wp.floor(cell_y[i] + origin))
+                    if wp.min(column, row) < 0 or wp.max(column, row) >= grid_size:
+                        column = (column % grid_size + grid_size) % grid_size
+                        row = (row % grid_size + grid_size) % grid_size
+                    at = (wave * grid_size + row) * grid_size + column
+                    image[star, at] = image[star, at] + light[i]
+
+
+@wp.kernel
+def combine_wavelengths(
+    first: wp.int32,
+    spectra: wp.array4d(dtype=wp.vec2f),
+    frequency: wp.float32,
+    metric: wp.array2d(dtype=wp.float32),
+    baseline: wp.array(dtype=wp.float32),
+    table: wp.array2d(dtype=wp.float32),
+    table_step: wp.float32,
+    detector: wp.array2d(dtype=wp.float32),
+    ramp_x: wp.array3d(dtype=wp.vec2f),
+    ramp_y: wp.array3d(dtype=wp.vec2f),
+    combined: wp.array3d(dtype=wp.vec2f),
+):
+    """Filter the transforms of one star's wavelengths and add them up, one row of frequencies an item.
+
+    Arguments: spectra [star, wave, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy of
+    jacobian @ jacobian.T [m^2/rad^2]; baseline [wave]: wavelength / 2 pi [m]; table [wave, sample]: filter against the
+    baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all wavelengths; ramp_x
+    [star, wave, kx], ramp_y [star, wave, ky]: phase factors; combined [star, ky, kx]: the sum.
+    """
+    item = first + wp.tid()
+    n_row = spectra.shape[2]
+    star = item // n_row
+    row = item % n_row
+    ky = wp.float32(wp.where(2 * row > n_row, row - n_row, row)) * frequency
+    for column in range(spectra.shape[3]):
+        kx = wp.float32(column) * frequency
+        squared = metric[star, 0] * kx * kx + wp.float32(2.0) * metric[star, 1] * kx * ky + metric[star, 2] * ky * ky
+        separation = wp.sqrt(wp.max(squared, wp.float32(0.0))) / table_step
+        total = wp.vec2f(0.0, 0.0)
+        for wave in range(spectra.shape[1]):
+            place = wp.min(separation * baseline[wave], wp.float32(table.shape[1]) - wp.float32(1.001))
+            knot = wp.int32(place)
+            part = place - wp.float32(knot)
+            value = table[wave, knot] + part * (table[wave, knot + 1] - table[wave, knot])
+            px = ramp_x[star, wave, column]
+            py = ramp_y[star, wave, row]
+            re = px[0] * py[0] - px[1] * py[1]
+            im = px[0] * py[1] + px[1] * py[0]
+            s = spectra[star, wave, row, column]
+            total = total + wp.vec2f(s[0] * re - s[1] * im, s[0] * im + s[1] * re) * value
+        combined[star, row, column] = total * detector[row, column]

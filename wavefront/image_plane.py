@@ -1,0 +1,73 @@
+r"""The detector end of both PSF engines: the grid of a stamp, and what pixels and charge diffusion do to it.
+
+An image :math:`I(X)` on the focal plane has the transform :math:`\tilde I(k) = \int I(X) e^{-i k \cdot X} dX`, with k in
+radians per metre of the focal plane. A pupil baseline b belongs to :math:`k = (2 \pi / \lambda) J^{-T} b`, where J is
+the Jacobian of the position on the focal plane with respect to the direction of the incoming light.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..models.errors import DomainError
+
+
+@dataclass(frozen=True)
+class ImagePlane:
+    """The pixels of a stamp and the detector behind them.
+
+    Attributes
+    ----------
+    stamp_size : int
+        Pixels on a side.
+    pixel_size : float
+        Side of a square pixel [m].
+    diffusion : float
+        Root mean square of the charge diffusion along each axis [m].
+    """
+
+    stamp_size: int
+    pixel_size: float
+    diffusion: float
+
+    def __post_init__(self) -> None:
+        if int(self.stamp_size) != self.stamp_size or self.stamp_size < 3:
+            raise DomainError(f"stamp_size = {self.stamp_size!r}: expected a whole number of at least 3 pixels")
+        if not (math.isfinite(self.pixel_size) and self.pixel_size > 0.0):
+            raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
+        if not (math.isfinite(self.diffusion) and self.diffusion >= 0.0):
+            raise DomainError(f"diffusion = {self.diffusion!r}: expected a length in metres from 0")
+
+    @property
+    def side(self) -> float:
+        """Side of the stamp [m]."""
+        return self.stamp_size * self.pixel_size
+
+    @property
+    def pixel_centers(self) -> np.ndarray:
+        """Coordinates of the pixel centres along an axis [m]; pixel ``stamp_size // 2`` is at 0."""
+        return (np.arange(self.stamp_size) - self.stamp_size // 2) * self.pixel_size
+
+    def transfer(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
+        """Return the transfer function of the detector: a square pixel and Gaussian charge diffusion.
+
+        Parameters
+        ----------
+        kx, ky : ndarray
+            Wavenumbers on the focal plane [rad/m], broadcast against each other.
+
+        Returns
+        -------
+        ndarray
+            Real factor of each wavenumber, 1 at zero.
+        """
+        pixel = np.sinc(kx * (0.5 * self.pixel_size / np.pi)) * np.sinc(ky * (0.5 * self.pixel_size / np.pi))
+        return pixel * np.exp(-0.5 * self.diffusion**2 * (kx * kx + ky * ky))
+
+
+def focal_length(jacobian: np.ndarray) -> np.ndarray:
+    """Return the effective focal length [m] of Jacobians [..., 2, 2]: the geometric mean of the two principal ones."""
+    return np.sqrt(np.abs(np.linalg.det(jacobian)))

@@ -1,0 +1,129 @@
+"""Atmospheric dispersion: the refractive index of air and differential refraction (Filippenko 1982, PASP 94, 715)."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..models.errors import DomainError
+from ..models.units import metres, radians
+
+#: Range of wavelengths that the formulae cover [m].
+WAVELENGTH_RANGE = (0.2e-6, 2.0e-6)
+#: Largest angle from the zenith for which the layers of air may be taken as flat [rad].
+LARGEST_ZENITH_ANGLE = math.radians(80.0)
+
+
+class Weather(Protocol):
+    """Weather at the telescope, such as that of a site."""
+
+    @property
+    def pressure_mmhg(self) -> float:
+        """Pressure [mm Hg]."""
+
+    @property
+    def temperature_c(self) -> float:
+        """Temperature [degrees Celsius]."""
+
+    @property
+    def water_vapour_mmhg(self) -> float:
+        """Partial pressure of water vapour [mm Hg]."""
+
+
+def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
+    """Return the refractive index of air less one (Filippenko 1982, eqs. 1 to 3).
+
+    Parameters
+    ----------
+    wavelength : array_like or Quantity
+        Wavelength in vacuum [m].
+    weather : Weather
+        Pressure [mm Hg], temperature [degrees Celsius] and water vapour [mm Hg].
+
+    Returns
+    -------
+    ndarray
+        ``n - 1``, shape of ``wavelength``.
+
+    Raises
+    ------
+    DomainError
+        If a wavelength lies outside 0.2 to 2 um, or the weather is not that of any observatory.
+    """
+    lam = metres(wavelength, "wavelength")
+    low, high = WAVELENGTH_RANGE
+    outside = lam[~((lam >= low) & (lam <= high))]
+    if outside.size:
+        raise DomainError(
+            f"wavelength = {outside[0]:g} m: expected {low:g} to {high:g} m, which the index of air covers"
+        )
+    pressure, temperature, vapour = _checked_weather(weather)
+    wavenumber2 = (1e-6 / lam) ** 2
+    # Eq. 1: dry air at 15 C and 760 mm Hg; eq. 2: other temperatures and pressures; eq. 3: water vapour.
+    standard = 64.328 + 29498.1 / (146.0 - wavenumber2) + 255.4 / (41.0 - wavenumber2)
+    expansion = 1.0 + 0.003661 * temperature
+    density = pressure * (1.0 + (1.049 - 0.0157 * temperature) * 1e-6 * pressure) / (720.883 * expansion)
+    return 1e-6 * (standard * density - (0.0624 - 0.000680 * wavenumber2) / expansion * vapour)
+
+
+def _checked_weather(weather: Weather) -> tuple[float, float, float]:
+    """Return pressure [mm Hg], temperature [degrees Celsius] and water vapour [mm Hg], each in its range."""
+    ranges = {"pressure_mmhg": (0.0, 1000.0), "temperature_c": (-100.0, 60.0), "water_vapour_mmhg": (0.0, 150.0)}
+    values = []
+    for name, (low, high) in ranges.items():
+        value = float(getattr(weather, name))
+        if not low <= value <= high:
+            raise DomainError(f"{name} = {value!r}: expected {low:g} to {high:g}")
+        values.append(value)
+    return values[0], values[1], values[2]
+
+
+def dispersion_shift(
+    wavelength: ArrayLike,
+    reference_wavelength: float,
+    zenith_angle: float,
+    position_angle: float,
+    weather: Weather,
+) -> np.ndarray:
+    """Return the shift in field angle of each wavelength against a reference wavelength.
+
+    Refraction lifts a star towards the zenith by ``(n - 1) tan z``, so one wavelength against another by the
+    difference of the indices (Filippenko 1982, eq. 4, there in arcseconds): shorter wavelengths lie nearer to the
+    zenith *on the sky*. A field angle is the slope of the light's own travel, and the source on the sky lies the
+    opposite way, so shorter wavelengths shift in field angle *away from* the zenith's direction.
+
+    Parameters
+    ----------
+    wavelength : array_like or Quantity
+        Wavelengths [m], shape [n_wave].
+    reference_wavelength : float or Quantity
+        Wavelength of no shift [m].
+    zenith_angle : float or Quantity
+        Angle of the line of sight from the zenith [rad].
+    position_angle : float or Quantity
+        Direction, on the sky as seen from the telescope, towards the zenith: angle in the x-y plane of the
+        telescope frame from +x towards +y [rad].
+    weather : Weather
+        Weather at the telescope, such as ``site.weather``.
+
+    Returns
+    -------
+    ndarray
+        Shift of the field angle ``(tx, ty)`` [rad], shape [n_wave, 2].
+
+    Raises
+    ------
+    DomainError
+        If a wavelength, the zenith angle (0 to 80 degrees) or the weather is outside its range.
+    """
+    zenith, position = float(radians(zenith_angle, "zenith_angle")), float(radians(position_angle, "position_angle"))
+    if not 0.0 <= zenith <= LARGEST_ZENITH_ANGLE:
+        raise DomainError(f"zenith_angle = {zenith!r} rad: expected 0 to {LARGEST_ZENITH_ANGLE:.4f} rad (80 degrees)")
+    if not math.isfinite(position):
+        raise DomainError(f"position_angle = {position!r} rad: expected a finite angle")
+    waves = np.atleast_1d(metres(wavelength, "wavelength"))
+    lift = (air_refractivity(waves, weather) - air_refractivity(reference_wavelength, weather)) * math.tan(zenith)
+    return -lift[:, np.newaxis] * np.array([math.cos(position), math.sin(position)])

@@ -1,0 +1,154 @@
+"""Annular Zernike polynomials in Noll order, orthonormal over an annulus.
+
+Mahajan (1981), J. Opt. Soc. Am. 71, 75: the radial polynomials for azimuthal order m are those of degree m, m + 2, ...
+made orthogonal over eps <= rho <= 1. They are built here by a QR factorisation on Gauss-Legendre nodes, which is exact
+for polynomials and needs no recursion; for eps = 0 they are Noll's (1976, J. Opt. Soc. Am. 66, 207).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..models.errors import DomainError
+from .opd import OpdMap
+
+#: Names of the first terms, as optical shops call them.
+NOLL_NAMES = {
+    1: "piston",
+    2: "tilt x",
+    3: "tilt y",
+    4: "defocus",
+    5: "astigmatism 45",
+    6: "astigmatism 0",
+    7: "coma y",
+    8: "coma x",
+    9: "trefoil y",
+    10: "trefoil x",
+    11: "spherical",
+}
+
+
+def noll_to_nm(j: int) -> tuple[int, int]:
+    """Return radial degree n and signed azimuthal order m of Noll index j (m < 0: sine)."""
+    if int(j) != j or j < 1:
+        raise DomainError(f"Noll index = {j!r}: expected a whole number of at least 1")
+    n = int((np.sqrt(8 * j - 7) - 1) / 2)
+    k = j - n * (n + 1) // 2
+    m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k + 1) // 2) - 1
+    return n, m if j % 2 == 0 else -m
+
+
+@lru_cache(maxsize=64)
+def _radial_coefficients(m: int, count: int, obscuration: float) -> np.ndarray:
+    """Coefficients [count, count] of rho^m times powers of rho^2, unit mean square over the annulus (m = 0)."""
+    # In s = rho^2 the annulus has the constant weight ds / (1 - eps^2); degree 2(count - 1) + m is exact.
+    nodes, weights = np.polynomial.legendre.leggauss(count + m + 1)
+    low = obscuration**2
+    s = 0.5 * (1 - low) * nodes + 0.5 * (1 + low)
+    root = np.sqrt(0.5 * weights)
+    # Legendre polynomials over the interval keep the factorisation well conditioned for thin annuli.
+    basis = np.polynomial.legendre.legvander(nodes, count - 1) * (s ** (m / 2))[:, None] * root[:, None]
+    _, upper = np.linalg.qr(basis)
+    signs = np.sign(np.diag(upper))
+    return np.linalg.inv(upper * signs[:, None])
+
+
+def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
+    """Evaluate annular Zernike polynomials 1 ... jmax, orthonormal over the annulus (mean square one).
+
+    Parameters
+    ----------
+    jmax : int
+        Highest Noll index.
+    x, y : ndarray
+        Pupil coordinates in units of the outer radius, one shape.
+    obscuration : float
+        Inner over outer radius, 0 <= obscuration < 1.
+
+    Returns
+    -------
+    ndarray, shape [jmax, ...]
+
+    Raises
+    ------
+    DomainError
+        If the obscuration or the index is out of range.
+    """
+    if not 0 <= obscuration < 1:
+        raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+    s = x * x + y * y
+    theta = np.arctan2(y, x)
+    low = obscuration**2
+    nodes = (2 * s - 1 - low) / (1 - low)
+    orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
+    degrees: dict[int, int] = {}
+    for n, m in orders:
+        degrees[abs(m)] = max(degrees.get(abs(m), 0), (n - abs(m)) // 2)
+    radial: dict[int, np.ndarray] = {}
+    for m, top in degrees.items():
+        powers = np.polynomial.legendre.legvander(nodes, top) * (s ** (m / 2))[..., None]
+        radial[m] = powers @ _radial_coefficients(m, top + 1, float(obscuration))
+    out = np.empty((jmax, *x.shape))
+    for row, (n, m) in enumerate(orders):
+        r = radial[abs(m)][..., (n - abs(m)) // 2]
+        if m == 0:
+            out[row] = r
+        elif m > 0:
+            out[row] = np.sqrt(2.0) * r * np.cos(m * theta)
+        else:
+            out[row] = np.sqrt(2.0) * r * np.sin(-m * theta)
+    return out
+
+
+@dataclass(frozen=True)
+class ZernikeFit:
+    """Annular Zernike coefficients of an OPD map.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape [jmax]
+        Noll order from j = 1 [m]; orthonormal terms, so each is its own rms over the unvignetted annulus.
+    obscuration : float
+        Inner over outer radius of the annulus.
+    residual_rms : float
+        Root mean square of what the fit leaves [m].
+    """
+
+    coefficients: np.ndarray
+    obscuration: float
+    residual_rms: float
+
+
+def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int = 28) -> ZernikeFit:
+    """Fit annular Zernikes to an OPD map by least squares over its lit points.
+
+    Coordinates are those of the entrance pupil. Where the pupil is vignetted the terms are no longer orthogonal over
+    the lit points, and the coefficients then depend on ``jmax``.
+
+    Parameters
+    ----------
+    opd : OpdMap
+        The map.
+    pupil_radius : float
+        Outer radius [m].
+    obscuration : float
+        Inner over outer radius.
+    jmax : int
+        Highest Noll index.
+
+    Raises
+    ------
+    DomainError
+        If fewer points are lit than there are terms.
+    """
+    lit = opd.lit
+    if lit.sum() < jmax:
+        raise DomainError(f"jmax = {jmax}: only {int(lit.sum())} pupil points are lit; expected at least as many")
+    terms = annular_zernikes(jmax, opd.x[lit] / pupil_radius, opd.y[lit] / pupil_radius, obscuration)
+    coefficients, *_ = np.linalg.lstsq(terms.T, opd.value[lit], rcond=None)
+    residual = opd.value[lit] - coefficients @ terms
+    return ZernikeFit(coefficients, obscuration, float(np.sqrt(np.mean(residual**2))))
