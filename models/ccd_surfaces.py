@@ -1,0 +1,134 @@
+"""Heights of CCD surfaces: a cubic polynomial, two cosine waves and, where measured, a B-spline for each CCD.
+
+On CCD ``i``, with ``dx, dy`` the distance from its centre [m] and ``u, v = dx / a, dy / a`` (``a`` half its side)::
+
+    h = sum_k polynomial[i, k] * (1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3)[k]
+      + sum_w amplitude_w cos(kx_w dx + ky_w dy + phase_w)
+      + sum_jk grid[i, j, k] B_j(v) B_k(u)
+
+`B` are the uniform cubic B-splines whose ``m - 3`` cells cover the CCD evenly. Positive heights are displaced along +z
+of the telescope frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Powers (of u, of v) of the ten terms.
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class CcdSurfaces:
+    """Height functions of `n` square CCDs of half side `half_size` [m].
+
+    Parameters
+    ----------
+    half_size : float
+        Half the side of a CCD [m].
+    polynomial : ndarray, shape (n, 10)
+        Coefficients [m] of 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3.
+    waves : ndarray, shape (n, 2, 4)
+        Amplitude [m], kx [rad/m], ky [rad/m], phase [rad] of two waves.
+    grid : ndarray, shape (n, m, m), optional
+        B-spline coefficients [m], index order CCD, y, x.
+    """
+
+    half_size: float
+    polynomial: np.ndarray
+    waves: np.ndarray
+    grid: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for array in (self.polynomial, self.waves, self.grid):
+            if array is not None:
+                array.flags.writeable = False
+
+    def height(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return heights [m] at local positions [m] on CCDs of given index, all of one shape (n,)."""
+        c = self.polynomial[ccd]
+        u, v = dx / self.half_size, dy / self.half_size
+        h = c[:, 0] + u * (c[:, 1] + u * (c[:, 3] + u * c[:, 6])) + v * (c[:, 2] + v * (c[:, 5] + v * c[:, 9]))
+        h = h + u * v * (c[:, 4] + u * c[:, 7] + v * c[:, 8])
+        for w in (0, 1):
+            amplitude, kx, ky, phase = self.waves[ccd, w].T
+            h = h + amplitude * np.cos(kx * dx + ky * dy + phase)
+        if self.grid is not None:
+            h = h + self._spline(ccd, u, v, 0, 0)
+        return h
+
+    def gradient(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return slopes (dh/dx, dh/dy), shape (n, 2), at local positions [m] on CCDs of given index."""
+        c = self.polynomial[ccd]
+        u, v = dx / self.half_size, dy / self.half_size
+        gx = c[:, 1] + 2 * u * c[:, 3] + v * c[:, 4] + 3 * u**2 * c[:, 6] + 2 * u * v * c[:, 7] + v**2 * c[:, 8]
+        gy = c[:, 2] + u * c[:, 4] + 2 * v * c[:, 5] + u**2 * c[:, 7] + 2 * u * v * c[:, 8] + 3 * v**2 * c[:, 9]
+        if self.grid is not None:
+            gx = gx + self._spline(ccd, u, v, 1, 0)
+            gy = gy + self._spline(ccd, u, v, 0, 1)
+        gx, gy = gx / self.half_size, gy / self.half_size
+        for w in (0, 1):
+            amplitude, kx, ky, phase = self.waves[ccd, w].T
+            fall = -amplitude * np.sin(kx * dx + ky * dy + phase)
+            gx, gy = gx + kx * fall, gy + ky * fall
+        return np.stack([gx, gy], axis=-1)
+
+    def curvature_bound(self) -> np.ndarray:
+        """Return an upper bound on the largest second derivative in any direction [1/m], shape (n,)."""
+        c = self.polynomial
+        # Second derivatives of a cubic are linear, so largest at a corner of the tile.
+        uu = 2 * np.abs(c[:, 3]) + 6 * np.abs(c[:, 6]) + 2 * np.abs(c[:, 7])
+        vv = 2 * np.abs(c[:, 5]) + 6 * np.abs(c[:, 9]) + 2 * np.abs(c[:, 8])
+        uv = np.abs(c[:, 4]) + 2 * np.abs(c[:, 7]) + 2 * np.abs(c[:, 8])
+        if self.grid is not None:
+            # A derivative of a B-spline lies within the hull of the differences of its coefficients.
+            cell = 2.0 / (self.grid.shape[1] - 3)
+            uu = uu + np.abs(np.diff(self.grid, 2, axis=2)).max(axis=(1, 2)) / cell**2
+            vv = vv + np.abs(np.diff(self.grid, 2, axis=1)).max(axis=(1, 2)) / cell**2
+            uv = uv + np.abs(np.diff(np.diff(self.grid, axis=1), axis=2)).max(axis=(1, 2)) / cell**2
+        # Spectral norm of a symmetric matrix: at most its larger diagonal element plus the off-diagonal one.
+        bound = (np.maximum(uu, vv) + uv) / self.half_size**2
+        amplitude, kx, ky = self.waves[:, :, 0], self.waves[:, :, 1], self.waves[:, :, 2]
+        return bound + np.sum(np.abs(amplitude) * (kx**2 + ky**2), axis=1)
+
+    def _spline(self, ccd: np.ndarray, u: np.ndarray, v: np.ndarray, order_u: int, order_v: int) -> np.ndarray:
+        assert self.grid is not None
+        m = self.grid.shape[1]
+        i, wu = spline_weights(u, m, order_u)
+        j, wv = spline_weights(v, m, order_v)
+        total = np.zeros_like(u)
+        for b in range(4):
+            for a in range(4):
+                total = total + wv[b] * wu[a] * self.grid[ccd, j + b, i + a]
+        return total
+
+
+def spline_weights(u: np.ndarray, m: int, order: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first of the four B-splines that are not zero at `u`, and their values or first derivatives.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+        Position on the tile, -1 to 1.
+    m : int
+        Number of coefficients along a side; ``m - 3`` cells.
+    order : int
+        0 for values, 1 for derivatives with respect to `u`.
+
+    Returns
+    -------
+    first : ndarray of int, shape (n,)
+        Index of the first of four.
+    weights : ndarray, shape (4, n)
+        Their values.
+    """
+    t = (u + 1.0) * (0.5 * (m - 3))
+    first = np.clip(np.floor(t).astype(np.int64), 0, m - 4)
+    f = t - first
+    if order == 0:
+        weights = ((1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3)
+        return first, np.stack(weights) / 6.0
+    weights = (-((1 - f) ** 2), 3 * f**2 - 4 * f, -3 * f**2 + 2 * f + 1, f**2)
+    return first, np.stack(weights) * (0.25 * (m - 3))

@@ -1,0 +1,312 @@
+"""What a run keeps of one CCD, and the FITS file that holds it.
+
+Whatever comes after a CCD is done, correlations, summary and report, reads this file and nothing else: a run that was
+interrupted and resumed sees exactly what an uninterrupted one does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from astropy.io import fits
+
+from ..models.errors import ProductError
+from .pca import PsfModel
+from .photometry import ARCSEC
+from .products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+
+
+class _Unit(NamedTuple):
+    name: str
+    size: float
+
+
+_MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("arcsec", ARCSEC), _Unit("", 1.0)
+_COLUMNS: dict[str, tuple[str, _Unit, str]] = {
+    "x": ("X", _MM, "detector x"),
+    "y": ("Y", _MM, "detector y"),
+    "field_x": ("FIELD_X", _DEG, "field angle, slope of the light along x"),
+    "field_y": ("FIELD_Y", _DEG, "field angle, slope of the light along y"),
+    "magnitude": ("MAG", _Unit("mag", 1.0), "AB magnitude"),
+    "electrons": ("ELECTRON", _Unit("electron", 1.0), "electrons of the star in the exposure"),
+    "snr": ("SNR", _NONE, "signal to noise of PSF photometry"),
+    "e1": ("E1", _NONE, "ellipticity (a-b)/(a+b) along x"),
+    "e2": ("E2", _NONE, "ellipticity along x = y"),
+    "size": ("SIZE", _SEC, "weighted rms size (Q11 Q22 - Q12^2)^(1/4)"),
+    "fwhm": ("FWHM", _SEC, "full width at half maximum"),
+    "flags": ("FLAGS", _NONE, "shape flags, 0 is good"),
+    "used": ("USED", _NONE, "whether the model was fitted to the star"),
+    "model_e1": ("MODEL_E1", _NONE, "ellipticity of the model there"),
+    "model_e2": ("MODEL_E2", _NONE, "ellipticity of the model there"),
+}
+
+
+@dataclass(frozen=True)
+class Stars:
+    """Positions and shapes, one array element a star.
+
+    Attributes
+    ----------
+    x, y : ndarray
+        Detector position [m].
+    field_x, field_y : ndarray
+        Field angle [rad].
+    e1, e2 : ndarray
+        Measured ellipticity, NaN where flagged.
+    size : ndarray
+        Weighted rms size [rad].
+    flags : ndarray of int
+        Flags of the shape measurement.
+    model_e1, model_e2 : ndarray
+        Ellipticity of the model at the position of the star.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    field_x: np.ndarray
+    field_y: np.ndarray
+    e1: np.ndarray
+    e2: np.ndarray
+    size: np.ndarray
+    flags: np.ndarray
+    model_e1: np.ndarray
+    model_e2: np.ndarray
+
+    @property
+    def residual_e1(self) -> np.ndarray:
+        """Measured minus model ellipticity, first component."""
+        return self.e1 - self.model_e1
+
+    @property
+    def residual_e2(self) -> np.ndarray:
+        """Measured minus model ellipticity, second component."""
+        return self.e2 - self.model_e2
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+@dataclass(frozen=True)
+class TruthStars(Stars):
+    """Places without an observed star, where the PSF is known without noise.
+
+    Attributes
+    ----------
+    fwhm : ndarray
+        Full width at half maximum of the PSF, pixel included [rad].
+    """
+
+    fwhm: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObservedStars(Stars):
+    """Observed stars.
+
+    Attributes
+    ----------
+    magnitude : ndarray
+        AB magnitude.
+    electrons : ndarray
+        Electrons in the exposure.
+    snr : ndarray
+        Signal to noise of PSF photometry.
+    used : ndarray of bool
+        Whether the model was fitted to the star.
+    """
+
+    magnitude: np.ndarray
+    electrons: np.ndarray
+    snr: np.ndarray
+    used: np.ndarray
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenvalues of the principal components.
+
+    Attributes
+    ----------
+    observed, truth : ndarray
+        Variance along each component of the observed and of the noise-free stars, largest first.
+    kink : int
+        Component after which the observed eigenvalues fall slowly: those beyond hold noise.
+    truth_fraction : float
+        Part of the truth's variance that as many components hold as the model has.
+    """
+
+    observed: np.ndarray
+    truth: np.ndarray
+    kink: int
+    truth_fraction: float
+
+
+@dataclass(frozen=True)
+class CcdProduct:
+    """All that a run keeps of one CCD.
+
+    Attributes
+    ----------
+    name : str
+        Name of the CCD.
+    center : tuple of float
+        Centre on the detector [m].
+    pixel_scale : float
+        Angle of a stamp's pixel [rad].
+    noise : tuple of float
+        Sky [electrons/pixel] and rms noise without light [electrons/pixel].
+    truth : TruthStars
+        Places where the PSF is known.
+    observed : ObservedStars
+        Observed stars.
+    truth_images, observed_images : ndarray of float32, shape [n, ny, nx]
+        Centred stamps of unit sum; NaN where a star could not be centred.
+    model : PsfModel
+        Mean, components and polynomials fitted to the observed stars.
+    spectrum : Spectrum
+        Eigenvalues.
+    left_out_rms : float
+        Root mean square ellipticity residual, per component, of observed stars left out of the fit in turn; NaN where
+        it was not made.
+    """
+
+    name: str
+    center: tuple[float, float]
+    pixel_scale: float
+    noise: tuple[float, float]
+    truth: TruthStars
+    observed: ObservedStars
+    truth_images: np.ndarray
+    observed_images: np.ndarray
+    model: PsfModel
+    spectrum: Spectrum
+    left_out_rms: float
+
+
+def product_path(folder: Path, ccd: str) -> Path:
+    """Return the path of the product of a CCD."""
+    return folder / f"ccd_{ccd}.fits"
+
+
+def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[tuple[str, Any, str]]) -> None:
+    """Write the product of one CCD.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write.
+    product : CcdProduct
+        What to write.
+    stamp : Stamp
+        Where it comes from.
+    cards : list of (keyword, value, comment)
+        What all CCDs of the run share: telescope, band, exposure.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be written.
+    """
+    spectrum = product.spectrum
+    n = np.arange(1, max(len(spectrum.observed), len(spectrum.truth)) + 1)
+    eigenvalues = {
+        "N": (n, "", "component, 1 is the largest"),
+        "OBSERVED": (_padded(spectrum.observed, len(n)), "", "variance of the observed stars along it"),
+        "TRUTH": (_padded(spectrum.truth, len(n)), "", "variance of the noise-free PSFs along it"),
+    }
+    header = [
+        ("CCD", product.name, "name of the CCD"),
+        ("XCENTER", product.center[0] * 1e3, "[mm] centre of the CCD"),
+        ("YCENTER", product.center[1] * 1e3, "[mm] centre of the CCD"),
+        ("PIXSCALE", product.pixel_scale / ARCSEC, "[arcsec] pixel of the stamps"),
+        ("SKY", product.noise[0], "[electron/pixel] expected sky"),
+        ("NOISE", product.noise[1], "[electron/pixel] rms noise without light"),
+        ("KINK", spectrum.kink, "components before the kink of the eigenvalues"),
+        ("VARFRAC", spectrum.truth_fraction, "part of the truth's variance in the components"),
+        *cards,
+    ]
+    if np.isfinite(product.left_out_rms):
+        header.append(("LOORMS", product.left_out_rms, "rms e residual of stars left out in turn"))
+    frame = [("BUNIT", "", "each stamp has unit sum")]
+    hdus = [
+        table_hdu("STARS", _table(product.observed)),
+        table_hdu("TRUTH", _table(product.truth)),
+        image_hdu("STAMPS", product.observed_images, frame),
+        image_hdu("TRUTH_PSF", product.truth_images, frame),
+        table_hdu("EIGENVALUES", eigenvalues),
+        *product.model.to_hdus(),
+    ]
+    write_fits(product_path(folder, product.name), hdus, stamp, header)
+
+
+def read_product(path: Path, stamp: Stamp | None = None) -> CcdProduct:
+    """Read the product of one CCD.
+
+    Parameters
+    ----------
+    path : Path
+        File to read.
+    stamp : Stamp, optional
+        What the product must carry.
+
+    Raises
+    ------
+    ProductError
+        If there is no such file, it is damaged, or it carries another stamp.
+    """
+    hdus = read_fits(path)
+    header = hdus[0].header
+    if stamp is not None and not stamp.matches(header):
+        raise ProductError(f"{path}: was made with another version, configuration or seed")
+    try:
+        values = hdus["EIGENVALUES"]
+        observed, truth = (column(values, name) for name in ("OBSERVED", "TRUTH"))
+        return CcdProduct(
+            name=header["CCD"],
+            center=(header["XCENTER"] * 1e-3, header["YCENTER"] * 1e-3),
+            pixel_scale=header["PIXSCALE"] * ARCSEC,
+            noise=(header["SKY"], header["NOISE"]),
+            truth=_stars(TruthStars, hdus["TRUTH"]),
+            observed=_stars(ObservedStars, hdus["STARS"]),
+            truth_images=_image(hdus["TRUTH_PSF"]),
+            observed_images=_image(hdus["STAMPS"]),
+            model=PsfModel.from_hdus(hdus),
+            spectrum=Spectrum(
+                observed[np.isfinite(observed)], truth[np.isfinite(truth)], header["KINK"], header["VARFRAC"]
+            ),
+            left_out_rms=header.get("LOORMS", np.nan),
+        )
+    except KeyError as error:
+        raise ProductError(f"{path}: no product of a CCD ({' '.join(str(error).split())})") from None
+
+
+def _padded(values: np.ndarray, size: int) -> np.ndarray:
+    return np.append(np.asarray(values, dtype=np.float64), np.full(size - len(values), np.nan))
+
+
+def _image(hdu: fits.ImageHDU) -> np.ndarray:
+    return np.asarray(hdu.data, dtype=np.float32)
+
+
+def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
+    table = {}
+    for key, (name, unit, description) in _COLUMNS.items():
+        if not hasattr(stars, key):
+            continue
+        values = getattr(stars, key)
+        table[name] = (values / unit.size if values.dtype.kind == "f" else values, unit.name, description)
+    table["RES_E1"] = (stars.residual_e1, "", "measured minus model")
+    table["RES_E2"] = (stars.residual_e2, "", "measured minus model")
+    return table
+
+
+def _stars[S: Stars](kind: type[S], hdu: fits.BinTableHDU) -> S:
+    values = {}
+    for field in fields(kind):
+        name, unit, _ = _COLUMNS[field.name]
+        data = column(hdu, name)
+        values[field.name] = data * unit.size if data.dtype.kind == "f" else data
+    return kind(**values)
