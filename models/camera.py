@@ -134,8 +134,8 @@ def lsst_camera() -> Camera:
     <column>``: rows along +y, columns along +x, R22_S11 at the centre. Order: rafts row by row, then CCDs row by row.
     """
     raft_pitch, ccd_pitch = 127.0e-3, 42.25e-3
-    grid = [(row, column) for row in range(5) for column in range(5) if {row, column} - {0, 4}]
     # A corner has both its row and its column at the rim; every other place has at least one that is not.
+    grid = [(row, column) for row in range(5) for column in range(5) if {row, column} - {0, 4}]
     rafts = [(f"R{row}{column}", row, column) for row, column in grid]
     names, raft_index, centers = [], [], []
     for index, (raft, row, column) in enumerate(rafts):

@@ -135,7 +135,7 @@ class FocalPlane:
 
     @classmethod
     def from_mesh(cls, mesh: trimesh.Trimesh, camera: str | Camera = "lsst") -> FocalPlane:
-        """Fit the vertices of a surface mesh [m], z positive along +z of the telescope frame, as `from_heights` does."""
+        """Fit the vertices of a surface mesh as `from_heights` does: metres, z positive along +z of the telescope."""
         camera = load_camera(camera) if isinstance(camera, str) else camera
         x, y, z = np.asarray(mesh.vertices, dtype=np.float64).T
         surfaces, measured = fit_heights(camera, x, y, z, margin=_MESH_MARGIN)

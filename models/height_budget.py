@@ -185,9 +185,8 @@ def _potato_chip(camera: Camera, budget: HeightBudget, seed: int) -> tuple[np.nd
         k = 2 * np.pi * rng.uniform(*budget.potato_chip_cycles, 2) / camera.ccd_size
         phase = rng.uniform(0.0, 2 * np.pi, 2)
         kx, ky = k * np.cos(angle), k * np.sin(angle)
-        ripple = sum(
-            np.real(np.outer(np.exp(1j * (ky[w] * axis + phase[w])), np.exp(1j * kx[w] * axis))) for w in (0, 1)
-        )
+        along_y, along_x = np.exp(1j * (np.outer(ky, axis) + phase[:, None])), np.exp(1j * np.outer(kx, axis))
+        ripple = np.real(along_y[:, :, None] * along_x[:, None, :]).sum(axis=0)
         amplitude = budget.potato_chip / (ripple.max() - ripple.min())
         waves[i] = np.stack([np.full(2, amplitude), kx, ky, phase], axis=-1)
         # Mean of a cosine over the square: each axis contributes sin(k a) / (k a).

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import splu
 
 from .camera import Camera
 from .ccd_surfaces import POWERS, CcdSurfaces, spline_weights
@@ -62,14 +65,15 @@ def fit_heights(
         m = int(np.clip(np.sqrt(rich.min() / _POINTS_PER_COEFFICIENT), 4, _LARGEST_GRID))
     polynomial = np.zeros((len(camera), 10))
     grid = np.zeros((len(camera), m, m)) if m else None
+    bending = _bending(m) if m else None
     for i, (first, last) in enumerate(pairwise(bounds)):
         if first == last:
             continue
         chosen = order[first:last]
         u, v = ((np.stack([x[chosen], y[chosen]]).T - camera.centers[i]) / camera.half_size).T
         polynomial[i], rest = _fit_polynomial(u, v, z[chosen], camera.ccd_names[i])
-        if grid is not None and last - first >= _SPLINE_POINTS:
-            grid[i] = _fit_spline(u, v, rest, m)
+        if grid is not None and bending is not None and last - first >= _SPLINE_POINTS:
+            grid[i] = _fit_spline(u, v, rest, bending)
     return CcdSurfaces(camera.half_size, polynomial, np.zeros((len(camera), 2, 4)), grid), counts > 0
 
 
@@ -77,27 +81,35 @@ def _fit_polynomial(u: np.ndarray, v: np.ndarray, z: np.ndarray, name: str) -> t
     for points, _, size in _DEGREES:
         if len(z) < points:
             continue
-        design = np.stack([u**p * v**q for p, q in POWERS[:size]], axis=-1)
-        solution, _, rank, _ = np.linalg.lstsq(design, z, rcond=1e-8)
+        design = np.stack([u**p * v**q for p, q in POWERS[:size]])
+        # Sums by einsum and not by BLAS, whose threads would change the last bits.
+        normal = np.einsum("in,jn->ij", design, design)
+        spread = np.linalg.eigvalsh(normal)
         # Points in a few rows cannot carry the higher terms: go down a degree.
-        if rank == size:
-            return np.concatenate([solution, np.zeros(10 - size)]), z - design @ solution
+        if spread[0] > 1e-10 * spread[-1]:
+            solution = np.linalg.solve(normal, np.einsum("in,n->i", design, z))
+            return np.concatenate([solution, np.zeros(10 - size)]), z - np.einsum("in,i->n", design, solution)
     raise DomainError(f"heights on {name}: {len(z)} points: expected at least 3 that are not on one line")
 
 
-def _fit_spline(u: np.ndarray, v: np.ndarray, z: np.ndarray, m: int) -> np.ndarray:
+def _bending(m: int) -> csc_array:
+    """Return the quadratic form of second differences along both sides, plus a tiny ridge, shape (m^2, m^2)."""
+    second = np.diff(np.eye(m), 2, axis=0)
+    stiffness = second.T @ second
+    # The ridge settles the plane that neither bending nor, in an empty corner, the data hold.
+    stiffness = _SMOOTHING * (np.kron(np.eye(m), stiffness) + np.kron(stiffness, np.eye(m)))
+    return csc_array(stiffness + 1e-9 * np.eye(m * m))
+
+
+def _fit_spline(u: np.ndarray, v: np.ndarray, z: np.ndarray, bending: csc_array) -> np.ndarray:
+    m = math.isqrt(bending.shape[0])
     i, wu = spline_weights(u, m)
     j, wv = spline_weights(v, m)
-    design = np.zeros((len(z), m, m))
-    row = np.arange(len(z))
-    for b in range(4):
-        for a in range(4):
-            design[row, j + b, i + a] = wv[b] * wu[a]
-    design = design.reshape(len(z), m * m)
-    normal = design.T @ design
-    second = np.diff(np.eye(m), 2, axis=0)
-    bending = np.kron(np.eye(m), second.T @ second) + np.kron(second.T @ second, np.eye(m))
-    # The tiny ridge settles the plane that neither bending nor, in an empty corner, the data hold.
-    weight = np.trace(normal) / m**2
-    normal = normal + weight * (_SMOOTHING * bending + 1e-9 * np.eye(m * m))
-    return np.linalg.solve(normal, design.T @ z).reshape(m, m)
+    four = np.arange(4)
+    columns = (j + four[:, None])[:, None] * m + (i + four[:, None])[None, :]
+    weights = wv[:, None] * wu[None, :]
+    rows = np.broadcast_to(np.arange(len(z)), weights.shape)
+    design = csr_array((weights.ravel(), (rows.ravel(), columns.ravel())), shape=(len(z), m * m))
+    normal = csc_array(design.T @ design)
+    normal = normal + bending * (normal.trace() / m**2)
+    return splu(normal).solve(design.T @ z).reshape(m, m)

@@ -171,8 +171,7 @@ def read_telescope(top: Section) -> Telescope:
         )
     except PrescriptionError as error:
         # Values of single keys carry their place already; what several keys say together does not.
-        text = str(error)
-        raise PrescriptionError(text if text.startswith(top.source) else f"{top.source}: {text}") from None
+        raise top.placed(error) from None
 
 
 def _read_media(media: Section, wavelength: Callable[[float], float]) -> dict[str, Medium]:
@@ -192,13 +191,8 @@ def _read_media(media: Section, wavelength: Callable[[float], float]) -> dict[st
                     cast(Vector, b), cast(Vector, c), cast("tuple[float, float]", tuple(map(wavelength, limits)))
                 )
         except PrescriptionError as error:
-            raise _placed(error, section) from None
+            raise section.placed(error) from None
     return found
-
-
-def _placed(error: PrescriptionError, section: Section) -> PrescriptionError:
-    text = str(error)
-    return PrescriptionError(text if text.startswith(section.source) else f"{section.source}: {section.place}.{text}")
 
 
 def _read_medium(section: Section, key: str, media: dict[str, Medium], default: Medium) -> Medium:
@@ -262,7 +256,7 @@ def _read_surface(
             rotation=rotation,
         )
     except PrescriptionError as error:
-        raise _placed(error, section) from None
+        raise section.placed(error) from None
 
 
 def _read_shape(section: Section, kind: str, length: Callable[[float], float]) -> Shape:

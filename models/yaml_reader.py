@@ -138,6 +138,13 @@ class Section:
             f"{self.source}: {self._path(key)} = {_shown(self._content.get(key))}: expected {expected}"
         )
 
+    def placed(self, error: PrescriptionError) -> PrescriptionError:
+        """Return an error of the model as one of this section, unless it names the file already."""
+        text = str(error)
+        if text.startswith(self.source):
+            return error
+        return PrescriptionError(f"{self.source}: {self._path(text)}")
+
     def allow(self, *keys: str) -> None:
         """Refuse every key that is not among these.
 

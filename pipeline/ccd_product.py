@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from astropy.io import fits
@@ -25,6 +25,7 @@ class _Unit(NamedTuple):
 
 
 _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("arcsec", ARCSEC), _Unit("", 1.0)
+_MODEL, _TRUTH_MODEL = "PSF", "TRUEPSF"
 _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "x": ("X", _MM, "detector x"),
     "y": ("Y", _MM, "detector y"),
@@ -41,6 +42,8 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "used": ("USED", _NONE, "whether the model was fitted to the star"),
     "model_e1": ("MODEL_E1", _NONE, "ellipticity of the model there"),
     "model_e2": ("MODEL_E2", _NONE, "ellipticity of the model there"),
+    "left_out_e1": ("LOO_E1", _NONE, "of the model fitted without the star"),
+    "left_out_e2": ("LOO_E2", _NONE, "of the model fitted without the star"),
 }
 
 
@@ -116,32 +119,16 @@ class ObservedStars(Stars):
         Signal to noise of PSF photometry.
     used : ndarray of bool
         Whether the model was fitted to the star.
+    left_out_e1, left_out_e2 : ndarray
+        Ellipticity of the model at the star with the star left out of the fit; NaN where it was not used.
     """
 
     magnitude: np.ndarray
     electrons: np.ndarray
     snr: np.ndarray
     used: np.ndarray
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Eigenvalues of the principal components.
-
-    Attributes
-    ----------
-    observed, truth : ndarray
-        Variance along each component of the observed and of the noise-free stars, largest first.
-    kink : int
-        Component after which the observed eigenvalues fall slowly: those beyond hold noise.
-    truth_fraction : float
-        Part of the truth's variance that as many components hold as the model has.
-    """
-
-    observed: np.ndarray
-    truth: np.ndarray
-    kink: int
-    truth_fraction: float
+    left_out_e1: np.ndarray
+    left_out_e2: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -164,13 +151,8 @@ class CcdProduct:
         Observed stars.
     truth_images, observed_images : ndarray of float32, shape [n, ny, nx]
         Centred stamps of unit sum; NaN where a star could not be centred.
-    model : PsfModel
-        Mean, components and polynomials fitted to the observed stars.
-    spectrum : Spectrum
-        Eigenvalues.
-    left_out_rms : float
-        Root mean square ellipticity residual, per component, of observed stars left out of the fit in turn; NaN where
-        it was not made.
+    model, truth_model : PsfModel
+        Mean, components and polynomials fitted to the observed stars, and to the noise-free PSFs.
     """
 
     name: str
@@ -182,8 +164,10 @@ class CcdProduct:
     truth_images: np.ndarray
     observed_images: np.ndarray
     model: PsfModel
-    spectrum: Spectrum
-    left_out_rms: float
+    truth_model: PsfModel
+
+
+_StarsKind = TypeVar("_StarsKind", bound=Stars)
 
 
 def product_path(folder: Path, ccd: str) -> Path:
@@ -210,13 +194,6 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
     ProductError
         If it cannot be written.
     """
-    spectrum = product.spectrum
-    n = np.arange(1, max(len(spectrum.observed), len(spectrum.truth)) + 1)
-    eigenvalues = {
-        "N": (n, "", "component, 1 is the largest"),
-        "OBSERVED": (_padded(spectrum.observed, len(n)), "", "variance of the observed stars along it"),
-        "TRUTH": (_padded(spectrum.truth, len(n)), "", "variance of the noise-free PSFs along it"),
-    }
     header = [
         ("CCD", product.name, "name of the CCD"),
         ("XCENTER", product.center[0] * 1e3, "[mm] centre of the CCD"),
@@ -224,20 +201,15 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
         ("PIXSCALE", product.pixel_scale / ARCSEC, "[arcsec] pixel of the stamps"),
         ("SKY", product.noise[0], "[electron/pixel] expected sky"),
         ("NOISE", product.noise[1], "[electron/pixel] rms noise without light"),
-        ("KINK", spectrum.kink, "components before the kink of the eigenvalues"),
-        ("VARFRAC", spectrum.truth_fraction, "part of the truth's variance in the components"),
         *cards,
     ]
-    if np.isfinite(product.left_out_rms):
-        header.append(("LOORMS", product.left_out_rms, "rms e residual of stars left out in turn"))
-    frame = [("BUNIT", "", "each stamp has unit sum")]
     hdus = [
         table_hdu("STARS", _table(product.observed)),
         table_hdu("TRUTH", _table(product.truth)),
-        image_hdu("STAMPS", product.observed_images, frame),
-        image_hdu("TRUTH_PSF", product.truth_images, frame),
-        table_hdu("EIGENVALUES", eigenvalues),
-        *product.model.to_hdus(),
+        image_hdu("STAMPS", product.observed_images, "each star centred, of unit sum"),
+        image_hdu("TRUTH_PSF", product.truth_images, "each PSF centred, of unit sum"),
+        *product.model.to_hdus(_MODEL),
+        *product.truth_model.to_hdus(_TRUTH_MODEL),
     ]
     write_fits(product_path(folder, product.name), hdus, stamp, header)
 
@@ -262,8 +234,6 @@ def read_product(path: Path, stamp: Stamp | None = None) -> CcdProduct:
     if stamp is not None and not stamp.matches(header):
         raise ProductError(f"{path}: was made with another version, configuration or seed")
     try:
-        values = hdus["EIGENVALUES"]
-        observed, truth = (column(values, name) for name in ("OBSERVED", "TRUTH"))
         return CcdProduct(
             name=header["CCD"],
             center=(header["XCENTER"] * 1e-3, header["YCENTER"] * 1e-3),
@@ -273,18 +243,11 @@ def read_product(path: Path, stamp: Stamp | None = None) -> CcdProduct:
             observed=_stars(ObservedStars, hdus["STARS"]),
             truth_images=_image(hdus["TRUTH_PSF"]),
             observed_images=_image(hdus["STAMPS"]),
-            model=PsfModel.from_hdus(hdus),
-            spectrum=Spectrum(
-                observed[np.isfinite(observed)], truth[np.isfinite(truth)], header["KINK"], header["VARFRAC"]
-            ),
-            left_out_rms=header.get("LOORMS", np.nan),
+            model=PsfModel.from_hdus(hdus, _MODEL),
+            truth_model=PsfModel.from_hdus(hdus, _TRUTH_MODEL),
         )
     except KeyError as error:
         raise ProductError(f"{path}: no product of a CCD ({' '.join(str(error).split())})") from None
-
-
-def _padded(values: np.ndarray, size: int) -> np.ndarray:
-    return np.append(np.asarray(values, dtype=np.float64), np.full(size - len(values), np.nan))
 
 
 def _image(hdu: fits.ImageHDU) -> np.ndarray:
@@ -303,7 +266,7 @@ def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
     return table
 
 
-def _stars[S: Stars](kind: type[S], hdu: fits.BinTableHDU) -> S:
+def _stars(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
     values = {}
     for field in fields(kind):
         name, unit, _ = _COLUMNS[field.name]

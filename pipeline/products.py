@@ -188,11 +188,10 @@ def table_hdu(name: str, columns: dict[str, tuple[np.ndarray, str, str]]) -> fit
 _FORMATS = {"f": "D", "i": "J", "b": "L"}
 
 
-def image_hdu(name: str, image: np.ndarray, cards: list[tuple[str, Any, str]]) -> fits.ImageHDU:
-    """Return a FITS image in single precision."""
+def image_hdu(name: str, image: np.ndarray, comment: str) -> fits.ImageHDU:
+    """Return a FITS image in single precision with a comment on what it holds."""
     hdu = fits.ImageHDU(np.asarray(image, dtype=np.float32), name=name)
-    for keyword, value, comment in cards:
-        hdu.header[keyword] = (value, comment)
+    hdu.header["COMMENT"] = comment
     return hdu
 
 

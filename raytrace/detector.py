@@ -63,19 +63,18 @@ def land_on_ccds(
     """
     p = detector.to_local(position)
     d = direction @ detector.matrix
-    x, y = p[:, 0].copy(), p[:, 1].copy()
-    ccd = focal_plane.ccd_at(x, y)
-    on_ccd = ccd >= 0
+    ccd = focal_plane.ccd_at(p[:, 0], p[:, 1])
+    center = focal_plane.camera.centers[ccd]
     t = np.zeros(len(p))
     for _ in range(STEPS):
         # The CCD of the first crossing is kept, so a ray near an edge cannot jump to and fro between two tiles.
-        height = focal_plane.height_on(ccd, x, y)
-        slope_x, slope_y = focal_plane.gradient_on(ccd, x, y)
-        rate = d[:, 2] - slope_x * d[:, 0] - slope_y * d[:, 1]
-        t = np.where(on_ccd, t + (height - (p[:, 2] + t * d[:, 2])) / rate, 0.0)
-        x = p[:, 0] + t * d[:, 0]
-        y = p[:, 1] + t * d[:, 1]
-    # A ray that slips over the edge on its last micrometres has left the CCD.
+        dx = p[:, 0] + t * d[:, 0] - center[:, 0]
+        dy = p[:, 1] + t * d[:, 1] - center[:, 1]
+        slope = focal_plane.surfaces.gradient(ccd, dx, dy)
+        rate = d[:, 2] - slope[:, 0] * d[:, 0] - slope[:, 1] * d[:, 1]
+        t = t + (focal_plane.surfaces.height(ccd, dx, dy) - (p[:, 2] + t * d[:, 2])) / rate
+    x, y = p[:, 0] + t * d[:, 0], p[:, 1] + t * d[:, 1]
+    # A ray that slips over the edge on its last micrometres has left the CCD. (In a gap, index -1, t meant nothing.)
     ccd = np.where(focal_plane.ccd_at(x, y) == ccd, ccd, -1).astype(np.int32)
     t = np.where(ccd >= 0, t, 0.0)
     return Landing(position + t[:, None] * direction, index * t, ccd)

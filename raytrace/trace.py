@@ -152,9 +152,7 @@ def trace(
     if focal_plane is not None:
         last = results[-1]
         index = float(refractive_indices(telescope, rays.wavelength)[-1])
-        landing = land_on_ccds(
-            telescope.surfaces[-1], focal_plane, last.position, last.direction, index=index
-        )
+        landing = land_on_ccds(telescope.surfaces[-1], focal_plane, last.position, last.direction, index=index)
         results[-1] = TraceResult(
             last.surface,
             landing.position,

@@ -134,7 +134,7 @@ def through_surface(
         nz = lanes(ONE) - ((ONE + k) * c) * z
         if n_coefficients > 0:
             r2 = wp.cw_mul(x, x) + wp.cw_mul(y, y)
-            sag, slope = sag_and_slope(c, k, surfaces.coefficients, s, n_coefficients, r2)
+            _sag, slope = sag_and_slope(c, k, surfaces.coefficients, s, n_coefficients, r2)
             nx = -wp.cw_mul(slope, x)
             ny = -wp.cw_mul(slope, y)
             nz = lanes(ONE)
@@ -219,7 +219,7 @@ def trace_rays(
 
 @wp.func
 def launched(px: lanes, py: lanes, pz: wp.float64, u: wp.float64, v: wp.float64, w: wp.float64, distance: wp.float64):
-    """Starting points of parallel rays through (px, py, pz), on the plane at -distance along the light's direction."""
+    """Start parallel rays through (px, py, pz) on the plane at -distance along the direction of the light."""
     back = u * px + v * py + lanes(w * pz + distance)
     return px - u * back, py - v * back, lanes(pz) - w * back
 

@@ -18,12 +18,16 @@ from numpy.typing import ArrayLike
 from ..models.errors import DomainError, unknown_name
 from ..models.random_streams import stream
 from ..models.site import Site, load_site
-from ..models.units import metres, radians
+from ..models.units import metres
+from .refraction import require_zenith_angle
 from .screens import evaluate, phase_screen
 from .turbulence import require_positive
 
 _cache_lock = threading.Lock()
 _SCALES = ("low", "high")
+# Beyond these a slip of the pen would fill the memory: 10 million steps, screens of 17 GB.
+_MOST_STEPS = 10_000_000
+_LARGEST_SIZE = 65536
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,13 +157,9 @@ class Atmosphere:
             raise DomainError(f"seed = {seed!r}: expected a whole number from 0")
         if not (isinstance(epoch, int | np.integer) and epoch >= 0):
             raise DomainError(f"epoch = {epoch!r}: expected a whole number from 0")
-        zenith = float(radians(zenith_angle, "zenith_angle"))
-        if not 0.0 <= zenith <= math.radians(80.0):
-            raise DomainError(f"zenith_angle = {zenith!r} rad: expected 0 to {math.radians(80.0):.4f} rad (80 degrees)")
-        fried = require_positive(float(metres(site.r0 if r0 is None else r0, "r0")), "r0", "metres")
-        fried *= math.cos(zenith) ** 0.6
-        outer = site.outer_scale if outer_scale is None else outer_scale
-        outer = require_positive(float(metres(outer, "outer_scale")), "outer_scale", "metres")
+        zenith = require_zenith_angle(zenith_angle)
+        fried = _length(site.r0 if r0 is None else r0, "r0") * math.cos(zenith) ** 0.6
+        outer = _length(site.outer_scale if outer_scale is None else outer_scale, "outer_scale")
         height, fraction, speed, direction = _layers(
             site, altitudes, weights, wind_speeds, wind_directions, seed, epoch
         )
@@ -168,17 +168,23 @@ class Atmosphere:
         height = np.where(height == 0.0, ground_lift, height) / math.cos(zenith)
         exposure = require_positive(exposure, "exposure", "seconds")
         steps = max(1, math.ceil(exposure / require_positive(time_step, "time_step", "seconds") - 1e-9))
+        if steps > _MOST_STEPS:
+            raise DomainError(f"time_step = {time_step!r}: expected at most {_MOST_STEPS} steps in {exposure:g} s")
         length = require_positive(screen_length, "screen_length", "metres")
-        offsets = np.array([stream(seed, "atmosphere", epoch, n, "offset").random(2) for n in range(len(height))])
+        offsets = length * np.array([_uniform(seed, epoch, n, "offset", 2) for n in range(len(height))])
+        velocities = speed[:, np.newaxis] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+        times = (np.arange(steps) + 0.5) * (exposure / steps)
+        for array in (height, fraction, velocities, offsets, times):
+            array.setflags(write=False)
         atmosphere = cls(
             altitudes=height,
             weights=fraction,
-            velocities=speed[:, np.newaxis] * np.stack([np.cos(direction), np.sin(direction)], axis=1),
-            offsets=offsets * length,
+            velocities=velocities,
+            offsets=offsets,
             r0=fried,
             outer_scale=outer,
             exposure=exposure,
-            times=(np.arange(steps) + 0.5) * (exposure / steps),
+            times=times,
             cutoff=require_positive(1.0 / fried if cutoff is None else cutoff, "cutoff", "radians per metre"),
             screen_size=_size(screen_size, "screen_size"),
             screen_length=length,
@@ -189,14 +195,6 @@ class Atmosphere:
             fixed_modulus=bool(fixed_modulus),
         )
         atmosphere._check_cutoff()
-        for array in (
-            atmosphere.altitudes,
-            atmosphere.weights,
-            atmosphere.velocities,
-            atmosphere.offsets,
-            atmosphere.times,
-        ):
-            array.setflags(write=False)
         return atmosphere
 
     @property
@@ -359,10 +357,20 @@ class Atmosphere:
         return evaluate(self._screen(layer, scale, stencil, None, None), pixel, x, y, stencil)
 
 
+def _uniform(seed: int, epoch: int, layer: int, name: str, count: int) -> np.ndarray:
+    """Return random numbers from 0 to 1 of the stream of one layer."""
+    return stream(seed, "atmosphere", epoch, layer, name).random(count)
+
+
 def _size(value: int, name: str) -> int:
-    if not (isinstance(value, int | np.integer) and value >= 4):
-        raise DomainError(f"{name} = {value!r}: expected a whole number of at least 4 samples")
+    if not (isinstance(value, int | np.integer) and 4 <= value <= _LARGEST_SIZE):
+        raise DomainError(f"{name} = {value!r}: expected a whole number of samples from 4 to {_LARGEST_SIZE}")
     return int(value)
+
+
+def _length(value: Any, name: str) -> float:
+    array = metres(value, name)
+    return require_positive(array.item() if array.size == 1 else value, name, "metres")
 
 
 def _layers(
@@ -378,7 +386,7 @@ def _layers(
     height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
     count = len(height)
     if wind_directions is None:
-        wind_directions = [2.0 * math.pi * stream(seed, "atmosphere", epoch, n, "wind").random() for n in range(count)]
+        wind_directions = [2.0 * math.pi * _uniform(seed, epoch, n, "wind", 1)[0] for n in range(count)]
     given = {
         "altitudes": height,
         "weights": np.array(site.weights if weights is None else weights, dtype=np.float64),

@@ -149,9 +149,7 @@ def wavefront_opd(
             raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
 
     # The chief ray goes last so that its packet cannot shift those of the map.
-    rays = launch_rays(
-        telescope, field, wavelength, (np.append(x.ravel(), 0.0), np.append(y.ravel(), 0.0)), projection
-    )
+    rays = launch_rays(telescope, field, wavelength, (np.append(x.ravel(), 0.0), np.append(y.ravel(), 0.0)), projection)
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
     lit = (end.status[:-1] == RayStatus.OK) | (end.status[:-1] == RayStatus.GAP)
     if reference == "chief":

@@ -19,7 +19,7 @@ from ..models.units import metres, radians
 from ..raytrace.launch import launch
 from ..raytrace.packed import pack_surfaces, refractive_indices
 from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
-from ..raytrace.rays import RayStatus, Rays, field_direction
+from ..raytrace.rays import Rays, RayStatus, field_direction
 from ..raytrace.trace import trace
 from ..raytrace.trace_kernels import trace_pupils as trace_pupils_kernel
 from .reference import distance_to_sphere
@@ -117,7 +117,9 @@ def fields_at(
     slopes = (target - origin) / scale
     # The scale on the axis is within a per cent everywhere, so each fixed-point step gains two digits or more.
     for _ in range(12):
-        landed = chief_rays(telescope, field_direction(*slopes.T, "gnomonic"), wavelength, threads=threads)
+        landed = chief_rays(
+            telescope, field_direction(slopes[:, 0], slopes[:, 1], "gnomonic"), wavelength, threads=threads
+        )
         miss = target - telescope.surfaces[-1].to_local(landed.position)[:, :2]
         if not np.isfinite(miss).all():
             raise DomainError("positions: a point of the detector lies outside the field of the telescope")
@@ -187,8 +189,8 @@ def trace_pupils(
             bad = int(np.flatnonzero(chief.ccd < 0)[0])
             raise DomainError(f"fields[{bad}] = {fields[bad]}: the star lands between the CCDs")
         on_detector = telescope.surfaces[-1].to_local(reference)
-        slope_x, slope_y = focal_plane.gradient_on(chief.ccd, on_detector[:, 0], on_detector[:, 1])
-        normal[:, 0], normal[:, 1] = -slope_x, -slope_y
+        offset = on_detector[:, :2] - focal_plane.camera.centers[chief.ccd]
+        normal[:, :2] = -focal_plane.surfaces.gradient(chief.ccd, offset[:, 0], offset[:, 1])
     rotation = telescope.surfaces[-1].matrix
     normal = normal @ rotation.T
 

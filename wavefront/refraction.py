@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..models.errors import DomainError
+from ..models.site import Weather
 from ..models.units import metres, radians
 
 #: Range of wavelengths that the formulae cover [m].
@@ -17,20 +18,12 @@ WAVELENGTH_RANGE = (0.2e-6, 2.0e-6)
 LARGEST_ZENITH_ANGLE = math.radians(80.0)
 
 
-class Weather(Protocol):
-    """Weather at the telescope, such as that of a site."""
-
-    @property
-    def pressure_mmhg(self) -> float:
-        """Pressure [mm Hg]."""
-
-    @property
-    def temperature_c(self) -> float:
-        """Temperature [degrees Celsius]."""
-
-    @property
-    def water_vapour_mmhg(self) -> float:
-        """Partial pressure of water vapour [mm Hg]."""
+def require_zenith_angle(value: Any) -> float:
+    """Return an angle from the zenith in radians, or raise :class:`DomainError` if it is not from 0 to 80 degrees."""
+    array = radians(value, "zenith_angle")
+    if not (array.size == 1 and 0.0 <= array.item() <= LARGEST_ZENITH_ANGLE):
+        raise DomainError(f"zenith_angle = {value!r}: expected 0 to {LARGEST_ZENITH_ANGLE:.4f} rad (80 degrees)")
+    return array.item()
 
 
 def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
@@ -51,7 +44,7 @@ def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
     Raises
     ------
     DomainError
-        If a wavelength lies outside 0.2 to 2 um, or the weather is not that of any observatory.
+        If a wavelength lies outside 0.2 to 2 um.
     """
     lam = metres(wavelength, "wavelength")
     low, high = WAVELENGTH_RANGE
@@ -60,25 +53,13 @@ def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
         raise DomainError(
             f"wavelength = {outside[0]:g} m: expected {low:g} to {high:g} m, which the index of air covers"
         )
-    pressure, temperature, vapour = _checked_weather(weather)
     wavenumber2 = (1e-6 / lam) ** 2
     # Eq. 1: dry air at 15 C and 760 mm Hg; eq. 2: other temperatures and pressures; eq. 3: water vapour.
     standard = 64.328 + 29498.1 / (146.0 - wavenumber2) + 255.4 / (41.0 - wavenumber2)
-    expansion = 1.0 + 0.003661 * temperature
-    density = pressure * (1.0 + (1.049 - 0.0157 * temperature) * 1e-6 * pressure) / (720.883 * expansion)
-    return 1e-6 * (standard * density - (0.0624 - 0.000680 * wavenumber2) / expansion * vapour)
-
-
-def _checked_weather(weather: Weather) -> tuple[float, float, float]:
-    """Return pressure [mm Hg], temperature [degrees Celsius] and water vapour [mm Hg], each in its range."""
-    ranges = {"pressure_mmhg": (0.0, 1000.0), "temperature_c": (-100.0, 60.0), "water_vapour_mmhg": (0.0, 150.0)}
-    values = []
-    for name, (low, high) in ranges.items():
-        value = float(getattr(weather, name))
-        if not low <= value <= high:
-            raise DomainError(f"{name} = {value!r}: expected {low:g} to {high:g}")
-        values.append(value)
-    return values[0], values[1], values[2]
+    expansion = 1.0 + 0.003661 * weather.temperature_c
+    pressure = weather.pressure_mmhg
+    density = pressure * (1.0 + (1.049 - 0.0157 * weather.temperature_c) * 1e-6 * pressure) / (720.883 * expansion)
+    return 1e-6 * (standard * density - (0.0624 - 0.000680 * wavenumber2) / expansion * weather.water_vapour_mmhg)
 
 
 def dispersion_shift(
@@ -117,11 +98,9 @@ def dispersion_shift(
     Raises
     ------
     DomainError
-        If a wavelength, the zenith angle (0 to 80 degrees) or the weather is outside its range.
+        If a wavelength or the zenith angle (0 to 80 degrees) is outside its range.
     """
-    zenith, position = float(radians(zenith_angle, "zenith_angle")), float(radians(position_angle, "position_angle"))
-    if not 0.0 <= zenith <= LARGEST_ZENITH_ANGLE:
-        raise DomainError(f"zenith_angle = {zenith!r} rad: expected 0 to {LARGEST_ZENITH_ANGLE:.4f} rad (80 degrees)")
+    zenith, position = require_zenith_angle(zenith_angle), float(radians(position_angle, "position_angle"))
     if not math.isfinite(position):
         raise DomainError(f"position_angle = {position!r} rad: expected a finite angle")
     waves = np.atleast_1d(metres(wavelength, "wavelength"))

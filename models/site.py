@@ -1,0 +1,143 @@
+"""Observing sites: layers of turbulence, wind and weather."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import PrescriptionError, unknown_name
+from .yaml_reader import Section, read_yaml
+
+DATA = Path(__file__).parent / "data"
+BUNDLED = ("cerro_pachon",)
+
+# The units a site file is in; stated in the file so that it can be read on its own.
+_UNITS = {"altitude": "m", "wind_speed": "m/s", "r0": "m", "outer_scale": "m"}
+
+
+@dataclass(frozen=True)
+class Weather:
+    """Air at the telescope.
+
+    Parameters
+    ----------
+    pressure_mmhg : float
+        Total pressure [mm Hg].
+    temperature_c : float
+        Temperature [deg C].
+    water_vapour_mmhg : float
+        Partial pressure of water vapour [mm Hg].
+    """
+
+    pressure_mmhg: float
+    temperature_c: float
+    water_vapour_mmhg: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.pressure_mmhg) and self.pressure_mmhg > 0):
+            raise PrescriptionError(f"pressure_mmhg = {self.pressure_mmhg!r}: expected a positive number")
+        if not self.temperature_c > -273.15:
+            raise PrescriptionError(f"temperature_c = {self.temperature_c!r}: expected above -273.15")
+        if not 0 <= self.water_vapour_mmhg <= self.pressure_mmhg:
+            raise PrescriptionError(f"water_vapour_mmhg = {self.water_vapour_mmhg!r}: expected 0 to the pressure")
+
+
+@dataclass(frozen=True)
+class Site:
+    """Turbulence over a site, in layers that the wind carries along.
+
+    Parameters
+    ----------
+    name : str
+        Name of the site.
+    altitudes : tuple of float
+        Altitudes of the layers above the telescope [m], rising.
+    weights : tuple of float
+        Fraction of the integral of Cn^2 in each layer; they sum to 1.
+    wind_speeds : tuple of float
+        Speed of the wind in each layer [m/s].
+    r0 : float
+        Fried parameter of all layers at 500 nm towards the zenith [m].
+    outer_scale : float
+        Outer scale of the turbulence [m].
+    weather : Weather
+        Air at the telescope.
+    source, description : str
+        Where the figures come from, and what they are.
+    """
+
+    name: str
+    altitudes: tuple[float, ...]
+    weights: tuple[float, ...]
+    wind_speeds: tuple[float, ...]
+    r0: float
+    outer_scale: float
+    weather: Weather
+    source: str = ""
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if not len(self.altitudes) == len(self.weights) == len(self.wind_speeds) > 0:
+            raise PrescriptionError(f"layers of site {self.name!r}: expected an altitude, weight and wind for each")
+        if self.altitudes[0] < 0 or any(np.diff(self.altitudes) <= 0):
+            raise PrescriptionError(f"altitudes = {self.altitudes!r}: expected to rise from 0 m or more")
+        # Published weights are rounded to three figures.
+        if min(self.weights) < 0 or abs(sum(self.weights) - 1) > 5e-3:
+            raise PrescriptionError(f"weights = {self.weights!r}: expected fractions that sum to 1")
+        if min(self.wind_speeds) < 0:
+            raise PrescriptionError(f"wind_speeds = {self.wind_speeds!r}: expected zero or more")
+        for key in ("r0", "outer_scale"):
+            if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
+                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
+
+
+def site_names() -> tuple[str, ...]:
+    """Return the names of the sites that come with the package."""
+    return BUNDLED
+
+
+def load_site(name_or_path: str | os.PathLike[str]) -> Site:
+    """Load a bundled site by name, or any site by the path of its ``.yaml`` file.
+
+    Raises
+    ------
+    UnknownNameError
+        If it is neither a bundled name nor a path.
+    PrescriptionError
+        If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
+    """
+    text = os.fspath(name_or_path)
+    path = DATA / f"{text}.yaml" if text in BUNDLED else Path(text)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise unknown_name("site", text, BUNDLED)
+    return _read_site(read_yaml(path))
+
+
+def _read_site(top: Section) -> Site:
+    top.allow("name", "description", "source", "units", "r0", "outer_scale", "layers", "weather")
+    units = top.section("units")
+    units.allow(*_UNITS)
+    for key, unit in _UNITS.items():
+        units.choice(key, (unit,))
+    weather = top.section("weather")
+    weather.allow("pressure_mmhg", "temperature_c", "water_vapour_mmhg")
+    layers = top.sections("layers", "altitude")
+    for layer in layers:
+        layer.allow("altitude", "weight", "wind_speed")
+    try:
+        return Site(
+            name=top.text("name"),
+            description=top.text("description", ""),
+            source=top.text("source"),
+            altitudes=tuple(layer.number("altitude") for layer in layers),
+            weights=tuple(layer.number("weight") for layer in layers),
+            wind_speeds=tuple(layer.number("wind_speed") for layer in layers),
+            r0=top.number("r0", positive=True),
+            outer_scale=top.number("outer_scale", positive=True),
+            weather=Weather(*(weather.number(k) for k in ("pressure_mmhg", "temperature_c", "water_vapour_mmhg"))),
+        )
+    except PrescriptionError as error:
+        raise top.placed(error) from None

@@ -1,0 +1,27 @@
+"""The type checker passes on the package."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mypy")
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_mypy(tmp_path):
+    # The folders stand at the top level and become one package only when installed, so show mypy that package.
+    package = tmp_path / "pachon"
+    package.mkdir()
+    for entry in (ROOT / "pachon").iterdir():
+        if entry.name != "__pycache__":
+            (package / entry.name).symlink_to(entry)
+    for layer in ("models", "raytrace", "wavefront", "pipeline"):
+        (package / layer).symlink_to(ROOT / layer, target_is_directory=True)
+    command = [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), "-p", "pachon"]
+    done = subprocess.run(
+        [*command, "--cache-dir", str(tmp_path / "cache")], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,0 +1,132 @@
+"""The OPD against Zemax, and against the rays that it belongs to."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+
+import pachon
+from pachon.models.errors import ConfigError, DomainError
+from pachon.wavefront.pupil_optics import fields_at
+
+ZEMAX = Path(__file__).parents[1] / "data" / "zemax"
+
+
+@pytest.fixture(scope="module")
+def zemax_map():
+    # Rows are listed from the top of the map.
+    return np.loadtxt(ZEMAX / "lsst_v3.3_opd_500nm_field_0.000_1.225.txt")[::-1]
+
+
+@pytest.fixture(scope="module")
+def zemax_lattice():
+    axis = (np.arange(32) - 16) / 15 * 4.18
+    return np.meshgrid(axis, axis)
+
+
+def test_zemax_map(zemax_lsst, zemax_map, zemax_lattice):
+    opd = pachon.wavefront_opd(zemax_lsst, (0, 1.225) * u.deg, 500 * u.nm, zemax_lattice)
+    both = (zemax_map != 0) & opd.lit
+    assert both.sum() > 0.95 * (zemax_map != 0).sum()
+    # 10 pm: the listing has seven digits (0.3 pm) and Zemax refers to the exit pupil, 2.7 m from the image, not 5 m.
+    assert np.abs(opd.value - zemax_map * 500e-9)[both].max() < 10e-12
+
+
+def test_zemax_map_on_the_sphere_of_the_exit_pupil(zemax_lsst, zemax_map, zemax_lattice):
+    # Exit pupil of diameter 2189.7 mm at f/1.23: 2.7 m. What remains is the rounding of the listing.
+    opd = pachon.wavefront_opd(zemax_lsst, (0, 1.225) * u.deg, 500e-9, zemax_lattice, sphere_radius=2.7)
+    both = (zemax_map != 0) & opd.lit
+    assert np.abs(opd.value - zemax_map * 500e-9)[both].max() < 0.5e-12
+
+
+@pytest.mark.parametrize("height_um", [0.0, 10.0])
+def test_transverse_aberration_is_the_gradient_of_the_opd(lsst_r, height_um):
+    """X = dW/du, with u the exit direction cosines: the ray meets the image where its wavefront points."""
+    camera = pachon.lsst_camera()
+    table = {
+        "x": (camera.centers[:, :1] + [0.0, 0.01, 0.0]).ravel(),
+        "y": (camera.centers[:, 1:] + [0.0, 0.0, 0.01]).ravel(),
+        "z": np.full(3 * 189, height_um * 1e-6),
+    }
+    focal_plane = pachon.FocalPlane.from_heights(table)
+    field = fields_at(lsst_r, [[0.15, 0.21]])[0]
+    n, h = 40, 0.02
+    rng = np.random.default_rng(1)
+    radius, angle = np.sqrt(rng.uniform(2.7**2, 4.0**2, n)), rng.uniform(0, 2 * np.pi, n)
+    px, py = radius * np.cos(angle), radius * np.sin(angle)
+    # Each point with its neighbours: derivatives over the entrance pupil by fourth-order central differences.
+    cross = h * np.array([[0, 0], [1, 0], [-1, 0], [2, 0], [-2, 0], [0, 1], [0, -1], [0, 2], [0, -2]])
+    opd = pachon.wavefront_opd(
+        lsst_r, field, 620e-9, (px[:, None] + cross[:, 0], py[:, None] + cross[:, 1]), focal_plane=focal_plane
+    )
+    lit = opd.lit.all(axis=1)
+    assert lit.sum() > 20
+
+    def slopes(values):
+        first, second = values[:, [1, 5]] - values[:, [2, 6]], values[:, [3, 7]] - values[:, [4, 8]]
+        return (8 * first - second) / (12 * h)
+
+    # Exactly, on a sphere at a finite distance: dW = X . ds / t, with s the point of the ray on the sphere and t its
+    # distance from the landing point (d path = d . ds, and d = (s - c - X) / t, where s - c is normal to ds).
+    offset = opd.landing - opd.center
+    along = np.einsum("ijk,ijk->ij", offset, opd.exit_direction)
+    t = np.sqrt(along**2 - np.einsum("ijk,ijk->ij", offset, offset) + opd.radius**2) - along
+    sphere = opd.landing + opd.exit_direction * t[..., None]
+    gradient = slopes(opd.value)
+    predicted = sum(offset[:, 0, k, None] * slopes(sphere[..., k]) for k in range(3)) / t[:, :1]
+    # Paths good to 1e-14 m over differences of 80 mm: slopes good to 1e-12, of 6e-7 and more.
+    scale = np.abs(gradient[lit]).max()
+    assert scale > 5e-7
+    assert np.abs(gradient - predicted)[lit].max() < 3e-6 * scale
+
+
+def test_defocus_has_the_size_and_sign_of_the_height(lsst_r):
+    """Raising the CCD by h moves the image point along the light: the OPD gains -h cos(angle of the ray)."""
+    height = 5e-6
+    raised = lsst_r.perturbed("Detector", shift=(0, 0, height))
+    x = np.array([2.7, 3.4, 4.1])
+    there, here = (pachon.wavefront_opd(t, (0, 0), 620e-9, (x, 0 * x)) for t in (raised, lsst_r))
+    cosine = here.exit_direction[:, 2]
+    change = there.value - here.value
+    # Path to a sphere about a point h further on is longer by h cos(theta); the chief ray's by h. The sphere's finite
+    # radius enters at h^2/R = 5e-12 m.
+    assert np.abs(change - (height - height * cosine)).max() < 1e-11
+
+
+def test_the_mean_reference(lsst_r):
+    opd = pachon.wavefront_opd(lsst_r, (0.02, 0.0), 620e-9, grid=32, reference="mean")
+    # Rounding of 30 m of path.
+    assert abs(opd.value[opd.lit].mean()) < 2e-14
+    assert np.abs(opd.landing[opd.lit].mean(axis=0) - opd.center).max() < 1e-15
+
+
+def test_mirror_symmetry(lsst_r):
+    opd = pachon.wavefront_opd(lsst_r, (0.0, 0.02), 620e-9, grid=24)
+    # The telescope and the field are symmetric in x: rounding only.
+    assert np.nanmax(np.abs(opd.value - opd.value[:, ::-1])) < 1e-13
+    assert np.array_equal(opd.lit, opd.lit[:, ::-1])
+
+
+def test_waves_and_figures(lsst_r):
+    opd = pachon.wavefront_opd(lsst_r, (0.0, 0.02), 620e-9, grid=24)
+    lit = opd.value[opd.lit]
+    assert np.allclose(opd.waves[opd.lit], lit / 620e-9)
+    assert np.isclose(opd.rms, np.sqrt(np.mean((lit - lit.mean()) ** 2)))
+    assert np.isclose(opd.peak_to_valley, lit.max() - lit.min())
+    assert np.isnan(opd.value[~opd.lit]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (dict(reference="axis"), ConfigError, "chief"),
+        (dict(grid=0), DomainError, "grid"),
+        (dict(grid=8, pupil=([3.0], [0.0])), ConfigError, "one of them"),
+        (dict(grid=8, sphere_radius=-1.0), DomainError, "sphere_radius"),
+        (dict(grid=8, field=(0.1, 0.0)), DomainError, "2.5 deg"),
+    ],
+)
+def test_bad_arguments(lsst_r, change, error, words):
+    with pytest.raises(error, match=words):
+        pachon.wavefront_opd(lsst_r, **(dict(field=(0.0, 0.0), wavelength=620e-9) | change))

@@ -1,0 +1,91 @@
+"""The bundle trace against the general trace, and the duality of pupil and image that both PSF engines rest on."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.models.errors import DomainError
+from pachon.raytrace.rays import RayStatus
+from pachon.wavefront.pupil_optics import fields_at, trace_pupils
+
+WAVELENGTHS = np.array([545e-9, 624e-9, 703e-9])
+
+
+@pytest.fixture(scope="module")
+def focal_plane():
+    return pachon.FocalPlane.from_budget("lsst", seed=2)
+
+
+@pytest.fixture(scope="module")
+def positions():
+    centers = pachon.lsst_camera().centers
+    return centers[[94, 5, 130, 188]] + [[0.001, 0.002], [-0.01, 0.01], [0.0, 0.0], [0.015, -0.012]]
+
+
+@pytest.fixture(scope="module")
+def optics(lsst_r, focal_plane, positions, annulus_points):
+    pupil = np.stack(annulus_points(70, 3), axis=-1)
+    return trace_pupils(lsst_r, fields_at(lsst_r, positions), WAVELENGTHS, pupil, focal_plane)
+
+
+def test_fields_at_inverts_the_chief_ray(lsst_r, positions):
+    for projection in ("zemax", "gnomonic"):
+        for field, position in zip(fields_at(lsst_r, positions, projection=projection), positions, strict=True):
+            rays = pachon.launch_rays(lsst_r, field, lsst_r.default_wavelength, ([0.0], [0.0]), projection)
+            assert np.abs(pachon.trace(lsst_r, rays).position[0, :2] - position).max() < 1e-12
+
+
+def test_fields_at_refuses_points_outside_the_field(lsst_r):
+    with pytest.raises(DomainError, match="outside the field"):
+        fields_at(lsst_r, [[3.0, 0.0]])
+
+
+def test_path_and_lit_are_those_of_the_opd(lsst_r, focal_plane, optics):
+    for star, field in enumerate(optics.fields):
+        opd = pachon.wavefront_opd(lsst_r, field, WAVELENGTHS[1], tuple(optics.pupil.T), focal_plane=focal_plane)
+        assert np.array_equal(opd.lit, optics.lit[star, 1])
+        # Rounding of 30 m of path.
+        assert np.abs(opd.value + optics.path[star, 1])[opd.lit].max() < 5e-14
+        assert np.abs(opd.center - optics.reference[star]).max() < 1e-15
+
+
+def test_displacement_is_the_landing_point_on_the_ccd(lsst_r, focal_plane, optics):
+    for star, field in enumerate(optics.fields):
+        for wave, wavelength in enumerate(WAVELENGTHS):
+            rays = pachon.launch_rays(lsst_r, field, wavelength, tuple(optics.pupil.T))
+            end = pachon.trace(lsst_r, rays, focal_plane=focal_plane)
+            offset = (end.position - optics.reference[star])[:, :2]
+            ok = end.status == RayStatus.OK
+            # Single precision of 50 um (3e-12 m), and the potato chip over 50 um (0.2 nm of height, 0.15 nm of x).
+            assert np.abs(offset - optics.displacement[star, wave])[ok].max() < 2e-10
+
+
+def test_jacobian_is_dual_to_the_pupil(lsst_r, optics):
+    """Exit direction cosines are linear in the entrance pupil: u = u0 - J^-T p (the isoplanatic, or cosine, law)."""
+    for star, field in enumerate(optics.fields):
+        opd = pachon.wavefront_opd(lsst_r, field, WAVELENGTHS[1], tuple(optics.pupil.T))
+        lit = opd.lit
+        cosines = opd.exit_direction[lit][:, :2]
+        expected = -(optics.pupil[lit] @ np.linalg.inv(optics.jacobian[star]))
+        off = (cosines - expected) - (cosines - expected).mean(axis=0)
+        # Departures are the change of the aberrations across the field: micrometres per 0.01 rad, so 1e-4 of 0.43.
+        assert np.abs(off).max() < 1.5e-4
+
+
+def test_lateral_colour_stays_in(optics):
+    blue, red = optics.displacement[3, 0], optics.displacement[3, 2]
+    both = optics.lit[3, 0] & optics.lit[3, 2]
+    assert np.abs(np.mean(blue[both] - red[both], axis=0)).max() > 1e-8
+
+
+def test_the_set_of_stars_and_threads_change_no_byte(lsst_r, focal_plane, optics):
+    for threads in (1, 3):
+        one = trace_pupils(lsst_r, optics.fields[2:3], WAVELENGTHS, optics.pupil, focal_plane, threads=threads)
+        for name in ("displacement", "path", "lit", "jacobian", "reference"):
+            assert np.array_equal(getattr(one, name)[0], getattr(optics, name)[2])
+
+
+def test_a_star_in_a_gap_is_refused(lsst_r, focal_plane, optics):
+    field = fields_at(lsst_r, [[0.5 * 0.04225, 0.0]])
+    with pytest.raises(DomainError, match=r"fields\[0\].*between the CCDs"):
+        trace_pupils(lsst_r, field, WAVELENGTHS, optics.pupil, focal_plane)
