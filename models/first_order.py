@@ -1,0 +1,241 @@
+"""First-order figures and Seidel sums of a centred telescope, from a paraxial trace.
+
+The trace unfolds the telescope along the light: ``s`` runs with the incoming light (``s = -z``), so a thickness is
+negative after an odd number of mirrors, and so is the index ``n``. At each surface of curvature ``c`` (along ``s``)::
+
+    n' u' = n u - h c (n' - n)        h_next = h + u' t
+
+Seidel sums follow Welford, "Aberrations of Optical Systems" (1986), chapter 8, with ``A = n (h c + u)`` of the marginal
+ray, ``B`` the same of the chief ray, ``H = n (u hb - ub h)`` and the aspheric term ``a = k c^3 + 8 a_4``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .errors import DomainError
+from .surface import Interaction, Surface
+from .telescope import Telescope
+
+ARCSEC = np.pi / 648000
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """First-order figures of a telescope.
+
+    Parameters
+    ----------
+    wavelength : float
+        Vacuum wavelength [m].
+    focal_length : float
+        Effective focal length [m].
+    f_number : float
+        Focal length over the diameter of the entrance pupil.
+    back_focus : float
+        From the last mirror or lens surface to the paraxial focus, along the light [m].
+    focus_z : float
+        Height of the paraxial focus [m], telescope frame.
+    plate_scale : float
+        Angle on the sky over length at the focus [rad/m].
+    entrance_pupil_z, exit_pupil_z : float
+        Heights of the pupils [m], telescope frame; infinite where the exit pupil is.
+    entrance_pupil_diameter, exit_pupil_diameter : float
+        Diameters of the pupils [m].
+    effective_area : float
+        Area of the entrance pupil less its obscuration [m^2].
+    """
+
+    wavelength: float
+    focal_length: float
+    f_number: float
+    back_focus: float
+    focus_z: float
+    plate_scale: float
+    entrance_pupil_z: float
+    entrance_pupil_diameter: float
+    exit_pupil_z: float
+    exit_pupil_diameter: float
+    effective_area: float
+
+    @property
+    def arcsec_per_um(self) -> float:
+        """Plate scale in arc seconds for each micrometre."""
+        return self.plate_scale / ARCSEC * 1e-6
+
+
+@dataclass(frozen=True)
+class SeidelSums:
+    """Seidel sums [m] of a telescope, surface by surface.
+
+    The wavefront of a sum ``S`` at the rim of the pupil and field is S1/8 (spherical), S2/2 (coma), S3/2
+    (astigmatism), (S3 + S4)/4 (field curvature), S5/2 (distortion).
+
+    Parameters
+    ----------
+    names : tuple of str
+        Mirrors and lens surfaces.
+    contributions : ndarray, shape (n_surface, 5)
+        Spherical aberration, coma, astigmatism, Petzval sum, distortion of each [m].
+    """
+
+    names: tuple[str, ...]
+    contributions: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """Sums over the surfaces [m], shape (5,)."""
+        return self.contributions.sum(axis=0)
+
+
+@dataclass(frozen=True)
+class _Trace:
+    """Two paraxial rays through the surfaces: heights before refraction, slopes and indices on either side."""
+
+    surfaces: tuple[Surface, ...]
+    curvature: np.ndarray
+    n: np.ndarray
+    n_after: np.ndarray
+    h: np.ndarray
+    u: np.ndarray
+    u_after: np.ndarray
+
+
+def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
+    """Return the first-order figures of a centred telescope.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        Prescription; its surfaces must share one axis.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's default where not given.
+
+    Raises
+    ------
+    DomainError
+        If a surface is decentred or tilted, the wavelength is not covered, or there is no focus.
+    """
+    w = _wavelength(telescope, wavelength)
+    radius = 0.5 * telescope.pupil_diameter
+    # Ray 0 enters parallel to the axis at the rim, ray 1 through the centre of the pupil with unit slope.
+    trace = _trace(telescope, w, (radius, 0.0), (0.0, 1.0))
+    last_z = trace.surfaces[-1].vertex[2]
+    n, (h, hb), (u, ub) = float(trace.n_after[-1]), map(float, trace.h[-1]), map(float, trace.u_after[-1])
+    power = -n * u / (abs(float(trace.n[0])) * radius)
+    if abs(power) * radius < 1e-9:
+        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its power is {power:.3g} 1/m")
+    focal_length = 1.0 / power
+    to_focus = -h / u
+    to_pupil = -hb / ub if ub != 0 else math.inf
+    return FirstOrder(
+        wavelength=w,
+        focal_length=focal_length,
+        f_number=focal_length / telescope.pupil_diameter,
+        back_focus=math.copysign(to_focus, to_focus * n),
+        focus_z=last_z - to_focus,
+        plate_scale=power,
+        entrance_pupil_z=telescope.stop_z,
+        entrance_pupil_diameter=telescope.pupil_diameter,
+        exit_pupil_z=last_z - to_pupil,
+        exit_pupil_diameter=2 * abs(h + u * to_pupil),
+        effective_area=math.pi * radius**2 * (1 - telescope.pupil_obscuration**2),
+    )
+
+
+def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np.ndarray:
+    """Return the paraxial radius that light of a field angle fills on each surface.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        Prescription.
+    field : float
+        Field angle [rad].
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m].
+
+    Returns
+    -------
+    ndarray, shape (n_surface,)
+        Radius [m] on each surface, detector left out.
+    """
+    rays = (0.5 * telescope.pupil_diameter, 0.0), (0.0, np.tan(field))
+    trace = _trace(telescope, _wavelength(telescope, wavelength), *rays)
+    return np.abs(trace.h).sum(axis=1)
+
+
+def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | None = None) -> SeidelSums:
+    """Return the Seidel sums of a centred telescope.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        Prescription; its surfaces must share one axis.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's default where not given.
+    field : float, optional
+        Field angle [rad] of the chief ray; the radius of the field of view where not given.
+
+    Raises
+    ------
+    DomainError
+        If a surface is decentred or tilted, or the wavelength is not covered.
+    """
+    angle = telescope.field_radius if field is None else field
+    rays = (0.5 * telescope.pupil_diameter, 0.0), (0.0, np.tan(angle))
+    trace = _trace(telescope, _wavelength(telescope, wavelength), *rays)
+    c, n, n2 = trace.curvature, trace.n, trace.n_after
+    h, hb = trace.h.T
+    u, ub = trace.u.T
+    a, b = n * (h * c + u), n * (hb * c + ub)
+    lagrange = n * (u * hb - ub * h)
+    bend = trace.u_after[:, 0] / n2 - u / n
+    flat, square = 1 / n2 - 1 / n, 1 / n2**2 - 1 / n**2
+    s1, s2, s3 = -(a**2) * h * bend, -a * b * h * bend, -(b**2) * h * bend
+    s4 = -(lagrange**2) * c * flat
+    # This form of the fifth sum stays finite where the marginal ray meets the surface at right angles (a = 0).
+    s5 = -(b**3) * h * square + b * hb * c * (2 * h * b - hb * a) * flat
+    # Along s both the curvature and the coefficient of r^4 change sign.
+    conic = np.array([s.shape.conic for s in trace.surfaces])
+    a4 = -np.array([(*s.shape.coefficients, 0.0)[0] for s in trace.surfaces])
+    figure = (conic * c**3 + 8 * a4) * (n2 - n)
+    aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * figure
+    contributions = np.stack([s1, s2, s3, s4, s5]) + aspheric
+    return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
+
+
+def _wavelength(telescope: Telescope, wavelength: Any) -> float:
+    return float(telescope.check_wavelength(telescope.default_wavelength if wavelength is None else wavelength))
+
+
+def _trace(telescope: Telescope, wavelength: float, first: tuple[float, float], second: tuple[float, float]) -> _Trace:
+    """Trace two rays, each given by height [m] and slope in the plane of the entrance pupil."""
+    surfaces = tuple(s for s in telescope.surfaces if s.interaction != Interaction.DETECTOR)
+    for surface in surfaces:
+        axis = surface.matrix[:, 2]
+        if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:
+            raise DomainError(f"surface {surface.name} of {telescope.name}: expected one on the axis, not perturbed")
+    curvature = np.array([-s.shape.curvature for s in surfaces])
+    (h1, u1), (h2, u2) = first, second
+    h, u = np.array([h1, h2]), np.array([u1, u2])
+    z, index = telescope.stop_z, float(telescope.medium_before.index(wavelength))
+    before, after, heights, slopes, slopes_after = [], [], [], [], []
+    for surface, c in zip(surfaces, curvature, strict=True):
+        mirror = surface.interaction == Interaction.MIRROR
+        glass = float(surface.medium_after.index(wavelength))
+        index_after = -index if mirror else np.copysign(glass, index)
+        h = h + u * (z - surface.vertex[2])
+        before.append(index)
+        heights.append(h)
+        slopes.append(u)
+        u = (index * u - h * c * (index_after - index)) / index_after
+        slopes_after.append(u)
+        after.append(index_after)
+        index, z = index_after, surface.vertex[2]
+    columns = (before, after, heights, slopes, slopes_after)
+    return _Trace(surfaces, curvature, *(np.array(v, dtype=np.float64) for v in columns))

@@ -1,0 +1,225 @@
+"""One CCD, from its stars to its PSF model: what of a run can be done on its own, whatever the other CCDs are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..models.errors import PachonError
+from ..models.random_streams import stream
+from ..wavefront.psf import make_psfs
+from ..wavefront.pupil_optics import fields_at
+from .ccd_product import CcdProduct, ObservedStars, TruthStars
+from .experiment import Experiment
+from .pca import PsfModel
+from .photometry import ARCSEC, instrument_noise, signal_to_noise, sky_electrons_per_pixel
+from .shapes import Shapes, fwhm, measure_shapes
+from .stamps import center_stamps, observe_stamps
+from .star_field import StarField, make_star_field
+
+#: A star is drawn on a stamp this many pixels larger than the one kept: room to shift it onto the centre of a pixel.
+_SHIFT_ROOM = 10
+#: Stars keep this many pixels from the rim: a ray that meets a CCD 20 um higher up lands micrometres farther in or out.
+_RIM = 2
+#: Observed stars keep this many pixels from the edge of the CCD, so that the whole stamp lies on it.
+_MARGIN = 20
+#: Sets magnitude limits until the PSF is known; positions do not depend on it.
+_PROVISIONAL_FWHM = 0.6 * ARCSEC
+
+
+def compute_ccd(
+    experiment: Experiment, name: str, *, threads: int | None = None, advance: Callable[[int], None] | None = None
+) -> CcdProduct:
+    """Make the stars of one CCD, look at them, and model the PSF from what was seen.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Telescope, focal plane, atmosphere and settings.
+    name : str
+        Name of the CCD.
+    threads : int, optional
+        Number of threads; no byte depends on it.
+    advance : callable, optional
+        Called with a number of PSFs after so many have been made.
+
+    Raises
+    ------
+    PachonError
+        If a stage fails: one line that starts with the name of the CCD.
+    """
+    try:
+        return _compute(experiment, name, threads, advance)
+    except PachonError as error:
+        raise type(error)(f"CCD {name}: {error}") from None
+
+
+def _compute(
+    experiment: Experiment, name: str, threads: int | None, advance: Callable[[int], None] | None
+) -> CcdProduct:
+    config = experiment.config
+    n_components = config.reconstruction.components
+    bounds = _bounds(experiment, name)
+    places = _star_field(experiment, name, _PROVISIONAL_FWHM)
+    truth = _expose(experiment, places.truth, np.zeros_like(places.truth), threads, advance)
+    truth_shapes, truth_images = _centered(experiment, truth.image, truth.pixel_scale)
+
+    stars = _star_field(experiment, name, effective_fwhm(truth.image, truth.pixel_scale))
+    pixel = stars.observed_pixel * (stars.pixel_size / experiment.pixel_size)
+    observed = _expose(experiment, stars.observed, pixel - np.rint(pixel), threads, advance)
+    exposure = config.atmosphere.exposure_s
+    sky = sky_electrons_per_pixel(stars.band, exposure, observed.pixel_scale)
+    noise = instrument_noise(exposure)
+    seen = observe_stamps(
+        observed.image, stars.electrons, sky, noise, stream(config.seed, "noise", name)
+    )
+    observed_shapes, observed_images = _centered(experiment, seen, observed.pixel_scale)
+
+    used = observed_shapes.usable & np.isfinite(observed_images).all(axis=(1, 2))
+    model = PsfModel.fit(
+        observed_images[used],
+        stars.observed[used],
+        n_components=n_components,
+        order=config.reconstruction.order,
+        extent=bounds,
+    )
+    # Noise-free stars have no outliers: what stands out there is the PSF.
+    truth_model = PsfModel.fit(
+        truth_images,
+        places.truth,
+        n_components=n_components,
+        order=config.reconstruction.truth_order,
+        extent=bounds,
+        clip_sigma=None,
+    )
+
+    def shapes_of(images: np.ndarray) -> Shapes:
+        return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
+
+    at_truth, at_stars = shapes_of(model.at(places.truth)), shapes_of(model.at(stars.observed))
+    left_out = shapes_of(model.leave_one_out())
+    left_out_e1, left_out_e2 = np.full((2, len(used)), np.nan)
+    left_out_e1[used], left_out_e2[used] = left_out.e1, left_out.e2
+    return CcdProduct(
+        name=name,
+        center=tuple(float(v) for v in experiment.camera.centers[experiment.camera.ccd_index(name)]),
+        pixel_scale=truth.pixel_scale,
+        noise=(sky, noise),
+        truth=TruthStars(
+            **_positions(places.truth, truth.fields),
+            **_shapes(truth_shapes, at_truth),
+            fwhm=fwhm(truth.image, truth.pixel_scale),
+        ),
+        observed=ObservedStars(
+            **_positions(stars.observed, observed.fields),
+            **_shapes(observed_shapes, at_stars),
+            magnitude=stars.magnitude,
+            electrons=stars.electrons,
+            snr=signal_to_noise(
+                stars.magnitude, stars.band, exposure, effective_fwhm(truth.image, truth.pixel_scale)
+            ),
+            used=used,
+            left_out_e1=left_out_e1,
+            left_out_e2=left_out_e2,
+        ),
+        truth_images=truth_images.astype(np.float32),
+        observed_images=observed_images.astype(np.float32),
+        model=model,
+        truth_model=truth_model,
+    )
+
+
+def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
+    """Return the FWHM of the Gaussian with as many noise-equivalent pixels as the median star [rad].
+
+    The noise-equivalent number of pixels of an image P of unit sum is 1/sum(P^2), and 2.266 FWHM^2 pixels that of a
+    Gaussian (SMTN-002).
+    """
+    pixels = 1.0 / np.median((images**2).sum(axis=(1, 2)))
+    return float(np.sqrt(pixels / 2.266) * pixel_scale)
+
+
+@dataclass(frozen=True)
+class _Exposed:
+    image: np.ndarray
+    pixel_scale: float
+    fields: np.ndarray
+
+
+def _expose(
+    experiment: Experiment,
+    positions: np.ndarray,
+    offsets: np.ndarray,
+    threads: int | None,
+    advance: Callable[[int], None] | None,
+) -> _Exposed:
+    """Make the PSFs at positions on the detector, noise-free."""
+    config, wavelengths = experiment.config, experiment.wavelengths
+    fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    psfs = make_psfs(
+        experiment.telescope,
+        fields,
+        wavelengths,
+        focal_plane=experiment.focal_plane,
+        atmosphere=experiment.atmosphere,
+        engine=config.psf.engine,
+        seed=config.seed,
+        stamp_size=config.psf.stamp + _SHIFT_ROOM,
+        pixel_size=experiment.pixel_size,
+        diffusion=experiment.diffusion,
+        offsets=offsets,
+        dispersion=experiment.dispersion,
+        n_pupil=config.psf.n_pupil,
+        threads=threads,
+        progress=advance,
+    )
+    return _Exposed(psfs.image, float(psfs.pixel_scale), fields)
+
+
+def _centered(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> tuple[Shapes, np.ndarray]:
+    """Shift stars to the centre of a pixel, cut the stamps, and measure the shapes there."""
+    first = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
+    stamps = center_stamps(images, first.x, first.y, size=experiment.config.psf.stamp)
+    return measure_shapes(stamps, pixel_scale, experiment.weight_fwhm), stamps
+
+
+def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, float]:
+    """Return the edges (xmin, xmax, ymin, ymax) of a CCD [m], less the rim that no star comes into."""
+    camera = experiment.camera
+    x, y = (float(v) for v in camera.centers[camera.ccd_index(name)])
+    half = camera.half_size - _RIM * camera.pixel_size
+    return x - half, x + half, y - half, y + half
+
+
+def _star_field(experiment: Experiment, name: str, width: float) -> StarField:
+    config = experiment.config
+    return make_star_field(
+        name,
+        _bounds(experiment, name),
+        config.stars.truth,
+        config.stars.observed,
+        config.seed,
+        fwhm=width,
+        band=config.band or "r",
+        exposure=config.atmosphere.exposure_s,
+        snr=config.stars.snr_min,
+        margin=_MARGIN,
+        pixel_size=experiment.camera.pixel_size,
+    )
+
+
+def _positions(positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
+    return {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
+
+
+def _shapes(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
+    return {
+        "e1": measured.e1,
+        "e2": measured.e2,
+        "size": measured.size,
+        "flags": measured.flags,
+        "model_e1": model.e1,
+        "model_e2": model.e2,
+    }
