@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import cast
 
@@ -56,10 +57,16 @@ DATA = Path(__file__).parent / "data"
 BUNDLED = (*(f"lsst_v3.3_{band}" for band in "ugrizy"), "lsst_v3.3_g_vacuum_zemax_check", "paul_baker")
 
 INTERACTIONS = {"mirror": Interaction.MIRROR, "refract": Interaction.REFRACT, "detector": Interaction.DETECTOR}
-# Units divide by a whole number, so that 0.624 um becomes the float nearest to 624e-9 m.
-LENGTHS: dict[str, Callable[[float], float]] = {"m": lambda v: v, "mm": lambda v: v / 1e3}
-ANGLES: dict[str, Callable[[float], float]] = {"rad": lambda v: v, "deg": math.radians}
-WAVELENGTHS: dict[str, Callable[[float], float]] = {"m": lambda v: v, "um": lambda v: v / 1e6, "nm": lambda v: v / 1e9}
+
+
+def _power_of_ten(exponent: int) -> Callable[[float], float]:
+    """Return a conversion that moves the decimal point of the figure as written: 0.545 um is the float 545e-9 m."""
+    return lambda v: float(Decimal(repr(v)).scaleb(exponent))
+
+
+LENGTHS = {"m": _power_of_ten(0), "mm": _power_of_ten(-3)}
+ANGLES: dict[str, Callable[[float], float]] = {"rad": _power_of_ten(0), "deg": math.radians}
+WAVELENGTHS = {"m": _power_of_ten(0), "um": _power_of_ten(-6), "nm": _power_of_ten(-9)}
 
 HEADER = (
     "name",

@@ -124,7 +124,7 @@ class PsfModel:
             _check_terms(terms, order)
             rejected = np.zeros(pixels.shape, dtype=bool)
             if clip_sigma is not None:
-                rejected = find_outliers(pixels, terms, clip_sigma, max_iterations)
+                rejected = find_outliers(pixels, clip_sigma, max_iterations)
             mean, normalized = _mean_and_normalized(pixels, rejected)
             deviations = normalized - mean
             _, singular, vectors = np.linalg.svd(deviations, full_matrices=False)

@@ -1,16 +1,43 @@
-"""What a run says while it works: bars on a terminal, one line a stage elsewhere, always on standard error."""
+"""What a run says while it works: bars on a terminal, plain lines elsewhere, always on standard error."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
-Advance = Callable[[int], None]
+
+class Stage:
+    """One stage of a run, on its way.
+
+    Parameters
+    ----------
+    bars : Progress, optional
+        Bars on a terminal.
+    task : TaskID, optional
+        The bar of this stage.
+    say : bool
+        Whether to write lines: nobody sees bars.
+    """
+
+    def __init__(self, bars: Progress | None, task: TaskID | None, say: bool) -> None:
+        self._bars = bars
+        self._task = task
+        self._say = say
+
+    def advance(self, count: int = 1) -> None:
+        """Tell that so many more items are done."""
+        if self._bars is not None and self._task is not None:
+            self._bars.advance(self._task, count)
+
+    def line(self, text: str) -> None:
+        """Write one line, where there are no bars to see."""
+        if self._say:
+            print(text, file=sys.stderr, flush=True)
 
 
 class Reporter:
@@ -26,14 +53,9 @@ class Reporter:
         self.quiet = quiet
         self.seconds: dict[str, float] = {}
 
-    def note(self, text: str) -> None:
-        """Say one line."""
-        if not self.quiet:
-            print(text, file=sys.stderr, flush=True)
-
     @contextmanager
-    def stage(self, title: str, total: int | None = None) -> Iterator[Advance]:
-        """Show one stage while it runs; yields what to call with the number of items done.
+    def stage(self, title: str, total: int | None = None) -> Iterator[Stage]:
+        """Show one stage while it runs.
 
         Parameters
         ----------
@@ -45,19 +67,21 @@ class Reporter:
         start = time.perf_counter()
         console = Console(stderr=True)
         if self.quiet or not console.is_terminal:
-            yield lambda count: None
-            self.seconds[title] = self.seconds.get(title, 0.0) + time.perf_counter() - start
-            self.note(f"{title}: {self.seconds[title]:.1f} s")
+            stage = Stage(None, None, not self.quiet)
+            yield stage
+            self.seconds[title] = time.perf_counter() - start
+            stage.line(f"{title}: {self.seconds[title]:.1f} s")
             return
         columns = (
-            SpinnerColumn(),
+            SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description}"),
             BarColumn(bar_width=32),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
         )
-        with Progress(*columns, console=console) as bars:
+        shown = columns if total is not None else (*columns[:2], columns[-1])
+        with Progress(*shown, console=console) as bars:
             task = bars.add_task(title, total=total)
-            yield lambda count: bars.advance(task, count)
+            yield Stage(bars, task, False)
             bars.update(task, total=total or 1, completed=total or 1)
-        self.seconds[title] = self.seconds.get(title, 0.0) + time.perf_counter() - start
+        self.seconds[title] = time.perf_counter() - start

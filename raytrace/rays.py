@@ -27,7 +27,7 @@ class RayStatus(IntEnum):
     #: Newton's method did not find the surface.
     NOT_CONVERGED = int(surface_kernels.NOT_CONVERGED)
     #: Landed between the CCDs (only when traced to a focal plane of CCDs).
-    GAP = int(surface_kernels.GAP)
+    GAP = 5
 
 
 PROJECTIONS = ("zemax", "gnomonic", "postel")

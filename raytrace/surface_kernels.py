@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from .launch import FORWARD_OPTIONS
-from .packet import LANES, lane_flags, lanes, lanes_sqrt
+from .packet import LANES, lanes, lanes_sqrt
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -22,12 +22,12 @@ wp.set_module_options(FORWARD_OPTIONS)
 NEWTON_STEP = wp.constant(wp.float64(2.0e-8))
 NEWTON_LIMIT = wp.constant(20)
 
-OK = wp.constant(0)
-VIGNETTED = wp.constant(1)
-MISSED = wp.constant(2)
-TOTAL_REFLECTION = wp.constant(3)
-NOT_CONVERGED = wp.constant(4)
-GAP = wp.constant(5)
+# Statuses are doubles within the kernels: a choice between lanes of one width stays a vector instruction.
+OK = wp.constant(wp.float64(0.0))
+VIGNETTED = wp.constant(wp.float64(1.0))
+MISSED = wp.constant(wp.float64(2.0))
+TOTAL_REFLECTION = wp.constant(wp.float64(3.0))
+NOT_CONVERGED = wp.constant(wp.float64(4.0))
 
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
@@ -59,32 +59,17 @@ def conic_distance(c: wp.float64, k: wp.float64, x: lanes, y: lanes, z: lanes, u
 
 
 @wp.func
-def sag_and_slope(
-    c: wp.float64,
-    k: wp.float64,
-    coefficients: wp.array2d(dtype=wp.float64),
-    surface: wp.int32,
-    n_coefficients: wp.int32,
-    r2: lanes,
-):
-    """Sag of each lane [m] and its slope divided by r, (1/r) d sag/d r [1/m]."""
-    one = lanes(ONE)
-    root = lanes_sqrt(one - ((ONE + k) * c * c) * r2)
-    # One division for both: c r^2 / (1 + root) and c / root.
-    shared = c * wp.cw_div(one, root + wp.cw_mul(root, root))
-    sag = wp.cw_mul(wp.cw_mul(r2, root), shared)
-    slope = shared + wp.cw_mul(root, shared)
-    polynomial = lanes(ZERO)
-    derivative = lanes(ZERO)
-    for j in range(n_coefficients):
+def polynomial(coefficients: wp.array2d(dtype=wp.float64), surface: wp.int32, terms: wp.int32, r2: lanes):
+    """Aspheric part of the sag, a_4 r^4 + a_6 r^6 + ... [m], and its slope divided by r [1/m]."""
+    value = lanes(ZERO)
+    slope = lanes(ZERO)
+    for j in range(terms):
         # Horner from the highest term down: sum a_j r2^j and sum (4 + 2 j) a_j r2^j.
-        m = n_coefficients - 1 - j
+        m = terms - 1 - j
         a = coefficients[surface, m]
-        polynomial = wp.cw_mul(polynomial, r2) + lanes(a)
-        derivative = wp.cw_mul(derivative, r2) + lanes(a * wp.float64(4 + 2 * m))
-    sag = sag + wp.cw_mul(polynomial, wp.cw_mul(r2, r2))
-    slope = slope + wp.cw_mul(derivative, r2)
-    return sag, slope
+        value = wp.cw_mul(value, r2) + lanes(a)
+        slope = wp.cw_mul(slope, r2) + lanes(a * wp.float64(4 + 2 * m))
+    return wp.cw_mul(value, wp.cw_mul(r2, r2)), wp.cw_mul(slope, r2)
 
 
 @wp.func
@@ -93,7 +78,7 @@ def aspheric_distance(
     k: wp.float64,
     coefficients: wp.array2d(dtype=wp.float64),
     surface: wp.int32,
-    n_coefficients: wp.int32,
+    terms: wp.int32,
     x: lanes,
     y: lanes,
     z: lanes,
@@ -102,28 +87,33 @@ def aspheric_distance(
     w: lanes,
     start: lanes,
 ):
-    """Distance to the asphere by Newton's method from ``start``, and which lanes did not converge."""
+    """Distance to the asphere by Newton's method from ``start``, and which lanes did not converge.
+
+    With b = z - (a_4 r^4 + ...), what is left must lie on the conic, G = c (r^2 + (1 + k) b^2) - 2 b = 0: the
+    implicit form takes neither a root nor a division per evaluation.
+    """
     t = start
-    running = lane_flags()
-    for i in range(LANES):
-        running[i] = 1
-    count = int(LANES)
+    running = lanes(ONE)
+    busy = wp.float64(1.0)
     steps = int(0)
-    while count > 0 and steps < NEWTON_LIMIT:
+    while busy > ZERO and steps < NEWTON_LIMIT:
         px = x + wp.cw_mul(t, u)
         py = y + wp.cw_mul(t, v)
-        pz = z + wp.cw_mul(t, w)
         r2 = wp.cw_mul(px, px) + wp.cw_mul(py, py)
-        sag, slope = sag_and_slope(c, k, coefficients, surface, n_coefficients, r2)
-        rate = w - wp.cw_mul(slope, wp.cw_mul(px, u) + wp.cw_mul(py, v))
-        step = wp.cw_div(sag - pz, rate)
-        count = int(0)
+        outward = wp.cw_mul(px, u) + wp.cw_mul(py, v)
+        value, slope = polynomial(coefficients, surface, terms, r2)
+        b = z + wp.cw_mul(t, w) - value
+        q = lanes(ONE) - ((ONE + k) * c) * b
+        # G / 2 and its derivative along the ray, both with the opposite sign.
+        g = b - (wp.float64(0.5) * c) * (r2 + (ONE + k) * wp.cw_mul(b, b))
+        rate = wp.cw_mul(q, w - wp.cw_mul(slope, outward)) - c * outward
+        step = wp.cw_div(g, rate)
         for i in range(LANES):
             # A lane that has converged stays as it is, whatever its neighbours still need.
-            t[i] = t[i] + wp.where(running[i] == 1, step[i], ZERO)
+            t[i] = wp.where(running[i] > ZERO, t[i] - step[i], t[i])
             # Written so that a NaN (a ray that misses) stops too.
-            running[i] = wp.where(wp.abs(step[i]) > NEWTON_STEP, running[i], 0)
-            count += running[i]
+            running[i] = wp.where(wp.abs(step[i]) > NEWTON_STEP, running[i], ZERO)
+        busy = wp.dot(running, running)
         steps += 1
     return t, running
 

@@ -114,7 +114,7 @@ def trace(
     n = len(rays)
     every = len(telescope.surfaces) if surfaces == "all" else 1
     packed = pack_surfaces(telescope)
-    indices = wp.array(refractive_indices(telescope, rays.wavelength), dtype=wp.float64, device="cpu")
+    indices = wp.array(refractive_indices(telescope, rays.wavelength)[None], dtype=wp.float64, device="cpu")
     count = packet_count(n)
 
     def inputs(values: np.ndarray) -> wp.array:

@@ -16,9 +16,9 @@ from .surface_kernels import (
     ZERO,
     aspheric_distance,
     conic_distance,
+    polynomial,
     reflected,
     refracted,
-    sag_and_slope,
 )
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -67,7 +67,7 @@ def through_surface(
     gv: lanes,
     gw: lanes,
     path: lanes,
-    status: lane_flags,
+    status: lanes,
 ):
     """Carry a packet to surface ``s`` and through it; positions and directions in the telescope frame."""
     x = gx - lanes(surfaces.numbers[s, VERTEX])
@@ -101,12 +101,12 @@ def through_surface(
 
     c = surfaces.numbers[s, CURVATURE]
     k = surfaces.numbers[s, CONIC]
-    n_coefficients = surfaces.kinds[s, TERMS]
+    terms = surfaces.kinds[s, TERMS]
     t = conic_distance(c, k, x, y, z, u, v, w)
-    if n_coefficients > 0:
-        t, running = aspheric_distance(c, k, surfaces.coefficients, s, n_coefficients, x, y, z, u, v, w, t)
+    if terms > 0:
+        t, running = aspheric_distance(c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t)
         for i in range(LANES):
-            status[i] = wp.where(running[i] == 1, NOT_CONVERGED, status[i])
+            status[i] = wp.where(running[i] > ZERO, NOT_CONVERGED, status[i])
     for i in range(LANES):
         # A NaN fails every comparison; wp.isfinite would be a call per lane and stop the compiler's vectors.
         status[i] = wp.where(wp.abs(t[i]) < FAR, status[i], wp.where(status[i] <= VIGNETTED, MISSED, status[i]))
@@ -128,16 +128,16 @@ def through_surface(
 
     interaction = surfaces.kinds[s, INTERACTION]
     if interaction == MIRROR or interaction == REFRACT:
-        # The normal's length does not matter, so that of a conic needs no root: (-c x, -c y, 1 - (1 + k) c z).
-        nx = -c * x
-        ny = -c * y
-        nz = lanes(ONE) - ((ONE + k) * c) * z
-        if n_coefficients > 0:
-            r2 = wp.cw_mul(x, x) + wp.cw_mul(y, y)
-            _sag, slope = sag_and_slope(c, k, surfaces.coefficients, s, n_coefficients, r2)
-            nx = -wp.cw_mul(slope, x)
-            ny = -wp.cw_mul(slope, y)
-            nz = lanes(ONE)
+        # The gradient of the implicit form G is normal to the surface, and its length does not matter.
+        b = z
+        bend = lanes(c)
+        if terms > 0:
+            value, slope = polynomial(surfaces.coefficients, s, terms, wp.cw_mul(x, x) + wp.cw_mul(y, y))
+            b = z - value
+            bend = bend + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
+        nx = -wp.cw_mul(bend, x)
+        ny = -wp.cw_mul(bend, y)
+        nz = lanes(ONE) - ((ONE + k) * c) * b
         if interaction == MIRROR:
             u, v, w = reflected(u, v, w, nx, ny, nz)
         else:
@@ -172,11 +172,62 @@ def through_surface(
     return x, y, z, u, v, w, path, status
 
 
+@wp.func
+def statuses(status: lanes):
+    """Statuses as integers."""
+    out = lane_flags()
+    for i in range(LANES):
+        out[i] = wp.int32(status[i])
+    return out
+
+
+@wp.func
+def through_telescope(
+    surfaces: PackedSurfaces,
+    indices: wp.array2d(dtype=wp.float64),
+    row: wp.int32,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+    path: lanes,
+    packet: wp.int32,
+    position_out: wp.array3d(dtype=lanes),
+    direction_out: wp.array3d(dtype=lanes),
+    path_out: wp.array2d(dtype=lanes),
+    status_out: wp.array2d(dtype=lane_flags),
+):
+    """Carry a packet through every surface, and write it after the last ones, as many as the outputs have room for.
+
+    The only place that calls ``through_surface``, so that the compiler puts it in line here.
+    """
+    status = lanes(OK)
+    n_surfaces = surfaces.kinds.shape[0]
+    skipped = n_surfaces - position_out.shape[0]
+    for s in range(n_surfaces):
+        x, y, z, u, v, w, path, status = through_surface(
+            surfaces, s, indices[row, s], indices[row, s + 1], x, y, z, u, v, w, path, status
+        )
+        if s >= skipped:
+            o = s - skipped
+            position_out[o, 0, packet] = x
+            position_out[o, 1, packet] = y
+            position_out[o, 2, packet] = z
+            direction_out[o, 0, packet] = u
+            direction_out[o, 1, packet] = v
+            direction_out[o, 2, packet] = w
+            path_out[o, packet] = path
+            status_out[o, packet] = statuses(status)
+    return x, y, z, u, v, w, path, status
+
+
 @wp.kernel
 def trace_rays(
     first: wp.int32,
     surfaces: PackedSurfaces,
-    indices: wp.array(dtype=wp.float64),
+    indices: wp.array2d(dtype=wp.float64),
     position: wp.array2d(dtype=lanes),
     direction: wp.array2d(dtype=lanes),
     path_in: wp.array(dtype=lanes),
@@ -191,30 +242,23 @@ def trace_rays(
     length 1 (the last surface) or ``n_surfaces``.
     """
     p = first + wp.tid()
-    x = position[0, p]
-    y = position[1, p]
-    z = position[2, p]
-    u = direction[0, p]
-    v = direction[1, p]
-    w = direction[2, p]
-    path = path_in[p]
-    status = lane_flags()
-    every = position_out.shape[0]
-    n_surfaces = surfaces.kinds.shape[0]
-    for s in range(n_surfaces):
-        x, y, z, u, v, w, path, status = through_surface(
-            surfaces, s, indices[s], indices[s + 1], x, y, z, u, v, w, path, status
-        )
-        if every > 1 or s == n_surfaces - 1:
-            o = wp.min(s, every - 1)
-            position_out[o, 0, p] = x
-            position_out[o, 1, p] = y
-            position_out[o, 2, p] = z
-            direction_out[o, 0, p] = u
-            direction_out[o, 1, p] = v
-            direction_out[o, 2, p] = w
-            path_out[o, p] = path
-            status_out[o, p] = status
+    through_telescope(
+        surfaces,
+        indices,
+        0,
+        position[0, p],
+        position[1, p],
+        position[2, p],
+        direction[0, p],
+        direction[1, p],
+        direction[2, p],
+        path_in[p],
+        p,
+        position_out,
+        direction_out,
+        path_out,
+        status_out,
+    )
 
 
 @wp.func
@@ -237,6 +281,10 @@ def trace_pupils(
     distance: wp.float64,
     reference: wp.array2d(dtype=wp.float64),
     radius: wp.float64,
+    no_position: wp.array3d(dtype=lanes),
+    no_direction: wp.array3d(dtype=lanes),
+    no_path: wp.array2d(dtype=lanes),
+    no_status: wp.array2d(dtype=lane_flags),
     displacement_x: wp.array2d(dtype=lanes),
     displacement_y: wp.array2d(dtype=lanes),
     path_out: wp.array2d(dtype=lanes),
@@ -257,15 +305,23 @@ def trace_pupils(
     dv = direction[b, 1]
     dw = direction[b, 2]
     x, y, z = launched(pupil[0, p], pupil[1, p], pupil_z, du, dv, dw, distance)
-    u = lanes(du)
-    v = lanes(dv)
-    w = lanes(dw)
-    path = lanes(ZERO)
-    status = lane_flags()
-    for s in range(n_surfaces):
-        x, y, z, u, v, w, path, status = through_surface(
-            surfaces, s, indices[row, s], indices[row, s + 1], x, y, z, u, v, w, path, status
-        )
+    x, y, z, u, v, w, path, status = through_telescope(
+        surfaces,
+        indices,
+        row,
+        x,
+        y,
+        z,
+        lanes(du),
+        lanes(dv),
+        lanes(dw),
+        lanes(ZERO),
+        p,
+        no_position,
+        no_direction,
+        no_path,
+        no_status,
+    )
     x = x - lanes(reference[b, 0])
     y = y - lanes(reference[b, 1])
     z = z - lanes(reference[b, 2])
@@ -280,4 +336,4 @@ def trace_pupils(
     qq = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
     ahead = lanes_sqrt(wp.cw_mul(qd, qd) - qq + lanes(radius * radius)) - qd
     path_out[b, p] = path + indices[row, n_surfaces - 1] * ahead
-    status_out[b, p] = status
+    status_out[b, p] = statuses(status)

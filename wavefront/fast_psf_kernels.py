@@ -25,40 +25,66 @@ def corner_of(position: wp.float64, size: wp.int32):
 
 
 @wp.func
-def patch_corners(
+def patch_slope(c00: samples, c10: samples, c01: samples, c11: samples, fraction_x: wp.float32, fraction_y: wp.float32):
+    """Differences of path across a pixel, in x and y, on the bilinear patch of four corners (named by x, then y)."""
+    along_x = c10 - c00
+    along_y = c01 - c00
+    twist = (c11 - c01) - along_x
+    return along_x + twist * fraction_y, along_y + twist * fraction_x
+
+
+@wp.func
+def slope_inside(
     screens: wp.array2d(dtype=wp.float32),
     layer: wp.int32,
     size: wp.int32,
-    corner_x: wp.int32,
-    corner_y: wp.int32,
-    column: sample_offsets,
-    row: sample_offsets,
-    reach: wp.int32,
+    corner: wp.int32,
+    offset: sample_offsets,
+    fraction_x: wp.float32,
+    fraction_y: wp.float32,
 ):
-    """Read the four corners of the patch under every lane: (0, 0), (1, 0), (0, 1), (1, 1) in (x, y)."""
+    """Read the patches under a packet that crosses no border of the screen; offset: of each lane from the corner."""
     c00 = samples()
     c10 = samples()
     c01 = samples()
     c11 = samples()
-    if corner_x + reach < size and corner_y + reach < size:
-        base = corner_y * size + corner_x
-        for i in range(LANES):
-            at = base + row[i] * size + column[i]
-            c00[i] = screens[layer, at]
-            c10[i] = screens[layer, at + 1]
-            c01[i] = screens[layer, at + size]
-            c11[i] = screens[layer, at + size + 1]
-    else:
-        for i in range(LANES):
-            x0 = (corner_x + column[i]) % size
-            y0 = (corner_y + row[i]) % size
-            x1 = (x0 + 1) % size
-            y1 = (y0 + 1) % size
-            c00[i] = screens[layer, y0 * size + x0]
-            c10[i] = screens[layer, y0 * size + x1]
-            c01[i] = screens[layer, y1 * size + x0]
-            c11[i] = screens[layer, y1 * size + x1]
-    return c00, c10, c01, c11
+    for i in range(LANES):
+        at = corner + offset[i]
+        c00[i] = screens[layer, at]
+        c10[i] = screens[layer, at + 1]
+        c01[i] = screens[layer, at + size]
+        c11[i] = screens[layer, at + size + 1]
+    return patch_slope(c00, c10, c01, c11, fraction_x, fraction_y)
+
+
+@wp.func
+def slope_across(
+    screens: wp.array2d(dtype=wp.float32),
+    layer: wp.int32,
+    size: wp.int32,
+    corner: wp.int32,
+    offset: sample_offsets,
+    fraction_x: wp.float32,
+    fraction_y: wp.float32,
+):
+    """Read the patches under a packet that may reach over the border of the screen, which is periodic."""
+    c00 = samples()
+    c10 = samples()
+    c01 = samples()
+    c11 = samples()
+    for i in range(LANES):
+        # an offset holds whole rows and columns; a column past the border runs on into the next row
+        x0 = corner % size + offset[i] % size
+        y0 = corner // size + offset[i] // size
+        x1 = (x0 + 1) % size
+        y1 = (y0 + 1) % size
+        x0 = x0 % size
+        y0 = y0 % size
+        c00[i] = screens[layer, y0 * size + x0]
+        c10[i] = screens[layer, y0 * size + x1]
+        c01[i] = screens[layer, y1 * size + x0]
+        c11[i] = screens[layer, y1 * size + x1]
+    return patch_slope(c00, c10, c01, c11, fraction_x, fraction_y)
 
 
 @wp.kernel
@@ -70,8 +96,7 @@ def deposit_rays(
     n_time: wp.int32,
     start: wp.array3d(dtype=wp.float64),
     step: wp.array2d(dtype=wp.float64),
-    columns: wp.array(dtype=sample_offsets),
-    rows: wp.array(dtype=sample_offsets),
+    lattice: wp.array(dtype=sample_offsets),
     reach: wp.int32,
     cells_per_slope: wp.array2d(dtype=wp.float32),
     displacement: wp.array4d(dtype=samples),
@@ -92,13 +117,14 @@ def deposit_rays(
     for the differences of path across a pixel [m]; image [star, (wave * size + y) * size + x], the origin at size / 2.
     """
     star = first + wp.tid()
-    n_packet = columns.shape[0]
+    n_packet = lattice.shape[0]
     n_wave = weight.shape[1]
     xx = cells_per_slope[star, 0]
     xy = cells_per_slope[star, 1]
     yx = cells_per_slope[star, 2]
     yy = cells_per_slope[star, 3]
     origin = wp.float32(grid_size // 2) + wp.float32(0.5)
+    side = wp.float32(grid_size)
     for t in range(n_time):
         for packet in range(n_packet):
             slope[star, packet, 0] = samples()
@@ -107,28 +133,33 @@ def deposit_rays(
             time = wp.float64(t)
             corner_x, fraction_x = corner_of(start[star, layer, 0] + time * step[layer, 0], screen_size)
             corner_y, fraction_y = corner_of(start[star, layer, 1] + time * step[layer, 1], screen_size)
-            for packet in range(n_packet):
-                c00, c10, c01, c11 = patch_corners(
-                    screens, layer, screen_size, corner_x, corner_y, columns[packet], rows[packet], reach
-                )
-                twist = (c11 - c01) - (c10 - c00)
-                slope[star, packet, 0] = slope[star, packet, 0] + ((c10 - c00) + twist * fraction_y)
-                slope[star, packet, 1] = slope[star, packet, 1] + ((c01 - c00) + twist * fraction_x)
+            corner = corner_y * screen_size + corner_x
+            if corner_x + reach < screen_size and corner_y + reach < screen_size:
+                for packet in range(n_packet):
+                    slope_x, slope_y = slope_inside(
+                        screens, layer, screen_size, corner, lattice[packet], fraction_x, fraction_y
+                    )
+                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
+            else:
+                for packet in range(n_packet):
+                    across_x, across_y = slope_across(
+                        screens, layer, screen_size, corner, lattice[packet], fraction_x, fraction_y
+                    )
+                    slope[star, packet, 0] = slope[star, packet, 0] + across_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + across_y
         for packet in range(n_packet):
-            slope_x = slope[star, packet, 0]
-            slope_y = slope[star, packet, 1]
-            x = slope_x * xx + slope_y * xy
-            y = slope_x * yx + slope_y * yy
+            bend_x = slope[star, packet, 0]
+            bend_y = slope[star, packet, 1]
+            x = bend_x * xx + bend_y * xy
+            y = bend_x * yx + bend_y * yy
             for wave in range(n_wave):
                 cell_x = x + displacement[star, wave, packet, 0]
                 cell_y = y + displacement[star, wave, packet, 1]
                 light = weight[star, wave, packet]
                 for i in range(LANES):
-                    column = wp.int32(wp.floor(cell_x[i] + origin))
-                    row = wp.int32(wp.floor(cell_y[i] + origin))
-                    if wp.min(column, row) < 0 or wp.max(column, row) >= grid_size:
-                        column = (column % grid_size + grid_size) % grid_size
-                        row = (row % grid_size + grid_size) % grid_size
+                    column = wp.clamp(wp.int32(cell_x[i] + origin), 0, grid_size - 1)
+                    row = wp.clamp(wp.int32(cell_y[i] + origin), 0, grid_size - 1)
                     at = (wave * grid_size + row) * grid_size + column
                     image[star, at] = image[star, at] + light[i]
 

@@ -209,6 +209,8 @@ def trace_pupils(
         return wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=wp.float64, device="cpu")
 
     out_x, out_y, out_path = (wp.empty((bundles, count), dtype=lanes, device="cpu") for _ in range(3))
+    nothing = [wp.empty((0, 0, 0), dtype=lanes, device="cpu")] * 2
+    nothing += [wp.empty((0, 0), dtype=kind, device="cpu") for kind in (lanes, lane_flags)]
     out_status = wp.empty((bundles, count), dtype=lane_flags, device="cpu")
     launch(
         trace_pupils_kernel,
@@ -224,6 +226,7 @@ def trace_pupils(
             float(telescope.launch_distance),
             doubles(np.repeat(np.concatenate([reference, normal], axis=1), n_wave, axis=0)),
             float(radius),
+            *nothing,
             out_x,
             out_y,
             out_path,

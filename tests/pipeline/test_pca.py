@@ -63,7 +63,7 @@ def test_cubic_field_is_recovered_between_the_stars():
 def test_too_low_an_order_leaves_something():
     places, elsewhere = positions(60, 1), positions(100, 2)
     error = [
-        np.abs(PsfModel.fit(psf(places), places, extent=EXTENT, order=n).at(elsewhere) - psf(elsewhere)).max()
+        np.abs(PsfModel.fit(psf(places), places, order=n, clip_sigma=None).at(elsewhere) - psf(elsewhere)).max()
         for n in (1, 2, 3)
     ]
     assert error[0] > error[1] > 1e-3 * profile().max() > 1e6 * error[2]

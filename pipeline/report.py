@@ -1,0 +1,184 @@
+"""The report of a run: one HTML file with everything in it, pictures included."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from .ccd_product import CcdProduct
+from .config import to_yaml
+from .correlation import Correlation
+from .experiment import Experiment
+from .figures_focal_plane import close_up_figure, heights_figure, whiskers_figure
+from .figures_psf import eigen_figure, spectrum_figure, stamps_figure
+from .figures_statistics import correlation_figure, scatter_figure
+from .tables import headline, per_ccd
+
+#: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
+_CLOSE_UPS = 3
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture of the report.
+
+    Attributes
+    ----------
+    title : str
+        Heading.
+    png : bytes
+        The picture.
+    shows : str
+        What is to be seen on it.
+    paper : str
+        What the paper shows in its place, with the figure's number; empty where it has none.
+    """
+
+    title: str
+    png: bytes
+    shows: str
+    paper: str
+
+    @property
+    def source(self) -> str:
+        """The picture as a data URI."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
+
+
+def build_report(
+    experiment: Experiment,
+    products: Sequence[CcdProduct],
+    correlated: dict[str, Correlation],
+    summary: dict[str, Any],
+) -> str:
+    """Return the report of a run as HTML that refers to no other file.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What was run.
+    products : sequence of CcdProduct
+        Its CCDs.
+    correlated : dict of str to Correlation
+        Correlations over all CCDs.
+    summary : dict
+        Figures, as in ``summary.json``.
+    """
+    environment = Environment(
+        loader=PackageLoader("pachon.pipeline", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        config=experiment.config,
+        telescope=experiment.telescope,
+        summary=summary,
+        headline=headline(summary),
+        ccds=per_ccd(summary),
+        pictures=pictures(experiment, products, correlated),
+        configuration=to_yaml(experiment.config),
+    )
+
+
+def pictures(
+    experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation]
+) -> list[Picture]:
+    """Return the pictures of a run in the order of the report."""
+    config, plane = experiment.config, experiment.focal_plane
+    radius = experiment.field_radius_on_detector
+    close = closest_middle_farthest(products)
+    optics = not config.atmosphere.enabled
+    components = config.reconstruction.components
+    return [
+        Picture(
+            "Focal plane",
+            heights_figure(plane, [p.name for p in products], radius),
+            "Height of every CCD surface over the nominal focal plane, positive towards the sky. Steps between CCDs "
+            "and rafts, tilts and the ripple within a CCD (the potato chip) come from the height budget, each term "
+            "from its own random stream. The same surface as a mesh: focal_plane.glb.",
+            "Fig. 7 shows one realisation of the same budget (Table 1), ±10 µm in all.",
+        ),
+        Picture(
+            "Whiskers over the field",
+            whiskers_figure(products, plane, radius),
+            "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
+            "panels share one scale, given by the key above their right corner, so lengths can be compared. The "
+            "pattern follows the heights behind it: whiskers jump where the CCD border is a step. Residuals at the "
+            "stars hold the noise of each star itself.",
+            "Fig. 8 (optics alone): |e| above 10 % in most places and near 30 % at the edge of the field, jumping at "
+            "CCD borders."
+            if optics
+            else "Fig. 11 (observed) and Fig. 12 (residual): the pattern of the optics alone (Fig. 8), made rounder by "
+            "the atmosphere, and residuals without visible pattern. The paper compares with the observed stars only.",
+        ),
+        Picture(
+            "Whiskers close up",
+            close_up_figure(close, plane),
+            "The CCD closest to the axis, one half-way out and the farthest one. The last column is what a galaxy "
+            "sees: the error of the model at places where there was no star to fit.",
+            "The paper notes a small-scale variation even within a CCD, from tilt and potato chip, and so fits "
+            "polynomials CCD by CCD.",
+        ),
+        Picture(
+            "Eigen-PSFs of the noise-free PSFs",
+            eigen_figure(close[0], truth=True),
+            f"Mean PSF of one CCD and its first {min(components, 20)} principal components, each with the part of the "
+            "variance along it. Order and signs are fixed, so that runs can be compared.",
+            "Fig. 9: components of 4000 PSFs of the atmosphere alone. The first resemble shapelets; structure gets "
+            "finer with n.",
+        ),
+        Picture(
+            "Eigen-PSFs of the observed stars",
+            eigen_figure(close[0], truth=False),
+            "The same CCD, from the stars that were observed: components beyond the first few are noise.",
+            "The paper keeps 20 components for observed stars too.",
+        ),
+        Picture(
+            "How many components are needed",
+            spectrum_figure(products),
+            "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
+            "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
+            "is the kink, the point farthest below the straight line from the first eigenvalue to the last.",
+            "The paper finds a kink by eye and that about 20 components suffice; physics asks for over 99 % of the "
+            "variance of the truth.",
+        ),
+        Picture(
+            "Ellipticity before and after",
+            scatter_figure(products),
+            "Left as in the paper: ellipticity of the observed stars, and what is left when the model is subtracted. "
+            "Right: the same for the noise-free PSFs at places where no star was fitted.",
+            "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
+        ),
+        Picture(
+            "Correlation of the ellipticity",
+            correlation_figure(correlated),
+            "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are from the scatter "
+            "of the ellipticities alone, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
+            "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
+            "triangles, away from the stars, are what a galaxy sees.",
+            "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
+            "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
+        ),
+        Picture(
+            "Stars",
+            stamps_figure(close),
+            "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
+            "the difference in units of the noise of each pixel: where the model is right, only noise is left.",
+            "",
+        ),
+    ]
+
+
+def closest_middle_farthest(products: Sequence[CcdProduct]) -> list[CcdProduct]:
+    """Return the CCD closest to the axis, the middle one and the farthest, or all where there are no more."""
+    ordered = sorted(products, key=lambda p: (round(float(np.hypot(*p.center)), 9), p.name))
+    if len(ordered) <= _CLOSE_UPS:
+        return ordered
+    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]

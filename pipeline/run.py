@@ -1,0 +1,180 @@
+"""A whole run, stage by stage: what is computed in which order, and what is left in the folder."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..raytrace.launch import thread_count
+from .ccd_product import CcdProduct, product_path, read_product, write_product
+from .ccd_stage import compute_ccd
+from .config import Configuration
+from .experiment import Experiment, prepare
+from .products import write_bytes, write_ecsv, write_json
+from .progress import Reporter
+from .report import build_report
+from .run_folder import claim_folder, finished_ccds, stamp_of
+from .statistics import correlations, run_figures
+
+_MESH_CELLS = 16
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to.
+
+    Attributes
+    ----------
+    folder : Path
+        Where its files are.
+    report : Path
+        The report.
+    summary : dict
+        The content of ``summary.json``.
+    kept, computed : tuple of str
+        CCDs that were done before, and those done now.
+    """
+
+    folder: Path
+    report: Path
+    summary: dict[str, Any]
+    kept: tuple[str, ...]
+    computed: tuple[str, ...]
+
+
+def run(
+    config: Configuration,
+    folder: Path,
+    *,
+    resume: bool = False,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> RunResult:
+    """Run a resolved configuration: stars, PSFs, models, correlations, report.
+
+    Every product but ``timings.json`` has the same bytes whenever, wherever on one machine, and with however many
+    threads the configuration is run; those of a CCD do not depend on which others are asked for.
+
+    Parameters
+    ----------
+    config : Configuration
+        Resolved configuration, as :func:`~pachon.pipeline.experiment.resolve` gives it.
+    folder : Path
+        Where to put the products; made if it is not there.
+    resume : bool
+        Keep CCDs that are finished already, and add to them.
+    threads : int, optional
+        Number of threads; all processors by default.
+    reporter : Reporter, optional
+        Who tells how far the run is; nobody by default.
+
+    Raises
+    ------
+    PachonError
+        If the configuration does not hold together, or a product cannot be written.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    experiment = prepare(config)
+    claim_folder(folder, experiment, resume=resume)
+    names = config.ccds or ()
+    kept = finished_ccds(folder, experiment) if resume else ()
+    missing = tuple(name for name in names if name not in kept)
+    if kept:
+        reporter.note(f"{len(kept)} of {len(names)} CCDs are finished already")
+    _compute(experiment, folder, missing, threads, reporter)
+    with reporter.stage("correlations"):
+        products = [read_product(product_path(folder, name), stamp_of(experiment)) for name in names]
+        correlated = correlations(products)
+        summary = {**_origin(experiment), **run_figures(products, correlated)}
+        write_json(folder / "summary.json", summary)
+    with reporter.stage("focal plane"):
+        _write_focal_plane(experiment, folder)
+    with reporter.stage("report"):
+        report = folder / "report.html"
+        write_bytes(report, build_report(experiment, products, correlated, summary).encode())
+    write_json(folder / "timings.json", _timings(reporter, threads))
+    return RunResult(folder, report, summary, kept, missing)
+
+
+def _compute(
+    experiment: Experiment, folder: Path, names: tuple[str, ...], threads: int | None, reporter: Reporter
+) -> None:
+    """Compute and write the CCDs that are missing."""
+    if not names:
+        return
+    config = experiment.config
+    if experiment.atmosphere is not None and config.psf.engine == "fast":
+        with reporter.stage(f"atmosphere: {experiment.atmosphere.layer_count} screens"):
+            experiment.atmosphere.low_gradient_screens(threads)
+    stars = config.stars.truth + config.stars.observed
+    with reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names)) as stage:
+        for i, name in enumerate(names, start=1):
+            product = compute_ccd(experiment, name, threads=threads, advance=stage.advance)
+            _write(experiment, folder, product)
+            stage.line(f"{name} ({i} of {len(names)})")
+    if experiment.atmosphere is not None:
+        experiment.atmosphere.release()
+
+
+def _write(experiment: Experiment, folder: Path, product: CcdProduct) -> None:
+    config = experiment.config
+    cards = [
+        ("TELESCOP", experiment.telescope.name, "prescription"),
+        ("FILTER", config.band, "band"),
+        ("EXPTIME", config.atmosphere.exposure_s, "[s] exposure"),
+        ("ENGINE", config.psf.engine, "PSF engine"),
+        ("ATMOSPH", config.atmosphere.enabled, "whether there is an atmosphere"),
+        ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
+    ]
+    write_product(folder, product, stamp_of(experiment), cards)
+
+
+def _origin(experiment: Experiment) -> dict[str, Any]:
+    """Return what says where a summary comes from."""
+    stamp = stamp_of(experiment)
+    return {
+        "pachon": stamp.version,
+        "config_hash": stamp.config_hash,
+        "seed": stamp.seed,
+        "configuration": experiment.config.as_dict(),
+    }
+
+
+def _write_focal_plane(experiment: Experiment, folder: Path) -> None:
+    """Write the CCD surfaces as a mesh for any viewer, and heights of CCD centres and corners as a table."""
+    mesh = experiment.focal_plane.to_mesh(_MESH_CELLS)
+    write_bytes(folder / "focal_plane.glb", bytes(mesh.export(file_type="glb")))
+    table = experiment.focal_plane.to_table(2)
+    write_ecsv(
+        folder / "focal_plane.ecsv",
+        {
+            "ccd": (np.asarray(table["ccd"]), "", "name of the CCD"),
+            "x_mm": (np.round(np.asarray(table["x"]) * 1e3, 6), "mm", "detector x"),
+            "y_mm": (np.round(np.asarray(table["y"]) * 1e3, 6), "mm", "detector y"),
+            "height_um": (np.round(np.asarray(table["z"]) * 1e6, 6), "um", "height along +z, towards the sky"),
+        },
+        {"what": "heights at the corners, edges and centre of each CCD"},
+    )
+
+
+def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:
+    """Return what differs from run to run, and is kept out of every other product for that reason."""
+    # Linux counts kibibytes, macOS bytes.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return {
+        "pachon": version("pachon"),
+        "seconds": reporter.seconds,
+        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30,
+        "threads": thread_count(threads),
+        "processors": os.cpu_count(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+    }

@@ -1,0 +1,89 @@
+"""The folder of a run: whose it is, and which of its CCDs are done."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+
+from ..models.errors import PachonError, ProductError
+from .ccd_product import product_path, read_product
+from .config import Configuration, differences, load_configuration, to_yaml
+from .experiment import Experiment
+from .products import Stamp, write_bytes
+
+CONFIG_NAME = "config.yaml"
+
+
+def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
+    """Make the folder of a run, or make sure that what is in it is of the same configuration, and write config.yaml.
+
+    A run may be resumed with more CCDs than before, since no CCD depends on the others.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    experiment : Experiment
+        What is to be computed.
+    resume : bool
+        Whether finished CCDs are to be kept.
+
+    Raises
+    ------
+    ProductError
+        If the folder holds another configuration's run, or cannot be made or written.
+    """
+    path = folder / CONFIG_NAME
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        exists = path.exists()
+    except OSError as error:
+        raise ProductError(f"cannot make the folder {folder}: {error.strerror}") from None
+    if exists:
+        try:
+            before = load_configuration(path)
+        except PachonError as error:
+            raise ProductError(f"{folder} holds a run that cannot be read ({error}); choose another --out") from None
+        _refuse_other(folder, before, experiment.config, resume)
+    else:
+        finished = sorted(folder.glob("ccd_*.fits"))
+        if finished:
+            raise ProductError(f"{folder} holds {finished[0].name} but no {CONFIG_NAME}; choose another --out")
+    for left_over in folder.glob(".*.partial"):
+        left_over.unlink(missing_ok=True)
+    heading = (f"pachon {version('pachon')}: all that decides this run. The same bytes again: pachon run config.yaml --out OTHER",)
+    write_bytes(path, to_yaml(experiment.config, heading).encode())
+
+
+def _refuse_other(folder: Path, before: Configuration, now: Configuration, resume: bool) -> None:
+    old, new = before.as_dict(), now.as_dict()
+    # No CCD depends on the others, so a run may grow; one that shrinks would leave products that nothing counts.
+    if resume and set(old["ccds"] or ()) <= set(new["ccds"]):
+        del old["ccds"], new["ccds"]
+    found = differences(old, new)
+    if found:
+        more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+        raise ProductError(
+            f"{folder} holds the run of another configuration ({'; '.join(found[:3])}{more}); choose another --out"
+        )
+
+
+def finished_ccds(folder: Path, experiment: Experiment) -> tuple[str, ...]:
+    """Return the CCDs of a run whose products are whole and of this configuration."""
+    stamp = stamp_of(experiment)
+    return tuple(name for name in experiment.config.ccds or () if _is_whole(product_path(folder, name), stamp))
+
+
+def _is_whole(path: Path, stamp: Stamp) -> bool:
+    if not path.exists():
+        return False
+    try:
+        read_product(path, stamp)
+    except ProductError:
+        return False
+    return True
+
+
+def stamp_of(experiment: Experiment) -> Stamp:
+    """Return what the products of an experiment carry."""
+    return Stamp(version("pachon"), experiment.config_hash, experiment.config.seed)

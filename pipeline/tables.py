@@ -1,0 +1,88 @@
+"""The figures of a run as tables that people read, on the terminal and in the report, in an astronomer's units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .statistics import KINDS, LONG_RANGE
+
+_NAMES = {
+    "truth": "truth",
+    "observed": "observed",
+    "residual": "observed - model, at the stars",
+    "away": "truth - model, where no star is",
+}
+
+
+def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the figures of a run: what, and its value with unit."""
+    figures = summary["all"]
+    rows = [
+        ("CCDs", f"{figures['ccds']}"),
+        ("PSFs known without noise", f"{figures['truth_psfs']}"),
+        ("observed stars, used in the fit", f"{figures['stars']}, {figures['stars_used']}"),
+        (
+            "FWHM, median and range",
+            f'{_figure(figures["fwhm_arcsec"])}", '
+            f'{_figure(figures["fwhm_min_arcsec"])} to {_figure(figures["fwhm_max_arcsec"])}"',
+        ),
+        ("mean |e|, truth", _percent(figures["mean_e_truth"])),
+        ("mean |e|, observed stars", _percent(figures["mean_e_observed"])),
+        ("rms e residual, at the stars", _percent(figures["rms_residual_at_stars"])),
+        ("rms e residual, each star left out in turn", _percent(figures["rms_residual_left_out"])),
+        ("rms e residual, where no star is (no noise)", _percent(figures["rms_residual_away"])),
+        ("truth's variance in the components, worst CCD", f"{100 * figures['truth_variance_in_components']:.4g} %"),
+    ]
+    for kind in KINDS:
+        short, far = (figures[f"xi_plus_{kind}_{name}"] for name in ("short", "long"))
+        rows.append((f"ξ+ of {_NAMES[kind]}, below / beyond {LONG_RANGE:g}'", f"{_power(short)} / {_power(far)}"))
+    return rows
+
+
+PER_CCD_COLUMNS = (
+    ("CCD", ""),
+    ("field", "deg"),
+    ("FWHM", "arcsec"),
+    ("mean |e| truth", "%"),
+    ("rms residual at stars", "%"),
+    ("left out", "%"),
+    ("where no star is", "%"),
+    ("truth's variance in components", "%"),
+    ("kink", ""),
+    ("stars used", ""),
+)
+
+
+def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row for each CCD, in the columns of :data:`PER_CCD_COLUMNS`."""
+    return [
+        (
+            name,
+            f"{f['field_deg']:.2f}",
+            _figure(f["fwhm_arcsec"]),
+            _bare_percent(f["mean_e_truth"]),
+            _bare_percent(f["rms_residual_at_stars"]),
+            _bare_percent(f["rms_residual_left_out"]),
+            _bare_percent(f["rms_residual_away"]),
+            f"{100 * f['truth_variance_in_components']:.4g}",
+            f"{f['kink_observed']}",
+            f"{f['stars_used']} of {f['stars']}",
+        )
+        for name, f in summary["ccd"].items()
+    ]
+
+
+def _figure(value: float) -> str:
+    return f"{value:.3f}"
+
+
+def _bare_percent(value: float) -> str:
+    return f"{100 * value:.2f}"
+
+
+def _percent(value: float) -> str:
+    return f"{_bare_percent(value)} %"
+
+
+def _power(value: float) -> str:
+    return f"{value:.1e}" if value == value else "-"

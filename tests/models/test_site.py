@@ -1,0 +1,53 @@
+import pytest
+
+from pachon.models.errors import PrescriptionError, UnknownNameError
+from pachon.models.site import DATA, load_site, site_names
+
+TEXT = (DATA / "cerro_pachon.yaml").read_text()
+
+
+def test_cerro_pachon_has_the_figures_of_the_paper():
+    # Jee & Tyson (2011), section 3, after Ellerbroek (2002); weather of section 2.
+    site = load_site("cerro_pachon")
+    assert site.altitudes == (0.0, 2580.0, 5160.0, 7730.0, 12890.0, 15460.0)
+    assert site.weights == (0.652, 0.172, 0.055, 0.025, 0.074, 0.022)
+    assert sum(site.weights) == pytest.approx(1.0, abs=1e-12)
+    assert site.r0 == 0.16
+    assert site.outer_scale == 25.0
+    assert max(site.wind_speeds) == site.wind_speeds[-1] == 20.0
+    assert list(site.wind_speeds) == sorted(site.wind_speeds)
+    assert (site.weather.pressure_mmhg, site.weather.temperature_c, site.weather.water_vapour_mmhg) == (520, 5, 8)
+    assert site_names() == ("cerro_pachon",)
+
+
+def test_unknown_and_missing_sites():
+    with pytest.raises(UnknownNameError, match="unknown site 'cerro_pachom': did you mean cerro_pachon"):
+        load_site("cerro_pachom")
+    with pytest.raises(PrescriptionError, match="no such file"):
+        load_site("nowhere.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("r0: 0.16 ", "r0: -1 ", "r0 = -1: expected a positive number"),
+        ("r0: 0.16 ", "r: 0.16 ", "unknown key r = 0.16"),
+        ("r0: m,", "r0: cm,", "units.r0 = 'cm': expected one of m"),
+        ("weight: 0.652", "weight: 0.9", "weights = (0.9, "),
+        ("weight: 0.652", "wait: 0.9", "unknown key layers[0.0].wait = 0.9: did you mean weight?"),
+        ("wind_speed: 5.0", "wind_speed: -5", "wind_speeds = "),
+        ("altitude: 2580.0", "altitude: 9000", "altitudes = "),
+        ("pressure_mmhg: 520.0", "pressure_mmhg: 0", "pressure_mmhg = 0.0: expected a positive number"),
+        ("temperature_c: 5.0", "temperature_c: -300", "temperature_c = -300.0: expected above -273.15"),
+        ("water_vapour_mmhg: 8.0", "water_vapour_mmhg: 600", "water_vapour_mmhg = 600.0: expected 0 to the pressure"),
+    ],
+)
+def test_malformed_sites_are_one_line(tmp_path, old, new, expected):
+    assert old in TEXT
+    path = tmp_path / "site.yaml"
+    path.write_text(TEXT.replace(old, new, 1))
+    with pytest.raises(PrescriptionError) as caught:
+        load_site(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
