@@ -199,7 +199,8 @@ def _yaml_lines(section: _Section, names: list[str], indent: str) -> list[str]:
         value = getattr(section, name)
         value = list(value) if isinstance(value, tuple) else value
         text = yaml.safe_dump(value, default_flow_style=True, width=2**20, allow_unicode=True)
-        entry = f"{indent}{field.alias or name}: {text.removesuffix('...\n').strip()}"
+        text = text.removesuffix("...\n").strip()
+        entry = f"{indent}{field.alias or name}: {text}"
         if len(entry) > 60:
             lines += [f"{indent}# {field.description}", entry]
         else:

@@ -6,7 +6,7 @@ import numpy as np
 
 # How far the PSF itself may stray from its mean within a CCD, as one standard deviation: this fraction of the geometric
 # mean of the pixel's value and the peak's. The wings may change by more of themselves than the core.
-_PSF_CHANGE = 0.02
+_PSF_CHANGE = 0.04
 # ... and of the peak anywhere: what deviates less is no cosmic ray, however quiet the stamps are.
 _FLOOR = 1e-4
 

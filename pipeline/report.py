@@ -5,10 +5,11 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .ccd_product import CcdProduct
 from .config import to_yaml
@@ -17,7 +18,7 @@ from .experiment import Experiment
 from .figures_focal_plane import close_up_figure, heights_figure, whiskers_figure
 from .figures_psf import eigen_figure, spectrum_figure, stamps_figure
 from .figures_statistics import correlation_figure, scatter_figure
-from .tables import headline, per_ccd
+from .tables import PER_CCD_COLUMNS, headline, per_ccd
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
 _CLOSE_UPS = 3
@@ -70,7 +71,7 @@ def build_report(
         Figures, as in ``summary.json``.
     """
     environment = Environment(
-        loader=PackageLoader("pachon.pipeline", "templates"),
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -81,6 +82,7 @@ def build_report(
         telescope=experiment.telescope,
         summary=summary,
         headline=headline(summary),
+        columns=PER_CCD_COLUMNS,
         ccds=per_ccd(summary),
         pictures=pictures(experiment, products, correlated),
         configuration=to_yaml(experiment.config),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from .statistics import KINDS, LONG_RANGE
@@ -85,4 +86,4 @@ def _percent(value: float) -> str:
 
 
 def _power(value: float) -> str:
-    return f"{value:.1e}" if value == value else "-"
+    return f"{value:.1e}" if math.isfinite(value) else "-"

@@ -124,7 +124,6 @@ def deposit_rays(
     yx = cells_per_slope[star, 2]
     yy = cells_per_slope[star, 3]
     origin = wp.float32(grid_size // 2) + wp.float32(0.5)
-    side = wp.float32(grid_size)
     for t in range(n_time):
         for packet in range(n_packet):
             slope[star, packet, 0] = samples()
@@ -158,10 +157,14 @@ def deposit_rays(
                 cell_y = y + displacement[star, wave, packet, 1]
                 light = weight[star, wave, packet]
                 for i in range(LANES):
-                    column = wp.clamp(wp.int32(cell_x[i] + origin), 0, grid_size - 1)
-                    row = wp.clamp(wp.int32(cell_y[i] + origin), 0, grid_size - 1)
-                    at = (wave * grid_size + row) * grid_size + column
-                    image[star, at] = image[star, at] + light[i]
+                    # no branch, so that the compiler keeps the lanes together; light beyond the grid is left out
+                    column = wp.int32(cell_x[i] + origin)
+                    row = wp.int32(cell_y[i] + origin)
+                    near_column = wp.clamp(column, 0, grid_size - 1)
+                    near_row = wp.clamp(row, 0, grid_size - 1)
+                    caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
+                    at = (wave * grid_size + near_row) * grid_size + near_column
+                    image[star, at] = image[star, at] + caught
 
 
 @wp.kernel
