@@ -33,7 +33,7 @@ and M3 stands at ``z3 = f1 (1 - m) - 2 f1 m / (1 - m)``. By default ``m = 2 - sq
 tertiary share their vertex, as the LSST's nearly do. ``m = 0.382`` would put the focus there (Willstrop 1985).
 
 Sources: Paul, Revue d'Optique 14, 169 (1935); Baker, IEEE Trans. Aerosp. Electron. Syst. 5, 261 (1969); Willstrop,
-MNRAS 216, 411 (1985); Wilson, Reflecting Telescope Optics I (2nd ed.), section 3.6.5.
+MNRAS 216, 411 (1985); Wilson, Reflecting Telescope Optics I (2nd ed.), section 3.6.
 """
 
 from __future__ import annotations

@@ -1,51 +1,21 @@
-"""Write a telescope as a prescription file that loads back equal to the last bit."""
+"""Write a telescope as the text of a prescription file; the format is described in `prescription`."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from .errors import PrescriptionError
 from .glass import ConstantIndex, Medium
-from .prescription import ANGLES, INTERACTIONS, WAVELENGTHS
+from .prescription_reader import ANGLES, INTERACTIONS, WAVELENGTHS
 from .surface import IDENTITY, Annulus, Circle, Conic, EvenAsphere, Plane, Sphere, Surface
 from .telescope import VACUUM, Telescope
 
 SHAPE_NAMES = {Plane: "plane", Sphere: "sphere", Conic: "conic", EvenAsphere: "even_asphere"}
 INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
-
-
-def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
-    """Write a prescription file.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        What to write.
-    path : str or path
-        File to write; it is replaced as a whole, or left as it was.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be written.
-    """
-    target = Path(path)
-    scratch = target.with_name(target.name + ".part")
-    try:
-        scratch.write_text(telescope_to_yaml(telescope), encoding="utf-8")
-        scratch.replace(target)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
-        raise PrescriptionError(f"{target}: cannot be written ({error.strerror})") from None
 
 
 def telescope_to_yaml(telescope: Telescope) -> str:

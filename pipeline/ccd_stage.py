@@ -157,6 +157,14 @@ def _expose(
 ) -> _Exposed:
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
+    told = 0
+
+    def tell(done: int) -> None:
+        nonlocal told
+        if advance is not None:
+            advance(done - told)
+        told = done
+
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
     psfs = make_psfs(
         experiment.telescope,
@@ -165,7 +173,6 @@ def _expose(
         focal_plane=experiment.focal_plane,
         atmosphere=experiment.atmosphere,
         engine=config.psf.engine,
-        seed=config.seed,
         stamp_size=config.psf.stamp + _SHIFT_ROOM,
         pixel_size=experiment.pixel_size,
         diffusion=experiment.diffusion,
@@ -173,7 +180,7 @@ def _expose(
         dispersion=experiment.dispersion,
         n_pupil=config.psf.n_pupil,
         threads=threads,
-        progress=advance,
+        progress=tell,
     )
     return _Exposed(psfs.image, float(psfs.pixel_scale), fields)
 

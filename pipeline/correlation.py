@@ -63,10 +63,10 @@ def shear_correlation(
 ) -> Correlation:
     """Correlate ellipticities of star pairs (Jee & Tyson 2011, eq. 7).
 
-    xi+ is the mean of Re(e e'*) over the pairs of a bin and xi- that of Re(e e' exp(-4 i phi)), phi being the direction of
-    the pair from x towards y; equal weights, flat sky. TreeCorr runs on one thread, since several would add the pairs in
-    another order: the same stars give the same bytes. It keeps ellipticities in single precision, so a correlation is good
-    to about 1e-7 of the mean |e|^2.
+    xi+ is the mean of Re(e e'*) over the pairs of a bin and xi- that of Re(e e' exp(-4 i phi)), phi being the
+    direction of the pair from x towards y; equal weights, flat sky. TreeCorr runs on one thread, since several would
+    add the pairs in another order: the same stars give the same bytes. It keeps ellipticities in single precision, so
+    a correlation is good to about 1e-7 of the mean |e|^2.
 
     Parameters
     ----------

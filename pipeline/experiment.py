@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012
 #: Pixel of the camera's CCDs, of which charge diffusion is a fraction [m].
 CCD_PIXEL = 10e-6
 _WAVELENGTHS = 5
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -275,7 +277,7 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         )
 
 
-def _given(value: object) -> object:
+def _given(value: _T | None) -> _T:
     """Return a value that a resolved configuration always has."""
     if value is None:
         raise ConfigError("the configuration is not resolved")
@@ -284,7 +286,7 @@ def _given(value: object) -> object:
 
 def _band_of(name: str) -> str:
     """Return the band that the name of a model ends in, such as lsst_v3.3_i; r where it does not."""
-    ending = Path(name).stem.rpartition("_")[2]
+    ending = name.removesuffix(".yaml").removesuffix(".yml").rpartition("_")[2]
     return ending if ending in tuple("ugrizy") else "r"
 
 

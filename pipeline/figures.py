@@ -102,7 +102,7 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
     """Draw a whisker of a given ellipticity, with its value, above the upper right corner; limits are set by then."""
     right = axes.get_xlim()[1]
     above = blended_transform_factory(axes.transData, axes.transAxes) + ScaledTranslation(
-        0.0, 7.0 / 72.0, _figure_of(axes).dpi_scale_trans
+        0.0, 7.0 / 72.0, figure_of(axes).dpi_scale_trans
     )
     line = Line2D([right - ellipticity * scale, right], [1.0, 1.0], transform=above, color="black", linewidth=1.5 * width)
     line.set_clip_on(False)
@@ -119,7 +119,8 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
     )
 
 
-def _figure_of(axes: Axes) -> Figure:
+def figure_of(axes: Axes) -> Figure:
+    """Return the figure that axes belong to."""
     figure = axes.get_figure(root=True)
     assert isinstance(figure, Figure)
     return figure

@@ -82,16 +82,16 @@ def whiskers_figure(
     pad = 0.25 * half
     low, high = centers.min(axis=0) - half - pad, centers.max(axis=0) + half + pad
     limits = (low[0], high[0], low[1], high[1])
-    key = key_ellipticity(np.concatenate([np.hypot(p.truth.e1, p.truth.e2) for p in products]))
-    span = max(high - low)
-    scale = 0.045 * max(span, 6.0 * half) / key / (1.0 if len(products) < 30 else 2.0)
+    key = _common_key(products)
+    # The key is as long as a third of a CCD's half side, or what can still be seen of it over the whole field.
+    scale = max(0.33 * half, 0.012 * float(max(high - low))) / key
     across = (high[0] - low[0]) / (high[1] - low[1])
     with styled():
         # Panels go under each other where the CCDs lie in a row, beside each other where they do not.
         stacked = across > 1.6
         wide = 12.0
         if stacked:
-            figure = new_figure(wide, len(kinds) * (wide / across + 0.55) + 0.3)
+            figure = new_figure(wide, len(kinds) * ((wide - 1.4) / across + 0.45) + 0.3)
             panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
         else:
             figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9)
@@ -116,21 +116,21 @@ def close_up_figure(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> 
     """Draw whiskers of some CCDs large, one a row: truth, observed, residual at the stars and away from them."""
     camera = focal_plane.camera
     kinds = ("truth", "observed", "residual", "away")
-    key = key_ellipticity(np.concatenate([np.hypot(p.truth.e1, p.truth.e2) for p in products]))
+    key = _common_key(products)
     half = camera.half_size * 1e3
-    scale = 0.16 * half / key
+    scale = 0.2 * half / key
     with styled():
         figure = new_figure(13.0, 3.35 * len(products) + 0.4)
         panels = figure.subplots(len(products), len(kinds), squeeze=False)
         image = None
-        for row, product in zip(panels, products, strict=True):
+        for last, row, product in zip(range(len(products) - 1, -1, -1), panels, products, strict=True):
             x, y = np.array(product.center) * 1e3
             limits = (x - 1.04 * half, x + 1.04 * half, y - 1.04 * half, y + 1.04 * half)
             for i, (axes, kind) in enumerate(zip(row, kinds, strict=True)):
                 image = _draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=_height_range(focal_plane))
                 _draw_kind(axes, product, kind, scale, 1.2)
                 draw_outlines(axes, camera, [camera.ccd_index(product.name)], "0.4", 0.7)
-                frame_axes(axes, limits, x_label=row is panels[-1], y_label=i == 0)
+                frame_axes(axes, limits, x_label=last == 0, y_label=i == 0)
                 name = f"{product.name}: " if i == 0 else ""
                 axes.set_title(name + _SHORT_TITLES[kind], loc="left")
                 draw_key_whisker(axes, key, scale, 1.2)
@@ -154,6 +154,12 @@ def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: 
     stars: Stars = product.truth if kind in ("truth", "away") else product.observed
     e1, e2 = (stars.e1, stars.e2) if kind in ("truth", "observed") else (stars.residual_e1, stars.residual_e2)
     draw_whiskers(axes, whiskers(stars.x * 1e3, stars.y * 1e3, e1, e2, scale), _COLORS[kind], width)
+
+
+def _common_key(products: Sequence[CcdProduct]) -> float:
+    """Return the ellipticity of the key whisker, from truth and observed stars together."""
+    stars: list[Stars] = [s for p in products for s in (p.truth, p.observed)]
+    return key_ellipticity(np.concatenate([np.hypot(s.e1, s.e2) for s in stars]))
 
 
 def _height_range(focal_plane: FocalPlane) -> float:

@@ -69,13 +69,12 @@ def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
         panels[0].set_ylabel("$|\\xi|$ of the ellipticity")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), high * 2)
-        for axes in panels:
-            for value, text in ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars")):
-                if low < value < 2 * high:
-                    axes.axhline(value, color="0.45", linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
-                    axes.annotate(
-                        text, (0.01, value), xycoords=("axes fraction", "data"), fontsize=7, color="0.35", va="bottom"
-                    )
+        for value, text in ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars")):
+            if panels[0].get_ylim()[0] < value < panels[0].get_ylim()[1]:
+                panels[0].axhline(value, color="0.45", linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
+                panels[0].annotate(
+                    text, (0.99, value), xycoords=("axes fraction", "data"), fontsize=7, color="0.35", ha="right", va="bottom"
+                )
         handles, labels = panels[0].get_legend_handles_labels()
         filled = panels[0].plot([], [], "o", color="0.4", markersize=4.5)[0]
         hollow = panels[0].plot([], [], "o", color="0.4", markersize=4.5, markerfacecolor="white")[0]

@@ -9,17 +9,20 @@ import numpy as np
 _PSF_CHANGE = 0.04
 # ... and of the peak anywhere: what deviates less is no cosmic ray, however quiet the stamps are.
 _FLOOR = 1e-4
+# A star's rejected pixels come back if the other stars' polynomials predict their deviations from the mean this well.
+_PREDICTED = 0.1
 
 
 def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) -> np.ndarray:
     """Find pixels that stand out from the mean PSF.
 
-    A pixel's deviation is held against three standard deviations in quadrature: that of the pixel over the stars, that of
-    the star over its pixels, and an allowance for the PSF's change within the CCD. The first is a fifth of the way down
-    from the largest deviation (the 80th percentile over 1.28): unlike the median it knows of the few stars in the
-    corners, where the PSF differs most, and it bears outliers in one star of five. Mean and fluxes come from the pixels
-    not rejected, and all pixels are judged anew until nothing changes. Stars are scaled to the mean by least squares:
-    the sum over a thousand pixels of sky noise would be off by far more than the star's own noise.
+    A pixel's deviation is held against three standard deviations in quadrature: that of the pixel over the stars,
+    that of the star over its pixels, and an allowance for the PSF's change within the CCD. The first is taken from
+    the 80th percentile, which unlike the median knows of the few stars in the corners, where the PSF differs most;
+    three times what the median gives bounds it, should more than a fifth of the stars be hit in that pixel. Mean and
+    fluxes come from the pixels not rejected, and all pixels are judged anew until nothing changes. Stars are scaled
+    to the mean by least squares: the sum over a thousand pixels of sky noise would be off by far more than the star's
+    own noise.
 
     Parameters
     ----------
@@ -39,7 +42,8 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
     rejected = np.zeros(images.shape, dtype=bool)
     for _ in range(max_iterations):
         deviation = np.abs(images / flux[:, None] - mean)
-        over_stars = np.percentile(deviation, 80.0, axis=0) / 1.2816
+        middle, high = np.percentile(deviation, (50.0, 80.0), axis=0)
+        over_stars = np.minimum(high / 1.2816, 3.0 * 1.4826 * middle)
         over_pixels = 1.4826 * np.median(deviation, axis=1)
         allowance = np.maximum(_PSF_CHANGE * np.sqrt(np.maximum(mean, 0.0) * mean.max()), _FLOOR * mean.max())
         scale = np.sqrt(over_pixels[:, None] ** 2 + over_stars**2 + allowance**2)
@@ -52,6 +56,37 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
         mean /= mean.sum()
         flux = (images * mean * good).sum(axis=1) / (mean**2 * good).sum(axis=1)
     return rejected
+
+
+def restore_predicted(values: np.ndarray, mean: np.ndarray, rejected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Take back the rejections of stars that deviate from the mean just as the other stars say they should.
+
+    Where the PSF changes by much, a star in a corner of the CCD may stand out from the mean. A smooth change is
+    foreseen by the polynomial in position through the other stars, in all of the star's rejected pixels, to a tenth
+    of the deviation; a cosmic ray is not.
+
+    Parameters
+    ----------
+    values : array
+        [n_stars, n_pixels] of unit sum.
+    mean : array
+        Mean PSF, [n_pixels].
+    rejected : array of bool
+        [n_stars, n_pixels].
+    terms : array
+        [n_stars, n_terms] of the polynomial, linearly independent.
+
+    Returns
+    -------
+    array of bool
+        [n_stars, n_pixels] still rejected.
+    """
+    q, _ = np.linalg.qr(terms)
+    residual = values - q @ (q.T @ values)
+    # The residual of a star in the fit is 1 - leverage times its distance from what the others predict.
+    distance = np.abs(residual) / np.maximum(1.0 - (q**2).sum(axis=1), 1e-6)[:, None]
+    surprising = rejected & (distance > _PREDICTED * np.abs(values - mean))
+    return rejected & surprising.any(axis=1)[:, None]
 
 
 def _first_guess(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

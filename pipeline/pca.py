@@ -15,7 +15,7 @@ import scipy.linalg
 from astropy.io import fits
 
 from ..models.errors import ConfigError, DomainError, ProductError
-from .outliers import find_outliers
+from .outliers import find_outliers, restore_predicted
 from .polynomial import Extent, as_positions, design_matrix, term_count
 from .single_thread import one_blas_thread
 
@@ -31,7 +31,8 @@ class PsfModel:
     mean : array
         Mean PSF, [ny, nx], unit sum.
     components : array
-        Eigen-PSFs, [k, ny, nx], orthonormal, by falling eigenvalue; the element of largest magnitude of each is positive.
+        Eigen-PSFs, [k, ny, nx], orthonormal, by falling eigenvalue; the element of largest magnitude of each is
+        positive.
     coefficients : array
         Projections of the stars on the components, [n, k].
     polynomial : array
@@ -75,9 +76,9 @@ class PsfModel:
     ) -> PsfModel:
         """Fit the model to the stars of one CCD.
 
-        Outliers are found pixel by pixel (:func:`~pachon.pipeline.outliers.find_outliers`) and replaced by the mean of the
-        stars that are good there. The polynomials are fitted without weights, since it is the spatial variation that
-        matters and not the brightest star (Jee & Tyson 2011, sec. 3).
+        Outliers are found pixel by pixel (:func:`~pachon.pipeline.outliers.find_outliers`) and replaced by the mean
+        of the stars that are good there. The polynomials are fitted without weights, since it is the spatial
+        variation that matters and not the brightest star (Jee & Tyson 2011, sec. 3).
 
         Parameters
         ----------
@@ -102,8 +103,8 @@ class PsfModel:
         ConfigError
             If there are more components than stars less one, or more polynomial terms than stars.
         DomainError
-            If an array has the wrong shape, a pixel is not finite, a star has no flux, or the stars do not determine the
-            polynomials (all on a line, say).
+            If an array has the wrong shape, a pixel is not finite, a star has no flux, or the stars do not determine
+            the polynomials (all on a line, say).
         """
         images = _stamps(stamps)
         n_stars, ny, nx = images.shape
@@ -113,10 +114,12 @@ class PsfModel:
         limit = min(n_stars - 1, ny * nx)
         if not 1 <= n_components <= limit:
             raise ConfigError(
-                f"n_components = {n_components}: expected 1 to {limit}, at most the number of stars ({n_stars}) less one"
+                f"n_components = {n_components}: expected 1 to {limit}, no more than the stars ({n_stars}) less one"
             )
         if clip_sigma is not None and not clip_sigma > 0.0:
             raise ConfigError(f"clip_sigma = {clip_sigma}: expected a positive number or None")
+        if max_iterations < 1:
+            raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
         span = _extent(extent, places)
         terms = design_matrix(places, span, order)
         pixels = images.reshape(n_stars, -1)
@@ -125,8 +128,11 @@ class PsfModel:
             rejected = np.zeros(pixels.shape, dtype=bool)
             if clip_sigma is not None:
                 rejected = find_outliers(pixels, clip_sigma, max_iterations)
-            mean, normalized = _mean_and_normalized(pixels, rejected)
-            deviations = normalized - mean
+            mean, flux = _mean_and_flux(pixels, rejected)
+            if rejected.any():
+                rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
+                mean, flux = _mean_and_flux(pixels, rejected)
+            deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
             _, singular, vectors = np.linalg.svd(deviations, full_matrices=False)
             vectors = vectors[:n_components]
             largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
@@ -176,9 +182,9 @@ class PsfModel:
     def kink(self) -> int:
         """Number of components before the eigenvalues flatten out.
 
-        The index, counted from 0, at which the logarithm of the eigenvalues lies farthest below the straight line from the
-        first to the middle one (Jee & Tyson 2011, sec. 3, find it by eye). Beyond the middle even pure noise falls steeply,
-        for want of stars. Eigenvalues under 1e-14 of the first are rounding and do not count.
+        The index, counted from 0, at which the logarithm of the eigenvalues lies farthest below the straight line
+        from the first to the middle one (Jee & Tyson 2011, sec. 3, find it by eye). Beyond the middle even pure noise
+        falls steeply, for want of stars. Eigenvalues under 1e-14 of the first are rounding and do not count.
         """
         values = self.eigenvalues[: (len(self.eigenvalues) + 1) // 2]
         values = values[values > 1e-14 * values[0]]
@@ -197,8 +203,8 @@ class PsfModel:
     def at(self, positions: Any) -> np.ndarray:
         """Evaluate the PSF at positions of any number, [m, ny, nx], unit sum.
 
-        Outside the extent the polynomials are extrapolated. Each position is evaluated on its own: splitting a batch changes
-        no byte.
+        Outside the extent the polynomials are extrapolated. Each position is evaluated on its own: splitting a batch
+        changes no byte.
 
         Parameters
         ----------
@@ -240,8 +246,8 @@ class PsfModel:
         Parameters
         ----------
         name : str
-            Start of the extension names, such as the CCD's name: NAME_MEAN, NAME_EIGEN, NAME_POLY, NAME_EXTENT images and
-            NAME_SPECTRUM, NAME_STARS tables.
+            Start of the extension names, such as the CCD's name: NAME_MEAN, NAME_EIGEN, NAME_POLY, NAME_EXTENT images
+            and NAME_SPECTRUM, NAME_STARS tables.
         """
         mean = fits.ImageHDU(self.mean, name=f"{name}_MEAN")
         mean.header["ORDER"] = (self.order, "total degree of the polynomials")
@@ -333,7 +339,9 @@ def _extent(extent: Any, positions: np.ndarray) -> Extent:
         except (TypeError, ValueError) as error:
             raise DomainError(f"extent = {extent!r}: expected (xmin, xmax, ymin, ymax)") from error
     if not (xmin < xmax and ymin < ymax and np.all(np.isfinite([xmin, xmax, ymin, ymax]))):
-        raise DomainError(f"extent = {(xmin, xmax, ymin, ymax)}: expected (xmin, xmax, ymin, ymax), minima below maxima")
+        raise DomainError(
+            f"extent = {(xmin, xmax, ymin, ymax)}: expected (xmin, xmax, ymin, ymax), minima below maxima"
+        )
     return float(xmin), float(xmax), float(ymin), float(ymax)
 
 
@@ -346,11 +354,11 @@ def _check_terms(terms: np.ndarray, order: int) -> None:
         raise DomainError(f"positions: the {n_stars} stars do not determine the {term_count(order)} polynomial terms")
 
 
-def _mean_and_normalized(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean PSF [n_pixels] and the stars of unit sum, rejected pixels replaced by the mean.
+def _mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean PSF [n_pixels], of unit sum, and the flux of each star [n_stars].
 
-    The flux of a star with rejected pixels is the sum of the others over the mean PSF's sum there, and the mean depends on
-    the fluxes in turn: both are iterated.
+    A star with its rejected pixels replaced by the mean PSF is to have unit sum as well: its flux is the sum of the
+    good pixels over the mean PSF's sum there. The mean depends on the fluxes in turn, so both are iterated.
     """
     flux = pixels.sum(axis=1)
     used = ~rejected
@@ -363,7 +371,7 @@ def _mean_and_normalized(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.n
             flux = np.where(used, pixels, 0.0).sum(axis=1) / np.where(used, mean, 0.0).sum(axis=1)
     if not np.all(flux > 0.0):
         raise DomainError(f"stamps[{int(np.flatnonzero(~(flux > 0.0))[0])}] has no flux left outside its outliers")
-    return mean, np.where(used, pixels / flux[:, None], mean)
+    return mean, flux
 
 
 def _native(array: Any) -> np.ndarray:

@@ -24,8 +24,8 @@ READ_NOISE = 8.8
 DARK_CURRENT = 0.2
 """Dark current [e-/s/pixel]: the upper limit that SMTN-002 takes from the camera requirements (LSE-59)."""
 FULL_WELL = 1.0e5
-"""Largest signal of an unsaturated pixel [e-], just under the lower of the two measured turn-offs of the photon transfer
-curve, 103 000 (e2v) and 129 000 (ITL) (SITCOMTN-148, Table 6)."""
+"""Largest signal of an unsaturated pixel [e-]: just under the lower of the two measured turn-offs of the photon
+transfer curve, 103 000 (e2v) and 129 000 (ITL) (SITCOMTN-148, Table 6)."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ def sky_electrons_per_pixel(
 ) -> float:
     """Return the electrons that the sky gives to one pixel.
 
-    Sky brightness is defined at the telescope's pupil, so the sky is not dimmed by the atmosphere as a star is: the zero
-    point without the atmosphere, ``zero_point + extinction``, applies (SMTN-002, "Sky Counts").
+    Sky brightness is defined at the telescope's pupil, so the sky is not dimmed by the atmosphere as a star is: the
+    zero point without the atmosphere, ``zero_point + extinction``, applies (SMTN-002, "Sky Counts").
 
     Parameters
     ----------
@@ -230,8 +230,8 @@ def saturation_magnitude(
 ) -> float:
     """Return the magnitude at which the brightest pixel of a star, centred on it, reaches the full well.
 
-    The star is taken to be a Gaussian of this FWHM; a turbulent PSF has more light in its wings and so a lower peak, which
-    makes the limit a safe one.
+    The star is taken to be a Gaussian of this FWHM; a turbulent PSF has more light in its wings and so a lower peak,
+    which makes the limit a safe one.
 
     Raises
     ------

@@ -98,7 +98,7 @@ class Stamp:
         """Return the header cards."""
         return [
             ("CREATOR", f"pachon {self.version}", "program and version"),
-            ("CONFHASH", self.config_hash, "SHA-256 of the configuration"),
+            ("CONFHASH", self.config_hash, ""),
             ("SEED", self.seed, "seed of all random numbers"),
         ]
 
@@ -127,7 +127,8 @@ def write_fits(path: Path, hdus: list[Any], stamp: Stamp, cards: list[tuple[str,
         If it cannot be written.
     """
     primary = fits.PrimaryHDU()
-    for keyword, value, comment in [*stamp.cards(), *cards]:
+    parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
+    for keyword, value, comment in [*stamp.cards(), parts, *cards]:
         primary.header[keyword] = (value, comment)
     buffer = io.BytesIO()
     everything = fits.HDUList([primary, *hdus])
@@ -157,6 +158,8 @@ def read_fits(path: Path) -> fits.HDUList:
                 if "CHECKSUM" not in hdu.header or "DATASUM" not in hdu.header:
                     raise ProductError(f"{path}: {hdu.name} has no checksum; expected a file that pachon wrote")
                 hdu.data  # noqa: B018 - reads it now, within the checks
+            if len(hdus) != hdus[0].header["NPARTS"]:
+                raise ProductError(f"{path}: cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}")
         except (AstropyWarning, OSError, ValueError, KeyError, TypeError, IndexError) as error:
             raise ProductError(f"{path}: damaged or no FITS product ({' '.join(str(error).split())})") from None
     return hdus

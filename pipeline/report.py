@@ -172,7 +172,9 @@ def pictures(
             "Stars",
             stamps_figure(close),
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
-            "the difference in units of the noise of each pixel: where the model is right, only noise is left.",
+            "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
+            "only that noise is left. A bright star can show more: mean and components are fitted without weights, "
+            "so the noise of the faint stars is in the model.",
             "",
         ),
     ]

@@ -23,8 +23,8 @@ _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with
 class ShapeFlag(IntFlag):
     """Why a shape cannot be used; zero means that it can.
 
-    ``CENTROID_LEFT_STAMP``: the centroid came nearer to an edge than the rms width of the weight (or half-way to it, where
-    the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive, or a pixel is not finite.
+    ``CENTROID_LEFT_STAMP``: the centroid came nearer to an edge than the rms width of the weight (or half-way to it,
+    where the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive, or a pixel is not finite.
     """
 
     OK = 0
@@ -43,8 +43,8 @@ class Shapes:
     e1, e2 : array
         Ellipticity (a - b)/(a + b), along x and along the diagonal. NaN where flagged.
     size : array
-        ``(Q11 Q22 - Q12^2)^(1/4)`` of the weighted moments [rad]: for a round Gaussian image of rms width s under a weight of
-        rms width w it is s w / sqrt(s^2 + w^2), not s. NaN where flagged.
+        ``(Q11 Q22 - Q12^2)^(1/4)`` of the weighted moments [rad]: for a round Gaussian image of rms width s under a
+        weight of rms width w it is s w / sqrt(s^2 + w^2), not s. NaN where flagged.
     flux : array
         Plain sum of the pixels, background subtracted and not weighted, in the units of the image.
     x, y : array
@@ -85,8 +85,9 @@ def measure_shapes(
     .. math:: Q_{ij} = \frac{\sum W I (\theta_i - \bar\theta_i)(\theta_j - \bar\theta_j)}{\sum W I},\qquad
               e = \frac{Q_{11} - Q_{22} + 2 i Q_{12}}{Q_{11} + Q_{22} + 2 \sqrt{Q_{11} Q_{22} - Q_{12}^2}}
 
-    with a round Gaussian W centred on the centroid, which is iterated until the weighted first moment vanishes. The paper's
-    eq. 6 prints Q12 where 2 Q12 belongs: its own orientation angle, and the (a - b)/(a + b) that it states, need the 2.
+    with a round Gaussian W centred on the centroid, which is iterated until the weighted first moment vanishes. The
+    paper's eq. 6 prints Q12 where 2 Q12 belongs: its own orientation angle, and the (a - b)/(a + b) that it states,
+    need the 2.
 
     The sums run over pixel centres. They stand for integrals as long as image times weight is well sampled: for a round
     Gaussian product of rms width s pixels the relative error is about 2 exp(-2 pi^2 s^2), 1e-4 at s = 0.7 and 1e-7 at
@@ -101,14 +102,15 @@ def measure_shapes(
     pixel_scale : float or Quantity
         Side of a pixel [rad].
     weight_fwhm : float or Quantity
-        FWHM of the Gaussian weight [rad]: 0.3" for the optics alone, 0.7" with the atmosphere (Jee & Tyson 2011, sec. 3).
+        FWHM of the Gaussian weight [rad]: 0.3" for the optics alone, 0.7" with the atmosphere (Jee & Tyson 2011, sec.
+        3).
     background : float or array
         Level to subtract, one for all or one per image.
     max_iterations : int
         Most centroid steps.
     tolerance : float
-        The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so what is left after the
-        last one is far smaller.
+        The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so what is left after
+        the last one is far smaller.
 
     Returns
     -------
@@ -150,10 +152,11 @@ def measure_shapes(
 def fwhm(images: Any, pixel_scale: Any, *, upsampling: int = 8) -> np.ndarray:
     """Measure the full width at half maximum of star images.
 
-    Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and maximum
-    are those of the band-limited function through the pixels: Fourier interpolation on a grid finer by `upsampling`, a
-    paraboloid through the highest node and its neighbours, and borders that count with the part of a fine pixel above half
-    maximum. The pixel is part of the width. For images of little noise: in a noisy one the maximum is biased upwards.
+    Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and
+    maximum are those of the band-limited function through the pixels: Fourier interpolation on a grid finer by
+    `upsampling`, a paraboloid through the highest node and its neighbours, and borders that count with the part of a
+    fine pixel above half maximum. The pixel is part of the width. For images of little noise: in a noisy one the
+    maximum is biased upwards.
 
     Parameters
     ----------
@@ -260,9 +263,9 @@ def _weighted_moments(
 def _newton_step(first: np.ndarray, second: np.ndarray, sigma: float) -> np.ndarray:
     """Return the step that brings the weighted first moment to zero.
 
-    The derivative of sum(W I (x - c)) with respect to -c is sum(W I) (1 - M/sigma^2), M being the second moments about c; for
-    a Gaussian image that gives the exact centroid at once. Where the image is too broad or too noisy for it (an eigenvalue
-    under 0.1) that eigenvalue is raised to 0.1, and no step is longer than the weight is wide.
+    The derivative of sum(W I (x - c)) with respect to -c is sum(W I) (1 - M/sigma^2), M being the second moments
+    about c; for a Gaussian image that gives the exact centroid at once. Where the image is too broad or too noisy for
+    it (an eigenvalue under 0.1) that eigenvalue is raised to 0.1, and no step is longer than the weight is wide.
     """
     a = 1.0 - second[:, 0] / sigma**2
     b = 1.0 - second[:, 1] / sigma**2
@@ -314,7 +317,7 @@ def _peak(fine: np.ndarray) -> float:
 
 
 def _area_above(fine: np.ndarray, level: float) -> float:
-    """Return the area above a level [fine pixel^2], border pixels counted in part (the image taken as a plane in each)."""
+    """Return the area above a level [fine pixel^2], border pixels counted in part as if the image were plane there."""
     gy, gx = np.gradient(fine)
     slope = np.hypot(gx, gy)
     inside = fine > level
@@ -331,8 +334,8 @@ def _stack(images: Any) -> np.ndarray:
         array = array[None]
     if array.ndim != 3 or min(array.shape[1:]) < 3 or array.dtype.kind not in "iufb":
         raise DomainError(
-            f"images have shape {np.shape(images)} and type {array.dtype}: expected real numbers [n, ny, nx] or [ny, nx], "
-            "at least 3 x 3"
+            f"images have shape {np.shape(images)} and type {array.dtype}: "
+            "expected real numbers [n, ny, nx] or [ny, nx], at least 3 x 3"
         )
     return array
 

@@ -15,9 +15,9 @@ _LOCK = threading.RLock()
 def one_blas_thread() -> Iterator[None]:
     """Hold BLAS and LAPACK to one thread inside a with block.
 
-    Several threads split the sums of a matrix product, and so round them, in a way that depends on their number; for the
-    matrices of one CCD they are no faster. The limit belongs to the process: one block runs at a time, or the end of one
-    would lift the limit of another.
+    Several threads split the sums of a matrix product, and so round them, in a way that depends on their number; for
+    the matrices of one CCD they are no faster. The limit belongs to the process: one block runs at a time, or the end
+    of one would lift the limit of another.
     """
     with _LOCK, threadpool_limits(limits=1, user_api="blas"):
         yield

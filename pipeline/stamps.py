@@ -103,7 +103,8 @@ def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: boo
         offsets = np.stack([np.broadcast_to(np.asarray(v, dtype=np.float64), (count,)) for v in (x, y)], axis=1)
     except ValueError as error:
         raise DomainError(f"x and y have shapes {np.shape(x)} and {np.shape(y)}: expected {count} centroids") from error
-    # Pixel (ny//2, nx//2) becomes the middle of the stamp: the central one, or the one after the centre of an even image.
+    # Pixel (ny//2, nx//2) becomes the middle of the stamp: the central one, or the one after the centre of an even
+    # image.
     rows, columns = (slice(n // 2 - size // 2, n // 2 - size // 2 + size) for n in (ny, nx))
     middle = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0])
     result = np.full((count, size, size), np.nan)

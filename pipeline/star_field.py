@@ -176,7 +176,8 @@ def _uniform(seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float
     """Draw positions evenly over a rectangle, x and y from streams of their own."""
     return np.stack(
         [
-            edges[2 * axis] + (edges[2 * axis + 1] - edges[2 * axis]) * stream(seed, "stars", ccd_name, kind, key).random(count)
+            edges[2 * axis]
+            + (edges[2 * axis + 1] - edges[2 * axis]) * stream(seed, "stars", ccd_name, kind, key).random(count)
             for axis, key in enumerate(("x", "y"))
         ],
         axis=1,

@@ -18,8 +18,8 @@ wp.config.log_level = wp.LOG_ERROR
 CPU_COMPILER_FLAGS = "-march=native" + (
     " -mprefer-vector-width=512" if platform.machine().lower() in ("x86_64", "amd64") else ""
 )
-#: Options that a forward-only kernel module sets with ``wp.set_module_options``.
-FORWARD_OPTIONS = {"enable_backward": False, "cpu_compiler_flags": CPU_COMPILER_FLAGS}
+#: Options that a forward-only kernel module sets with ``wp.set_module_options``; loops over lanes are unrolled whole.
+FORWARD_OPTIONS = {"enable_backward": False, "max_unroll": 32, "cpu_compiler_flags": CPU_COMPILER_FLAGS}
 
 _loaded: set[tuple[str, str]] = set()
 _start = threading.Lock()

@@ -14,8 +14,9 @@ from .launch import FORWARD_OPTIONS
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: Rays in one packet.
-LANES = 16
+#: Rays in one packet: four 512-bit registers a quantity, so that one vector can wait for its square root while the next
+#: is computed (16 lanes take a fifth longer).
+LANES = 32
 
 lanes = wp.types.vector(LANES, wp.float64)
 lane_flags = wp.types.vector(LANES, wp.int32)

@@ -2,72 +2,67 @@ r"""The fast PSF engine: geometric optics for the long waves of the atmosphere, 
 
 Each pair of a pupil point and a time step is a ray. Its angle is the gradient of the low screens where it crosses them;
 the Jacobian of the star turns that into a displacement on its CCD, to which the traced transverse aberration of the
-optics is added. All rays of a star are binned on a fine grid, at each wavelength from the same pass over the atmosphere.
-What geometric optics leaves out multiplies the transform of that image: the ensemble average of the high modes
-:math:`\exp(-D_{high}/2)` (the "second kick" of Peterson et al. 2015, as a filter), diffraction by the annular pupil,
-charge diffusion, the pixel, and a phase ramp for atmospheric dispersion and the position within the pixel.
+optics is added. All rays of a star are binned on a fine grid, at every wavelength from one pass over the atmosphere.
+What geometric optics leaves out multiplies the transform of that image: the ensemble average of the high modes (the
+"second kick" of Peterson et al. 2015, as a filter), diffraction by the annular pupil, charge diffusion, the pixel, and
+a phase ramp for atmospheric dispersion and the place within the pixel.
+
+The filter of the atmosphere is chosen so that the mean over many exposures is right. With the structure function
+:math:`D(b)` of the whole atmosphere and the variance :math:`g` of one component of the low gradient, rays alone give
+:math:`\exp(-g b^2 / 2)` (both in radians of phase), so the rest is :math:`\exp(-D_{rest}/2)` with
+:math:`D_{rest} = D - g b^2`. It starts as the structure function of the high modes does, and falls below that where low
+modes already bend over a baseline, which makes plain geometric optics blur too much. Far out, where the rays have left
+no light, it would turn negative: from its maximum on it is held.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.fft
 import warp as wp
 
+from ..models.errors import DomainError
 from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch, thread_count
 from ..raytrace.rays import field_direction
 from .atmosphere import Atmosphere
-from .fast_psf_kernels import LANES, combine_wavelengths, deposit_rays, sample_offsets, samples
-from .image_plane import ImagePlane, focal_length
+from .fast_psf_kernels import combine_wavelengths, deposit_rays
+from .image_plane import ImagePlane, RenderedStars, focal_length, square_transfer
 from .pupil_optics import PupilOptics, trace_pupils
-from .turbulence import REFERENCE_WAVELENGTH, SPECTRUM_CONSTANT, diffraction_otf, high_structure_function, structure_function
+from .sample_packets import indices, samples, shared, to_packets
+from .turbulence import REFERENCE_WAVELENGTH, SPECTRUM_CONSTANT, diffraction_otf, structure_function
 
-#: Stars in one batch: memory does not grow with the number of stars beyond it.
-BATCH = 32
-#: Side of the fine periodic grid over that of the stamp, so that wings come back round from far outside it only.
+#: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
+PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
+#: Side of the fine periodic grid over that of the stamp: wings come back round from 1.5 stamp radii out, not nearer.
 GRID_MARGIN = 1.25
+#: Cells to a pixel.
+OVERSAMPLING = 4
+# Stars of one batch, fewer where their grids would fill more than this many bytes.
+_BATCH, _BATCH_BYTES = 32, 1 << 25
+# Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
 _TABLE_SIZE = 4096
-
-
-@dataclass(frozen=True)
-class RenderedStars:
-    """Images of some stars, before they are put together.
-
-    Attributes
-    ----------
-    image : ndarray of float64, shape [n_star, ny, nx]
-        Light per pixel, as a fraction of what passes the pupil; the whole plane would hold 1.
-    throughput : ndarray, shape [n_star, n_wave]
-        Lit fraction of the pupil.
-    jacobian : ndarray, shape [n_star, 2, 2]
-        See :class:`~pachon.wavefront.pupil_optics.PupilOptics`.
-    reference : ndarray, shape [n_star, 3]
-        See :class:`~pachon.wavefront.pupil_optics.PupilOptics`.
-    """
-
-    image: np.ndarray
-    throughput: np.ndarray
-    jacobian: np.ndarray
-    reference: np.ndarray
 
 
 @dataclass(frozen=True)
 class PupilLattice:
     """Points of a square lattice that lie in an annular pupil, symmetric about its centre.
 
+    The gradient of the low screens has no modes beyond the cut-off, so on a lattice finer than half their wavelength
+    sums over the pupil of the gradient and its squares are exact but for the rim; random points would be noisier.
+
     Attributes
     ----------
     spacing : float
         Distance of neighbouring points [m].
-    column, row : ndarray of int
-        Indices of the points from the first column and row, shape [n_pupil].
+    column, row : ndarray of int, shape [n_pupil]
+        Indices of the points, from the first column and row.
     origin : float
         Coordinate of the first column and row [m].
     """
@@ -76,11 +71,6 @@ class PupilLattice:
     column: np.ndarray
     row: np.ndarray
     origin: float
-
-    @property
-    def points(self) -> np.ndarray:
-        """Pupil coordinates [m], shape [n_pupil, 2]."""
-        return self.origin + self.spacing * np.stack([self.column, self.row], axis=-1)
 
     @classmethod
     def fill(cls, diameter: float, obscuration: float, spacing: float) -> PupilLattice:
@@ -92,11 +82,30 @@ class PupilLattice:
         row, column = np.nonzero((radius < 0.5 * diameter) & (radius >= 0.5 * obscuration * diameter))
         return cls(spacing, column, row, origin)
 
+    @property
+    def points(self) -> np.ndarray:
+        """Pupil coordinates [m], shape [n_pupil, 2]."""
+        return self.origin + self.spacing * np.stack([self.column, self.row], axis=-1)
+
 
 def low_slope_variance(r0: float, outer_scale: float, cutoff: float) -> float:
-    """Return the variance of one component of the gradient of the modes below a cut-off wavenumber [rad^2].
+    """Return the variance of one component of the gradient of the modes below a cut-off wavenumber.
 
-    Half of the integral of ``(2 pi nu)^2 W(nu)`` over the disc of wavenumbers, in closed form.
+    It is half of the integral of ``(2 pi nu)^2 W(nu)`` over the disc of frequencies, in closed form.
+
+    Parameters
+    ----------
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    cutoff : float
+        Cut-off wavenumber [rad/m].
+
+    Returns
+    -------
+    float
+        Variance [rad^2].
     """
     low = outer_scale**-2
     high = low + (cutoff / (2.0 * math.pi)) ** 2
@@ -105,177 +114,260 @@ def low_slope_variance(r0: float, outer_scale: float, cutoff: float) -> float:
     return 2.0 * math.pi**3 * scale * integral
 
 
+def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
+    """Return the structure function that rays through the low modes leave to the filter.
+
+    Parameters
+    ----------
+    separation : ndarray
+        Rising baselines in the pupil [m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    cutoff : float
+        Cut-off wavenumber of the low modes [rad/m].
+
+    Returns
+    -------
+    ndarray
+        Path squared [m^2], not falling, shape of ``separation``.
+    """
+    rest = structure_function(separation, r0, outer_scale)
+    rest = rest - low_slope_variance(r0, outer_scale, cutoff) * separation**2
+    return np.maximum.accumulate(np.maximum(rest, 0.0))
+
+
 class FastPsfEngine:
+    """Renders stars by rays through the low modes of the atmosphere, and filters.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    plane : ImagePlane
+        Stamp and detector.
+    focal_plane : FocalPlane, optional
+        CCD heights.
+    atmosphere : Atmosphere, optional
+        The exposure.
+    dispersion : ndarray, shape [n_wave, 2]
+        Shift in field angle of each wavelength [rad].
+    n_pupil : int, optional
+        About how many pupil points to use; the lattice is a whole number of screen pixels wide.
+    oversampling : int, optional
+        Cells of the fine grid to a pixel.
+    projection : str
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; no byte depends on it.
+    """
+
     def __init__(
         self,
         telescope: Telescope,
         wavelengths: np.ndarray,
         plane: ImagePlane,
         *,
+        dispersion: np.ndarray,
         focal_plane: FocalPlane | None = None,
         atmosphere: Atmosphere | None = None,
-        dispersion: np.ndarray | None = None,
-        n_pupil: int = 334,
-        oversampling: int = 4,
+        n_pupil: int | None = None,
+        oversampling: int | None = None,
         projection: str = "zemax",
         threads: int | None = None,
-        correct: bool = True,
     ) -> None:
-        self.telescope = telescope
-        self.wavelengths = wavelengths
-        self.plane = plane
-        self.focal_plane = focal_plane
-        self.atmosphere = atmosphere
-        self.dispersion = np.zeros((len(wavelengths), 2)) if dispersion is None else dispersion
-        self.oversampling = oversampling
-        self.projection = projection
-        self.threads = threads
-        self.correct = correct
-        self.batch = BATCH
-        diameter, obscuration = telescope.pupil_diameter, telescope.pupil_obscuration
-        spacing = math.sqrt(0.25 * math.pi * diameter**2 * (1.0 - obscuration**2) / n_pupil)
-        self.stride = 1
-        if atmosphere is not None:
-            self.stride = max(1, round(spacing / atmosphere.screen_pixel))
-            spacing = self.stride * atmosphere.screen_pixel
-        self.lattice = PupilLattice.fill(diameter, obscuration, spacing)
-        self.cell = plane.pixel_size / oversampling
-        self.grid_size = scipy.fft.next_fast_len(math.ceil(GRID_MARGIN * plane.stamp_size * oversampling), real=True)
-        self.grid_size += self.grid_size % 2
-        k = 2.0 * math.pi * scipy.fft.fftfreq(self.grid_size, self.cell)
-        self.kx, self.ky = np.abs(k[: self.grid_size // 2 + 1]), k
-        ky = self.ky[:, None]
-        gridding = np.sinc(self.kx * (0.5 * self.cell / math.pi)) * np.sinc(ky * (0.5 * self.cell / math.pi))
-        self.detector = (plane.transfer(self.kx, ky) / gridding).astype(np.float32)
+        if n_pupil is None:
+            n_pupil = PUPIL_POINTS_STILL if atmosphere is None else PUPIL_POINTS
+        if oversampling is None:
+            oversampling = OVERSAMPLING
+        if not n_pupil >= 10:
+            raise DomainError(f"n_pupil = {n_pupil!r}: expected at least 10 pupil points")
+        if int(oversampling) != oversampling or not 1 <= oversampling <= 32:
+            raise DomainError(f"oversampling = {oversampling!r}: expected a whole number of cells, 1 to 32 to a pixel")
+        self._telescope = telescope
+        self._wavelengths = wavelengths
+        self._plane = plane
+        self._dispersion = dispersion
+        self._focal_plane = focal_plane
+        self._atmosphere = atmosphere
+        self._oversampling = int(oversampling)
+        self._projection = projection
+        self._threads = threads
+        self._place_pupil(n_pupil)
+        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
+        #: Effective focal length on the axis [m].
+        self.focal_length = float(focal_length(center.jacobian)[0])
+        self._make_grid()
+        self._filter_step, self._filter = self._filter_table()
         if atmosphere is None:
-            self.screens = np.zeros((1, 1), dtype=np.float32)
+            self._screens = np.zeros((1, 1), dtype=np.float32)
         else:
             screens = atmosphere.low_gradient_screens(threads)
-            self.screens = screens.reshape(len(screens), -1)
-        self.focal = float(focal_length(trace_pupils(telescope, [(0.0, 0.0)], wavelengths, np.zeros((1, 2)), threads=threads).jacobian)[0])
-        self.table_step, self.table = self._filters()
+            self._screens = screens.reshape(len(screens), -1)
 
-    def _filters(self):
-        # 1.5: the diagonal of the grid, and room for a focal length that varies over the field
-        longest = 1.5 * self.focal * float(self.wavelengths.max()) / (2.0 * self.cell)
-        baseline = np.linspace(0.0, longest, _TABLE_SIZE)
-        otf = diffraction_otf(baseline, self.telescope.pupil_diameter, self.telescope.pupil_obscuration)
-        table = np.repeat(otf[None], len(self.wavelengths), axis=0)
-        if self.atmosphere is not None:
-            a = self.atmosphere
-            structure = high_structure_function(baseline, a.r0, a.outer_scale, a.cutoff)
-            if self.correct:
-                geometric = baseline**2 * low_slope_variance(a.r0, a.outer_scale, a.cutoff)
-                structure = np.maximum.accumulate(
-                    np.maximum(structure_function(baseline, a.r0, a.outer_scale) - geometric, 0.0)
+    @property
+    def batch(self) -> int:
+        """Number of stars to render at a time."""
+        star_bytes = 4 * len(self._wavelengths) * self._grid_size**2
+        return max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
+
+    def _place_pupil(self, n_pupil: int) -> None:
+        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
+        spacing = 0.5 * diameter * math.sqrt(math.pi * (1.0 - obscuration**2) / n_pupil)
+        self._stride = 1
+        if self._atmosphere is not None:
+            pixel = self._atmosphere.screen_pixel
+            self._stride = max(1, round(spacing / pixel))
+            spacing = self._stride * pixel
+            if self._atmosphere.screen_length < diameter + 2.0 * pixel:
+                raise DomainError(
+                    f"screen_length = {self._atmosphere.screen_length!r}: expected screens wider than the pupil,"
+                    f" {diameter} m"
                 )
-            table *= np.exp(-0.5 * (2.0 * math.pi / self.wavelengths[:, None]) ** 2 * structure)
-        return baseline[1], table.astype(np.float32)
+        self._lattice = PupilLattice.fill(diameter, obscuration, spacing)
 
-    def _packets(self, values: np.ndarray, fill) -> np.ndarray:
-        missing = -values.shape[-1] % LANES
-        pad = [(0, 0)] * (values.ndim - 1) + [(0, missing)]
-        values = np.pad(values, pad, constant_values=fill)
-        return np.ascontiguousarray(values.reshape(*values.shape[:-1], -1, LANES))
+    def _make_grid(self) -> None:
+        """Lay out the fine grid and its frequencies."""
+        self._cell = self._plane.pixel_size / self._oversampling
+        size = math.ceil(GRID_MARGIN * self._plane.stamp_size * self._oversampling)
+        # even, for the half plane of frequencies of a real transform
+        self._grid_size = 2 * scipy.fft.next_fast_len(-(-size // 2), real=True)
+        self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)
+        self._kx = 2.0 * math.pi * scipy.fft.rfftfreq(self._grid_size, self._cell)
+        ky = self._ky[:, None]
+        # Binning into cells averaged over a cell already: take that back.
+        detector = self._plane.transfer(self._kx, ky) / square_transfer(self._kx, ky, self._cell)
+        self._detector = detector.astype(np.float32)
+
+    def _filter_table(self) -> tuple[float, np.ndarray]:
+        """Return the step of the baselines [m] and the filter at them, shape [n_wave, n]."""
+        # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
+        longest = 1.5 * self.focal_length * float(self._wavelengths.max()) / (2.0 * self._cell)
+        baseline = np.linspace(0.0, longest, _TABLE_SIZE)
+        otf = diffraction_otf(baseline, self._telescope.pupil_diameter, self._telescope.pupil_obscuration)
+        table = np.repeat(otf[None], len(self._wavelengths), axis=0)
+        atmosphere = self._atmosphere
+        if atmosphere is not None:
+            rest = rest_structure_function(baseline, atmosphere.r0, atmosphere.outer_scale, atmosphere.cutoff)
+            table *= np.exp(-0.5 * (2.0 * math.pi / self._wavelengths[:, None]) ** 2 * rest)
+        return float(baseline[1]), table.astype(np.float32)
 
     def render(self, fields: np.ndarray, offsets: np.ndarray) -> RenderedStars:
+        """Render one batch of stars.
+
+        Parameters
+        ----------
+        fields : ndarray, shape [n_star, 2]
+            Field angles [rad].
+        offsets : ndarray, shape [n_star, 2]
+            Places of the reference points from the centre of the middle pixel [pixels].
+
+        Returns
+        -------
+        RenderedStars
+        """
         optics = trace_pupils(
-            self.telescope, fields, self.wavelengths, self.lattice.points, self.focal_plane, self.projection, self.threads
+            self._telescope,
+            fields,
+            self._wavelengths,
+            self._lattice.points,
+            self._focal_plane,
+            self._projection,
+            self._threads,
         )
-        n_star, n_wave, n = len(fields), len(self.wavelengths), self.grid_size
-        image = self._deposit(optics)
-        spectra = np.empty((n_star, n_wave, n, n // 2 + 1), dtype=np.complex64)
-        def transform(star: int) -> None:
-            spectra[star] = scipy.fft.rfft2(image[star])
-        with ThreadPoolExecutor(thread_count(self.threads)) as pool:
-            list(pool.map(transform, range(n_star)))
+        n_star, n = len(fields), self._grid_size
+        deposit = self._deposit(optics)
+        # One transform a star, so that its bytes do not depend on its neighbours.
+        spectra = np.empty((*deposit.shape[:-1], n // 2 + 1), dtype=np.complex64)
+        self._for_each(n_star, lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])))
         combined = self._combine(spectra, optics, offsets)
-        size, step = self.plane.stamp_size, self.oversampling
-        stamps = np.empty((n_star, size, size))
-        def back(star: int) -> None:
-            fine = scipy.fft.irfft2(combined[star], s=(n, n))
-            stamps[star] = fine[: size * step : step, : size * step : step]
-        with ThreadPoolExecutor(thread_count(self.threads)) as pool:
-            list(pool.map(back, range(n_star)))
-        lit = optics.lit.mean(axis=2)
-        n_time = 1 if self.atmosphere is None else len(self.atmosphere.times)
-        light = optics.lit.sum(axis=(1, 2)) * n_time
-        stamps *= (step * step / np.where(light > 0, light, np.nan))[:, None, None]
-        return RenderedStars(stamps, lit, optics.jacobian, optics.reference)
+        span = slice(0, self._plane.stamp_size * self._oversampling, self._oversampling)
+        stamps = np.empty((n_star, self._plane.stamp_size, self._plane.stamp_size))
+        self._for_each(
+            n_star, lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span])
+        )
+        n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
+        rays = np.maximum(optics.lit.sum(axis=(1, 2)), 1) * n_time
+        # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
+        stamps *= (self._oversampling**2 / rays)[:, None, None]
+        return RenderedStars(stamps, optics.lit.mean(axis=2), optics.reference)
+
+    def _for_each(self, count: int, job: Callable[[int], None]) -> None:
+        with ThreadPoolExecutor(thread_count(self._threads)) as pool:
+            list(pool.map(job, range(count)))
 
     def _deposit(self, optics: PupilOptics) -> np.ndarray:
+        """Return the rays of each star binned on the fine grid, shape [n_star, n_wave, grid_size, grid_size]."""
         n_star, n_wave = optics.lit.shape[:2]
-        atmosphere = self.atmosphere
-        pixel, n_time, n_layer = 1.0, 1, 0
-        start, step = np.zeros((n_star, 1, 2)), np.zeros((1, 2))
-        screen_size = 1
-        if atmosphere is not None:
-            pixel, n_time, n_layer = atmosphere.screen_pixel, len(atmosphere.times), atmosphere.layer_count
-            screen_size = atmosphere.screen_size
-            direction = field_direction(*optics.fields.T, self.projection)
-            slopes = direction[:, :2] / -direction[:, 2:]
-            first = self.lattice.origin + atmosphere.offsets - atmosphere.velocities * atmosphere.times[0]
-            start = (first - atmosphere.altitudes[:, None] * slopes[:, None, :]) / pixel
+        atmosphere = self._atmosphere
+        if atmosphere is None:
+            pixel, screen_size, n_layer, n_time = 1.0, 1, 0, 1
+            start, step = np.zeros((n_star, 1, 2)), np.zeros((1, 2))
+        else:
+            pixel, screen_size = atmosphere.screen_pixel, atmosphere.screen_size
+            n_layer, n_time = atmosphere.layer_count, len(atmosphere.times)
+            direction = field_direction(*optics.fields.T, self._projection)
+            slopes = direction[:, None, :2] / -direction[:, None, 2:]
+            corner = self._lattice.origin + atmosphere.offsets - atmosphere.velocities * atmosphere.times[0]
+            start = (corner - atmosphere.altitudes[:, None] * slopes) / pixel
             step = -atmosphere.velocities * (atmosphere.exposure / n_time) / pixel
-        column = self._packets(self.lattice.column * self.stride, 0).astype(np.int32)
-        row = self._packets(self.lattice.row * self.stride, 0).astype(np.int32)
-        weight = self._packets(optics.lit.astype(np.float32), 0.0)
-        shift = np.where(optics.lit[..., None], optics.displacement, 0.0) / self.cell
-        shift = self._packets(np.moveaxis(shift, -1, -2).astype(np.float32), 0.0)
-        shift = np.ascontiguousarray(np.moveaxis(shift, 2, 3))
-        cells = optics.jacobian.reshape(n_star, 4) / (pixel * self.cell)
-        image = np.zeros((n_star, n_wave * self.grid_size**2), dtype=np.float32)
+        column, row = self._lattice.column * self._stride, self._lattice.row * self._stride
+        lattice = to_packets(row * screen_size + column, np.int32)
+        # Rays that were lost have no place to land; they carry no light either.
+        landed = np.where(optics.lit[..., None], optics.displacement, 0.0) / self._cell
+        displacement = np.stack([to_packets(landed[..., axis], np.float32) for axis in (0, 1)], axis=-2)
+        cells_per_slope = optics.jacobian.reshape(n_star, 4) / (pixel * self._cell)
+        image = np.zeros((n_star, n_wave * self._grid_size**2), dtype=np.float32)
         launch(
             deposit_rays,
             n_star,
             [
-                _array(self.screens, wp.float32),
-                screen_size, n_layer, n_time,
-                _array(start, wp.float64),
-                _array(step, wp.float64),
-                _array(row * screen_size + column, sample_offsets),
+                shared(self._screens, wp.float32),
+                screen_size,
+                n_layer,
+                n_time,
+                shared(start, wp.float64),
+                shared(step, wp.float64),
+                shared(lattice, indices),
                 int(max(column.max(), row.max())) + 1,
-                _array(cells.astype(np.float32), wp.float32),
-                _array(shift, samples),
-                _array(weight, samples),
-                self.grid_size,
-                wp.empty((n_star, len(column), 2), dtype=samples, device="cpu"),
-                _array(image, wp.float32),
+                shared(cells_per_slope.astype(np.float32), wp.float32),
+                shared(displacement, samples),
+                shared(to_packets(optics.lit, np.float32, fill="constant"), samples),
+                self._grid_size,
+                wp.empty((n_star, len(lattice), 2), dtype=samples, device="cpu"),
+                shared(image, wp.float32),
             ],
-            threads=self.threads,
+            threads=self._threads,
         )
-        return image.reshape(n_star, n_wave, self.grid_size, self.grid_size)
+        return image.reshape(n_star, n_wave, self._grid_size, self._grid_size)
 
     def _combine(self, spectra: np.ndarray, optics: PupilOptics, offsets: np.ndarray) -> np.ndarray:
-        n_star, n_wave, n_row, n_column = spectra.shape
-        jj = optics.jacobian @ np.swapaxes(optics.jacobian, 1, 2)
-        metric = np.stack([jj[:, 0, 0], jj[:, 0, 1], jj[:, 1, 1]], axis=-1)
-        middle = self.plane.stamp_size // 2 * self.plane.pixel_size - self.grid_size // 2 * self.cell
-        shift = np.einsum("sij,wj->swi", optics.jacobian, self.dispersion)
-        shift = shift + (offsets * self.plane.pixel_size + middle)[:, None, :]
-        ramp_x = np.exp(-1j * shift[..., :1] * self.kx).astype(np.complex64)
-        ramp_y = np.exp(-1j * shift[..., 1:] * self.ky).astype(np.complex64)
+        """Return the filtered sum over wavelengths of the transforms of each star, shape [n_star, ky, kx]."""
+        n_star, _, n_row, n_column = spectra.shape
+        metric = optics.jacobian @ np.swapaxes(optics.jacobian, 1, 2)
+        shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)
+        # The deposit has its origin in the middle cell; the first pixel of the stamp is wanted in the first.
+        middle = self._plane.middle * self._plane.pixel_size - self._grid_size // 2 * self._cell
+        shift = shift + (offsets * self._plane.pixel_size + middle)[:, None, :]
         combined = np.empty((n_star, n_row, n_column), dtype=np.complex64)
         launch(
             combine_wavelengths,
             n_star * n_row,
             [
-                _array(spectra.view(np.float32).reshape(*spectra.shape, 2), wp.vec2f),
-                float(self.kx[1]),
-                _array(metric.astype(np.float32), wp.float32),
-                _array((self.wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
-                _array(self.table, wp.float32),
-                float(self.table_step),
-                _array(self.detector, wp.float32),
-                _array(ramp_x.view(np.float32).reshape(*ramp_x.shape, 2), wp.vec2f),
-                _array(ramp_y.view(np.float32).reshape(*ramp_y.shape, 2), wp.vec2f),
-                _array(combined.view(np.float32).reshape(*combined.shape, 2), wp.vec2f),
+                shared(spectra, wp.vec2f),
+                float(self._kx[1]),
+                shared(metric.reshape(n_star, 4)[:, [0, 1, 3]].astype(np.float32), wp.float32),
+                shared((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
+                shared(self._filter, wp.float32),
+                self._filter_step,
+                shared(self._detector, wp.float32),
+                shared(np.exp(-1j * shift[..., :1] * self._kx).astype(np.complex64), wp.vec2f),
+                shared(np.exp(-1j * shift[..., 1:] * self._ky).astype(np.complex64), wp.vec2f),
+                shared(combined, wp.vec2f),
             ],
-            threads=self.threads,
+            threads=self._threads,
         )
         return combined
-
-
-def _array(values: np.ndarray, dtype: Any) -> wp.array:
-    """Wrap a contiguous array for Warp without a copy."""
-    return wp.array(values, dtype=dtype, device="cpu", copy=False)

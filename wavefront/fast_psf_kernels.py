@@ -5,14 +5,9 @@ from __future__ import annotations
 import warp as wp
 
 from ..raytrace.launch import FORWARD_OPTIONS
+from .sample_packets import LANES, indices, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
-
-#: Pupil points in one packet.
-LANES = 16
-
-samples = wp.types.vector(LANES, wp.float32)
-sample_offsets = wp.types.vector(LANES, wp.int32)
 
 
 @wp.func
@@ -39,11 +34,11 @@ def slope_inside(
     layer: wp.int32,
     size: wp.int32,
     corner: wp.int32,
-    offset: sample_offsets,
+    offset: indices,
     fraction_x: wp.float32,
     fraction_y: wp.float32,
 ):
-    """Read the patches under a packet that crosses no border of the screen; offset: of each lane from the corner."""
+    """Read the patches under a packet that crosses no border of the screen."""
     c00 = samples()
     c10 = samples()
     c01 = samples()
@@ -63,23 +58,21 @@ def slope_across(
     layer: wp.int32,
     size: wp.int32,
     corner: wp.int32,
-    offset: sample_offsets,
+    offset: indices,
     fraction_x: wp.float32,
     fraction_y: wp.float32,
 ):
-    """Read the patches under a packet that may reach over the border of the screen, which is periodic."""
+    """Read the patches under a packet that may reach over a border of the screen, which is periodic."""
     c00 = samples()
     c10 = samples()
     c01 = samples()
     c11 = samples()
     for i in range(LANES):
-        # an offset holds whole rows and columns; a column past the border runs on into the next row
-        x0 = corner % size + offset[i] % size
-        y0 = corner // size + offset[i] // size
+        # columns and rows are added apart: a column past the border must not run on into the next row
+        x0 = (corner % size + offset[i] % size) % size
+        y0 = (corner // size + offset[i] // size) % size
         x1 = (x0 + 1) % size
         y1 = (y0 + 1) % size
-        x0 = x0 % size
-        y0 = y0 % size
         c00[i] = screens[layer, y0 * size + x0]
         c10[i] = screens[layer, y0 * size + x1]
         c01[i] = screens[layer, y1 * size + x0]
@@ -96,7 +89,7 @@ def deposit_rays(
     n_time: wp.int32,
     start: wp.array3d(dtype=wp.float64),
     step: wp.array2d(dtype=wp.float64),
-    lattice: wp.array(dtype=sample_offsets),
+    lattice: wp.array(dtype=indices),
     reach: wp.int32,
     cells_per_slope: wp.array2d(dtype=wp.float32),
     displacement: wp.array4d(dtype=samples),
@@ -108,13 +101,14 @@ def deposit_rays(
     """Deposit all rays of one star, at every wavelength, on its fine grid.
 
     The pupil points lie on the lattice of the screens, so at one time all of them share one fraction of a pixel and
-    differ in whole samples only.
+    differ by whole samples only: the bilinear weights are two numbers per layer and time.
 
-    Arguments: screens [layer, y * size + x] [m]; start [star, layer, 2] screen coordinates of the first lattice point at the
-    first time [pixels]; step [layer, 2] [pixels per time step]; columns, rows [packet] lattice points [pixels]; reach: the
-    largest of them, plus one; cells_per_slope [star, 4]: Jacobian, row by row, over the screen pixel and the cell;
-    displacement [star, wave, packet, 2] by the optics [cells]; weight [star, wave, packet]; slope [star, packet, 2]: room
-    for the differences of path across a pixel [m]; image [star, (wave * size + y) * size + x], the origin at size / 2.
+    Arguments: screens [layer, y * size + x] [m]; start [star, layer, 2]: screen coordinates of the first lattice point
+    at the first time [pixels]; step [layer, 2] [pixels per time step]; lattice [packet]: row * size + column of the
+    pupil points [pixels]; reach: the largest row or column, plus one; cells_per_slope [star, 4]: Jacobian, row by row,
+    over the screen's pixel and the cell of the grid; displacement [star, wave, packet, 2] by the optics [cells];
+    weight [star, wave, packet]; slope [star, packet, 2]: room for the differences of path across a pixel [m]; image
+    [star, (wave * size + y) * size + x], with the origin in the cell size // 2.
     """
     star = first + wp.tid()
     n_packet = lattice.shape[0]
@@ -133,13 +127,14 @@ def deposit_rays(
             corner_x, fraction_x = corner_of(start[star, layer, 0] + time * step[layer, 0], screen_size)
             corner_y, fraction_y = corner_of(start[star, layer, 1] + time * step[layer, 1], screen_size)
             corner = corner_y * screen_size + corner_x
+            # Two loops in place of one with a choice inside: the compiler vectorizes these.
             if corner_x + reach < screen_size and corner_y + reach < screen_size:
                 for packet in range(n_packet):
-                    slope_x, slope_y = slope_inside(
+                    inside_x, inside_y = slope_inside(
                         screens, layer, screen_size, corner, lattice[packet], fraction_x, fraction_y
                     )
-                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
-                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
+                    slope[star, packet, 0] = slope[star, packet, 0] + inside_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + inside_y
             else:
                 for packet in range(n_packet):
                     across_x, across_y = slope_across(
@@ -157,7 +152,7 @@ def deposit_rays(
                 cell_y = y + displacement[star, wave, packet, 1]
                 light = weight[star, wave, packet]
                 for i in range(LANES):
-                    # no branch, so that the compiler keeps the lanes together; light beyond the grid is left out
+                    # No branch, so that the lanes stay together; light beyond the grid is left out.
                     column = wp.int32(cell_x[i] + origin)
                     row = wp.int32(cell_y[i] + origin)
                     near_column = wp.clamp(column, 0, grid_size - 1)

@@ -1,8 +1,8 @@
 r"""The detector end of both PSF engines: the grid of a stamp, and what pixels and charge diffusion do to it.
 
-An image :math:`I(X)` on the focal plane has the transform :math:`\tilde I(k) = \int I(X) e^{-i k \cdot X} dX`, with k in
-radians per metre of the focal plane. A pupil baseline b belongs to :math:`k = (2 \pi / \lambda) J^{-T} b`, where J is
-the Jacobian of the position on the focal plane with respect to the direction of the incoming light.
+An image :math:`I(X)` on the focal plane has the transform :math:`\tilde I(k) = \int I(X) e^{-i k \cdot X} dX`, with k
+in radians per metre of the focal plane. A pupil baseline b belongs to :math:`k = (2 \pi / \lambda) J^{-T} b`, where J
+is the Jacobian of the position on the focal plane with respect to the direction of the incoming light.
 """
 
 from __future__ import annotations
@@ -47,9 +47,14 @@ class ImagePlane:
         return self.stamp_size * self.pixel_size
 
     @property
+    def middle(self) -> int:
+        """Index of the middle pixel, where a star without an offset has its reference point."""
+        return self.stamp_size // 2
+
+    @property
     def pixel_centers(self) -> np.ndarray:
-        """Coordinates of the pixel centres along an axis [m]; pixel ``stamp_size // 2`` is at 0."""
-        return (np.arange(self.stamp_size) - self.stamp_size // 2) * self.pixel_size
+        """Coordinates of the pixel centres along an axis from the middle pixel [m]."""
+        return (np.arange(self.stamp_size) - self.middle) * self.pixel_size
 
     def transfer(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
         """Return the transfer function of the detector: a square pixel and Gaussian charge diffusion.
@@ -64,8 +69,32 @@ class ImagePlane:
         ndarray
             Real factor of each wavenumber, 1 at zero.
         """
-        pixel = np.sinc(kx * (0.5 * self.pixel_size / np.pi)) * np.sinc(ky * (0.5 * self.pixel_size / np.pi))
-        return pixel * np.exp(-0.5 * self.diffusion**2 * (kx * kx + ky * ky))
+        return square_transfer(kx, ky, self.pixel_size) * np.exp(-0.5 * self.diffusion**2 * (kx * kx + ky * ky))
+
+
+@dataclass(frozen=True)
+class RenderedStars:
+    """What an engine makes of some stars.
+
+    Attributes
+    ----------
+    image : ndarray, shape [n_star, ny, nx]
+        Fraction of the light that reaches the focal plane in each pixel, float64; 0 where no light does.
+    throughput : ndarray, shape [n_star, n_wave]
+        Lit fraction of the pupil.
+    reference : ndarray, shape [n_star, 3]
+        Point of the CCD at the star's place on the stamp, telescope frame [m].
+    """
+
+    image: np.ndarray
+    throughput: np.ndarray
+    reference: np.ndarray
+
+
+def square_transfer(kx: np.ndarray, ky: np.ndarray, side: float) -> np.ndarray:
+    """Return the transfer function of averaging over a square of given side [m] at wavenumbers [rad/m]."""
+    scale = 0.5 * side / np.pi
+    return np.sinc(kx * scale) * np.sinc(ky * scale)
 
 
 def focal_length(jacobian: np.ndarray) -> np.ndarray:

@@ -19,9 +19,9 @@ from ..models.units import metres, radians
 from ..raytrace.launch import launch
 from ..raytrace.packed import pack_surfaces, refractive_indices
 from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
+from ..raytrace.pupil_kernels import trace_pupils as trace_pupils_kernel
 from ..raytrace.rays import Rays, RayStatus, field_direction
 from ..raytrace.trace import trace
-from ..raytrace.trace_kernels import trace_pupils as trace_pupils_kernel
 from .reference import distance_to_sphere
 
 #: Step of the central differences for the Jacobian [rad]: 20 arcsec, so that both rounding (1e-15 m / 1e-4) and the

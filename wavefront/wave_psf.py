@@ -1,4 +1,21 @@
-"""Wave."""
+r"""The wave PSF engine: the truth that the fast engine is held to.
+
+The field on the focal plane at X from the reference point is the sum over the pupil of
+
+.. math:: A \, e^{i k (\psi + w)} \, e^{-i k X \cdot (J^{-T} p)},
+
+with the path :math:`\psi` of the atmosphere and :math:`w` of the optics (to the reference sphere, less the chief
+ray's), the entrance-pupil coordinate p, and the Jacobian J of the position on the focal plane with respect to the
+direction of the incoming light: :math:`J^{-T} p` are the direction cosines of the light at the focus, less the chief
+ray's. The pupil grid is regular in :math:`q = f J^{-T} p`, so the transform is separable along the axes of the CCD. The
+squared modulus is averaged over time steps; its transform is the optical transfer function (OTF) at the differences of
+grid points, the baselines.
+
+A long exposure through an atmosphere has no OTF left at baselines beyond 1.5 m, and charge diffusion leaves none in any
+case. The grid then needs no padding to twice the pupil: it is so wide that baselines up to 1.5 m are free of those that
+come round.
+"""
+
 from __future__ import annotations
 
 import math
@@ -8,151 +25,235 @@ import numpy as np
 import scipy.fft
 import warp as wp
 
+from ..models.errors import DomainError
 from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch, thread_count
 from ..raytrace.rays import field_direction
 from .atmosphere import Atmosphere
-from .fast_psf import RenderedStars
-from .image_plane import ImagePlane, focal_length
-from .pupil_optics import trace_pupils
-from .wave_psf_kernels import LANES, indices, places, points, pupil_fields
+from .image_plane import ImagePlane, RenderedStars, focal_length
+from .pupil_optics import PupilOptics, trace_pupils
+from .sample_packets import indices, places, samples, shared, to_packets
+from .wave_psf_kernels import pupil_fields
 
+#: Longest baseline [m] that an unpadded grid keeps.
 LONGEST_BASELINE = 1.5
+#: Largest distance of pupil points [m]; the scale below which turbulence is left out.
 LARGEST_SPACING = 0.02
+# What charge diffusion may leave of longer baselines for a grid without padding.
+_NEGLIGIBLE = 1e-4
 
 
 class WavePsfEngine:
+    """Renders stars by Fourier optics.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    plane : ImagePlane
+        Stamp and detector.
+    focal_plane : FocalPlane, optional
+        CCD heights.
+    atmosphere : Atmosphere, optional
+        The exposure.
+    dispersion : ndarray, shape [n_wave, 2]
+        Shift in field angle of each wavelength [rad].
+    padding : bool, optional
+        Keep all baselines, up to the diameter of the pupil; by default where there is no atmosphere or next to no
+        charge diffusion.
+    pupil_spacing : float, optional
+        Distance of the pupil points [m]; by default so small that the image repeats itself outside the stamp only, and
+        at most :data:`LARGEST_SPACING`.
+    projection : str
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads, one star each; no byte depends on it.
+    """
+
     def __init__(
         self,
         telescope: Telescope,
         wavelengths: np.ndarray,
         plane: ImagePlane,
         *,
+        dispersion: np.ndarray,
         focal_plane: FocalPlane | None = None,
         atmosphere: Atmosphere | None = None,
-        dispersion: np.ndarray | None = None,
-        projection: str = "zemax",
-        threads: int | None = None,
         padding: bool | None = None,
         pupil_spacing: float | None = None,
+        projection: str = "zemax",
+        threads: int | None = None,
     ) -> None:
-        self.telescope = telescope
-        self.wavelengths = wavelengths
-        self.plane = plane
-        self.focal_plane = focal_plane
-        self.atmosphere = atmosphere
-        self.dispersion = np.zeros((len(wavelengths), 2)) if dispersion is None else dispersion
-        self.projection = projection
-        self.threads = threads
-        self.batch = max(1, thread_count(threads))
-        self.focal = float(focal_length(trace_pupils(telescope, [(0.0, 0.0)], wavelengths, np.zeros((1, 2)), threads=threads).jacobian)[0])
-        shortest = float(wavelengths.min())
-        if pupil_spacing is None:
-            pupil_spacing = min(LARGEST_SPACING, shortest * self.focal / plane.side)
-        self.spacing = pupil_spacing
+        self._telescope = telescope
+        self._wavelengths = wavelengths
+        self._plane = plane
+        self._dispersion = dispersion
+        self._focal_plane = focal_plane
+        self._atmosphere = atmosphere
+        self._projection = projection
+        self._threads = threads
+        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
+        #: Effective focal length on the axis [m].
+        self.focal_length = float(focal_length(center.jacobian)[0])
+        self._lay_grid(padding, pupil_spacing)
+        self._low, self._high = self._spline_screens()
+
+    @property
+    def batch(self) -> int:
+        """Number of stars to render at a time."""
+        return thread_count(self._threads)
+
+    def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
+        if spacing is None:
+            spacing = min(LARGEST_SPACING, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
+        if not (math.isfinite(spacing) and spacing > 0.0):
+            raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
         if padding is None:
-            k = 2 * math.pi * LONGEST_BASELINE / (float(wavelengths.max()) * self.focal)
-            padding = atmosphere is None or math.exp(-0.5 * (k * plane.diffusion) ** 2) > 1e-4
-        diameter = telescope.pupil_diameter * 1.01
-        self.longest = diameter if padding else LONGEST_BASELINE
-        self.size = scipy.fft.next_fast_len(math.ceil((diameter + self.longest) / self.spacing) + 1)
-        # Baselines of up to this many samples are free of those that come round from the other side.
-        self.reach = min(math.floor(self.longest / self.spacing), self.size // 2)
-        self.radius = 0.5 * diameter
-        if atmosphere is not None:
-            self.low = np.stack([atmosphere.low_screen(n, "spline", threads=threads) for n in range(atmosphere.layer_count)])
-            self.high = np.stack([atmosphere.high_screen(n, "spline", threads=threads) for n in range(atmosphere.layer_count)])
-        else:
-            self.low = self.high = np.zeros((1, 4, 4), np.float32)
+            k = 2.0 * math.pi * LONGEST_BASELINE / (float(self._wavelengths.max()) * self.focal_length)
+            left = math.exp(-0.5 * (k * self._plane.diffusion) ** 2)
+            padding = self._atmosphere is None or left > _NEGLIGIBLE
+        # 1 %: the scale of the pupil in q changes by some tenths of a per cent over the field.
+        diameter = 1.01 * self._telescope.pupil_diameter
+        longest = diameter if padding else LONGEST_BASELINE
+        self._spacing = spacing
+        # Multiples of 16 keep the rows aligned, and sizes with small factors the transforms fast.
+        self._size = 16 * scipy.fft.next_fast_len(math.ceil((diameter + longest) / spacing / 16.0))
+        self._reach = min(math.floor(longest / spacing), self._size // 2 - 1)
+
+    def _spline_screens(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the spline coefficients of the low and the high screens [m], shape [n_layer, size * size]."""
+        atmosphere = self._atmosphere
+        if atmosphere is None:
+            nothing = np.zeros((1, 1), dtype=np.float32)
+            return nothing, nothing
+        count, n, m = atmosphere.layer_count, atmosphere.screen_size, atmosphere.fine_size
+        low, high = np.empty((count, n, n), dtype=np.float32), np.empty((count, m, m), dtype=np.float32)
+        for layer in range(count):
+            atmosphere.low_screen(layer, "spline", threads=self._threads, out=low[layer])
+            atmosphere.high_screen(layer, "spline", threads=self._threads, out=high[layer])
+        return low.reshape(count, -1), high.reshape(count, -1)
 
     def render(self, fields: np.ndarray, offsets: np.ndarray) -> RenderedStars:
-        with ThreadPoolExecutor(thread_count(self.threads)) as pool:
+        """Render one batch of stars.
+
+        Parameters
+        ----------
+        fields : ndarray, shape [n_star, 2]
+            Field angles [rad].
+        offsets : ndarray, shape [n_star, 2]
+            Places of the reference points from the centre of the middle pixel [pixels].
+
+        Returns
+        -------
+        RenderedStars
+        """
+        with ThreadPoolExecutor(thread_count(self._threads)) as pool:
             stars = list(pool.map(self._render_star, fields, offsets))
         return RenderedStars(
-            np.stack([s.image for s in stars]),
-            np.stack([s.throughput for s in stars]),
-            np.stack([s.jacobian for s in stars]),
-            np.stack([s.reference for s in stars]),
+            np.stack([star.image for star in stars]),
+            np.stack([star.throughput for star in stars]),
+            np.stack([star.reference for star in stars]),
         )
 
     def _render_star(self, field: np.ndarray, offset: np.ndarray) -> RenderedStars:
-        chief = trace_pupils(self.telescope, field[None], self.wavelengths, np.zeros((1, 2)), self.focal_plane, self.projection, threads=1)
+        def seen(pupil: np.ndarray) -> PupilOptics:
+            return trace_pupils(
+                self._telescope,
+                field[None],
+                self._wavelengths,
+                pupil,
+                self._focal_plane,
+                self._projection,
+                threads=1,
+            )
+
+        chief = seen(np.zeros((1, 2)))
         jacobian = chief.jacobian[0]
-        # q = f J^-T p is the exit direction of a ray times f: regular in q, the transform to the focal plane is separable.
-        line = (np.arange(self.size) - self.size // 2) * self.spacing
+        focal = float(focal_length(jacobian))
+        line = (np.arange(self._size) - self._size // 2) * self._spacing
         q = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        p = q @ jacobian / self.focal
-        inside = np.flatnonzero(np.hypot(p[:, 0], p[:, 1]) < self.radius)
-        optics = trace_pupils(self.telescope, field[None], self.wavelengths, p[inside], self.focal_plane, self.projection, threads=1)
+        p = q @ jacobian / focal
+        place = np.flatnonzero(np.hypot(p[:, 0], p[:, 1]) < 0.5 * self._telescope.pupil_diameter)
+        optics = seen(p[place])
         lit = optics.lit[0]
-        some = lit.any(axis=0)
-        at, lit, path, pupil = inside[some], lit[:, some], optics.path[0][:, some], p[inside[some]]
-        intensity = self._expose(field, pupil, at, path, lit)
-        image = self._sample(intensity, jacobian, offset)
-        area = math.pi / 4 * self.telescope.pupil_diameter**2 * (1 - self.telescope.pupil_obscuration**2)
-        cell = self.spacing**2 * abs(np.linalg.det(jacobian)) / self.focal**2
-        return RenderedStars(image, lit.sum(axis=1) * cell / area, jacobian, optics.reference[0])
+        used = lit.any(axis=0)
+        intensity = self._expose(field, p[place[used]], place[used], optics.path[0][:, used], lit[:, used])
+        area = 0.25 * math.pi * self._telescope.pupil_diameter**2 * (1.0 - self._telescope.pupil_obscuration**2)
+        return RenderedStars(
+            self._sample(intensity, jacobian, focal, offset),
+            lit.sum(axis=1) * self._spacing**2 / area,
+            chief.reference[0],
+        )
 
-    def _expose(self, field, pupil, at, path, lit) -> np.ndarray:
-        n_wave, size = len(self.wavelengths), self.size
-        missing = -len(at) % LANES
-        packets = lambda a, **kw: np.ascontiguousarray(np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)], mode="edge").reshape(*a.shape[:-1], -1, LANES))
-        turns = path / self.wavelengths[:, None]
-        turns = np.where(lit, turns - np.rint(turns), 0.0)
-        fields = np.zeros((n_wave, size * size), dtype=np.complex64)
-        a = self.atmosphere
-        n_time, n_layer = 1, 0
-        start = np.zeros((1, 1, 4))
-        pixels = wp.vec2d(1.0, 1.0)
-        if a is not None:
-            n_time, n_layer = len(a.times), a.layer_count
-            direction = field_direction(*field, self.projection)
-            slope = direction[:2] / -direction[2]
-            center = a.offsets - a.altitudes[:, None] * slope - a.velocities * a.times[:, None, None]
-            start = np.concatenate([center / a.screen_pixel % a.screen_size, center / a.fine_pixel % a.fine_size], axis=-1)
-            pixels = wp.vec2d(1.0 / a.screen_pixel, 1.0 / a.fine_pixel)
-        starts = [_array(np.ascontiguousarray(s), wp.float64) for s in start]
-        inputs = [
-            _array(packets(pupil[:, 0]), places),
-            _array(packets(pupil[:, 1]), places),
-            _array(self.low, wp.float32),
-            _array(self.high, wp.float32),
-            n_layer,
-            None,
-            pixels,
-            _array((1.0 / self.wavelengths).astype(np.float32), wp.float32),
-            _array(packets(turns.astype(np.float32)), points),
-            _array(packets(lit.astype(np.float32)), points),
-            _array(packets(at.astype(np.int32)), indices),
-            _array(fields.view(np.float32).reshape(n_wave, -1, 2), wp.vec2f),
-        ]
+    def _expose(
+        self, field: np.ndarray, pupil: np.ndarray, place: np.ndarray, path: np.ndarray, lit: np.ndarray
+    ) -> np.ndarray:
+        """Return the squared field on the focal plane, averaged over time, shape [n_wave, size, size].
+
+        Scaled so that the means over the grid add up to 1 over the wavelengths.
+        """
+        n_wave, size = len(self._wavelengths), self._size
         intensity = np.zeros((n_wave, size, size))
-        for t in range(n_time):
-            inputs[5] = starts[t]
-            launch(pupil_fields, inputs[0].shape[0], inputs, threads=1)
+        if not len(place):
+            return intensity
+        turns = path / self._wavelengths[:, None]
+        turns = np.where(lit, turns - np.rint(turns), 0.0)
+        starts, n_layer, pixels_per_meter = self._screen_places(field)
+        fields = np.zeros((n_wave, size * size), dtype=np.complex64)
+        before = [
+            shared(to_packets(pupil[:, 0], np.float64), places),
+            shared(to_packets(pupil[:, 1], np.float64), places),
+            shared(self._low, wp.float32),
+            math.isqrt(self._low.shape[1]),
+            shared(self._high, wp.float32),
+            math.isqrt(self._high.shape[1]),
+            n_layer,
+        ]
+        after = [
+            pixels_per_meter,
+            shared((1.0 / self._wavelengths).astype(np.float32), wp.float32),
+            shared(to_packets(turns, np.float32), samples),
+            shared(to_packets(lit, np.float32), samples),
+            shared(to_packets(place, np.int32), indices),
+            shared(fields, wp.vec2f),
+        ]
+        for start in starts:
+            launch(pupil_fields, len(before[0]), [*before, shared(start, wp.float64), *after], threads=1)
             for wave in range(n_wave):
-                image = scipy.fft.fft2(fields[wave].reshape(size, size)).view(np.float32)
-                np.multiply(image, image, out=image)
-                intensity[wave] += image[:, 0::2]
-                intensity[wave] += image[:, 1::2]
-        return intensity / (n_time * lit.sum() * size * size)
+                parts = scipy.fft.fft2(fields[wave].reshape(size, size)).view(np.float32)
+                np.multiply(parts, parts, out=parts)
+                intensity[wave] += parts[:, 0::2]
+                intensity[wave] += parts[:, 1::2]
+        intensity /= len(starts) * lit.sum()
+        return intensity
 
-    def _sample(self, intensity, jacobian, offset) -> np.ndarray:
-        image = 0.0
-        # fields are centred on sample size // 2, which puts no phase on an intensity
-        step = np.arange(-self.reach, self.reach + 1)
-        for wave, wavelength in enumerate(self.wavelengths):
+    def _screen_places(self, field: np.ndarray) -> tuple[np.ndarray, int, wp.vec2d]:
+        """Return where the pupil's centre is seen on the screens at each time [pixels], [n_time, n_layer, 4]."""
+        atmosphere = self._atmosphere
+        if atmosphere is None:
+            return np.zeros((1, 1, 4)), 0, wp.vec2d(1.0, 1.0)
+        direction = field_direction(*field, self._projection)
+        slopes = direction[:2] / -direction[2]
+        center = atmosphere.offsets - atmosphere.altitudes[:, None] * slopes
+        center = center - atmosphere.velocities * atmosphere.times[:, None, None]
+        starts = np.concatenate([center / atmosphere.screen_pixel, center / atmosphere.fine_pixel], axis=-1)
+        return starts, atmosphere.layer_count, wp.vec2d(1.0 / atmosphere.screen_pixel, 1.0 / atmosphere.fine_pixel)
+
+    def _sample(self, intensity: np.ndarray, jacobian: np.ndarray, focal: float, offset: np.ndarray) -> np.ndarray:
+        """Return the stamp: the OTF, filtered by the detector, evaluated at the pixel centres."""
+        image = np.zeros((self._plane.stamp_size, self._plane.stamp_size))
+        step = np.arange(-self._reach, self._reach + 1)
+        shift = offset * self._plane.pixel_size + self._dispersion @ jacobian.T
+        for wave, wavelength in enumerate(self._wavelengths):
             otf = scipy.fft.ifft2(intensity[wave])[np.ix_(step, step)]
-            k = -2.0 * math.pi * self.spacing / (wavelength * self.focal) * step
-            otf *= self.plane.transfer(k, k[:, None])
-            x, y = jacobian @ self.dispersion[wave] + offset * self.plane.pixel_size
-            to_x = np.exp(1j * k * (self.plane.pixel_centers - x)[:, None])
-            to_y = np.exp(1j * k * (self.plane.pixel_centers - y)[:, None])
-            share = self.plane.pixel_size**2 * (self.spacing / (wavelength * self.focal)) ** 2
-            image = image + share * (to_y @ otf @ to_x.T).real * self.size**2
+            # the wavenumber on the focal plane of a baseline of so many steps, by the sign of the transform
+            k_step = 2.0 * math.pi * self._spacing / (wavelength * focal)
+            k = -k_step * step
+            otf *= self._plane.transfer(k, k[:, None])
+            at_x = np.exp(1j * k * (self._plane.pixel_centers - shift[wave, 0])[:, None])
+            at_y = np.exp(1j * k * (self._plane.pixel_centers - shift[wave, 1])[:, None])
+            image += (self._plane.pixel_size * k_step / (2.0 * math.pi)) ** 2 * (at_y @ otf @ at_x.T).real
         return image
-
-
-def _array(values, dtype):
-    return wp.array(values, dtype=dtype, device="cpu", copy=False)

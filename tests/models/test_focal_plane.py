@@ -22,12 +22,13 @@ def points_on(names, rng, n):
 def dense(n=81):
     """Return x, y, shape (189, n, n), of a grid on every CCD."""
     axis = np.linspace(-HALF, HALF, n) * (1 - 1e-12)
-    return CAMERA.centers[:, 0, None, None] + axis, CAMERA.centers[:, 1, None, None] + axis[:, None]
+    x, y = CAMERA.centers[:, 0, None, None] + axis, CAMERA.centers[:, 1, None, None] + axis[:, None]
+    return np.broadcast_arrays(x, y)
 
 
 def test_budgets_are_the_columns_of_table_1():
-    assert SPECIFICATION == HeightBudget(10e-6, 4.8e-6, 4e-6, 2.5e-4, 4e-6, (1.0, 2.0))
-    assert SIMULATED == HeightBudget(10e-6, 6.5e-6, 10e-6, 2.5e-4, 5e-6, (1.0, 2.0))
+    assert HeightBudget(10e-6, 4.8e-6, 4e-6, 2.5e-4, 4e-6, (1.0, 2.0)) == SPECIFICATION
+    assert HeightBudget(10e-6, 6.5e-6, 10e-6, 2.5e-4, 5e-6, (1.0, 2.0)) == SIMULATED
 
 
 def test_flat_is_zero_on_ccds_and_nan_in_gaps():
@@ -62,7 +63,7 @@ def test_global_spans_its_peak_to_valley_exactly_and_is_one_quadratic():
     # A grid of 1 mm misses an extreme inside a CCD by curvature * (0.5 mm)^2 / 2 < 1e-10 m; corners it holds.
     assert h.max() - h.min() == pytest.approx(10e-6, abs=1e-10)
     assert h.max() + h.min() == pytest.approx(0.0, abs=1e-10)
-    basis = np.stack([np.ones(x.size), *(v.ravel() for v in np.broadcast_arrays(x, y, x * x, x * y, y * y))], -1)
+    basis = np.stack([np.ones(x.size), *(v.ravel() for v in (x, y, x * x, x * y, y * y))], -1)
     coefficients, *_ = np.linalg.lstsq(basis, h.ravel(), rcond=None)
     assert np.allclose(basis @ coefficients, h.ravel(), rtol=0, atol=1e-17)
 
@@ -99,7 +100,8 @@ def test_tilts_are_uniform_about_each_axis():
 
 def test_potato_chip_has_its_peak_to_valley_cycles_and_zero_mean():
     fp = FocalPlane.from_budget("lsst", seed=4, terms=["potato_chip"])
-    h = fp.height(*dense(129))
+    x, y = dense(129)
+    h = fp.height(x[::8], y[::8])
     # Scaled on the same number of points.
     assert np.allclose(np.ptp(h, axis=(1, 2)), 5e-6, rtol=0, atol=1e-12)
     cycles = np.hypot(fp.waves[:, :, 1], fp.waves[:, :, 2]) * 40.96e-3 / (2 * np.pi)
@@ -182,10 +184,13 @@ def test_measured_points_recover_a_known_surface():
     assert fp.grid.shape == (189, 18, 18)
     px, py = points_on([NAME, "R30_S02"], rng, 4000)
     error = fp.height(px, py) - truth.height(px, py)
-    # Cubic splines on 15 cells of a ripple of up to 2 cycles: (k h)^4 / 384 = 0.1 % of 1.25 um inside, more at rims
-    # with few points.
-    assert np.sqrt(np.mean(error**2)) < 1e-9
-    assert np.abs(error).max() < 50e-9
+    # Cubic splines on 15 cells of a ripple of up to 2 cycles: (k h)^4 / 384 = 0.13 % of two waves of 1.25 um, 3 nm at
+    # most where points surround; a strip of 2.5 % along the rim, and corners above all, is extrapolated.
+    assert np.sqrt(np.mean(error**2)) < 3e-9
+    center = CAMERA.centers[CAMERA.ccd_at(px, py)].T
+    inside = np.hypot(*(np.maximum(np.abs([px, py] - center) - 0.95 * HALF, 0))) == 0
+    assert np.abs(error[inside]).max() < 10e-9
+    assert np.abs(error).max() < 200e-9
 
 
 def test_noise_in_measured_points_averages_down():
@@ -279,7 +284,7 @@ def test_bad_arguments_are_refused():
     for seed in (-1, 1.5, "1", True):
         with pytest.raises(DomainError, match="seed = "):
             FocalPlane.from_budget("lsst", seed=seed)
-    with pytest.raises(DomainError, match="ccd_tilt = -1.0"):
+    with pytest.raises(DomainError, match=r"ccd_tilt = -1\.0"):
         HeightBudget(0.0, 0.0, 0.0, -1.0, 0.0)
     with pytest.raises(DomainError, match="potato_chip_cycles"):
         HeightBudget(0.0, 0.0, 0.0, 0.0, 0.0, (2.0, 1.0))
@@ -300,11 +305,11 @@ def test_mesh_has_a_tile_a_ccd_facing_up_within_the_facet_error():
     assert np.all(mesh.face_normals[:, 2] > 0.99)
     # Tiles cover the CCDs and nothing else; slopes of 1e-3 add a part in 1e6 of area.
     assert mesh.area == pytest.approx(189 * 40.96e-3**2, rel=2e-6)
-    # Interpolate in the triangles at their centres and at the middles of their longest sides.
+    # Interpolate at centres and near the middles of the longest sides, off the rims by more than rounding.
     bound = np.repeat(fp.facet_error(cells), 2 * cells**2)
     corners = mesh.vertices[mesh.faces]
     worst = 0.0
-    for weights in ((1 / 3, 1 / 3, 1 / 3), (0.5, 0.0, 0.5), (0.2, 0.5, 0.3)):
+    for weights in ((1 / 3, 1 / 3, 1 / 3), (0.49, 0.02, 0.49), (0.49, 0.49, 0.02)):
         x, y, z = np.einsum("c,fcd->df", weights, corners)
         h = fp.height(x, y)
         assert np.all(np.abs(z - h) <= bound)

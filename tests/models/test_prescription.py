@@ -6,8 +6,8 @@ import yaml
 
 from pachon.models.errors import PrescriptionError, UnknownNameError
 from pachon.models.glass import ConstantIndex, Sellmeier
-from pachon.models.prescription import DATA, bundled_names, load_telescope
-from pachon.models.prescription_writer import save_telescope, telescope_to_yaml
+from pachon.models.prescription import DATA, bundled_names, load_telescope, save_telescope
+from pachon.models.prescription_writer import telescope_to_yaml
 from pachon.models.surface import Annulus, Circle, Conic, EvenAsphere, Interaction, Plane, Sphere
 from pachon.models.telescope import rotation_matrix
 

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -31,9 +32,9 @@ def positions(count, seed):
     return np.stack([rng.uniform(EXTENT[0], EXTENT[1], count), rng.uniform(EXTENT[2], EXTENT[3], count)], axis=1)
 
 
-def psf(places, seed=0, order=3):
+def psf(places, seed=0, order=3, change=0.015):
     """PSFs of unit sum whose shape is a polynomial in position, restated here as plain monomials."""
-    coefficients = np.random.default_rng(seed).normal(0.0, 0.03, ((order + 1) * (order + 2) // 2, 7))
+    coefficients = np.random.default_rng(seed).normal(0.0, change, ((order + 1) * (order + 2) // 2, 7))
     u, v = places[:, 0] / 20.0, (places[:, 1] - 120.0) / 20.0
     terms = [u**a * v**b for a in range(order + 1) for b in range(order + 1 - a)]
     return profile() + np.tensordot(np.stack(terms, axis=1) @ coefficients, modes(), 1)
@@ -44,20 +45,25 @@ def noisy(count=40, sigma=2e-4, seed=0):
     return psf(places) + np.random.default_rng(seed + 50).normal(0.0, sigma, (count, SIZE, SIZE)), places
 
 
-def test_cubic_field_is_recovered_between_the_stars():
-    places, elsewhere = positions(40, 1), positions(200, 2)
-    fluxes = np.random.default_rng(3).uniform(1.0, 1e5, (40, 1, 1))
-    peak = profile().max()
-    for clip in (5.0, None):
-        model = PsfModel.fit(psf(places) * fluxes, places, extent=EXTENT, clip_sigma=clip)
+@pytest.mark.parametrize("change", [0.015, 0.15])  # by 13 % and by 130 % of the peak
+@pytest.mark.parametrize("clip", [5.0, None])
+def test_cubic_field_is_recovered_between_the_stars(change, clip):
+    elsewhere, peak = positions(200, 2), profile().max()
+    truth = psf(elsewhere, change=change)
+    for seed in (1, 3):
+        places = positions(40, seed)
+        fluxes = np.random.default_rng(3).uniform(1.0, 1e5, (40, 1, 1))
+        model = PsfModel.fit(psf(places, change=change) * fluxes, places, extent=EXTENT, clip_sigma=clip)
         assert model.n_rejected == 0
-        # The field lies in the model's space: only rounding is left. The issue asks for 1e-6.
-        np.testing.assert_allclose(model.at(elsewhere), psf(elsewhere), atol=1e-12 * peak)
+        # The field lies in the model's space: only rounding is left, enlarged where the stars leave a corner empty.
+        np.testing.assert_allclose(model.at(elsewhere), truth, atol=1e-12 * peak)
         np.testing.assert_allclose(model.at(elsewhere).sum(axis=(1, 2)), 1.0, rtol=1e-12)
         assert model.explained == pytest.approx(1.0, abs=1e-12)
         assert model.leave_one_out_rms < 1e-12 * peak
     # Without an extent the positions are mapped differently, but onto the same polynomials.
-    np.testing.assert_allclose(PsfModel.fit(psf(places), places).at(elsewhere), psf(elsewhere), atol=1e-11 * peak)
+    places = positions(40, 1)
+    other = PsfModel.fit(psf(places, change=change), places, clip_sigma=clip)
+    np.testing.assert_allclose(other.at(elsewhere), truth, atol=1e-11 * peak)
 
 
 def test_too_low_an_order_leaves_something():
@@ -143,11 +149,9 @@ def test_cosmic_rays_change_little():
     hit = stamps.copy()
     rng = np.random.default_rng(7)
     struck = rng.choice(40, 4, replace=False)
-    pixels = []
     for i in struck:
         x, y = rng.integers(3, 28, 2)
         hit[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3)
-        pixels.append((i, y, x))
     clean = PsfModel.fit(stamps, places, extent=EXTENT)
     model = PsfModel.fit(hit, places, extent=EXTENT)
     spoiled = PsfModel.fit(hit, places, extent=EXTENT, clip_sigma=None)
@@ -161,18 +165,24 @@ def test_cosmic_rays_change_little():
     assert rms(spoiled) > 5.0 * rms(clean)
 
 
-def test_one_bad_pixel_in_ten():
+@pytest.mark.parametrize("fraction", [0.01, 0.05])
+def test_bad_pixels_in_every_star(fraction):
     stamps, places = noisy(sigma=1e-4)
-    rng = np.random.default_rng(8)
-    bad = rng.random(stamps.shape) < 0.1
-    hit = np.where(bad, rng.uniform(0.0, 0.1, stamps.shape), stamps)
-    model = PsfModel.fit(hit, places, extent=EXTENT, n_components=7)
     elsewhere = positions(100, 9)
-    error = np.abs(model.at(elsewhere) - psf(elsewhere)).max()
-    # A bad pixel is given the mean PSF and so loses the star's own change there, a tenth of all changes.
-    assert error < 0.25 * np.abs(psf(elsewhere) - profile()).max()
-    spoiled = PsfModel.fit(hit, places, extent=EXTENT, n_components=7, clip_sigma=None)
-    assert error < 0.2 * np.abs(spoiled.at(elsewhere) - psf(elsewhere)).max()
+    truth = psf(elsewhere)
+    rng = np.random.default_rng(8)
+    bad = rng.random(stamps.shape) < fraction
+    hit = np.where(bad, rng.uniform(0.0, 0.1, stamps.shape), stamps)  # up to 1.6 times the peak
+
+    def rms(pixels, clip):
+        model = PsfModel.fit(pixels, places, extent=EXTENT, n_components=7, clip_sigma=clip)
+        return np.sqrt(((model.at(elsewhere) - truth) ** 2).mean())
+
+    # The bad pixels that are found get the mean PSF, which costs the star's own change there: a small part of the
+    # change that the model is to follow, where without rejection far more than all of it is lost.
+    change = np.sqrt(((truth - truth.mean(axis=0)) ** 2).mean())
+    assert rms(hit, 5.0) < 0.5 * change
+    assert rms(hit, None) > 5.0 * change
 
 
 def test_order_of_the_stars_does_not_matter():
@@ -207,7 +217,11 @@ def test_bytes_do_not_depend_on_blas_threads():
     )
     sums = {
         subprocess.run(
-            [sys.executable, "-c", code], env={"OPENBLAS_NUM_THREADS": n}, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": n},
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout
         for n in ("1", "2")
     }
@@ -216,10 +230,15 @@ def test_bytes_do_not_depend_on_blas_threads():
 
 def test_kink_is_where_the_eigenvalues_flatten():
     rng = np.random.default_rng(2)
-    basis = np.linalg.qr(rng.normal(size=(SIZE * SIZE, 5)))[0].T.reshape(5, SIZE, SIZE)
+    patterns = rng.normal(size=(SIZE * SIZE, 5))
+    basis = np.linalg.qr(patterns - patterns.mean(axis=0))[0].T.reshape(
+        5, SIZE, SIZE
+    )  # sums of zero, so unit sums stay
     amplitudes = rng.normal(size=(80, 5)) * np.array([5.0, 4.0, 3.0, 2.5, 2.0]) * 1e-2
-    stamps = profile() + np.tensordot(amplitudes, basis, 1) + rng.normal(0.0, 1e-5, (80, SIZE, SIZE))
-    assert PsfModel.fit(stamps, positions(80, 1)).kink == 5
+    noise = rng.normal(0.0, 1e-5, (80, SIZE, SIZE))
+    noise -= noise.mean(axis=(1, 2), keepdims=True)  # else the normalisation makes of its sum a sixth component
+    stamps = profile() + np.tensordot(amplitudes, basis, 1) + noise
+    assert PsfModel.fit(stamps, positions(80, 1), clip_sigma=None).kink == 5
 
 
 def test_equal_stars_have_no_variance():
@@ -260,6 +279,8 @@ def test_bad_arguments():
         PsfModel.fit(stamps, places, n_components=3, order=-1)
     with pytest.raises(ConfigError, match="clip_sigma"):
         PsfModel.fit(stamps, places, n_components=3, clip_sigma=0.0)
+    with pytest.raises(ConfigError, match="max_iterations"):
+        PsfModel.fit(stamps, places, n_components=3, max_iterations=0)
     line = np.stack([np.linspace(0, 1, 12), np.linspace(0, 1, 12)], axis=1)
     with pytest.raises(DomainError, match="do not determine"):
         PsfModel.fit(stamps, line, n_components=3)

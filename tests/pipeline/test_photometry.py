@@ -7,13 +7,15 @@ from pachon.pipeline import photometry
 
 ARCSEC = np.pi / 180.0 / 3600.0
 
-# Total r throughput of the LSST from 535 nm in steps of 5 nm: github.com/lsst/throughputs, baseline/total_r.dat, version
-# 1.9, which is for airmass 1.2.
-R_THROUGHPUT = np.array(
-    [0.00524, 0.03769, 0.13215, 0.28986, 0.41015, 0.46948, 0.48362, 0.48980, 0.49606, 0.49957, 0.50191, 0.50172]
-    + [0.50523, 0.51012, 0.51457, 0.51991, 0.52792, 0.53260, 0.53724, 0.53624, 0.54598, 0.55019, 0.55684, 0.55950]
-    + [0.56357, 0.56795, 0.57160, 0.57460, 0.57271, 0.53939, 0.44252, 0.28851, 0.17394, 0.05222, 0.00546]
-)
+# Total r throughput of the LSST from 535 nm in steps of 5 nm: github.com/lsst/throughputs, baseline/total_r.dat,
+# version 1.9, which is for airmass 1.2.
+# fmt: off
+R_THROUGHPUT = np.array([
+    0.00524, 0.03769, 0.13215, 0.28986, 0.41015, 0.46948, 0.48362, 0.48980, 0.49606, 0.49957, 0.50191, 0.50172,
+    0.50523, 0.51012, 0.51457, 0.51991, 0.52792, 0.53260, 0.53724, 0.53624, 0.54598, 0.55019, 0.55684, 0.55950,
+    0.56357, 0.56795, 0.57160, 0.57460, 0.57271, 0.53939, 0.44252, 0.28851, 0.17394, 0.05222, 0.00546,
+])
+# fmt: on
 
 
 def test_r_zero_point_follows_from_the_ab_magnitude_system():
@@ -29,7 +31,14 @@ def test_r_zero_point_follows_from_the_ab_magnitude_system():
 
 @pytest.mark.parametrize(
     ("band", "fwhm", "depth"),
-    [("u", 0.92, 23.70), ("g", 0.87, 24.97), ("r", 0.83, 24.52), ("i", 0.80, 24.13), ("z", 0.78, 23.56), ("y", 0.76, 22.55)],
+    [
+        ("u", 0.92, 23.70),
+        ("g", 0.87, 24.97),
+        ("r", 0.83, 24.52),
+        ("i", 0.80, 24.13),
+        ("z", 0.78, 23.56),
+        ("y", 0.76, 22.55),
+    ],
 )
 def test_published_depths_of_a_30_s_visit(band, fwhm, depth):
     # SMTN-002 lists zero points, sky, extinction, FWHM and depth to 0.01 each: together they allow 0.012.

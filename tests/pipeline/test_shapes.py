@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from scipy import optimize
+
 from pachon.models.errors import DomainError
 from pachon.pipeline.shapes import ShapeFlag, fwhm, measure_shapes
-from scipy import optimize
 
 ARCSEC = np.pi / 180.0 / 3600.0
 PIXEL = 0.2 * ARCSEC
@@ -26,7 +27,7 @@ def lumpy(seed, size=31):
     rng = np.random.default_rng(seed)
     image = np.zeros((size, size))
     for _ in range(4):
-        a, b, c = rng.uniform(1.5, 4.0, 2).tolist() + [rng.uniform(-0.7, 0.7)]
+        a, b, c = [*rng.uniform(1.5, 4.0, 2), rng.uniform(-0.7, 0.7)]
         image += rng.uniform(0.5, 1.0) * gaussian(size, np.array([[a, c], [c, b]]), rng.uniform(-1.5, 1.5, 2))
     return image
 
@@ -85,8 +86,8 @@ def test_brute_force(seed):
 
 
 def test_galsim_round_moments():
-    # HSM with a round weight matches its width to the image; given that width as ours, the definitions are the same, and HSM's
-    # g1, g2 are (a - b)/(a + b). It stops at 1e-6 in the moments.
+    # HSM with a round weight matches its width to the image; given that width as ours, the definitions are the same,
+    # and HSM's g1, g2 are (a - b)/(a + b). It stops at 1e-6 in the moments.
     galsim = pytest.importorskip("galsim")
     for seed in range(4):
         image = galsim.Image(lumpy(seed), scale=1.0)
@@ -116,7 +117,9 @@ def test_symmetries():
 def test_units_background_and_types():
     images = np.stack([lumpy(1), lumpy(2)])
     s = measure_shapes(images, PIXEL, WEIGHT)
-    same = measure_shapes(images + np.array([3.0, -2.0])[:, None, None], 0.2 * u.arcsec, 0.7 * u.arcsec, background=[3.0, -2.0])
+    same = measure_shapes(
+        images + np.array([3.0, -2.0])[:, None, None], 0.2 * u.arcsec, 0.7 * u.arcsec, background=[3.0, -2.0]
+    )
     # A background of 3 costs four of the sixteen digits of pixels of 0.05.
     np.testing.assert_allclose(same.e1, s.e1, atol=1e-11)
     np.testing.assert_allclose(same.size, s.size, rtol=1e-11)
@@ -175,7 +178,8 @@ def test_no_images():
 def test_fwhm_of_a_gaussian(size, center):
     # The half-maximum ellipse has the area of a circle of diameter sqrt(8 ln 2) sqrt(ab).
     expected = np.sqrt(8 * np.log(2)) * np.linalg.det(COVARIANCE) ** 0.25
-    # Area counted on eighths of a pixel with borders as planes: (1/8 pixel / FWHM)^2 = 1e-3, half of it in the diameter.
+    # Area counted on eighths of a pixel with borders as planes: (1/8 pixel / FWHM)^2 = 1e-3, half of it in the
+    # diameter.
     assert fwhm(gaussian(size, COVARIANCE, center), 1.0)[0] == pytest.approx(expected, rel=5e-4)
 
 

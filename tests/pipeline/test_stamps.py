@@ -11,7 +11,7 @@ WEIGHT = 0.7 * ARCSEC
 
 
 def kolmogorov(size, dx, dy, shear=0.03, grid=512):
-    """Kolmogorov PSF of FWHM 0.55", stretched along x, in pixels of 0.2": made in Fourier space on a far larger grid."""
+    """Kolmogorov PSF of FWHM 0.55", stretched along x, in pixels of 0.2", from Fourier space on a far larger grid."""
     frequency = np.fft.fftfreq(grid)
     kx, ky = frequency[None, :], frequency[:, None]
     otf = np.exp(-((5.67 * np.hypot(kx * (1 + shear), ky * (1 - shear))) ** (5.0 / 3.0)))
@@ -35,8 +35,8 @@ def test_centring_adds_no_ellipticity(size, offset):
     found = measure_shapes(image, PIXEL, WEIGHT)
     stamp = center_stamps(image, found.x, found.y)
     centred = measure_shapes(stamp, PIXEL, WEIGHT)
-    # What wraps round the edge is 1e-4 of the light at most, and lies where the weight is below 1e-9; what is left is the
-    # pixel sums' own dependence on the sub-pixel position, 1e-7.
+    # What wraps round the edge is 1e-4 of the light at most, and lies where the weight is below 1e-9; what is left is
+    # the pixel sums' own dependence on the sub-pixel position, 1e-7.
     assert centred.e1[0] == pytest.approx(direct.e1[0], abs=3e-7)
     assert centred.e2[0] == pytest.approx(direct.e2[0], abs=3e-7)
     assert (centred.x[0], centred.y[0]) == pytest.approx((0.0, 0.0), abs=1e-6)

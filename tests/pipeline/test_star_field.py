@@ -22,7 +22,8 @@ def test_positions_and_pixels():
         high = np.array([BOUNDS[1], BOUNDS[3]]) - margin * 1e-5
         assert np.all((positions >= low) & (positions <= high))
         unit = (positions - low) / (high - low)
-        # Uniform: mean 1/2 with a scatter of 0.289/sqrt(4000) = 0.0046 per axis, and no correlation (1/sqrt(4000)); 4 sigma.
+        # Uniform: mean 1/2 with a scatter of 0.289/sqrt(4000) = 0.0046 per axis, and no correlation (1/sqrt(4000)); 4
+        # sigma.
         assert np.abs(unit.mean(axis=0) - 0.5).max() < 0.019
         assert abs(np.corrcoef(unit.T)[0, 1]) < 0.064
     pixel = stars.observed_pixel
@@ -42,7 +43,8 @@ def test_magnitudes_follow_the_star_counts():
     cumulative = (10 ** (0.2 * edges) - 10 ** (0.2 * bright)) / (10 ** (0.2 * faint) - 10 ** (0.2 * bright))
     expected = count * np.diff(cumulative)
     found, _ = np.histogram(magnitudes, edges)
-    # chi^2 of 11 degrees of freedom: 31 is its 99.9 % point; the draw is fixed, so this holds or does not, once for all.
+    # chi^2 of 11 degrees of freedom: 31 is its 99.9 % point; the draw is fixed, so this holds or does not, once for
+    # all.
     assert ((found - expected) ** 2 / expected).sum() < 31.0
     assert magnitudes.min() >= bright
     assert magnitudes.max() <= faint

@@ -1,0 +1,198 @@
+import numpy as np
+import pytest
+from conic_trace import fan_coefficients, trace
+
+from pachon.models.errors import DomainError
+from pachon.models.first_order import first_order, footprints, seidel_sums
+from pachon.models.glass import ConstantIndex
+from pachon.models.prescription import load_telescope
+from pachon.models.surface import Conic, EvenAsphere, Interaction, Plane, Surface
+from pachon.models.telescope import VACUUM, Telescope
+
+LSST_NAMES = [f"lsst_v3.3_{band}" for band in "ugrizy"]
+
+
+def telescope_of(rows, *, stop_z, diameter, field=0.01):
+    """Build a telescope of (z, radius, conic, index after or None for a mirror)."""
+    surfaces, medium = [], VACUUM
+    for i, (z, radius, conic, after) in enumerate(rows):
+        kind = Interaction.MIRROR if after is None else Interaction.REFRACT
+        medium = medium if after is None else ConstantIndex(after)
+        shape = Plane() if np.isinf(radius) else Conic(radius, conic)
+        surfaces.append(Surface(f"s{i}", kind, shape, (0.0, 0.0, z), medium))
+    return Telescope(
+        name="test",
+        surfaces=tuple(surfaces),
+        stop_z=stop_z,
+        pupil_diameter=diameter,
+        pupil_obscuration=0.5,
+        launch_distance=10.0,
+        reference_sphere_radius=1.0,
+        field_radius=field,
+        field_limit=2 * field,
+        wavelength_range=(3e-7, 1e-6),
+        default_wavelength=5e-7,
+    )
+
+
+# A paraboloid alone; a Cassegrain with odd conics and a stop in front; a thick lens behind a stop; a mirror and a lens
+# in one, immersed at the end in a medium of index 1.2.
+SYSTEMS = {
+    "mirror": ([(0.0, 4.0, -1.0, None)], 0.5, 0.4),
+    "cassegrain": ([(0.0, 5.0, -0.7, None), (1.7, 2.0, -3.5, None)], 0.8, 0.4),
+    "lens": ([(0.0, -1.1, 0.4, 1.5), (-0.05, 1.4, -0.3, 1.0)], 0.07, 0.08),
+    "catadioptric": (
+        [(0.0, 6.0, -0.5, None), (2.0, 3.5, 0.2, 1.4), (2.05, -5.0, 1.0, 1.0), (2.2, np.inf, 0.0, 1.2)],
+        -0.4,
+        0.5,
+    ),
+}
+
+
+def test_a_paraboloid_has_the_textbook_figures():
+    rows, stop_z, diameter = SYSTEMS["mirror"]
+    figures = first_order(telescope_of(rows, stop_z=stop_z, diameter=diameter))
+    assert figures.focal_length == pytest.approx(2.0, rel=1e-15)
+    assert figures.f_number == pytest.approx(5.0, rel=1e-15)
+    assert figures.back_focus == pytest.approx(2.0, rel=1e-15)
+    assert figures.focus_z == pytest.approx(2.0, rel=1e-15)
+    # 206265" over 2 m.
+    assert figures.arcsec_per_um == pytest.approx(206264.806 / 2e6, rel=1e-8)
+    # The stop 0.5 m in front is imaged by 1/s' = 1/2 - 1/0.5: 2/3 m behind the mirror, 4/3 times as large.
+    assert figures.exit_pupil_z == pytest.approx(-2 / 3, rel=1e-14)
+    assert figures.exit_pupil_diameter == pytest.approx(0.4 * 4 / 3, rel=1e-14)
+    assert figures.effective_area == pytest.approx(np.pi * 0.04 * 0.75, rel=1e-14)
+
+
+def test_a_stop_at_the_focus_makes_it_telecentric():
+    rows, _, diameter = SYSTEMS["mirror"]
+    figures = first_order(telescope_of(rows, stop_z=2.0, diameter=diameter))
+    assert np.isinf(figures.exit_pupil_z)
+    assert np.isinf(figures.exit_pupil_diameter)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_focus_is_where_a_close_ray_crosses_the_axis(system):
+    rows, stop_z, diameter = SYSTEMS[system]
+    figures = first_order(telescope_of(rows, stop_z=stop_z, diameter=diameter))
+    h = 1e-5
+    points, v = trace(rows, np.array([[0.0, h, stop_z]]), np.array([[0.0, 0.0, -1.0]]))
+    slope = v[0, 1] / abs(v[0, 2])
+    # A real ray at 10 um: third order adds parts of (1e-5)^2.
+    assert figures.focus_z == pytest.approx(points[-1][0, 2] - points[-1][0, 1] * v[0, 2] / v[0, 1], rel=1e-8)
+    n = 1.2 if system == "catadioptric" else 1.0
+    assert figures.focal_length == pytest.approx(-h / slope / n, rel=1e-8)
+    assert figures.back_focus == pytest.approx(-points[-1][0, 1] / slope, rel=1e-8)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_seidel_sums_are_the_third_order_coefficients_of_traced_rays(system):
+    rows, stop_z, diameter = SYSTEMS[system]
+    field = 1e-3
+    telescope = telescope_of(rows, stop_z=stop_z, diameter=diameter, field=field)
+    s1, s2, s3, s4, s5 = seidel_sums(telescope).total
+    figures = first_order(telescope)
+    # Welford (1986), chapter 8: y = y0 + (S1 r^3 + 3 S2 r^2 + (3 S3 + S4) r + S5) / (2 n u) along the meridional fan,
+    # x = (S1 r^3 + (S3 + S4) r) / (2 n u) along the sagittal one, and n u = -1 / (2 f-number) of the marginal ray.
+    scale = -1 / figures.f_number
+
+    def coefficients(t, shrink=1.0):
+        return fan_coefficients(rows, figures.focus_z, stop_z, shrink * diameter / 2, t)
+
+    t = np.tan(field)
+    # A tenth of the pupil, so that the Taylor series ends early; powers of the fan scale back exactly.
+    shrink = 0.1
+    y_plus, x_plus = coefficients(t, shrink)
+    y_axis, _ = coefficients(0.0, shrink)
+    spherical = y_axis[3] / shrink**3
+    coma = y_plus[2] / shrink**2
+    meridional = (y_plus[1] - y_axis[1]) / shrink
+    sagittal = (x_plus[1] - y_axis[1]) / shrink
+    # The chief ray at the field and at twice the field: y(2 t) - 2 y(t) = (8 - 2) times the cubic part.
+    chief = [fan_coefficients(rows, figures.focus_z, stop_z, diameter / 20, k * t)[0][0] for k in (1, 2)]
+    distortion = (chief[1] - 2 * chief[0]) / 6
+    measured = np.array([spherical, coma, meridional, sagittal, distortion])
+    expected = np.array([s1, 3 * s2, 3 * s3 + s4, s3 + s4, s5]) / scale
+    # Higher orders are down by the squares of the field and of a hundredth of the pupil; rounding is 1e-16 m / 0.1^3.
+    assert np.allclose(measured, expected, rtol=1e-4, atol=1e-12)
+
+
+def test_an_aspheric_coefficient_acts_as_its_fourth_order_conic():
+    # c^3 k / 8 r^4 and a4 r^4 are the same to third order.
+    rows, stop_z, diameter = SYSTEMS["cassegrain"]
+    conic = telescope_of(rows, stop_z=stop_z, diameter=diameter)
+    surfaces = tuple(
+        Surface(s.name, s.interaction, EvenAsphere(r, 0.0, (k / (8 * r**3), 1.0)), s.vertex, s.medium_after)
+        for s, (_, r, k, _) in zip(conic.surfaces, rows, strict=True)
+    )
+    fields = {f: getattr(conic, f) for f in conic.__dataclass_fields__}
+    even = Telescope(**(fields | {"surfaces": surfaces}))
+    assert np.allclose(seidel_sums(even).contributions, seidel_sums(conic).contributions, rtol=1e-12, atol=1e-20)
+
+
+def test_known_sums_of_a_sphere_and_a_paraboloid():
+    # A sphere stopped at its centre has spherical aberration only; S1 = 2 y^4 / R^3, S4 = -2 H^2 / R (Petzval, n = 1).
+    field = 1e-3
+    sphere = telescope_of([(0.0, 4.0, 0.0, None)], stop_z=4.0, diameter=0.4, field=field)
+    total = seidel_sums(sphere).total
+    lagrange = 0.2 * np.tan(field)
+    assert np.allclose(total[:4], [2 * 0.2**4 / 64, 0, 0, -2 * lagrange**2 / 4], rtol=1e-12, atol=1e-20)
+    paraboloid = telescope_of([(0.0, 4.0, -1.0, None)], stop_z=0.0, diameter=0.4, field=field)
+    assert seidel_sums(paraboloid).total[0] == pytest.approx(0.0, abs=1e-19)
+
+
+@pytest.mark.parametrize("name", LSST_NAMES)
+def test_the_lsst_is_f_1_23_of_10_31_m(name):
+    figures = first_order(load_telescope(name))
+    # 10.302 m in u to 10.314 m in y: the lenses disperse.
+    assert figures.focal_length == pytest.approx(10.31, abs=0.01)
+    assert figures.f_number == pytest.approx(1.23, abs=0.005)
+    assert 0.0197 <= figures.arcsec_per_um <= 0.02003
+    # The prescriptions are in best focus for the field, within 0.1 mm of the paraxial one.
+    detector = load_telescope(name).surface("Detector").vertex[2]
+    assert figures.focus_z == pytest.approx(detector, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", LSST_NAMES)
+def test_lsst_first_order_equals_batoids_close_rays(name):
+    batoid = pytest.importorskip("batoid")
+    telescope = load_telescope(name)
+    figures = first_order(telescope)
+    optic = batoid.Optic.fromYaml(f"LSST_{name[-1]}.yaml")
+    h, t = 1e-4, 1e-5
+    position = np.array([[h, 0, 10.0], [0, 0, 10.0], [0, (10.0 - telescope.stop_z) * t, 10.0]])
+    velocity = np.array([[0, 0, -1.0], [0, 0, -1.0], [0, -t, -1.0]])
+    velocity /= np.linalg.norm(velocity, axis=1)[:, None]
+    rays = batoid.RayVector(*position.T, *velocity.T, wavelength=telescope.default_wavelength)
+    optic.trace(rays)
+    slope = rays.vx[0] / rays.vz[0]
+    # Real rays a tenth of a millimetre off: third order is down by 1e-9; batoid's refraction rounds at 1e-13 of slope.
+    assert figures.focal_length == pytest.approx(abs(h / slope), rel=1e-7)
+    height = telescope.surface("Detector").vertex[2]
+    assert figures.focus_z == pytest.approx(height - rays.x[0] / slope, abs=1e-7)
+    crossing = height - rays.y[2] * rays.vz[2] / rays.vy[2]
+    assert figures.exit_pupil_z == pytest.approx(crossing, rel=1e-6)
+
+
+def test_footprints_are_marginal_plus_chief_ray():
+    rows, stop_z, diameter = SYSTEMS["cassegrain"]
+    telescope = telescope_of(rows, stop_z=stop_z, diameter=diameter)
+    # M1: the rim plus the chief ray's travel of 0.8 m; M2: the converging rim, and the chief ray reflected.
+    t = np.tan(0.01)
+    on_m1 = 0.2 + 0.8 * t
+    on_m2 = 0.2 * (1 - 1.7 / 2.5) + abs(0.8 * t + 1.7 * (t - 0.8 * t / 2.5))
+    assert np.allclose(footprints(telescope, 0.01), [on_m1, on_m2], rtol=1e-12)
+
+
+def test_what_has_no_first_order_figures_is_refused():
+    telescope = load_telescope("lsst_v3.3_r")
+    for moved in (telescope.perturbed("M2", shift=(1e-3, 0, 0)), telescope.perturbed("M2", tilt=(1e-3, 0, 0))):
+        with pytest.raises(DomainError, match="surface M2 of lsst_v3"):
+            first_order(moved)
+    # A shift along the axis, or a turn about it, keeps it centred.
+    first_order(telescope.perturbed("M2", shift=(0, 0, 1e-3), tilt=(0, 0, 1.0)))
+    with pytest.raises(DomainError, match="wavelength"):
+        seidel_sums(telescope, wavelength=2e-6)
+    mersenne = [(0.0, 4.0, -1.0, None), (1.5, 1.0, -1.0, None)]
+    with pytest.raises(DomainError, match="expected one with a focus"):
+        first_order(telescope_of(mersenne, stop_z=0.0, diameter=0.4))

@@ -1,0 +1,173 @@
+"""Configuration: every problem is one line with file, key, value and what was expected; resolving fills in all else."""
+
+import pytest
+from pachon.models.errors import ConfigError, PachonError
+from pachon.models.prescription import load_telescope, save_telescope
+from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
+from pachon.pipeline.experiment import DEFAULT_CCDS, prepare, resolve
+
+# Screens are not made by what is tested here, so their size costs nothing.
+SMALL = {"stars__truth": 30, "stars__observed": 25}
+
+
+def written(tmp_path, text):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("sed: 3", ["unknown key sed = 3", "did you mean seed?"]),
+        ("focal_plane: {bugdet: flat}", ["unknown key focal_plane.bugdet", "did you mean budget?"]),
+        ("focal_plane: {zzz: flat}", ["unknown key focal_plane.zzz", "expected one of budget, global, raft"]),
+        ("seed: -1", ["seed = -1", "from 0"]),
+        ("seed: 1.5", ["seed = 1.5", "a whole number"]),
+        ("seed: true", ["seed = true", "a whole number"]),
+        ("atmosphere: {r0_m: 0}", ["atmosphere.r0_m = 0", "above 0"]),
+        ("atmosphere: {r0_m: thick}", ['atmosphere.r0_m = "thick"', "a number"]),
+        ("atmosphere: {exposure_s: .nan}", ["atmosphere.exposure_s = NaN"]),
+        ("atmosphere: 5", ["atmosphere = 5", "a mapping"]),
+        ("stars: {truth: 0}", ["stars.truth = 0", "from 1"]),
+        ("psf: {engine: fats}", ['psf.engine = "fats"', "one of fast, wave"]),
+        ("band: q", ['band = "q"', "u, g, r, i, z, y"]),
+        ("wavelengths_nm: [600, red]", ['wavelengths_nm[1] = "red"', "a number"]),
+        ("focal_plane: {tilt: 1}", ["focal_plane.tilt = 1", "true or false"]),
+        ("seed: [1", ["line", "not valid YAML"]),
+        ("seed: 1\nseed: 2", ["line 2", "'seed' occurs twice"]),
+        ("3", ["expected a mapping"]),
+    ],
+)
+def test_a_wrong_file_says_where_and_what(tmp_path, text, parts):
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_configuration(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in [str(path), *parts]:
+        assert part in message
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="none.yaml: no such file"):
+        load_configuration(tmp_path / "none.yaml")
+
+
+def test_numbers_without_a_point_are_numbers(tmp_path):
+    # YAML 1.1 reads 16e-2 as text.
+    assert load_configuration(written(tmp_path, "atmosphere: {r0_m: 16e-2}")).atmosphere.r0_m == 0.16
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        ({"reconstruction__components": 40}, ["reconstruction.components = 40", "at most 39", "stars.observed = 40"]),
+        ({"stars__truth": 15}, ["reconstruction.components = 20", "at most 14", "stars.truth = 15"]),
+        ({"reconstruction__order": 8}, ["reconstruction.order = 8", "45 terms", "stars.observed = 40"]),
+        ({"psf__stamp": 30}, ["psf.stamp = 30", "odd"]),
+        ({"wavelengths_nm": (2000.0,)}, ["wavelengths_nm[0] = 2000", "300 to 1200"]),
+        ({"wavelengths_nm": ()}, ["wavelengths_nm = []"]),
+        ({"ccds": ("R22_S1",)}, ["unknown CCD", "'R22_S1'", "R22_S1"]),
+        ({"ccds": ("R2",)}, ["unknown raft", "'R2'"]),
+        ({"ccds": ()}, ["ccds = []"]),
+        ({"telescope": "lsst_v3.3_q"}, ["unknown telescope", "did you mean"]),
+        ({"telescope": "paul_baker"}, ["telescope = paul_baker", "a camera"]),
+        ({"atmosphere__site": "cerro_pachn"}, ["unknown site", "did you mean cerro_pachon?"]),
+        ({"atmosphere__time_step_s": 20.0}, ["atmosphere.time_step_s = 20", "atmosphere.exposure_s = 15"]),
+    ],
+)
+def test_what_does_not_fit_together_is_said_in_one_line(options, parts):
+    with pytest.raises(PachonError) as caught:
+        resolve(with_options(Configuration(), **options))
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_screens_that_cannot_hold_the_cutoff_name_the_section():
+    config = resolve(with_options(Configuration(), atmosphere__screen_size=64))
+    with pytest.raises(ConfigError, match="^atmosphere: "):
+        prepare(config)
+
+
+def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
+    config = resolve(Configuration())
+    assert config.telescope == "lsst_v3.3_r"
+    assert config.band == "r"
+    assert config.ccds == DEFAULT_CCDS
+    assert len(config.ccds) == 9
+    # Five equally spaced wavelengths over 545 to 703 nm.
+    assert config.wavelengths_nm == (545.0, 584.5, 624.0, 663.5, 703.0)
+    assert (config.stars.truth, config.stars.observed) == (100, 40)
+    experiment = prepare(config)
+    radius = experiment.field_radius_on_detector
+    x, y = experiment.camera.centers[[experiment.camera.ccd_index(n) for n in config.ccds]].T
+    nearest, farthest = abs(x[0] + 1j * y[0]), (x**2 + y**2).max() ** 0.5
+    assert nearest <= experiment.camera.ccd_size * 1.1
+    assert farthest + experiment.camera.half_size > radius > farthest
+
+
+def test_band_and_telescope_follow_each_other():
+    assert resolve(with_options(Configuration(), band="i")).telescope == "lsst_v3.3_i"
+    assert resolve(with_options(Configuration(), telescope="lsst_v3.3_z")).band == "z"
+
+
+def test_without_an_atmosphere_pixels_and_weight_are_finer():
+    config = resolve(with_options(Configuration(), atmosphere__enabled=False))
+    assert config.reconstruction.weight_fwhm_arcsec == 0.3
+    assert config.psf.pixel_um == 5.0
+    assert prepare(config).atmosphere is None
+
+
+def test_ccds_are_put_in_the_order_of_the_camera_each_once():
+    names = ("R24_S12", "R22", "R22_S11")
+    chosen = resolve(with_options(Configuration(), ccds=names)).ccds
+    assert chosen == (*(f"R22_S{row}{column}" for row in "012" for column in "012"), "R24_S12")
+    assert len(resolve(with_options(Configuration(), ccds=("all",))).ccds) == 189
+
+
+def test_a_resolved_configuration_is_read_back_as_it_was(tmp_path):
+    config = resolve(with_options(Configuration(), seed=7, focal_plane__tilt=False, **SMALL))
+    path = written(tmp_path, to_yaml(config, ["heading"]))
+    again = resolve(load_configuration(path), tmp_path)
+    assert again == config
+    assert to_yaml(again, ["heading"]) == path.read_text()
+
+
+def test_the_hash_tells_settings_apart_but_not_sets_of_ccds():
+    def hash_of(**options):
+        return prepare(resolve(with_options(Configuration(), **SMALL, **options))).config_hash
+
+    base = hash_of()
+    assert hash_of(ccds=("R22_S11",)) == base
+    assert hash_of(seed=2) != base
+    assert hash_of(focal_plane__raft=False) != base
+    assert hash_of(atmosphere__r0_m=0.15) != base
+
+
+def test_a_prescription_counts_by_its_content_wherever_it_lies(tmp_path):
+    hashes = []
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        save_telescope(load_telescope("lsst_v3.3_r"), tmp_path / folder / "mine.yaml")
+        path = tmp_path / folder / "run.yaml"
+        path.write_text("telescope: mine.yaml\n")
+        config = resolve(load_configuration(path), path.parent)
+        assert config.telescope == str((tmp_path / folder / "mine.yaml").resolve())
+        hashes.append(prepare(config).config_hash)
+    assert hashes[0] == hashes[1]
+
+
+def test_differences_name_key_old_and_new():
+    old = resolve(Configuration()).as_dict()
+    new = resolve(with_options(Configuration(), seed=2, stars__truth=50)).as_dict()
+    assert differences(old, new) == ["seed: 1 -> 2", "stars.truth: 100 -> 50"]
+    assert differences(old, old) == []
+
+
+def test_the_digest_does_not_depend_on_the_order_of_keys():
+    assert digest({"a": 1, "b": 2.5}) == digest({"b": 2.5, "a": 1})
+    # sha256sum of the canonical text, by coreutils: printf '{"a":1}' | sha256sum
+    assert digest({"a": 1}) == "015abd7f5cc57a2dd94b7590f04ad8084273905ee33ec5cebeae62276a97f862"

@@ -1,0 +1,199 @@
+"""Point spread functions of many stars, by either engine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..models.errors import ConfigError, DomainError
+from ..models.focal_plane import FocalPlane
+from ..models.telescope import Telescope
+from ..models.units import metres, radians
+from .atmosphere import Atmosphere
+from .fast_psf import FastPsfEngine
+from .image_plane import ImagePlane
+from .wave_psf import WavePsfEngine
+
+ENGINES = ("fast", "wave")
+#: Value of :attr:`Psfs.flags` for a star none of whose light reaches the focal plane; its image is zero.
+DARK = 1
+
+
+@dataclass(frozen=True)
+class Psfs:
+    """Images of stars.
+
+    Attributes
+    ----------
+    image : ndarray of float32, shape [n_star, ny, nx]
+        Fraction of the light of the stamp in each pixel: of unit sum. ``[y, x]`` along the axes of the detector.
+    pixel_scale : float
+        Angle on the sky of a pixel [rad], at the centre of the field.
+    fields : ndarray, shape [n_star, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    reference : ndarray, shape [n_star, 3]
+        Where the chief ray of the middle wavelength meets the CCD, telescope frame [m]: the centre of pixel
+        ``[size // 2, size // 2]`` plus the star's offset.
+    throughput : ndarray, shape [n_star, n_wave]
+        Lit fraction of the annular pupil.
+    inside : ndarray, shape [n_star]
+        Fraction of the light that falls on the stamp.
+    flags : ndarray of int, shape [n_star]
+        0, or :data:`DARK`.
+    """
+
+    image: np.ndarray
+    pixel_scale: float
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    reference: np.ndarray
+    throughput: np.ndarray
+    inside: np.ndarray
+    flags: np.ndarray
+
+
+def make_psfs(
+    telescope: Telescope,
+    fields: Any,
+    wavelengths: Any,
+    *,
+    focal_plane: FocalPlane | None = None,
+    atmosphere: Atmosphere | None = None,
+    engine: str = "fast",
+    seed: int = 0,
+    stamp_size: int = 31,
+    pixel_size: Any = 10e-6,
+    diffusion: Any = 4e-6,
+    offsets: Any = None,
+    dispersion: Any = None,
+    n_pupil: int | None = None,
+    oversampling: int | None = None,
+    padding: bool | None = None,
+    pupil_spacing: float | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Psfs:
+    """Make the point spread functions of stars, as pixels see them.
+
+    A star's image depends on the star and the exposure alone: no byte of it depends on the other stars of the call, on
+    the threads or on how the work is cut.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_star, 2]
+        Field angles [rad], of the light's own travel.
+    wavelengths : array_like or Quantity, shape [n_wave]
+        Vacuum wavelengths [m], of equal numbers of photons before the telescope.
+    focal_plane : FocalPlane, optional
+        CCD heights; the nominal flat plane if not given.
+    atmosphere : Atmosphere, optional
+        The exposure; none outside the atmosphere.
+    engine : {"fast", "wave"}
+        Geometric optics with filters, or Fourier optics (the truth, slow).
+    seed : int
+        Accepted so that a call reads alike for every engine. Neither of these draws a random number: those of the
+        exposure hang on the atmosphere's own seed.
+    stamp_size : int
+        Pixels on a side of a stamp.
+    pixel_size : float or Quantity
+        Side of a pixel [m].
+    diffusion : float or Quantity
+        Root mean square of the charge diffusion along each axis [m].
+    offsets : array_like, shape [n_star, 2], optional
+        Place of each star (x, y) from the centre of the middle pixel [pixels]; 0 by default.
+    dispersion : array_like or Quantity, shape [n_wave, 2], optional
+        Shift in field angle of each wavelength by the atmosphere [rad], such as
+        :func:`~pachon.wavefront.refraction.dispersion_shift` gives.
+    n_pupil, oversampling : int, optional
+        Fast engine: about how many pupil points, and cells of the fine grid to a pixel.
+    padding, pupil_spacing : bool, float, optional
+        Wave engine: whether to keep all baselines, and the distance of pupil points [m].
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+    progress : callable, optional
+        Called with the number of stars done, after each batch.
+
+    Returns
+    -------
+    Psfs
+
+    Raises
+    ------
+    ConfigError
+        If there is no such engine or projection.
+    DomainError
+        If an argument is outside its range or of the wrong shape, or a star falls between the CCDs.
+    """
+    if engine not in ENGINES:
+        raise ConfigError(f"engine = {engine!r}: expected one of {', '.join(ENGINES)}")
+    angles = _table(radians(fields, "fields"), "fields", None)
+    lengths = metres(wavelengths, "wavelengths").reshape(-1)
+    if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
+        raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
+    places = np.zeros((len(angles), 2)) if offsets is None else _table(offsets, "offsets", len(angles))
+    shifts = np.zeros((len(lengths), 2))
+    if dispersion is not None:
+        shifts = _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
+    plane = ImagePlane(stamp_size, float(metres(pixel_size, "pixel_size")), float(metres(diffusion, "diffusion")))
+    maker: FastPsfEngine | WavePsfEngine
+    common: dict[str, Any] = {
+        "dispersion": shifts,
+        "focal_plane": focal_plane,
+        "atmosphere": atmosphere,
+        "projection": projection,
+        "threads": threads,
+    }
+    if engine == "fast":
+        maker = FastPsfEngine(telescope, lengths, plane, n_pupil=n_pupil, oversampling=oversampling, **common)
+    else:
+        maker = WavePsfEngine(telescope, lengths, plane, padding=padding, pupil_spacing=pupil_spacing, **common)
+
+    image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
+    throughput = np.empty((len(angles), len(lengths)))
+    reference, inside = np.empty((len(angles), 3)), np.empty(len(angles))
+    for first in range(0, len(angles), maker.batch):
+        part = slice(first, min(first + maker.batch, len(angles)))
+        stars = maker.render(angles[part], places[part])
+        inside[part] = stars.image.sum(axis=(1, 2))
+        image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
+        throughput[part], reference[part] = stars.throughput, stars.reference
+        if progress is not None:
+            progress(part.stop)
+    return Psfs(
+        image=image,
+        pixel_scale=plane.pixel_size / maker.focal_length,
+        fields=angles,
+        wavelengths=lengths,
+        reference=reference,
+        throughput=throughput,
+        inside=inside,
+        flags=np.where(throughput.any(axis=1), 0, DARK),
+    )
+
+
+def _table(values: Any, name: str, count: int | None) -> np.ndarray:
+    """Return pairs of finite numbers as a float64 array of shape [count, 2]."""
+    try:
+        table = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"{name} = {values!r}: expected pairs of numbers") from error
+    if count is None and table.size:
+        table = np.atleast_2d(table)
+    if count is None and not table.size:
+        table = table.reshape(0, 2)
+    if table.ndim != 2 or table.shape[1] != 2 or (count is not None and len(table) != count):
+        expected = f"[{'n' if count is None else count}, 2]"
+        raise DomainError(f"{name} of shape {table.shape}: expected {expected}")
+    if not np.isfinite(table).all():
+        raise DomainError(f"{name}: expected finite numbers only")
+    return table

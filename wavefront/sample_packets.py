@@ -1,0 +1,40 @@
+"""Packets of the PSF kernels: ``LANES`` pupil points side by side, in single precision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+#: Pupil points in one packet.
+LANES = 16
+
+samples = wp.types.vector(LANES, wp.float32)
+places = wp.types.vector(LANES, wp.float64)
+indices = wp.types.vector(LANES, wp.int32)
+
+
+def to_packets(values: np.ndarray, dtype: Any, fill: str = "edge") -> np.ndarray:
+    """Return values as whole packets, shape [..., n_packet, LANES], contiguous.
+
+    Parameters
+    ----------
+    values : ndarray, shape [..., n]
+        One number per pupil point.
+    dtype : numpy dtype
+        Type of the packets.
+    fill : {"edge", "constant"}
+        What fills the last packet up: copies of the last value, or zeros.
+    """
+    missing = -values.shape[-1] % LANES
+    padding = [(0, 0)] * (values.ndim - 1) + [(0, missing)]
+    filled = np.pad(values.astype(dtype), padding, mode=fill)  # type: ignore[call-overload]
+    return np.ascontiguousarray(filled.reshape(*values.shape[:-1], -1, LANES))
+
+
+def shared(values: np.ndarray, dtype: Any) -> wp.array:
+    """Wrap a contiguous array for a kernel without a copy; complex numbers as pairs."""
+    if values.dtype == np.complex64:
+        values = values.view(np.float32).reshape(*values.shape, 2)
+    return wp.array(values, dtype=dtype, device="cpu", copy=False)
