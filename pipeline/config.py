@@ -87,7 +87,7 @@ class PsfConfig(_Section):
     """How point-spread functions are made."""
 
     engine: Literal["fast", "wave"] = Field("fast", description="fast (geometric and filters) or wave (Fourier optics)")
-    n_pupil: Count = Field(334, description="points across which the fast engine samples the pupil")
+    n_pupil: Count | None = Field(None, description="pupil points of the fast engine")
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] = Field(31, description="pixels on a side of a stamp, odd")
     diffusion_pixels: NotNegative = Field(0.4, description="rms of the charge diffusion [CCD pixels of 10 um]")

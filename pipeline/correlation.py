@@ -115,10 +115,12 @@ def shear_correlation(
     pairs = treecorr.GGCorrelation(min_sep=low, max_sep=high, nbins=n_bins, bin_slop=0.1, brute=exact, verbose=0)
     pairs.process(treecorr.Catalog(x=px, y=py, g1=g1, g2=g2), num_threads=1)
     empty = pairs.npairs == 0
-    values = (pairs.xip, pairs.xim, np.sqrt(pairs.varxip), np.sqrt(pairs.varxim))
     return Correlation(
-        np.where(empty, pairs.rnom, pairs.meanr),
-        *(np.where(empty, np.nan, v) for v in values),
+        r=np.where(empty, pairs.rnom, pairs.meanr),
+        xi_plus=np.where(empty, np.nan, pairs.xip),
+        xi_minus=np.where(empty, np.nan, pairs.xim),
+        error_plus=np.where(empty, np.nan, np.sqrt(pairs.varxip)),
+        error_minus=np.where(empty, np.nan, np.sqrt(pairs.varxim)),
         n_pairs=np.rint(pairs.npairs).astype(np.int64),
         n_stars=n_stars,
     )

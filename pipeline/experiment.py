@@ -19,6 +19,7 @@ from ..models.prescription import bundled_names, load_telescope
 from ..models.site import Site, load_site
 from ..models.telescope import Telescope
 from ..wavefront.atmosphere import Atmosphere
+from ..wavefront.fast_psf import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.pupil_optics import chief_rays
 from ..wavefront.refraction import dispersion_shift
 from ..raytrace.rays import field_direction
@@ -169,7 +170,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> Configuration:
             ),
             # A weight of 0.3" needs pixels of 0.1" or less, so without an atmosphere the PSF is sampled finer.
             "psf": config.psf.model_copy(
-                update={"pixel_um": config.psf.pixel_um or (10.0 if atmosphere.enabled else 5.0)}
+                update={
+                    "pixel_um": config.psf.pixel_um or (10.0 if atmosphere.enabled else 5.0),
+                    "n_pupil": config.psf.n_pupil or (PUPIL_POINTS if atmosphere.enabled else PUPIL_POINTS_STILL),
+                }
             ),
             "reconstruction": config.reconstruction.model_copy(
                 update={

@@ -53,6 +53,11 @@ class Reporter:
         self.quiet = quiet
         self.seconds: dict[str, float] = {}
 
+    def line(self, text: str) -> None:
+        """Write one line."""
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Stage]:
         """Show one stage while it runs.

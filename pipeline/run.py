@@ -88,7 +88,7 @@ def run(
     kept = finished_ccds(folder, experiment) if resume else ()
     missing = tuple(name for name in names if name not in kept)
     if kept:
-        reporter.note(f"{len(kept)} of {len(names)} CCDs are finished already")
+        reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     _compute(experiment, folder, missing, threads, reporter)
     with reporter.stage("correlations"):
         products = [read_product(product_path(folder, name), stamp_of(experiment)) for name in names]

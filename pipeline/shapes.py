@@ -145,7 +145,8 @@ def measure_shapes(
         for i in range(0, count, batch)
     ]
     if not parts:
-        return Shapes(*(np.empty(0) for _ in range(6)), flags=np.empty(0, dtype=np.int32))
+        none = np.empty(0)
+        return Shapes(none, none, none, none, none, none, np.empty(0, dtype=np.int32))
     return Shapes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Shapes)})
 
 
