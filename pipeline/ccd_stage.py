@@ -63,8 +63,7 @@ def _compute(
     n_components = config.reconstruction.components
     bounds = _bounds(experiment, name)
     places = _star_field(experiment, name, _PROVISIONAL_FWHM)
-    truth = _expose(experiment, places.truth, np.zeros_like(places.truth), threads, advance)
-    truth_shapes, truth_images = _centered(experiment, truth.image, truth.pixel_scale)
+    truth, truth_shapes, truth_images = _truth(experiment, places.truth, threads, advance)
 
     stars = _star_field(experiment, name, effective_fwhm(truth.image, truth.pixel_scale))
     pixel = stars.observed_pixel * (stars.pixel_size / experiment.pixel_size)
@@ -72,9 +71,7 @@ def _compute(
     exposure = config.atmosphere.exposure_s
     sky = sky_electrons_per_pixel(stars.band, exposure, observed.pixel_scale)
     noise = instrument_noise(exposure)
-    seen = observe_stamps(
-        observed.image, stars.electrons, sky, noise, stream(config.seed, "noise", name)
-    )
+    seen = observe_stamps(observed.image, stars.electrons, sky, noise, stream(config.seed, "noise", name))
     observed_shapes, observed_images = _centered(experiment, seen, observed.pixel_scale)
 
     used = observed_shapes.usable & np.isfinite(observed_images).all(axis=(1, 2))
@@ -104,7 +101,7 @@ def _compute(
     left_out_e1[used], left_out_e2[used] = left_out.e1, left_out.e2
     return CcdProduct(
         name=name,
-        center=tuple(float(v) for v in experiment.camera.centers[experiment.camera.ccd_index(name)]),
+        center=_center(experiment, name),
         pixel_scale=truth.pixel_scale,
         noise=(sky, noise),
         truth=TruthStars(
@@ -117,9 +114,7 @@ def _compute(
             **_shapes(observed_shapes, at_stars),
             magnitude=stars.magnitude,
             electrons=stars.electrons,
-            snr=signal_to_noise(
-                stars.magnitude, stars.band, exposure, effective_fwhm(truth.image, truth.pixel_scale)
-            ),
+            snr=signal_to_noise(stars.magnitude, stars.band, exposure, effective_fwhm(truth.image, truth.pixel_scale)),
             used=used,
             left_out_e1=left_out_e1,
             left_out_e2=left_out_e2,
@@ -129,6 +124,24 @@ def _compute(
         model=model,
         truth_model=truth_model,
     )
+
+
+def _truth(
+    experiment: Experiment, positions: np.ndarray, threads: int | None, advance: Callable[[int], None] | None
+) -> tuple[_Exposed, Shapes, np.ndarray]:
+    """Make noise-free PSFs whose centroid is the centre of a pixel.
+
+    The atmosphere moves a star by a part of a pixel. The truth is made again at the place that undoes this, not shifted
+    as observed stars are: a shift of an image that is not quite band-limited rings along rows and columns.
+    """
+    first = _expose(experiment, positions, np.zeros_like(positions), threads, None)
+    moved = measure_shapes(first.image, first.pixel_scale, experiment.weight_fwhm)
+    shift = np.nan_to_num(np.stack([moved.x, moved.y], axis=1))
+    truth = _expose(experiment, positions, -shift, threads, advance)
+    edge = _SHIFT_ROOM // 2
+    images = truth.image[:, edge:-edge, edge:-edge].astype(np.float64)
+    images /= images.sum(axis=(1, 2), keepdims=True)
+    return truth, measure_shapes(images, truth.pixel_scale, experiment.weight_fwhm), images
 
 
 def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
@@ -173,7 +186,7 @@ def _expose(
         focal_plane=experiment.focal_plane,
         atmosphere=experiment.atmosphere,
         engine=config.psf.engine,
-        stamp_size=config.psf.stamp + _SHIFT_ROOM,
+        stamp_size=experiment.stamp_size + _SHIFT_ROOM,
         pixel_size=experiment.pixel_size,
         diffusion=experiment.diffusion,
         offsets=offsets,
@@ -188,14 +201,20 @@ def _expose(
 def _centered(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> tuple[Shapes, np.ndarray]:
     """Shift stars to the centre of a pixel, cut the stamps, and measure the shapes there."""
     first = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
-    stamps = center_stamps(images, first.x, first.y, size=experiment.config.psf.stamp)
+    stamps = center_stamps(images, first.x, first.y, size=experiment.stamp_size)
     return measure_shapes(stamps, pixel_scale, experiment.weight_fwhm), stamps
+
+
+def _center(experiment: Experiment, name: str) -> tuple[float, float]:
+    """Return the centre of a CCD [m]."""
+    x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
+    return float(x), float(y)
 
 
 def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, float]:
     """Return the edges (xmin, xmax, ymin, ymax) of a CCD [m], less the rim that no star comes into."""
     camera = experiment.camera
-    x, y = (float(v) for v in camera.centers[camera.ccd_index(name)])
+    x, y = _center(experiment, name)
     half = camera.half_size - _RIM * camera.pixel_size
     return x - half, x + half, y - half, y + half
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from ..models.errors import ConfigError, PachonError
 
 # Both live in typer or in click, as the version of typer has it; this way the right ones are caught.
-_UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+_UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
     name="pachon",
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status if isinstance(status, int) else 0
     except _UsageError as error:
-        return _fail(error.format_message())  # type: ignore[attr-defined]
+        return _fail(error.format_message())
     except BrokenPipeError:
         # Whoever read our output has gone; Python would complain once more when it closes the stream.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -85,13 +85,17 @@ def _common(
 
 @app.command("run")
 def run_command(
-    config: Annotated[Path | None, typer.Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    config: Annotated[
+        Path | None, typer.Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")
+    ] = None,
     ccds: Annotated[str | None, typer.Option(help="CCDs, separated by commas: R22_S11,R22_S12.")] = None,
     raft: Annotated[str | None, typer.Option(help="All CCDs of rafts: R22 or R22,R23.")] = None,
     all_ccds: Annotated[bool, typer.Option("--all", help="All CCDs of the camera.")] = False,
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("pachon_run"),
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Keep the CCDs that are finished, compute the others.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the CCDs that are finished, compute the others.")
+    ] = False,
     truth_stars: Annotated[int | None, typer.Option(help="Noise-free PSFs on each CCD.")] = None,
     observed_stars: Annotated[int | None, typer.Option(help="Observed stars on each CCD.")] = None,
     threads: Threads = None,
@@ -129,9 +133,7 @@ def run_command(
             raise ConfigError("--ccds, --raft and --all: expected one of them")
         names = ("all",) if all_ccds else _names(chosen[0], "--ccds" if ccds else "--raft") if chosen else None
         base = Configuration() if config is None else load_configuration(config)
-        settings = with_options(
-            base, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
-        )
+        settings = with_options(base, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars)
         resolved = resolve(settings, None if config is None else config.parent)
         reporter = Reporter(quiet)
         try:
@@ -153,7 +155,7 @@ def _names(text: str, option: str) -> tuple[str, ...]:
 
 
 def _show_run(result: Any, seconds: float) -> None:
-    from .tables import PER_CCD_COLUMNS, headline, per_ccd
+    from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
     console = _console()
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
@@ -163,10 +165,13 @@ def _show_run(result: Any, seconds: float) -> None:
     if len(rows) <= 21:
         each = Table(box=None, header_style="bold", padding=(0, 1, 0, 0))
         for name, unit in PER_CCD_COLUMNS:
-            each.add_column(f"{name} [{unit}]".replace("[", "\\[") if unit else name, justify="right" if unit else "left")
+            each.add_column(
+                f"{name} [{unit}]".replace("[", "\\[") if unit else name, justify="right" if unit else "left"
+            )
         for row in rows:
             each.add_row(*row)
         console.print(each)
+        console.print(PER_CCD_CAPTION, style="dim", width=100)
         console.print()
     console.print(table)
     console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
@@ -182,7 +187,9 @@ def opd_command(
     ] = None,
     grid: Annotated[int, typer.Option(min=8, max=4096, help="Points across the pupil.")] = 256,
     zernikes: Annotated[int, typer.Option(min=4, max=500, help="Highest Noll index to fit.")] = 28,
-    out: Annotated[Path | None, typer.Option(help="Picture to write; by default named after the model and field.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Picture to write; by default named after the model and field.")
+    ] = None,
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
@@ -251,7 +258,8 @@ def _show_opd(figures: dict[str, Any]) -> None:
     console.print(
         f"{figures['model']} at field ({figures['field_deg'][0]:g}, {figures['field_deg'][1]:g}) deg, "
         f"{figures['wavelength_nm']:g} nm: rms {figures['rms_nm']:.2f} nm = {figures['rms_waves']:.4f} waves, "
-        f"peak to valley {figures['peak_to_valley_nm']:.1f} nm; tilt taken off, rms {figures['rms_without_tilt_nm']:.2f} nm"
+        f"peak to valley {figures['peak_to_valley_nm']:.1f} nm; "
+        f"tilt taken off, rms {figures['rms_without_tilt_nm']:.2f} nm"
     )
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for name in ("Noll", "n", "m", "\\[nm]", "\\[waves]"):
@@ -273,8 +281,8 @@ def info_command(
 ) -> None:
     """Show the lens table and the first-order figures of a telescope; without a model, list those that come along.
 
-    Radii and z are in the telescope frame: origin at the vertex of the primary, +z towards the sky, a positive radius has
-    its centre on the +z side.
+    Radii and z are in the telescope frame: origin at the vertex of the primary, +z towards the sky, a positive radius
+    has its centre on the +z side.
 
     **Examples**
 

@@ -87,10 +87,10 @@ class PsfConfig(_Section):
     """How point-spread functions are made."""
 
     engine: Literal["fast", "wave"] = Field("fast", description="fast (geometric and filters) or wave (Fourier optics)")
-    n_pupil: Count | None = Field(None, description="pupil points of the fast engine")
+    n_pupil: Annotated[int, Field(strict=True, ge=10)] | None = Field(None, description="pupil points of the fast engine")
     pixel_um: Positive | None = Field(None, description="pixel [um]")
-    stamp: Annotated[int, Field(strict=True, ge=7)] = Field(31, description="pixels on a side of a stamp, odd")
-    diffusion_pixels: NotNegative = Field(0.4, description="rms of the charge diffusion [CCD pixels of 10 um]")
+    stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")
+    diffusion_pixels: NotNegative | None = Field(None, description="rms of the charge diffusion [CCD pixels of 10 um]")
 
 
 class ReconstructionConfig(_Section):
@@ -165,9 +165,7 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Return one ``key: old -> new`` for each key in which two resolved configurations differ."""
     before, after = dict(_flat(old)), dict(_flat(new))
     keys = [*before, *(k for k in after if k not in before)]
-    return [
-        f"{k}: {_shown(before.get(k))} -> {_shown(after.get(k))}" for k in keys if before.get(k) != after.get(k)
-    ]
+    return [f"{k}: {_shown(before.get(k))} -> {_shown(after.get(k))}" for k in keys if before.get(k) != after.get(k)]
 
 
 def digest(content: Any) -> str:

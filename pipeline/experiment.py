@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from pydantic import BaseModel
 
 from ..models.camera import Camera, load_camera
 from ..models.errors import ConfigError, PachonError
@@ -18,12 +19,12 @@ from ..models.focal_plane import FocalPlane
 from ..models.prescription import bundled_names, load_telescope
 from ..models.site import Site, load_site
 from ..models.telescope import Telescope
+from ..raytrace.rays import field_direction
 from ..wavefront.atmosphere import Atmosphere
 from ..wavefront.fast_psf import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.pupil_optics import chief_rays
 from ..wavefront.refraction import dispersion_shift
-from ..raytrace.rays import field_direction
-from .config import Configuration, digest
+from .config import BandName, Configuration, digest
 from .photometry import ARCSEC
 from .polynomial import term_count
 
@@ -32,7 +33,12 @@ DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012
 #: Pixel of the camera's CCDs, of which charge diffusion is a fraction [m].
 CCD_PIXEL = 10e-6
 _WAVELENGTHS = 5
+# The optics alone are seen as the paper's Fig. 8 has them: without charge diffusion, which would hide most of their
+# ellipticity, and on pixels fine enough for a weight of 0.3".
+_WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "pixel_um": 10.0, "stamp": 31, "diffusion_pixels": 0.4}
+_OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "pixel_um": 2.5, "stamp": 61, "diffusion_pixels": 0.0}
 _T = TypeVar("_T")
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -75,9 +81,14 @@ class Experiment:
         return _given(self.config.psf.pixel_um) * 1e-6
 
     @property
+    def stamp_size(self) -> int:
+        """Pixels on a side of a stamp."""
+        return _given(self.config.psf.stamp)
+
+    @property
     def diffusion(self) -> float:
         """Charge diffusion, rms [m]."""
-        return self.config.psf.diffusion_pixels * CCD_PIXEL
+        return _given(self.config.psf.diffusion_pixels) * CCD_PIXEL
 
     @property
     def weight_fwhm(self) -> float:
@@ -159,27 +170,13 @@ def resolve(config: Configuration, folder: Path | None = None) -> Configuration:
             "telescope": name,
             "ccds": chosen_ccds(camera, DEFAULT_CCDS if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
-            "atmosphere": atmosphere.model_copy(
-                update={
-                    "site": site_name,
-                    "r0_m": float(site.r0) if atmosphere.r0_m is None else atmosphere.r0_m,
-                    "outer_scale_m": float(site.outer_scale)
-                    if atmosphere.outer_scale_m is None
-                    else atmosphere.outer_scale_m,
-                }
+            "atmosphere": _filled(
+                atmosphere.model_copy(update={"site": site_name}),
+                {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
             ),
-            # A weight of 0.3" needs pixels of 0.1" or less, so without an atmosphere the PSF is sampled finer.
-            "psf": config.psf.model_copy(
-                update={
-                    "pixel_um": config.psf.pixel_um or (10.0 if atmosphere.enabled else 5.0),
-                    "n_pupil": config.psf.n_pupil or (PUPIL_POINTS if atmosphere.enabled else PUPIL_POINTS_STILL),
-                }
-            ),
-            "reconstruction": config.reconstruction.model_copy(
-                update={
-                    "weight_fwhm_arcsec": config.reconstruction.weight_fwhm_arcsec
-                    or (0.7 if atmosphere.enabled else 0.3)
-                }
+            "psf": _filled(config.psf, _WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE),
+            "reconstruction": _filled(
+                config.reconstruction, {"weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3}
             ),
         }
     )
@@ -257,7 +254,7 @@ def _check(config: Configuration, telescope: Telescope) -> None:
             )
     if not config.wavelengths_nm:
         raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")
-    if config.psf.stamp % 2 == 0:
+    if _given(config.psf.stamp) % 2 == 0:
         raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
     fit, stars = config.reconstruction, config.stars
     for kind in ("observed", "truth"):
@@ -288,10 +285,16 @@ def _given(value: _T | None) -> _T:
     return value
 
 
-def _band_of(name: str) -> str:
+def _filled(section: _Model, defaults: Mapping[str, object]) -> _Model:
+    """Return a section with defaults in place of what was left open."""
+    return section.model_copy(update={key: v for key, v in defaults.items() if getattr(section, key) is None})
+
+
+def _band_of(name: str) -> BandName:
     """Return the band that the name of a model ends in, such as lsst_v3.3_i; r where it does not."""
     ending = name.removesuffix(".yaml").removesuffix(".yml").rpartition("_")[2]
-    return ending if ending in tuple("ugrizy") else "r"
+    bands: dict[str, BandName] = {"u": "u", "g": "g", "r": "r", "i": "i", "z": "z", "y": "y"}
+    return bands.get(ending, "r")
 
 
 def _absolute(name: str, folder: Path | None, bundled: Sequence[str]) -> str:

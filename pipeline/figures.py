@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import logging
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -48,9 +48,9 @@ def styled() -> Any:
     return matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE, "backend": "agg"})
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
     """Return an empty figure of a size in inches that belongs to no window and no global state."""
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
@@ -72,7 +72,7 @@ def ccd_corners(camera: Camera, indices: Iterable[int]) -> np.ndarray:
 def draw_outlines(axes: Axes, camera: Camera, indices: Iterable[int], color: str = "0.6", width: float = 0.5) -> None:
     """Draw the outlines of CCDs."""
     axes.add_collection(
-        PolyCollection(ccd_corners(camera, indices), facecolors="none", edgecolors=color, linewidths=width)
+        PolyCollection(list(ccd_corners(camera, indices)), facecolors="none", edgecolors=color, linewidths=width)
     )
 
 
@@ -80,7 +80,14 @@ def draw_field_circle(axes: Axes, radius_mm: float, label: str) -> None:
     """Draw the edge of the field of view."""
     axes.add_patch(Circle((0.0, 0.0), radius_mm, fill=False, edgecolor="0.35", linewidth=0.8, linestyle=(0, (5, 3))))
     axes.annotate(
-        label, (0.0, -radius_mm), xytext=(0, -3), textcoords="offset points", ha="center", va="top", fontsize=8, color="0.35"
+        label,
+        (0.0, -radius_mm),
+        xytext=(0, -3),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontsize=8,
+        color="0.35",
     )
 
 
@@ -95,7 +102,7 @@ def whiskers(x: np.ndarray, y: np.ndarray, e1: np.ndarray, e2: np.ndarray, scale
 
 def draw_whiskers(axes: Axes, ends: np.ndarray, color: str, width: float) -> None:
     """Draw whiskers."""
-    axes.add_collection(LineCollection(ends, colors=color, linewidths=width, capstyle="round"))
+    axes.add_collection(LineCollection(list(ends), colors=color, linewidths=width, capstyle="round"))
 
 
 def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float) -> None:
@@ -104,7 +111,9 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
     above = blended_transform_factory(axes.transData, axes.transAxes) + ScaledTranslation(
         0.0, 7.0 / 72.0, figure_of(axes).dpi_scale_trans
     )
-    line = Line2D([right - ellipticity * scale, right], [1.0, 1.0], transform=above, color="black", linewidth=1.5 * width)
+    line = Line2D(
+        [right - ellipticity * scale, right], [1.0, 1.0], transform=above, color="black", linewidth=1.5 * width
+    )
     line.set_clip_on(False)
     axes.add_line(line)
     axes.annotate(
@@ -134,7 +143,9 @@ def key_ellipticity(values: np.ndarray) -> float:
     return float(rounds[np.argmin(np.abs(np.log(rounds / max(typical, 1e-4))))])
 
 
-def frame_axes(axes: Axes, limits: tuple[float, float, float, float], x_label: bool = True, y_label: bool = True) -> None:
+def frame_axes(
+    axes: Axes, limits: tuple[float, float, float, float], x_label: bool = True, y_label: bool = True
+) -> None:
     """Set limits [mm] with equal scales on both axes, and name the axes."""
     axes.set_xlim(limits[0], limits[1])
     axes.set_ylim(limits[2], limits[3])

@@ -28,6 +28,8 @@ from .figures import (
 )
 
 _HEIGHT_MAP = "RdBu_r"
+#: More CCDs than this are many: each is small on the page.
+_MANY = 30
 
 
 def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
@@ -49,7 +51,7 @@ def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: f
         axes = figure.add_subplot()
         edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
         limits = (-edge, edge, -edge, edge)
-        image = _draw_heights(axes, focal_plane, limits, 1400)
+        image = _draw_heights(axes, focal_plane, limits, 900)
         draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
         draw_outlines(axes, camera, indices, "black", 1.4)
         draw_field_circle(axes, field_radius * 1e3, "")
@@ -87,22 +89,22 @@ def whiskers_figure(
     scale = max(0.33 * half, 0.012 * float(max(high - low))) / key
     across = (high[0] - low[0]) / (high[1] - low[1])
     with styled():
-        # Panels go under each other where the CCDs lie in a row, beside each other where they do not.
-        stacked = across > 1.6
-        wide = 12.0
+        # Panels go under each other where the CCDs lie in a row or are many, beside each other where they do not.
+        stacked = across > 1.6 or len(products) > _MANY
+        wide = 9.0 if len(products) > _MANY else 12.0
         if stacked:
-            figure = new_figure(wide, len(kinds) * ((wide - 1.4) / across + 0.45) + 0.3)
+            figure = new_figure(wide, len(kinds) * ((wide - 1.4) / across + 0.45) + 0.3, "compressed")
             panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
         else:
-            figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9)
+            figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9, "compressed")
             panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-        image = None
+        image, bounds = None, _height_range(focal_plane)
         for i, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
-            image = _draw_heights(axes, focal_plane, limits, 700, alpha=0.35)
+            image = _draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
             draw_outlines(axes, focal_plane.camera, range(len(focal_plane.camera)), "0.5", 0.5)
             draw_field_circle(axes, field_radius * 1e3, "")
             for product in products:
-                _draw_kind(axes, product, kind, scale, 0.8 if len(products) < 30 else 0.4)
+                _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
             axes.set_title(_TITLES[kind], loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
@@ -122,12 +124,12 @@ def close_up_figure(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> 
     with styled():
         figure = new_figure(13.0, 3.35 * len(products) + 0.4)
         panels = figure.subplots(len(products), len(kinds), squeeze=False)
-        image = None
+        image, bounds = None, _height_range(focal_plane)
         for last, row, product in zip(range(len(products) - 1, -1, -1), panels, products, strict=True):
             x, y = np.array(product.center) * 1e3
             limits = (x - 1.04 * half, x + 1.04 * half, y - 1.04 * half, y + 1.04 * half)
             for i, (axes, kind) in enumerate(zip(row, kinds, strict=True)):
-                image = _draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=_height_range(focal_plane))
+                image = _draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=bounds)
                 _draw_kind(axes, product, kind, scale, 1.2)
                 draw_outlines(axes, camera, [camera.ccd_index(product.name)], "0.4", 0.7)
                 frame_axes(axes, limits, x_label=last == 0, y_label=i == 0)
@@ -146,7 +148,12 @@ _TITLES = {
     "residual": "residual at the stars: observed - model",
     "away": "residual away from the stars: truth - model",
 }
-_SHORT_TITLES = {"truth": "truth", "observed": "observed", "residual": "residual at stars", "away": "residual elsewhere"}
+_SHORT_TITLES = {
+    "truth": "truth",
+    "observed": "observed",
+    "residual": "residual at stars",
+    "away": "residual elsewhere",
+}
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
 

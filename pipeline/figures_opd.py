@@ -27,7 +27,9 @@ def opd_figure(opd: OpdMap, without_tilt: np.ndarray, zernikes: ZernikeFit, name
     tx, ty = np.rad2deg(opd.field)
     with styled():
         figure = new_figure(11.0, 9.0)
-        panels = figure.subplot_mosaic([["map", "rest"], ["bars", "bars"]], height_ratios=(1.0, 0.55))
+        panels: dict[str, Axes] = figure.subplot_mosaic(
+            [["map", "rest"], ["bars", "bars"]], height_ratios=(1.0, 0.55)
+        )
         _draw_map(panels["map"], opd, opd.value, "as it is: against the chief ray")
         _draw_map(panels["rest"], opd, without_tilt, "piston and tilt taken off")
         _draw_bars(panels["bars"], zernikes)
@@ -47,10 +49,14 @@ def _draw_map(axes: Axes, opd: OpdMap, value: np.ndarray, title: str) -> None:
     axes.set_xlabel("entrance pupil x [m]")
     axes.set_ylabel("entrance pupil y [m]")
     rms, span = float(np.nanstd(nm)), float(np.nanmax(nm) - np.nanmin(nm))
-    axes.set_title(f"{title}\nrms {rms:.4g} nm = {rms / wavelength:.4f} waves; peak to valley {span:.4g} nm", loc="left")
+    axes.set_title(
+        f"{title}\nrms {rms:.4g} nm = {rms / wavelength:.4f} waves; peak to valley {span:.4g} nm", loc="left"
+    )
     bar = figure_of(axes).colorbar(image, ax=axes, location="right", fraction=0.046, pad=0.02)
     bar.set_label("OPD [nm]: positive where the wavefront leads")
-    waves = bar.ax.secondary_yaxis("left", functions=(lambda v: v / wavelength, lambda v: v * wavelength))
+    waves = bar.ax.secondary_yaxis(
+        "left", functions=(lambda v: np.divide(v, wavelength), lambda v: np.multiply(v, wavelength))
+    )
     waves.tick_params(labelsize=7)
     waves.set_ylabel(f"waves at {wavelength:g} nm", fontsize=8, labelpad=2)
 
@@ -60,7 +66,9 @@ def _draw_bars(axes: Axes, zernikes: ZernikeFit) -> None:
     axes.bar(j, zernikes.coefficients[1:] * 1e9, color=OBSERVED, width=0.75)
     axes.axhline(0.0, color="0.3", linewidth=0.7)
     if len(j) <= 45:
-        axes.set_xticks(j, [f"{n} {NOLL_NAMES.get(int(n), '')}".strip() for n in j], rotation=60, ha="right", rotation_mode="anchor")
+        axes.set_xticks(
+            j, [f"{n} {NOLL_NAMES.get(int(n), '')}".strip() for n in j], rotation=60, ha="right", rotation_mode="anchor"
+        )
     axes.set_xlim(1.3, j[-1] + 0.7)
     # Tilt is often far larger than all else; a scale that is linear about zero shows both.
     largest = float(np.abs(zernikes.coefficients[1:]).max()) * 1e9

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
+from matplotlib.colors import SymLogNorm
 
 from .ccd_product import CcdProduct
 from .figures import AWAY, OBSERVED, TRUTH, new_figure, png_bytes, styled
 from .photometry import ARCSEC
+from .tables import percent
 
 
 def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
@@ -32,15 +33,18 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
         panels = figure.subplots(rows, columns, sharex=True, sharey=True).ravel()
         for axes in panels[count + 1 :]:
             axes.set_axis_off()
-        mean = panels[0].imshow(np.sqrt(np.maximum(model.mean, 0.0)), extent=extent, cmap="viridis", vmin=0.0)
+        panels[0].imshow(np.sqrt(np.maximum(model.mean, 0.0)), extent=extent, cmap="viridis", vmin=0.0)
         panels[0].set_title("mean (square root)", fontsize=8)
-        del mean
         image = None
         for k, axes in enumerate(panels[1 : count + 1]):
             component = model.components[k]
             edge = float(np.abs(component).max())
             image = axes.imshow(component / edge, extent=extent, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-            axes.set_title(f"n = {k + 1}: {_percent(model.explained_variance[k])}", fontsize=8)
+            axes.set_title(f"n = {k + 1}: {percent(model.explained_variance[k])}", fontsize=8)
+        # Beyond three times the width of the PSF there is nothing to see.
+        shown = min(extent[1], 3.0 * float(np.nanmedian(product.truth.fwhm)) / ARCSEC)
+        panels[0].set_xlim(-shown, shown)
+        panels[0].set_ylim(-shown, shown)
         for i, axes in enumerate(panels[: count + 1]):
             if i % columns == 0:
                 axes.set_ylabel("y [arcsec]")
@@ -53,7 +57,7 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
         kind = "noise-free PSFs" if truth else "observed stars"
         figure.suptitle(
             f"{product.name}: mean and eigen-PSFs of {model.n_stars} {kind}; "
-            f"{model.n_components} components hold {_percent(model.explained)} of the variance",
+            f"{model.n_components} components hold {percent(model.explained)} of the variance",
             fontsize=10,
         )
         return png_bytes(figure)
@@ -123,22 +127,28 @@ def stamps_figure(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
             top = model.max()
             light = column[0].imshow(_stretched(observed / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
             column[1].imshow(_stretched(model / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
-            noise = column[2].imshow(left_over, extent=extent, cmap="RdBu_r", vmin=-5.0, vmax=5.0)
-            column[0].set_title(f"{product.name}\nr = {stars.magnitude[i]:.1f}, S/N {stars.snr[i]:.0f}", fontsize=8)
+            noise = column[2].imshow(
+                left_over, extent=extent, cmap="RdBu_r", norm=SymLogNorm(3.0, vmin=-_FAR_OFF, vmax=_FAR_OFF)
+            )
+            column[0].set_title(f"{product.name}\n{stars.magnitude[i]:.1f} mag, S/N {stars.snr[i]:.0f}", fontsize=8)
             column[2].set_xlabel("x [arcsec]")
         for axes, name in zip(panels[:, 0], ("observed", "model", "observed - model"), strict=True):
             axes.set_ylabel(f"{name}\ny [arcsec]")
         if light is not None and noise is not None:
             bar = figure.colorbar(light, ax=panels[:2].ravel().tolist(), fraction=0.02, pad=0.01, aspect=30)
             ticks = np.array([0.0, 0.01, 0.1, 0.5, 1.0])
-            bar.set_ticks(_stretched(ticks), labels=[f"{t:g}" for t in ticks])
+            bar.set_ticks(_stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
             bar.set_label("over the model's peak (asinh)")
             bar = figure.colorbar(noise, ax=panels[2].tolist(), fraction=0.02, pad=0.01, aspect=15)
+            steps = (-100, -30, -10, -3, 0, 3, 10, 30, 100)
+            bar.set_ticks(steps, labels=[f"{t}" for t in steps], minor=False)
+            bar.ax.minorticks_off()
             bar.set_label("pixel noise σ")
         return png_bytes(figure)
 
 
 _SOFTENING = 0.02
+_FAR_OFF = 100.0
 
 
 def _stretched(values: np.ndarray) -> np.ndarray:
@@ -159,10 +169,3 @@ def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
 def _extent(size: int, pixel_scale: float) -> tuple[float, float, float, float]:
     half = 0.5 * size * pixel_scale / ARCSEC
     return -half, half, -half, half
-
-
-def _percent(fraction: float) -> str:
-    """Return a fraction in per cent, with more digits the nearer it is to all or nothing."""
-    return f"{100 * fraction:.3g} %" if fraction < 0.99 else f"{100 * fraction:.4g} %"
-
-

@@ -21,7 +21,7 @@ _LABELS = {
 
 def scatter_figure(products: Sequence[CcdProduct]) -> bytes:
     """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
-    panels = (
+    panels: tuple[tuple[str, Sequence[Stars], str, str, str, str], ...] = (
         ("at the observed stars", [p.observed for p in products], OBSERVED, RESIDUAL, "observed", "observed - model"),
         ("where no star is", [p.truth for p in products], TRUTH, AWAY, "truth", "truth - model"),
     )
@@ -36,7 +36,7 @@ def scatter_figure(products: Sequence[CcdProduct]) -> bytes:
             axes.set_aspect("equal")
             axes.set_xlabel("$e_1$: $(a-b)/(a+b)$ along x")
             axes.set_title(title, loc="left")
-            axes.legend(loc="upper right", markerscale=2.0)
+            axes.legend(loc="upper right")
         both[0].set_ylabel("$e_2$: along the diagonal x = y")
         values = np.concatenate([np.abs([s.e1, s.e2]).ravel() for p in products for s in (p.truth, p.observed)])
         edge = 1.1 * float(np.nanmax(values))
@@ -49,7 +49,10 @@ def _draw_cloud(axes: Axes, stars: Sequence[Stars], keys: tuple[str, str], color
     e1, e2 = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
     finite = np.isfinite(e1) & np.isfinite(e2)
     rms = np.sqrt(0.5 * np.mean(e1[finite] ** 2 + e2[finite] ** 2)) if finite.any() else np.nan
-    axes.plot(e1, e2, ".", color=color, markersize=3.5, alpha=0.6, markeredgewidth=0, label=f"{name}: rms {rms:.2g}")
+    # Many points would hide those below them.
+    alpha = min(0.6, 600.0 / max(len(e1), 1) + 0.05)
+    axes.plot(e1, e2, ".", color=color, markersize=3.5, alpha=alpha, markeredgewidth=0)
+    axes.plot([], [], "o", color=color, markersize=3.0, label=f"{name}: rms {rms:.2g}")
 
 
 def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
@@ -73,7 +76,13 @@ def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
             if panels[0].get_ylim()[0] < value < panels[0].get_ylim()[1]:
                 panels[0].axhline(value, color="0.45", linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
                 panels[0].annotate(
-                    text, (0.99, value), xycoords=("axes fraction", "data"), fontsize=7, color="0.35", ha="right", va="bottom"
+                    text,
+                    (0.99, value),
+                    xycoords=("axes fraction", "data"),
+                    fontsize=7,
+                    color="0.35",
+                    ha="right",
+                    va="bottom",
                 )
         handles, labels = panels[0].get_legend_handles_labels()
         filled = panels[0].plot([], [], "o", color="0.4", markersize=4.5)[0]
@@ -94,9 +103,7 @@ def _draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: st
     some = np.isfinite(xi) & (size > 0.0)
     # On a logarithmic scale an error bar cannot go through zero: it ends at a tenth of the value instead.
     below = np.minimum(error, 0.9 * size)
-    axes.errorbar(
-        r[some], size[some], [below[some], error[some]], fmt="none", ecolor=color, elinewidth=0.7, alpha=0.6
-    )
+    axes.errorbar(r[some], size[some], [below[some], error[some]], fmt="none", ecolor=color, elinewidth=0.7, alpha=0.6)
     axes.plot(r[some], size[some], "-", color=color, linewidth=0.6, alpha=0.5)
     for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
         axes.plot(

@@ -82,7 +82,16 @@ def _clear(surface: Surface) -> list[float] | None:
     return None
 
 
-SURFACE_COLUMNS = ("surface", "type", "radius [m]", "conic", "r^4, r^6, r^8...", "z [m]", "index after", "clear radius [m]")
+SURFACE_COLUMNS = (
+    "surface",
+    "type",
+    "radius [m]",
+    "conic",
+    "r^4, r^6, r^8...",
+    "z [m]",
+    "index after",
+    "clear radius [m]",
+)
 
 
 def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:

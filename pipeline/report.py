@@ -18,7 +18,7 @@ from .experiment import Experiment
 from .figures_focal_plane import close_up_figure, heights_figure, whiskers_figure
 from .figures_psf import eigen_figure, spectrum_figure, stamps_figure
 from .figures_statistics import correlation_figure, scatter_figure
-from .tables import PER_CCD_COLUMNS, headline, per_ccd
+from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
 _CLOSE_UPS = 3
@@ -51,24 +51,17 @@ class Picture:
         return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
 
-def build_report(
-    experiment: Experiment,
-    products: Sequence[CcdProduct],
-    correlated: dict[str, Correlation],
-    summary: dict[str, Any],
-) -> str:
+def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
     """Return the report of a run as HTML that refers to no other file.
 
     Parameters
     ----------
     experiment : Experiment
         What was run.
-    products : sequence of CcdProduct
-        Its CCDs.
-    correlated : dict of str to Correlation
-        Correlations over all CCDs.
     summary : dict
         Figures, as in ``summary.json``.
+    pictures : sequence of Picture
+        Pictures, as :func:`draw_pictures` gives them.
     """
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -82,14 +75,15 @@ def build_report(
         telescope=experiment.telescope,
         summary=summary,
         headline=headline(summary),
+        caption=PER_CCD_CAPTION,
         columns=PER_CCD_COLUMNS,
         ccds=per_ccd(summary),
-        pictures=pictures(experiment, products, correlated),
+        pictures=pictures,
         configuration=to_yaml(experiment.config),
     )
 
 
-def pictures(
+def draw_pictures(
     experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation]
 ) -> list[Picture]:
     """Return the pictures of a run in the order of the report."""
@@ -164,7 +158,8 @@ def pictures(
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are from the scatter "
             "of the ellipticities alone, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
             "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
-            "triangles, away from the stars, are what a galaxy sees.",
+            "triangles, away from the stars, are what a galaxy sees. Where the CCDs lie in a row, long pairs all point "
+            "along it, and an ellipticity common to the field does not average out of ξ-.",
             "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
             "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
         ),

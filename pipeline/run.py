@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import resource
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
+from trimesh.exchange.gltf import export_glb
 
 from ..raytrace.launch import thread_count
 from .ccd_product import CcdProduct, product_path, read_product, write_product
@@ -20,9 +21,9 @@ from .config import Configuration
 from .experiment import Experiment, prepare
 from .products import write_bytes, write_ecsv, write_json
 from .progress import Reporter
-from .report import build_report
+from .report import build_report, draw_pictures
 from .run_folder import claim_folder, finished_ccds, stamp_of
-from .statistics import correlations, run_figures
+from .summary import correlations, run_figures
 
 _MESH_CELLS = 16
 
@@ -99,7 +100,8 @@ def run(
         _write_focal_plane(experiment, folder)
     with reporter.stage("report"):
         report = folder / "report.html"
-        write_bytes(report, build_report(experiment, products, correlated, summary).encode())
+        pictures = draw_pictures(experiment, products, correlated)
+        write_bytes(report, build_report(experiment, summary, pictures).encode())
     write_json(folder / "timings.json", _timings(reporter, threads))
     return RunResult(folder, report, summary, kept, missing)
 
@@ -151,7 +153,7 @@ def _origin(experiment: Experiment) -> dict[str, Any]:
 def _write_focal_plane(experiment: Experiment, folder: Path) -> None:
     """Write the CCD surfaces as a mesh for any viewer, and heights of CCD centres and corners as a table."""
     mesh = experiment.focal_plane.to_mesh(_MESH_CELLS)
-    write_bytes(folder / "focal_plane.glb", bytes(mesh.export(file_type="glb")))
+    write_bytes(folder / "focal_plane.glb", export_glb(trimesh.Scene(mesh)))
     table = experiment.focal_plane.to_table(2)
     write_ecsv(
         folder / "focal_plane.ecsv",
@@ -167,14 +169,22 @@ def _write_focal_plane(experiment: Experiment, folder: Path) -> None:
 
 def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:
     """Return what differs from run to run, and is kept out of every other product for that reason."""
-    # Linux counts kibibytes, macOS bytes.
-    unit = 1 if sys.platform == "darwin" else 1024
     return {
         "pachon": version("pachon"),
         "seconds": reporter.seconds,
-        "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30,
+        "peak_memory_gib": _peak_memory() / 2**30,
         "threads": thread_count(threads),
         "processors": os.cpu_count(),
         "machine": platform.machine(),
         "python": platform.python_version(),
     }
+
+
+def _peak_memory() -> float:
+    """Return the most memory that this process has held [bytes]; NaN where the system does not say."""
+    if sys.platform == "win32":
+        return float("nan")
+    import resource
+
+    # Linux counts kibibytes, macOS bytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0)

@@ -51,7 +51,10 @@ def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
             raise ProductError(f"{folder} holds {finished[0].name} but no {CONFIG_NAME}; choose another --out")
     for left_over in folder.glob(".*.partial"):
         left_over.unlink(missing_ok=True)
-    heading = (f"pachon {version('pachon')}: all that decides this run. The same bytes again: pachon run config.yaml --out OTHER",)
+    heading = (
+        f"pachon {version('pachon')}: all that decides this run.",
+        "The same bytes again: pachon run config.yaml --out OTHER",
+    )
     write_bytes(path, to_yaml(experiment.config, heading).encode())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .statistics import KINDS, LONG_RANGE
+from .summary import KINDS, LONG_RANGE
 
 _NAMES = {
     "truth": "truth",
@@ -32,7 +32,7 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("rms e residual, at the stars", _percent(figures["rms_residual_at_stars"])),
         ("rms e residual, each star left out in turn", _percent(figures["rms_residual_left_out"])),
         ("rms e residual, where no star is (no noise)", _percent(figures["rms_residual_away"])),
-        ("truth's variance in the components, worst CCD", f"{100 * figures['truth_variance_in_components']:.4g} %"),
+        ("truth's variance in the components, worst CCD", percent(figures["truth_variance_in_components"])),
     ]
     for kind in KINDS:
         short, far = (figures[f"xi_plus_{kind}_{name}"] for name in ("short", "long"))
@@ -44,13 +44,19 @@ PER_CCD_COLUMNS = (
     ("CCD", ""),
     ("field", "deg"),
     ("FWHM", "arcsec"),
-    ("mean |e| truth", "%"),
-    ("rms residual at stars", "%"),
+    ("truth |e|", "%"),
+    ("at stars", "%"),
     ("left out", "%"),
-    ("where no star is", "%"),
-    ("truth's variance in components", "%"),
+    ("no star", "%"),
+    ("variance", "%"),
     ("kink", ""),
     ("stars used", ""),
+)
+PER_CCD_CAPTION = (
+    "Mean |e| of the truth, and rms of one component of the residual: observed - model at the stars; the same with "
+    "each star left out of the polynomial fit in turn; truth - model where no star is, which holds no noise of a star. "
+    "Variance: part of the truth's variance that the components hold. Kink: components before the eigenvalues flatten, "
+    "of the observed stars and of the truth."
 )
 
 
@@ -65,12 +71,19 @@ def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
             _bare_percent(f["rms_residual_at_stars"]),
             _bare_percent(f["rms_residual_left_out"]),
             _bare_percent(f["rms_residual_away"]),
-            f"{100 * f['truth_variance_in_components']:.4g}",
-            f"{f['kink_observed']}",
+            percent(f["truth_variance_in_components"]).removesuffix(" %"),
+            f"{f['kink_observed']}, {f['kink_truth']}",
             f"{f['stars_used']} of {f['stars']}",
         )
         for name, f in summary["ccd"].items()
     ]
+
+
+def percent(fraction: float) -> str:
+    """Return a fraction in per cent, with more digits near all, and never rounded up to all."""
+    if fraction < 0.99:
+        return f"{100 * fraction:.3g} %"
+    return f"{100 * fraction:.2f} %" if fraction < 0.99985 else "> 99.98 %"
 
 
 def _figure(value: float) -> str:

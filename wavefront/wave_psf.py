@@ -235,7 +235,7 @@ class WavePsfEngine:
         atmosphere = self._atmosphere
         if atmosphere is None:
             return np.zeros((1, 1, 4)), 0, wp.vec2d(1.0, 1.0)
-        direction = field_direction(*field, self._projection)
+        direction = field_direction(field[0], field[1], self._projection)
         slopes = direction[:2] / -direction[2]
         center = atmosphere.offsets - atmosphere.altitudes[:, None] * slopes
         center = center - atmosphere.velocities * atmosphere.times[:, None, None]

@@ -1,6 +1,7 @@
 """Configuration: every problem is one line with file, key, value and what was expected; resolving fills in all else."""
 
 import pytest
+
 from pachon.models.errors import ConfigError, PachonError
 from pachon.models.prescription import load_telescope, save_telescope
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
@@ -50,7 +51,7 @@ def test_a_wrong_file_says_where_and_what(tmp_path, text, parts):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ConfigError, match="none.yaml: no such file"):
+    with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         load_configuration(tmp_path / "none.yaml")
 
 
@@ -88,7 +89,7 @@ def test_what_does_not_fit_together_is_said_in_one_line(options, parts):
 
 def test_screens_that_cannot_hold_the_cutoff_name_the_section():
     config = resolve(with_options(Configuration(), atmosphere__screen_size=64))
-    with pytest.raises(ConfigError, match="^atmosphere: "):
+    with pytest.raises(ConfigError, match=r"^atmosphere: "):
         prepare(config)
 
 
@@ -117,7 +118,7 @@ def test_band_and_telescope_follow_each_other():
 def test_without_an_atmosphere_pixels_and_weight_are_finer():
     config = resolve(with_options(Configuration(), atmosphere__enabled=False))
     assert config.reconstruction.weight_fwhm_arcsec == 0.3
-    assert config.psf.pixel_um == 5.0
+    assert (config.psf.pixel_um, config.psf.stamp, config.psf.diffusion_pixels) == (2.5, 61, 0.0)
     assert prepare(config).atmosphere is None
 
 

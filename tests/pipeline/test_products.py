@@ -7,6 +7,7 @@ import os
 import numpy as np
 import pytest
 from astropy.io import fits
+
 from pachon.models.errors import ProductError
 from pachon.pipeline import products
 from pachon.pipeline.products import Stamp, column, image_hdu, json_text, read_fits, table_hdu, write_bytes, write_fits

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
 from pachon.wavefront import fast_psf, wave_psf
 from pachon.wavefront.atmosphere import Atmosphere
 from pachon.wavefront.pupil_optics import PupilOptics
@@ -58,7 +59,7 @@ def polynomial_pupil(monkeypatch):
 class SingleModes(Atmosphere):
     """Layers whose low screens are one long sine wave each, alternately along x and y, and whose high screens are 0."""
 
-    amplitude = 40e-6
+    amplitude = 200e-6
 
     def low_screen(self, layer, stencil="gradient", *, threads=None, out=None):
         wave = self.amplitude * np.sin(2 * np.pi * np.arange(self.screen_size) / self.screen_size)

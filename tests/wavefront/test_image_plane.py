@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.special import erf
+
 from pachon.models.errors import DomainError
 from pachon.wavefront.image_plane import ImagePlane, focal_length, square_transfer
-from scipy.special import erf
 
 
 def test_transfer_is_that_of_a_gaussian_integrated_over_pixels():
@@ -48,8 +49,14 @@ def test_focal_length_of_a_turned_and_stretched_jacobian():
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [((2, 1e-5, 0.0), "stamp_size"), ((9.5, 1e-5, 0.0), "stamp_size"), ((9, 0.0, 0.0), "pixel_size")]
-    + [((9, np.nan, 0.0), "pixel_size"), ((9, 1e-5, -1e-6), "diffusion"), ((9, 1e-5, np.inf), "diffusion")],
+    [
+        ((2, 1e-5, 0.0), "stamp_size"),
+        ((9.5, 1e-5, 0.0), "stamp_size"),
+        ((9, 0.0, 0.0), "pixel_size"),
+        ((9, np.nan, 0.0), "pixel_size"),
+        ((9, 1e-5, -1e-6), "diffusion"),
+        ((9, 1e-5, np.inf), "diffusion"),
+    ],
 )
 def test_refuses_what_is_no_stamp(arguments, named):
     with pytest.raises(DomainError, match=named):

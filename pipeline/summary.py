@@ -27,7 +27,9 @@ def correlations(products: Sequence[CcdProduct]) -> dict[str, Correlation]:
     between CCDs cancels whatever the error of the model is; residuals away from the stars are what a galaxy sees. Both
     are always given.
     """
-    everywhere = np.concatenate([np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1)
+    everywhere = np.concatenate(
+        [np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1
+    )
     longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
     bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (_SHORTEST * _ARCMIN))))
     result = {}
