@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,6 +34,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print figures as JSON on sta
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
 
 
+_INTERRUPTED = 130
+
+
+class _InterruptedRunError(Exception):
+    """A run that Ctrl-C ended; says where what was finished lies."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status.
 
@@ -46,7 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = app(args=None if arguments is None else list(arguments), prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()
+        if status == _INTERRUPTED:
+            return _fail("interrupted", _INTERRUPTED)
         return status if isinstance(status, int) else 0
+    except _InterruptedRunError as error:
+        return _fail(str(error), _INTERRUPTED)
     except _UsageError as error:
         return _fail(error.format_message())
     except BrokenPipeError:
@@ -60,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _fail("not enough memory; fewer threads or smaller atmosphere.screen_size need less")
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted", 130)
+        return _fail("interrupted", _INTERRUPTED)
 
 
 def _fail(text: str, status: int = 2) -> int:
@@ -121,26 +131,28 @@ def run_command(
 
     - `pachon run --all --out full --resume`: go on where a run was stopped
     """
-    with _quiet_libraries():
-        from .config import Configuration, load_configuration, with_options
-        from .experiment import resolve
-        from .products import json_text
-        from .progress import Reporter
-        from .run import run
+    from .config import Configuration, load_configuration, with_options
+    from .experiment import resolve
+    from .interrupt import remembered_interrupts
+    from .products import json_text
+    from .progress import Reporter
+    from .run import run
 
-        chosen = [text for text in (ccds, raft) if text is not None]
-        if len(chosen) + all_ccds > 1:
-            raise ConfigError("--ccds, --raft and --all: expected one of them")
-        names = ("all",) if all_ccds else _names(chosen[0], "--ccds" if ccds else "--raft") if chosen else None
-        base = Configuration() if config is None else load_configuration(config)
-        settings = with_options(base, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars)
-        resolved = resolve(settings, None if config is None else config.parent)
-        reporter = Reporter(quiet)
-        try:
+    chosen = [text for text in (ccds, raft) if text is not None]
+    if len(chosen) + all_ccds > 1:
+        raise ConfigError("--ccds, --raft and --all: expected one of them")
+    names = ("all",) if all_ccds else _names(chosen[0], "--ccds" if ccds else "--raft") if chosen else None
+    base = Configuration() if config is None else load_configuration(config)
+    settings = with_options(base, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars)
+    resolved = resolve(settings, None if config is None else config.parent)
+    try:
+        with remembered_interrupts() as check:
+            reporter = Reporter(quiet, check)
             result = run(resolved, out, resume=resume, threads=threads, reporter=reporter)
-        except KeyboardInterrupt:
-            _fail(f"interrupted; finished CCDs are in {out}, and --resume goes on from there", 130)
-            raise typer.Exit(130) from None
+    except KeyboardInterrupt:
+        raise _InterruptedRunError(
+            f"interrupted; finished CCDs are in {out}, and --resume goes on from there"
+        ) from None
     if as_json:
         print(json_text(result.summary))
     elif not quiet:
@@ -205,25 +217,24 @@ def opd_command(
 
     - `pachon opd my_telescope.yaml --json`: figures only on standard output
     """
-    with _quiet_libraries():
-        import numpy as np
+    import numpy as np
 
-        from ..models.prescription import load_telescope
-        from ..wavefront.opd import wavefront_opd
-        from ..wavefront.zernike import annular_zernikes, fit_zernikes
-        from .figures_opd import opd_figure
-        from .products import json_text, write_bytes
+    from ..models.prescription import load_telescope
+    from ..wavefront.opd import wavefront_opd
+    from ..wavefront.zernike import annular_zernikes, fit_zernikes
+    from .figures_opd import opd_figure
+    from .products import json_text, write_bytes
 
-        telescope = load_telescope(model)
-        x, y = _pair(field_deg, "--field-deg")
-        wavelength = telescope.default_wavelength if wavelength_nm is None else wavelength_nm * 1e-9
-        opd = wavefront_opd(telescope, tuple(np.deg2rad([x, y])), wavelength, grid=grid, threads=threads)
-        radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-        fit = fit_zernikes(opd, radius, obscuration, zernikes)
-        tilt = fit_zernikes(opd, radius, obscuration, 3).coefficients
-        rest = opd.value - np.tensordot(tilt, annular_zernikes(3, opd.x / radius, opd.y / radius, obscuration), axes=1)
-        path = out or Path(f"opd_{telescope.name}_{x:g}_{y:g}_{opd.wavelength * 1e9:g}nm.png")
-        write_bytes(path, opd_figure(opd, rest, fit, telescope.name))
+    telescope = load_telescope(model)
+    x, y = _pair(field_deg, "--field-deg")
+    wavelength = telescope.default_wavelength if wavelength_nm is None else wavelength_nm * 1e-9
+    opd = wavefront_opd(telescope, tuple(np.deg2rad([x, y])), wavelength, grid=grid, threads=threads)
+    radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
+    fit = fit_zernikes(opd, radius, obscuration, zernikes)
+    tilt = fit_zernikes(opd, radius, obscuration, 3).coefficients
+    rest = opd.value - np.tensordot(tilt, annular_zernikes(3, opd.x / radius, opd.y / radius, obscuration), axes=1)
+    path = out or Path(f"opd_{telescope.name}_{x:g}_{y:g}_{opd.wavelength * 1e9:g}nm.png")
+    write_bytes(path, opd_figure(opd, rest, fit, telescope.name))
     figures = {
         "model": telescope.name,
         "field_deg": [x, y],
@@ -339,17 +350,6 @@ def _pair(text: str, option: str) -> tuple[float, float]:
     except ValueError:
         raise ConfigError(f"{option} = {text!r}: expected two numbers in degrees, such as 0,1.2") from None
     return x, y
-
-
-@contextmanager
-def _quiet_libraries() -> Iterator[None]:
-    """Keep warnings of libraries, meant for programmers, off the screen of a user."""
-    import warnings
-
-    with warnings.catch_warnings():
-        if not sys.warnoptions:
-            warnings.simplefilter("ignore")
-        yield
 
 
 if __name__ == "__main__":

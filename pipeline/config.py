@@ -87,7 +87,9 @@ class PsfConfig(_Section):
     """How point-spread functions are made."""
 
     engine: Literal["fast", "wave"] = Field("fast", description="fast (geometric and filters) or wave (Fourier optics)")
-    n_pupil: Annotated[int, Field(strict=True, ge=10)] | None = Field(None, description="pupil points of the fast engine")
+    n_pupil: Annotated[int, Field(strict=True, ge=10)] | None = Field(
+        None, description="pupil points of the fast engine"
+    )
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")
     diffusion_pixels: NotNegative | None = Field(None, description="rms of the charge diffusion [CCD pixels of 10 um]")

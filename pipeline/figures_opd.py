@@ -27,9 +27,7 @@ def opd_figure(opd: OpdMap, without_tilt: np.ndarray, zernikes: ZernikeFit, name
     tx, ty = np.rad2deg(opd.field)
     with styled():
         figure = new_figure(11.0, 9.0)
-        panels: dict[str, Axes] = figure.subplot_mosaic(
-            [["map", "rest"], ["bars", "bars"]], height_ratios=(1.0, 0.55)
-        )
+        panels: dict[str, Axes] = figure.subplot_mosaic([["map", "rest"], ["bars", "bars"]], height_ratios=(1.0, 0.55))
         _draw_map(panels["map"], opd, opd.value, "as it is: against the chief ray")
         _draw_map(panels["rest"], opd, without_tilt, "piston and tilt taken off")
         _draw_bars(panels["bars"], zernikes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -31,15 +31,19 @@ class Stage:
         The bar of this stage.
     say : bool
         Whether to write lines: nobody sees bars.
+    check : callable
+        Called whenever something is done; may raise.
     """
 
-    def __init__(self, bars: Progress | None, task: TaskID | None, say: bool) -> None:
+    def __init__(self, bars: Progress | None, task: TaskID | None, say: bool, check: Callable[[], None]) -> None:
         self._bars = bars
+        self._check = check
         self._task = task
         self._say = say
 
     def advance(self, count: int = 1) -> None:
         """Tell that so many more items are done."""
+        self._check()
         if self._bars is not None and self._task is not None:
             self._bars.advance(self._task, count)
 
@@ -56,10 +60,13 @@ class Reporter:
     ----------
     quiet : bool
         Say nothing at all.
+    check : callable, optional
+        Called at every step that is reported, to stop the run by raising an exception.
     """
 
-    def __init__(self, quiet: bool = False) -> None:
+    def __init__(self, quiet: bool = False, check: Callable[[], None] | None = None) -> None:
         self.quiet = quiet
+        self._check = check or (lambda: None)
         self.seconds: dict[str, float] = {}
 
     def line(self, text: str) -> None:
@@ -78,10 +85,11 @@ class Reporter:
         total : int, optional
             Number of items; without it the stage shows that it runs, not how far it is.
         """
+        self._check()
         start = time.perf_counter()
         console = Console(stderr=True)
         if self.quiet or not console.is_terminal:
-            stage = Stage(None, None, not self.quiet)
+            stage = Stage(None, None, not self.quiet, self._check)
             yield stage
             self.seconds[title] = time.perf_counter() - start
             stage.line(f"{title}: {self.seconds[title]:.1f} s")
@@ -97,6 +105,6 @@ class Reporter:
         shown = columns if total is not None else (*columns[:2], columns[-1])
         with Progress(*shown, console=console) as bars:
             task = bars.add_task(title, total=total)
-            yield Stage(bars, task, False)
+            yield Stage(bars, task, False, self._check)
             bars.update(task, total=total or 1, completed=total or 1)
         self.seconds[title] = time.perf_counter() - start

@@ -38,8 +38,11 @@ from .wave_psf_kernels import pupil_fields
 
 #: Longest baseline [m] that an unpadded grid keeps.
 LONGEST_BASELINE = 1.5
-#: Largest distance of pupil points [m]; the scale below which turbulence is left out.
+#: Largest distance of pupil points [m] under an atmosphere: the scale below which turbulence is left out.
 LARGEST_SPACING = 0.02
+#: Largest distance of pupil points [m] for the optics alone, which vary over metres: what limits it is the image, which
+#: repeats itself after lambda / spacing (3" at 0.04 m), and the rim of the pupil.
+LARGEST_SPACING_OPTICS = 0.04
 # What charge diffusion may leave of longer baselines for a grid without padding.
 _NEGLIGIBLE = 1e-4
 
@@ -66,7 +69,7 @@ class WavePsfEngine:
         charge diffusion.
     pupil_spacing : float, optional
         Distance of the pupil points [m]; by default so small that the image repeats itself outside the stamp only, and
-        at most :data:`LARGEST_SPACING`.
+        at most :data:`LARGEST_SPACING`, or :data:`LARGEST_SPACING_OPTICS` without an atmosphere.
     projection : str
         Meaning of the field angles.
     threads : int, optional
@@ -108,7 +111,8 @@ class WavePsfEngine:
 
     def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
         if spacing is None:
-            spacing = min(LARGEST_SPACING, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
+            largest = LARGEST_SPACING_OPTICS if self._atmosphere is None else LARGEST_SPACING
+            spacing = min(largest, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
         if not (math.isfinite(spacing) and spacing > 0.0):
             raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
         if padding is None:

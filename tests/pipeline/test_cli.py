@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from pachon.models import prescription
 from pachon.models.prescription import bundled_names
 from pachon.pipeline import cli
 from pachon.pipeline import run as run_module
@@ -164,6 +165,15 @@ def test_a_full_disk_is_one_line(capsys, settings_file, tmp_path, monkeypatch):
     monkeypatch.setattr(run_module, "claim_folder", full)
     assert main(["run", str(settings_file), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err == "pachon: error: /data/run: No space left on device\n"
+
+
+def test_ctrl_c_in_a_short_command_is_one_line(capsys, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(prescription, "load_telescope", interrupted)
+    assert main(["info", "lsst_v3.3_r"]) == 130
+    assert capsys.readouterr().err == "pachon: error: interrupted\n"
 
 
 def test_too_little_memory_is_one_line(capsys, monkeypatch):
