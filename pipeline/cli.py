@@ -144,7 +144,12 @@ def run_command(
     names = ("all",) if all_ccds else _names(chosen[0], "--ccds" if ccds else "--raft") if chosen else None
     base = Configuration() if config is None else load_configuration(config)
     settings = with_options(base, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars)
-    resolved = resolve(settings, None if config is None else config.parent)
+    try:
+        resolved = resolve(settings, None if config is None else config.parent)
+    except PachonError as error:
+        if config is None or settings is not base:
+            raise
+        raise ConfigError(f"{config}: {error}") from None
     try:
         with remembered_interrupts() as check:
             reporter = Reporter(quiet, check)

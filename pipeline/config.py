@@ -151,10 +151,11 @@ def with_options(config: Configuration, **options: Any) -> Configuration:
     **options : object
         Values by dotted key, dots written as two underscores: ``stars__truth=50``.
     """
+    given = {dotted: value for dotted, value in options.items() if value is not None}
+    if not given:
+        return config
     content = config.model_dump(by_alias=True)
-    for dotted, value in options.items():
-        if value is None:
-            continue
+    for dotted, value in given.items():
         *sections, key = dotted.split("__")
         target = content
         for section in sections:

@@ -113,9 +113,11 @@ def _compute(
     if not names:
         return
     config = experiment.config
-    if experiment.atmosphere is not None and config.psf.engine == "fast":
+    if experiment.atmosphere is not None:
+        wanted = [("low", "gradient")] if config.psf.engine == "fast" else [("low", "spline"), ("high", "spline")]
         with reporter.stage(f"atmosphere: {experiment.atmosphere.layer_count} screens"):
-            experiment.atmosphere.low_gradient_screens(threads)
+            for scale, stencil in wanted:
+                experiment.atmosphere.kept_screens(scale, stencil, threads)
     stars = config.stars.truth + config.stars.observed
     with reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names)) as stage:
         for i, name in enumerate(names, start=1):

@@ -84,7 +84,7 @@ class Atmosphere:
     seed: int
     epoch: int
     fixed_modulus: bool = False
-    _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _cache: dict[tuple[str, str], np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def from_site(
@@ -276,27 +276,32 @@ class Atmosphere:
             out=out,
         )
 
-    def low_gradient_screens(self, threads: int | None = None) -> np.ndarray:
-        """Return the low screens of all layers for reading gradients, made once and kept.
+    def kept_screens(self, scale: str, stencil: str, threads: int | None = None) -> np.ndarray:
+        """Return the screens of all layers at one scale, made once and kept for whoever asks next.
 
         Parameters
         ----------
+        scale : {"low", "high"}
+            Which screens.
+        stencil : str
+            How they will be read, as for :meth:`low_screen`.
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
 
         Returns
         -------
         ndarray
-            Path [m], float32, shape [n_layer, screen_size, screen_size], not writable.
+            Path [m], float32, shape [n_layer, size, size], not writable.
         """
+        make, size = {"low": (self.low_screen, self.screen_size), "high": (self.high_screen, self.fine_size)}[scale]
         with _cache_lock:
-            if "gradient" not in self._cache:
-                screens = np.empty((self.layer_count, self.screen_size, self.screen_size), dtype=np.float32)
+            if (scale, stencil) not in self._cache:
+                screens = np.empty((self.layer_count, size, size), dtype=np.float32)
                 for layer in range(self.layer_count):
-                    self.low_screen(layer, "gradient", threads=threads, out=screens[layer])
+                    make(layer, stencil, threads=threads, out=screens[layer])
                 screens.setflags(write=False)
-                self._cache["gradient"] = screens
-            return self._cache["gradient"]
+                self._cache[scale, stencil] = screens
+            return self._cache[scale, stencil]
 
     def release(self) -> None:
         """Forget the kept screens; they come back, byte for byte, when next asked for."""

@@ -209,7 +209,7 @@ class FastPsfEngine:
         if atmosphere is None:
             self._screens = np.zeros((1, 1), dtype=np.float32)
         else:
-            screens = atmosphere.low_gradient_screens(threads)
+            screens = atmosphere.kept_screens("low", "gradient", threads)
             self._screens = screens.reshape(len(screens), -1)
 
     @property

@@ -133,12 +133,8 @@ class WavePsfEngine:
         if atmosphere is None:
             nothing = np.zeros((1, 1), dtype=np.float32)
             return nothing, nothing
-        count, n, m = atmosphere.layer_count, atmosphere.screen_size, atmosphere.fine_size
-        low, high = np.empty((count, n, n), dtype=np.float32), np.empty((count, m, m), dtype=np.float32)
-        for layer in range(count):
-            atmosphere.low_screen(layer, "spline", threads=self._threads, out=low[layer])
-            atmosphere.high_screen(layer, "spline", threads=self._threads, out=high[layer])
-        return low.reshape(count, -1), high.reshape(count, -1)
+        low, high = (atmosphere.kept_screens(scale, "spline", self._threads) for scale in ("low", "high"))
+        return low.reshape(len(low), -1), high.reshape(len(high), -1)
 
     def render(self, fields: np.ndarray, offsets: np.ndarray) -> RenderedStars:
         """Render one batch of stars.

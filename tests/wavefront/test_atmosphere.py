@@ -140,17 +140,17 @@ def test_streams_are_separate_and_repeatable():
     assert abs(correlation) < 0.4
 
 
-def test_gradient_screens_are_kept_until_released():
+def test_screens_are_kept_until_released():
     atmosphere = small_atmosphere()
-    screens = atmosphere.low_gradient_screens()
+    screens = atmosphere.kept_screens("low", "gradient")
     assert screens.dtype == np.float32
     assert screens.shape == (6, 512, 512)
-    assert atmosphere.low_gradient_screens() is screens
+    assert atmosphere.kept_screens("low", "gradient") is screens
     np.testing.assert_array_equal(screens[4], atmosphere.low_screen(4, "gradient"))
     with pytest.raises(ValueError, match="read-only"):
         screens[0, 0, 0] = 1.0
     atmosphere.release()
-    anew = atmosphere.low_gradient_screens()
+    anew = atmosphere.kept_screens("low", "gradient")
     assert anew is not screens
     np.testing.assert_array_equal(anew, screens)
 

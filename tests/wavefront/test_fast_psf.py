@@ -95,7 +95,7 @@ def test_binning_against_plain_numpy(polynomial_pupil, seed):
     binned = engine._deposit(optics)
 
     cell, n = 2.5e-6, engine._grid_size
-    screens = atmosphere.low_gradient_screens()
+    screens = atmosphere.kept_screens("low", "gradient")
     for star, field in enumerate(fields):
         slopes = np.tan(field)
         expected = np.zeros((2, n, n))
