@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from astropy import units as u
+
 from pachon.models.errors import DomainError, UnknownNameError
 from pachon.models.site import load_site
 from pachon.wavefront.atmosphere import Atmosphere

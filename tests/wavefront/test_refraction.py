@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from astropy import units as u
+
 from pachon.models.errors import DomainError
 from pachon.models.site import Weather
 from pachon.wavefront.refraction import air_refractivity, dispersion_shift

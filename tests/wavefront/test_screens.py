@@ -9,11 +9,12 @@ import math
 import numpy as np
 import pytest
 import scipy.fft
+from scipy.optimize import brentq
+
 from pachon.models.errors import DomainError, UnknownNameError
 from pachon.models.random_streams import stream
 from pachon.wavefront.screens import STENCILS, evaluate, phase_screen, stencil_gain
 from pachon.wavefront.turbulence import long_exposure_fwhm, path_spectrum, path_variance, structure_function
-from scipy.optimize import brentq
 
 R0, L0 = 0.16, 25.0
 CUTOFF = 1.0 / R0

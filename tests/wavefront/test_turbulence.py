@@ -4,6 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from scipy.special import j0
+
 from pachon.models.errors import DomainError
 from pachon.wavefront.turbulence import (
     diffraction_otf,
@@ -15,8 +18,6 @@ from pachon.wavefront.turbulence import (
     path_variance,
     structure_function,
 )
-from scipy.integrate import quad
-from scipy.special import j0
 
 R0, L0 = 0.16, 25.0
 RADIANS_PER_METRE = 2.0 * math.pi / 500e-9
