@@ -35,6 +35,8 @@ def test_illumination_is_flat_and_falls_by_a_tenth_at_the_edge(band):
         rays = pachon.launch_rays(telescope, (angle, 0.0), telescope.default_wavelength, (x, y))
         light.append((pachon.trace(telescope, rays).status == 0).sum())
     relative = np.array(light) / light[0]
-    # Flat to 1.2 deg, "about 10 % decrease at the edge"; 200 cells across leave 0.2 % of noise.
-    assert np.abs(relative[:5] - 1).max() < 0.01
+    # "Nearly uniform" to 1.2 deg, where the design has lost 1.7 %, and "about 10 %" less at the edge. Which rays are
+    # lost is held to batoid ray by ray elsewhere; 200 cells across leave 0.2 % of noise.
+    assert np.abs(relative[:4] - 1).max() < 0.01
+    assert 0.98 < relative[4] < 0.99
     assert 0.87 < relative[-1] < 0.93
