@@ -24,6 +24,10 @@ from .screens import evaluate, phase_screen
 from .turbulence import require_positive
 
 _cache_lock = threading.Lock()
+
+#: Default cut-off in units of 1/r0 [rad/m]. Of 1.0, 1.2, 1.4 and 2.0 this brings the fast PSF engine's ellipticities
+#: nearest to the wave engine's (docs/accuracy.md); beyond it geometric optics makes the image too wide.
+DEFAULT_CUTOFF = 1.4
 _SCALES = ("low", "high")
 # Beyond these a slip of the pen would fill the memory: 10 million steps, screens of 17 GB.
 _MOST_STEPS = 10_000_000
@@ -127,7 +131,8 @@ class Atmosphere:
         screen_size, screen_length : int, float
             Samples on a side of a low screen, and its side [m].
         cutoff : float, optional
-            Wavenumber that divides the low from the high modes [rad/m]; one over the Fried parameter by default.
+            Wavenumber that divides the low from the high modes [rad/m]; by default :data:`DEFAULT_CUTOFF` over the
+            Fried parameter, but at most half the Nyquist limit of the low screens.
         fine_size, fine_pixel : int, float
             Samples on a side of a high screen, and their distance [m].
         epoch : int
@@ -176,6 +181,9 @@ class Atmosphere:
         times = (np.arange(steps) + 0.5) * (exposure / steps)
         for array in (height, fraction, velocities, offsets, times):
             array.setflags(write=False)
+        size = _size(screen_size, "screen_size")
+        # Up to half the Nyquist limit: beyond, slopes read off a patch of four samples say little of where they are.
+        split = min(DEFAULT_CUTOFF / fried, 0.5 * math.pi * size / length)
         atmosphere = cls(
             altitudes=height,
             weights=fraction,
@@ -185,8 +193,8 @@ class Atmosphere:
             outer_scale=outer,
             exposure=exposure,
             times=times,
-            cutoff=require_positive(1.0 / fried if cutoff is None else cutoff, "cutoff", "radians per metre"),
-            screen_size=_size(screen_size, "screen_size"),
+            cutoff=require_positive(split if cutoff is None else cutoff, "cutoff", "radians per metre"),
+            screen_size=size,
             screen_length=length,
             fine_size=_size(fine_size, "fine_size"),
             fine_pixel=require_positive(fine_pixel, "fine_pixel", "metres"),

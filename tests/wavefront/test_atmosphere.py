@@ -27,7 +27,7 @@ def test_default_atmosphere_of_the_site():
     np.testing.assert_allclose(atmosphere.weights, [0.652, 0.172, 0.055, 0.025, 0.074, 0.022])
     assert (atmosphere.r0, atmosphere.outer_scale, atmosphere.exposure) == (0.16, 25.0, 15.0)
     assert (atmosphere.screen_size, atmosphere.screen_length) == (8192, 1300.0)
-    assert atmosphere.cutoff == 1.0 / 0.16
+    assert atmosphere.cutoff == 1.4 / 0.16
     assert len(atmosphere.times) == 300
     assert (atmosphere.screen_pixel, atmosphere.fine_length) == (1300.0 / 8192, 40.96)
     speeds = np.hypot(*atmosphere.velocities.T)
@@ -163,7 +163,9 @@ def test_ground_lift_and_zenith_angle():
     # Along a line at 60 degrees everything is twice as far and the turbulence twice as strong.
     np.testing.assert_allclose(low.altitudes[:2], [400.0, 5160.0])
     assert low.r0 == pytest.approx(0.16 * 0.5**0.6)
-    assert low.cutoff == pytest.approx(1.0 / low.r0)
+    assert lifted.cutoff == pytest.approx(1.4 / 0.16)
+    # 1.4 / 0.106 m would be beyond half the Nyquist limit.
+    assert low.cutoff == pytest.approx(0.5 * np.pi / low.screen_pixel)
 
 
 def test_quantities_and_sites_are_accepted():
@@ -194,7 +196,6 @@ def test_quantities_and_sites_are_accepted():
         ({"cutoff": 30.0}, "cutoff = 30 rad/m: expected between the lowest mode and the Nyquist limit of the low"),
         ({"cutoff": 0.07}, "cutoff = 0.07 rad/m"),
         ({"cutoff": 0.3}, "Nyquist limit of the high screens, 0.6136 to 157.1 rad/m"),
-        ({"r0": 0.03}, "cutoff = 33.3333 rad/m"),
         ({"weights": [1.0, 2.0]}, "weights of shape (2,): expected one number for each of the 6 layers"),
         ({"weights": [0.0] * 6}, "weights = [0.0"),
         ({"weights": [1.0, -1.0, 0.0, 0.0, 0.0, 0.0]}, "weights = [1.0, -1.0"),
