@@ -10,7 +10,7 @@ import numpy as np
 from ..models.errors import ConfigError, DomainError
 from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..models.units import metres
+from ..models.units import metres, radians
 from ..raytrace.rays import RayStatus, launch_rays
 from ..raytrace.trace import trace
 from .reference import distance_to_sphere
@@ -173,7 +173,7 @@ def wavefront_opd(
         y=y,
         lit=lit.reshape(x.shape),
         wavelength=rays.wavelength,
-        field=(float(np.asarray(field[0], dtype=float)), float(np.asarray(field[1], dtype=float))),
+        field=(float(radians(field[0], "field x")), float(radians(field[1], "field y"))),
         center=center,
         radius=radius,
         exit_direction=end.direction[:-1].reshape(*x.shape, 3),

@@ -115,6 +115,11 @@ def test_waves_and_figures(lsst_r):
     assert np.isclose(opd.rms, np.sqrt(np.mean((lit - lit.mean()) ** 2)))
     assert np.isclose(opd.peak_to_valley, lit.max() - lit.min())
     assert np.isnan(opd.value[~opd.lit]).all()
+    same = pachon.wavefront_opd(lsst_r, (0.0, 0.02) * u.rad, 620 * u.nm, grid=24)
+    assert np.array_equal(same.value, opd.value, equal_nan=True)
+    assert same.field == opd.field == (0.0, 0.02)
+    degrees = pachon.wavefront_opd(lsst_r, (0.0, 1.0) * u.deg, 620e-9, grid=24)
+    assert degrees.field == pytest.approx((0.0, np.deg2rad(1.0)))
 
 
 @pytest.mark.parametrize(
