@@ -214,7 +214,7 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
     write_fits(product_path(folder, product.name), hdus, stamp, header)
 
 
-def read_product(path: Path, stamp: Stamp | None = None) -> CcdProduct:
+def read_product(path: Path, stamp: Stamp | None = None, *, truth_images: bool = True) -> CcdProduct:
     """Read the product of one CCD.
 
     Parameters
@@ -223,6 +223,8 @@ def read_product(path: Path, stamp: Stamp | None = None) -> CcdProduct:
         File to read.
     stamp : Stamp, optional
         What the product must carry.
+    truth_images : bool
+        Whether to keep the noise-free PSFs, by far the largest part; without, there are none of them.
 
     Raises
     ------
@@ -241,7 +243,7 @@ def read_product(path: Path, stamp: Stamp | None = None) -> CcdProduct:
             noise=(header["SKY"], header["NOISE"]),
             truth=_stars(TruthStars, hdus["TRUTH"]),
             observed=_stars(ObservedStars, hdus["STARS"]),
-            truth_images=_image(hdus["TRUTH_PSF"]),
+            truth_images=_image(hdus["TRUTH_PSF"])[: None if truth_images else 0].copy(),
             observed_images=_image(hdus["STAMPS"]),
             model=PsfModel.from_hdus(hdus, _MODEL),
             truth_model=PsfModel.from_hdus(hdus, _TRUTH_MODEL),

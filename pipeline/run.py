@@ -92,7 +92,9 @@ def run(
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     _compute(experiment, folder, missing, threads, reporter)
     with reporter.stage("correlations"):
-        products = [read_product(product_path(folder, name), stamp_of(experiment)) for name in names]
+        stamp = stamp_of(experiment)
+        # Pictures and figures need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
+        products = [read_product(product_path(folder, name), stamp, truth_images=False) for name in names]
         correlated = correlations(products)
         summary = {**_origin(experiment), **run_figures(products, correlated)}
         write_json(folder / "summary.json", summary)
