@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..models.errors import PachonError
+from ..models.errors import DomainError, PachonError
 from ..models.random_streams import stream
 from ..wavefront.psf import make_psfs
 from ..wavefront.pupil_optics import fields_at
 from .ccd_product import CcdProduct, ObservedStars, TruthStars
 from .experiment import Experiment
 from .pca import PsfModel
-from .photometry import ARCSEC, instrument_noise, signal_to_noise, sky_electrons_per_pixel
+from .photometry import ARCSEC, instrument_noise, limiting_magnitude, signal_to_noise, sky_electrons_per_pixel
 from .shapes import Shapes, fwhm, measure_shapes
 from .stamps import center_stamps, observe_stamps
 from .star_field import StarField, make_star_field
@@ -65,13 +65,18 @@ def _compute(
     places = _star_field(experiment, name, _PROVISIONAL_FWHM)
     truth, truth_shapes, truth_images = _truth(experiment, places.truth, threads, advance)
 
-    stars = _star_field(experiment, name, effective_fwhm(truth.image, truth.pixel_scale))
-    pixel = stars.observed_pixel * (stars.pixel_size / experiment.pixel_size)
-    observed = _expose(experiment, stars.observed, pixel - np.rint(pixel), threads, advance)
+    # Places do not depend on the limits of magnitude, which in turn need to know how much light the stars lose.
+    pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
+    observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, advance)
+    if not observed.light.min() > 0.0:
+        raise DomainError("no light reaches some of its stars: expected a CCD within the field of the telescope")
+    width = effective_fwhm(truth.image, truth.pixel_scale)
+    stars = _star_field(experiment, name, width, least_light=float(observed.light.min()))
+    electrons = stars.electrons * observed.light
     exposure = config.atmosphere.exposure_s
     sky = sky_electrons_per_pixel(stars.band, exposure, observed.pixel_scale)
     noise = instrument_noise(exposure)
-    seen = observe_stamps(observed.image, stars.electrons, sky, noise, stream(config.seed, "noise", name))
+    seen = observe_stamps(observed.image, electrons, sky, noise, stream(config.seed, "noise", name))
     observed_shapes, observed_images = _centered(experiment, seen, observed.pixel_scale)
 
     used = observed_shapes.usable & np.isfinite(observed_images).all(axis=(1, 2))
@@ -113,8 +118,8 @@ def _compute(
             **_positions(stars.observed, observed.fields),
             **_shapes(observed_shapes, at_stars),
             magnitude=stars.magnitude,
-            electrons=stars.electrons,
-            snr=signal_to_noise(stars.magnitude, stars.band, exposure, effective_fwhm(truth.image, truth.pixel_scale)),
+            electrons=electrons,
+            snr=signal_to_noise(stars.magnitude - 2.5 * np.log10(observed.light), stars.band, exposure, width),
             used=used,
             left_out_e1=left_out_e1,
             left_out_e2=left_out_e2,
@@ -159,6 +164,8 @@ class _Exposed:
     image: np.ndarray
     pixel_scale: float
     fields: np.ndarray
+    #: Light of each star over what an unvignetted pupil lets through.
+    light: np.ndarray
 
 
 def _expose(
@@ -195,7 +202,7 @@ def _expose(
         threads=threads,
         progress=tell,
     )
-    return _Exposed(psfs.image, float(psfs.pixel_scale), fields)
+    return _Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.throughput.mean(axis=1))
 
 
 def _centered(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> tuple[Shapes, np.ndarray]:
@@ -219,8 +226,10 @@ def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, flo
     return x - half, x + half, y - half, y + half
 
 
-def _star_field(experiment: Experiment, name: str, width: float) -> StarField:
+def _star_field(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
+    """Draw the stars of one CCD, the faintest still of the wanted S/N where the least light arrives."""
     config = experiment.config
+    band, exposure = config.band or "r", config.atmosphere.exposure_s
     return make_star_field(
         name,
         _bounds(experiment, name),
@@ -228,9 +237,9 @@ def _star_field(experiment: Experiment, name: str, width: float) -> StarField:
         config.stars.observed,
         config.seed,
         fwhm=width,
-        band=config.band or "r",
-        exposure=config.atmosphere.exposure_s,
-        snr=config.stars.snr_min,
+        band=band,
+        exposure=exposure,
+        faint=limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light),
         margin=_MARGIN,
         pixel_size=experiment.camera.pixel_size,
     )

@@ -55,9 +55,11 @@ def test_the_report_refers_to_nothing_outside_itself(page):
     assert reader.open == []
     for reference in reader.references:
         assert reference.startswith(("data:image/png;base64,", "#"))
-    assert "http" not in page
-    assert "@import" not in page
-    assert "<script" not in page
+    # Pictures aside: four megabytes of base64 hold any four letters by chance.
+    text = re.sub(r'data:image/png;base64,[^"]+', "", page)
+    assert "http" not in text
+    assert "@import" not in text
+    assert "<script" not in text
     anchors = {r[1:] for r in reader.references if r.startswith("#")}
     assert anchors <= set(re.findall(r'id="([^"]+)"', page))
 

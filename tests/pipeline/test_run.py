@@ -12,6 +12,7 @@ from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.photometry import electrons
 from pachon.pipeline.run import run
 
 CCDS = ("R22_S11", "R24_S12")
@@ -176,6 +177,10 @@ def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run
     # The faintest star is still at the limit asked for, S/N 30.
     assert product.observed.snr.min() >= 30.0 * (1 - 1e-9)
     assert product.observed.used.all()
+    # At 1.66 deg the camera and the mirrors' rims take some 5 to 10 % of the light.
+    exposure = prepare(tiny()).config.atmosphere.exposure_s
+    light = product.observed.electrons / electrons(product.observed.magnitude, "r", exposure)
+    assert np.all((light > 0.86) & (light < 0.98))
 
 
 def test_without_an_atmosphere_the_optics_alone_make_the_psf(tmp_path, tiny, no_report):
