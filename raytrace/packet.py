@@ -31,15 +31,6 @@ def lanes_sqrt(a: lanes):
     return out
 
 
-@wp.func
-def lanes_filled(a: wp.float64):
-    """Packet with the same value in every lane."""
-    out = lanes()
-    for i in range(LANES):
-        out[i] = a
-    return out
-
-
 def packet_count(n: int) -> int:
     """Return the number of packets that hold ``n`` rays."""
     return -(-n // LANES)
