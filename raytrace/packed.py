@@ -48,7 +48,10 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
 
 
 def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
-    """Return the index before the first surface and after each surface at one wavelength, shape [n_surface + 1]."""
+    """Return the index before the first surface and after each at one wavelength, shape [n_surface + 1].
+
+    The last but one is therefore that of the medium in which the light meets the detector.
+    """
     telescope.check_wavelength(wavelength)
     media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
     return np.array([medium.index(wavelength) for medium in media], dtype=np.float64)

@@ -114,7 +114,8 @@ def trace(
     n = len(rays)
     every = len(telescope.surfaces) if surfaces == "all" else 1
     packed = pack_surfaces(telescope)
-    indices = wp.array(refractive_indices(telescope, rays.wavelength)[None], dtype=wp.float64, device="cpu")
+    index = refractive_indices(telescope, rays.wavelength)
+    indices = wp.array(index[None], dtype=wp.float64, device="cpu")
     count = packet_count(n)
 
     def inputs(values: np.ndarray) -> wp.array:
@@ -151,8 +152,9 @@ def trace(
     ]
     if focal_plane is not None:
         last = results[-1]
-        index = float(refractive_indices(telescope, rays.wavelength)[-1])
-        landing = land_on_ccds(telescope.surfaces[-1], focal_plane, last.position, last.direction, index=index)
+        landing = land_on_ccds(
+            telescope.surfaces[-1], focal_plane, last.position, last.direction, index=float(index[-2])
+        )
         results[-1] = TraceResult(
             last.surface,
             landing.position,

@@ -316,6 +316,25 @@ class Atmosphere:
         with _cache_lock:
             self._cache.clear()
 
+    def pupil_centers(self, direction: np.ndarray, time: ArrayLike = 0.0) -> np.ndarray:
+        """Return where the light through the pupil's centre crosses each layer, in the coordinates of its screens.
+
+        Parameters
+        ----------
+        direction : ndarray, shape [..., 3]
+            Directions in which the light travels, of any length.
+        time : array_like
+            Times since the start of the exposure [s]; its shape and that of the directions are broadcast.
+
+        Returns
+        -------
+        ndarray
+            Screen coordinates [m], shape [..., n_layer, 2], not yet taken modulo the side.
+        """
+        slopes = direction[..., None, :2] / -direction[..., None, 2:]
+        elapsed = np.asarray(time, dtype=np.float64)[..., None, None]
+        return self.offsets - self.altitudes[:, None] * slopes - self.velocities * elapsed
+
     def screen_coordinates(
         self, x: ArrayLike, y: ArrayLike, layer: int, *, field: tuple[float, float] = (0.0, 0.0), time: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -337,7 +356,7 @@ class Atmosphere:
         tuple of ndarray
             Screen coordinates x and y [m], not yet taken modulo the side.
         """
-        shift = self.offsets[layer] - self.altitudes[layer] * np.asarray(field) - self.velocities[layer] * time
+        shift = self.pupil_centers(np.array([*field, -1.0]), time)[layer]
         return np.asarray(x, dtype=np.float64) + shift[0], np.asarray(y, dtype=np.float64) + shift[1]
 
     def path(

@@ -314,9 +314,7 @@ class FastPsfEngine:
             pixel, screen_size = atmosphere.screen_pixel, atmosphere.screen_size
             n_layer, n_time = atmosphere.layer_count, len(atmosphere.times)
             direction = field_direction(optics.fields[:, 0], optics.fields[:, 1], self._projection)
-            slopes = direction[:, None, :2] / -direction[:, None, 2:]
-            corner = self._lattice.origin + atmosphere.offsets - atmosphere.velocities * atmosphere.times[0]
-            start = (corner - atmosphere.altitudes[:, None] * slopes) / pixel
+            start = (atmosphere.pupil_centers(direction, atmosphere.times[0]) + self._lattice.origin) / pixel
             step = -atmosphere.velocities * (atmosphere.exposure / n_time) / pixel
         column, row = self._lattice.column * self._stride, self._lattice.row * self._stride
         lattice = to_packets(row * screen_size + column, np.int32)

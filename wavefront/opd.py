@@ -11,6 +11,7 @@ from ..models.errors import ConfigError, DomainError
 from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..models.units import metres, radians
+from ..raytrace.packed import refractive_indices
 from ..raytrace.rays import RayStatus, launch_rays
 from ..raytrace.trace import trace
 from .reference import distance_to_sphere
@@ -162,8 +163,7 @@ def wavefront_opd(
         if not lit.any():
             raise DomainError(f"field = {field!r}: no ray reaches the image")
         center = end.position[:-1][lit].mean(axis=0)
-    final = telescope.surfaces[-1].medium_after if len(telescope.surfaces) == 1 else telescope.surfaces[-2].medium_after
-    index = final.index(rays.wavelength)
+    index = refractive_indices(telescope, rays.wavelength)[-2]
     path = end.path_length + index * distance_to_sphere(end.position, end.direction, center, radius)
     zero = path[-1] if reference == "chief" else path[:-1][lit].mean()
     value = np.where(lit, zero - path[:-1], np.nan)

@@ -236,9 +236,7 @@ class WavePsfEngine:
         if atmosphere is None:
             return np.zeros((1, 1, 4)), 0, wp.vec2d(1.0, 1.0)
         direction = field_direction(field[0], field[1], self._projection)
-        slopes = direction[:2] / -direction[2]
-        center = atmosphere.offsets - atmosphere.altitudes[:, None] * slopes
-        center = center - atmosphere.velocities * atmosphere.times[:, None, None]
+        center = atmosphere.pupil_centers(direction, atmosphere.times)
         starts = np.concatenate([center / atmosphere.screen_pixel, center / atmosphere.fine_pixel], axis=-1)
         return starts, atmosphere.layer_count, wp.vec2d(1.0 / atmosphere.screen_pixel, 1.0 / atmosphere.fine_pixel)
 

@@ -1,11 +1,14 @@
 """Landing on CCD surfaces: against the height function itself, the mesh, and in the gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pachon
 from pachon.models.camera import lsst_camera
 from pachon.models.errors import DomainError
+from pachon.models.glass import ConstantIndex
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.pupil_optics import fields_at
 
@@ -97,6 +100,27 @@ def test_cutting_a_batch_changes_no_byte(lsst_r, focal_plane, annulus_points):
         end = pachon.trace(lsst_r, rays, focal_plane=focal_plane)
         assert np.array_equal(end.position, whole.position[part])
         assert np.array_equal(end.path_length, whole.path_length[part])
+
+
+def test_the_last_step_is_in_the_medium_before_the_detector(lsst_r, annulus_points):
+    # L3's exit face into water, and vacuum named behind the detector: what counts is the water in front of it.
+    wet = replace(
+        lsst_r,
+        surfaces=(
+            *lsst_r.surfaces[:-2],
+            replace(lsst_r.surfaces[-2], medium_after=ConstantIndex(1.33)),
+            lsst_r.surfaces[-1],
+        ),
+    )
+    center = lsst_camera().centers[lsst_camera().ccd_index("R22_S11")]
+    table = {"x": center[0] + np.array([0, 0.01, 0]), "y": center[1] + np.array([0, 0, 0.01]), "z": np.full(3, 1e-5)}
+    rays = pachon.launch_rays(wet, (0.0, 0.0), 620e-9, annulus_points(20))
+    flat = pachon.trace(wet, rays)
+    end = pachon.trace(wet, rays, focal_plane=pachon.FocalPlane.from_heights(table))
+    along = np.einsum("ij,ij->i", end.position - flat.position, flat.direction)
+    assert along.min() > 1e-5
+    # 30 m of path round to 4e-15 m.
+    assert np.abs(end.path_length - flat.path_length - 1.33 * along).max() < 2e-14
 
 
 def test_heights_follow_a_tilted_detector(lsst_r, annulus_points):
