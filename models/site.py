@@ -11,6 +11,9 @@ import numpy as np
 from .errors import PrescriptionError, unknown_name
 from .yaml_reader import Section, read_yaml
 
+#: How far the weights of a site may be from a sum of 1: published ones are rounded to three figures.
+WEIGHT_TOLERANCE = 5e-3
+
 DATA = Path(__file__).parent / "data"
 BUNDLED = ("cerro_pachon",)
 
@@ -67,6 +70,9 @@ class Site:
         Air at the telescope.
     source, description : str
         Where the figures come from, and what they are.
+    wind_directions : tuple of float or None
+        Direction that the wind blows to in each layer, from +x towards +y of the telescope [rad]; None where it is
+        drawn from the seed of the atmosphere. All are by default.
     """
 
     name: str
@@ -78,17 +84,25 @@ class Site:
     weather: Weather
     source: str = ""
     description: str = ""
+    wind_directions: tuple[float | None, ...] = ()
 
     def __post_init__(self) -> None:
-        if not len(self.altitudes) == len(self.weights) == len(self.wind_speeds) > 0:
+        if not self.wind_directions:
+            object.__setattr__(self, "wind_directions", (None,) * len(self.altitudes))
+        parts = (self.altitudes, self.weights, self.wind_speeds, self.wind_directions)
+        if not self.altitudes or len({len(part) for part in parts}) > 1:
             raise PrescriptionError(f"layers of site {self.name!r}: expected an altitude, weight and wind for each")
-        if self.altitudes[0] < 0 or any(np.diff(self.altitudes) <= 0):
+        if not (np.isfinite(self.altitudes).all() and self.altitudes[0] >= 0 and (np.diff(self.altitudes) > 0).all()):
             raise PrescriptionError(f"altitudes = {self.altitudes!r}: expected to rise from 0 m or more")
-        # Published weights are rounded to three figures.
-        if min(self.weights) < 0 or abs(sum(self.weights) - 1) > 5e-3:
-            raise PrescriptionError(f"weights = {self.weights!r}: expected fractions that sum to 1")
-        if min(self.wind_speeds) < 0:
+        total = sum(self.weights)
+        if not (min(self.weights) >= 0 and abs(total - 1) <= WEIGHT_TOLERANCE):
+            raise PrescriptionError(
+                f"weights = {self.weights!r}: expected fractions from 0 that sum to 1, not {total:.6g}"
+            )
+        if not (np.isfinite(self.wind_speeds).all() and min(self.wind_speeds) >= 0):
             raise PrescriptionError(f"wind_speeds = {self.wind_speeds!r}: expected zero or more")
+        if not all(d is None or np.isfinite(d) for d in self.wind_directions):
+            raise PrescriptionError(f"wind_directions = {self.wind_directions!r}: expected angles in radians")
         for key in ("r0", "outer_scale"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
@@ -126,7 +140,7 @@ def _read_site(top: Section) -> Site:
     weather.allow("pressure_mmhg", "temperature_c", "water_vapour_mmhg")
     layers = top.sections("layers", "altitude")
     for layer in layers:
-        layer.allow("altitude", "weight", "wind_speed")
+        layer.allow("altitude", "weight", "wind_speed", "wind_direction_deg")
     try:
         return Site(
             name=top.text("name"),
@@ -135,9 +149,15 @@ def _read_site(top: Section) -> Site:
             altitudes=tuple(layer.number("altitude") for layer in layers),
             weights=tuple(layer.number("weight") for layer in layers),
             wind_speeds=tuple(layer.number("wind_speed") for layer in layers),
+            wind_directions=tuple(_direction(layer) for layer in layers),
             r0=top.number("r0", positive=True),
             outer_scale=top.number("outer_scale", positive=True),
             weather=Weather(*(weather.number(k) for k in ("pressure_mmhg", "temperature_c", "water_vapour_mmhg"))),
         )
     except PrescriptionError as error:
         raise top.placed(error) from None
+
+
+def _direction(layer: Section) -> float | None:
+    key = "wind_direction_deg"
+    return float(np.deg2rad(layer.number(key))) if key in layer else None

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .raytrace.rays import RayStatus as RayStatus
     from .raytrace.rays import launch_rays as launch_rays
     from .raytrace.trace import trace as trace
+    from .wavefront.aberration import ResidualWavefront as ResidualWavefront
     from .wavefront.atmosphere import Atmosphere as Atmosphere
     from .wavefront.opd import wavefront_opd as wavefront_opd
     from .wavefront.psf import make_psfs as make_psfs
@@ -47,6 +48,7 @@ _HOMES = {
     "raytrace.mesh": ("land_on_mesh",),
     "raytrace.rays": ("RayStatus", "Rays", "launch_rays"),
     "raytrace.trace": ("trace",),
+    "wavefront.aberration": ("ResidualWavefront",),
     "wavefront.atmosphere": ("Atmosphere",),
     "wavefront.opd": ("wavefront_opd",),
     "wavefront.psf": ("make_psfs",),

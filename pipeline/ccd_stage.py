@@ -76,7 +76,7 @@ def _compute(
     exposure = config.atmosphere.exposure_s
     sky = sky_electrons_per_pixel(stars.band, exposure, observed.pixel_scale)
     noise = instrument_noise(exposure)
-    seen = observe_stamps(observed.image, electrons, sky, noise, stream(config.seed, "noise", name))
+    seen = observe_stamps(observed.image, electrons, sky, noise, stream(*_noise_key(experiment, name)))
     observed_shapes, observed_images = _centered(experiment, seen, observed.pixel_scale)
 
     used = observed_shapes.usable & np.isfinite(observed_images).all(axis=(1, 2))
@@ -131,18 +131,27 @@ def _compute(
     )
 
 
+def _noise_key(experiment: Experiment, name: str) -> tuple[int, *tuple[str | int, ...]]:
+    """Return what the photon noise of a CCD hangs on: each visit has its own, and the first the plain one."""
+    config = experiment.config
+    visit = (config.atmosphere.epoch,) if config.atmosphere.epoch else ()
+    return config.seed, "noise", name, *visit
+
+
 def _truth(
     experiment: Experiment, positions: np.ndarray, threads: int | None, advance: Callable[[int], None] | None
 ) -> tuple[_Exposed, Shapes, np.ndarray]:
     """Make noise-free PSFs whose centroid is the centre of a pixel.
 
-    The atmosphere moves a star by a part of a pixel. The truth is made again at the place that undoes this, not shifted
-    as observed stars are: a shift of an image that is not quite band-limited rings along rows and columns.
+    The atmosphere moves a star by a part of a pixel. The engine draws the truth at the place that undoes this; it is
+    not shifted as observed stars are: a shift of an image that is not quite band-limited rings along rows and columns.
     """
-    first = _expose(experiment, positions, np.zeros_like(positions), threads, None)
-    moved = measure_shapes(first.image, first.pixel_scale, experiment.weight_fwhm)
-    shift = np.nan_to_num(np.stack([moved.x, moved.y], axis=1))
-    truth = _expose(experiment, positions, -shift, threads, advance)
+
+    def seen_at(images: np.ndarray, pixel_scale: float) -> np.ndarray:
+        moved = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
+        return np.nan_to_num(np.stack([moved.x, moved.y], axis=1))
+
+    truth = _expose(experiment, positions, np.zeros_like(positions), threads, advance, recenter=seen_at)
     edge = _SHIFT_ROOM // 2
     images = truth.image[:, edge:-edge, edge:-edge].astype(np.float64)
     images /= images.sum(axis=(1, 2), keepdims=True)
@@ -174,6 +183,7 @@ def _expose(
     offsets: np.ndarray,
     threads: int | None,
     advance: Callable[[int], None] | None,
+    recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
 ) -> _Exposed:
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
@@ -192,11 +202,14 @@ def _expose(
         wavelengths,
         focal_plane=experiment.focal_plane,
         atmosphere=experiment.atmosphere,
+        aberration=experiment.aberration,
         engine=config.psf.engine,
         stamp_size=experiment.stamp_size + _SHIFT_ROOM,
         pixel_size=experiment.pixel_size,
         diffusion=experiment.diffusion,
+        jitter=experiment.jitter,
         offsets=offsets,
+        recenter=recenter,
         dispersion=experiment.dispersion,
         n_pupil=config.psf.n_pupil,
         threads=threads,

@@ -65,10 +65,21 @@ class FocalPlaneConfig(_Section):
         return tuple(n for n in names if getattr(self, "global_" if n == "global" else n))
 
 
+class ActiveOpticsConfig(_Section):
+    """What the active optics leaves uncorrected: an aberration of each visit (0.2 um in Jee & Tyson 2011)."""
+
+    residual_um: Annotated[float, BeforeValidator(_number), Field(strict=True, ge=0, le=2)] = Field(
+        0.0, description="rms of the wavefront left over, over pupil and field [um]"
+    )
+
+
 class AtmosphereConfig(_Section):
     """Turbulence and refraction above the telescope."""
 
     enabled: Switch = Field(True, description="false for the optics alone")
+    epoch: Whole = Field(
+        0, description="number of the visit: turbulence, wind, residual aberration and noise are its own"
+    )
     site: str = Field("cerro_pachon", description="bundled site, or path of a site file")
     r0_m: Positive | None = Field(None, description="Fried parameter at 500 nm at the zenith [m]")
     outer_scale_m: Positive | None = Field(None, description="outer scale [m]")
@@ -93,6 +104,7 @@ class PsfConfig(_Section):
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")
     diffusion_pixels: NotNegative | None = Field(None, description="rms of the charge diffusion [CCD pixels of 10 um]")
+    jitter_arcsec: NotNegative = Field(0.0, description="rms of the telescope's pointing along each axis [arcsec]")
 
 
 class ReconstructionConfig(_Section):
@@ -114,6 +126,7 @@ class Configuration(_Section):
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()
+    active_optics: ActiveOpticsConfig = ActiveOpticsConfig()
     atmosphere: AtmosphereConfig = AtmosphereConfig()
     psf: PsfConfig = PsfConfig()
     reconstruction: ReconstructionConfig = ReconstructionConfig()

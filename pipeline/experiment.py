@@ -20,6 +20,7 @@ from ..models.prescription import bundled_names, load_telescope
 from ..models.site import Site, load_site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
+from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere import Atmosphere
 from ..wavefront.fast_psf import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.pupil_optics import chief_rays
@@ -27,6 +28,7 @@ from ..wavefront.refraction import dispersion_shift
 from .config import BandName, Configuration, digest
 from .photometry import ARCSEC
 from .polynomial import term_count
+from .screen_cover import check_screens
 
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
 DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
@@ -55,6 +57,8 @@ class Experiment:
         CCD heights.
     atmosphere : Atmosphere or None
         Turbulence; None for the optics alone.
+    aberration : ResidualWavefront or None
+        What active optics leaves uncorrected; None for nothing.
     site : Site
         Where the telescope stands.
     """
@@ -63,6 +67,7 @@ class Experiment:
     telescope: Telescope
     focal_plane: FocalPlane
     atmosphere: Atmosphere | None
+    aberration: ResidualWavefront | None
     site: Site
 
     @property
@@ -89,6 +94,11 @@ class Experiment:
     def diffusion(self) -> float:
         """Charge diffusion, rms [m]."""
         return _given(self.config.psf.diffusion_pixels) * CCD_PIXEL
+
+    @property
+    def jitter(self) -> float:
+        """Pointing of the telescope, rms along each axis [rad]."""
+        return self.config.psf.jitter_arcsec * ARCSEC
 
     @property
     def weight_fwhm(self) -> float:
@@ -181,6 +191,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> Configuration:
         }
     )
     _check(resolved, telescope)
+    check_screens(resolved, telescope, camera, site)
     return resolved
 
 
@@ -215,10 +226,15 @@ def prepare(config: Configuration) -> Experiment:
                 screen_length=air.screen_length_m,
                 ground_lift=air.ground_lift_m,
                 zenith_angle=math.radians(air.zenith_angle_deg),
+                epoch=air.epoch,
             )
         except PachonError as error:
             raise ConfigError(f"atmosphere: {error}") from None
-    return Experiment(config, telescope, focal_plane, atmosphere, site)
+    aberration = None
+    if config.active_optics.residual_um > 0.0:
+        rms = config.active_optics.residual_um * 1e-6
+        aberration = ResidualWavefront.draw(telescope, rms, config.seed, air.epoch)
+    return Experiment(config, telescope, focal_plane, atmosphere, aberration, site)
 
 
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:

@@ -15,10 +15,12 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 
 from ..raytrace.launch import thread_count
+from ..wavefront.psf import SCREENS
 from .ccd_product import CcdProduct, product_path, read_product, write_product
 from .ccd_stage import compute_ccd
 from .config import Configuration
 from .experiment import Experiment, prepare
+from .memory import check_memory
 from .products import write_bytes, write_ecsv, write_json
 from .progress import Reporter
 from .report import build_report, draw_pictures
@@ -84,8 +86,11 @@ def run(
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = prepare(config)
-    claim_folder(folder, experiment, resume=resume)
     names = config.ccds or ()
+    # To draw the report of a finished run again, no screen is needed.
+    if not (resume and all(product_path(folder, name).exists() for name in names)):
+        check_memory(experiment, threads)
+    claim_folder(folder, experiment, resume=resume)
     kept = finished_ccds(folder, experiment) if resume else ()
     missing = tuple(name for name in names if name not in kept)
     if kept:
@@ -116,10 +121,10 @@ def _compute(
         return
     config = experiment.config
     if experiment.atmosphere is not None:
-        wanted = [("low", "gradient")] if config.psf.engine == "fast" else [("low", "spline"), ("high", "spline")]
+        wanted = SCREENS.get(config.psf.engine, ())
         with reporter.stage(f"atmosphere: {experiment.atmosphere.layer_count} screens"):
-            for scale, stencil in wanted:
-                experiment.atmosphere.kept_screens(scale, stencil, threads)
+            for kind in wanted:
+                experiment.atmosphere.kept_screens(kind, threads)
     stars = config.stars.truth + config.stars.observed
     with reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names)) as stage:
         for i, name in enumerate(names, start=1):

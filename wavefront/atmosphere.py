@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,15 +20,20 @@ from ..models.errors import DomainError, unknown_name
 from ..models.random_streams import stream
 from ..models.site import Site, load_site
 from ..models.units import metres
+from .layers import check_drift, checked_layers, layer_random, line_of_sight
+from .memory import require_bytes
 from .refraction import require_zenith_angle
-from .screens import evaluate, phase_screen
-from .turbulence import require_positive
+from .screens import evaluate, phase_screen, slope_screen, working_bytes
+from .turbulence import require_positive, slope_variance
 
 _cache_lock = threading.Lock()
 
 #: Default cut-off in units of 1/r0 [rad/m]. Of 1.0, 1.2, 1.4 and 2.0 this brings the fast PSF engine's ellipticities
 #: nearest to the wave engine's (docs/accuracy.md); beyond it geometric optics makes the image too wide.
 DEFAULT_CUTOFF = 1.4
+#: Distance over which rays feel the slope of the low screens [m]: a gradient proper lets waves of a metre bend light
+#: more than they do where it interferes over baselines of some tenths of a metre.
+SLOPE_LAG = 0.0
 _SCALES = ("low", "high")
 # Beyond these a slip of the pen would fill the memory: 10 million steps, screens of 17 GB.
 _MOST_STEPS = 10_000_000
@@ -88,7 +94,7 @@ class Atmosphere:
     seed: int
     epoch: int
     fixed_modulus: bool = False
-    _cache: dict[tuple[str, str], np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    _cache: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def from_site(
@@ -103,8 +109,8 @@ class Atmosphere:
         screen_size: int = 8192,
         screen_length: float = 1300.0,
         cutoff: float | None = None,
-        fine_size: int = 2048,
-        fine_pixel: float = 0.02,
+        fine_size: int = 3072,
+        fine_pixel: float = 0.014,
         epoch: int = 0,
         altitudes: ArrayLike | None = None,
         weights: ArrayLike | None = None,
@@ -138,9 +144,11 @@ class Atmosphere:
         epoch : int
             Number of the exposure, not negative.
         altitudes, weights, wind_speeds : array_like, optional
-            Layers in place of the site's: heights above the telescope [m], relative turbulence, wind [m/s].
+            Layers in place of the site's: heights above the telescope [m], fractions of the turbulence that sum to 1
+            but for their rounding, wind [m/s]. No layer may drift farther in the exposure than its screen is long.
         wind_directions : array_like, optional
-            Directions that the wind blows to, from +x towards +y [rad]; random by default.
+            Directions that the wind blows to, from +x towards +y [rad]; the site's by default, and random where it has
+            none.
         ground_lift : float
             Height given to a layer at exactly 0 [m]: at 0 neighbouring stars see one and the same ground layer.
         zenith_angle : float or Quantity
@@ -165,18 +173,19 @@ class Atmosphere:
         zenith = require_zenith_angle(zenith_angle)
         fried = _length(site.r0 if r0 is None else r0, "r0") * math.cos(zenith) ** 0.6
         outer = _length(site.outer_scale if outer_scale is None else outer_scale, "outer_scale")
-        height, fraction, speed, direction = _layers(
+        height, fraction, speed, direction = checked_layers(
             site, altitudes, weights, wind_speeds, wind_directions, seed, epoch
         )
         if not (math.isfinite(ground_lift) and ground_lift >= 0.0):
             raise DomainError(f"ground_lift = {ground_lift!r}: expected a height of 0 m or more")
-        height = np.where(height == 0.0, ground_lift, height) / math.cos(zenith)
+        height = line_of_sight(height, ground_lift, zenith)
         exposure = require_positive(exposure, "exposure", "seconds")
         steps = max(1, math.ceil(exposure / require_positive(time_step, "time_step", "seconds") - 1e-9))
         if steps > _MOST_STEPS:
             raise DomainError(f"time_step = {time_step!r}: expected at most {_MOST_STEPS} steps in {exposure:g} s")
         length = require_positive(screen_length, "screen_length", "metres")
-        offsets = length * np.array([_uniform(seed, epoch, n, "offset", 2) for n in range(len(height))])
+        check_drift(height, speed, exposure, length)
+        offsets = length * np.array([layer_random(seed, epoch, n, "offset", 2) for n in range(len(height))])
         velocities = speed[:, np.newaxis] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
         times = (np.arange(steps) + 0.5) * (exposure / steps)
         for array in (height, fraction, velocities, offsets, times):
@@ -234,8 +243,20 @@ class Atmosphere:
                     f" {scale} screens, {lowest:.4g} to {nyquist:.4g} rad/m"
                 )
 
+    def _band(self, scale: str) -> tuple[int, float, tuple[float, float]]:
+        """Return samples, side [m] and wavenumbers [rad/m] of one kind of screens."""
+        if scale == "high":
+            return self.fine_size, self.fine_length, (self.cutoff, math.inf)
+        return self.screen_size, self.screen_length, (0.0, self.cutoff)
+
+    def screen_bytes(self, scales: Iterable[str]) -> int:
+        """Return how much memory the kept screens of some scales take, and the making of the last of them."""
+        grids = [self._band(scale) for scale in scales]
+        kept = sum(4 * self.layer_count * size * size for size, _, _ in grids)
+        return kept + max((working_bytes(*grid) for grid in grids), default=0)
+
     def low_screen(
-        self, layer: int, stencil: str = "gradient", *, threads: int | None = None, out: np.ndarray | None = None
+        self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
     ) -> np.ndarray:
         """Return the low screen of a layer: the modes at and below the cut-off.
 
@@ -255,7 +276,7 @@ class Atmosphere:
         ndarray
             Path [m], float32, shape [screen_size, screen_size], ``[y, x]``.
         """
-        return self._screen(layer, "low", stencil, threads, out)
+        return phase_screen(**self._drawing(layer, "low"), stencil=stencil, threads=threads, out=out)
 
     def high_screen(
         self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
@@ -264,52 +285,91 @@ class Atmosphere:
 
         Arguments are those of :meth:`low_screen`; the screen has shape [fine_size, fine_size].
         """
-        return self._screen(layer, "high", stencil, threads, out)
+        return phase_screen(**self._drawing(layer, "high"), stencil=stencil, threads=threads, out=out)
 
-    def _screen(self, layer: int, scale: str, stencil: str, threads: int | None, out: np.ndarray | None) -> np.ndarray:
-        if not 0 <= layer < self.layer_count:
-            raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
-        low = scale == "low"
-        return phase_screen(
-            stream(self.seed, "atmosphere", self.epoch, layer, scale),
-            size=self.screen_size if low else self.fine_size,
-            length=self.screen_length if low else self.fine_length,
-            r0=self.r0,
-            outer_scale=self.outer_scale,
-            band=(0.0, self.cutoff) if low else (self.cutoff, math.inf),
-            weight=float(self.weights[layer]),
-            stencil=stencil,
-            fixed_modulus=self.fixed_modulus,
-            threads=threads,
-            out=out,
-        )
+    def slope_unit(self, layer: int) -> float:
+        """Return the slope of one count of :meth:`slope_screen` [rad]: eight standard deviations fill 15 bits."""
+        variance = slope_variance(self.r0, self.outer_scale, self.cutoff, SLOPE_LAG) * float(self.weights[layer])
+        return max(8.0 * math.sqrt(variance) / 32767.0, 1e-30)
 
-    def kept_screens(self, scale: str, stencil: str, threads: int | None = None) -> np.ndarray:
-        """Return the screens of all layers at one scale, made once and kept for whoever asks next.
+    def slope_screen(self, layer: int, *, threads: int | None = None, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the slopes of the low screen of a layer over :data:`SLOPE_LAG`, packed.
 
         Parameters
         ----------
-        scale : {"low", "high"}
-            Which screens.
-        stencil : str
-            How they will be read, as for :meth:`low_screen`.
+        layer : int
+            Index of the layer.
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+        out : ndarray, optional
+            Where to write the slopes: int32, shape [screen_size, screen_size].
+
+        Returns
+        -------
+        ndarray
+            As :func:`~pachon.wavefront.screens.slope_screen` packs them, in counts of :meth:`slope_unit`.
+        """
+        return slope_screen(
+            **self._drawing(layer, "low"), unit=self.slope_unit(layer), lag=SLOPE_LAG, threads=threads, out=out
+        )
+
+    def _drawing(self, layer: int, scale: str) -> dict[str, Any]:
+        """Return what decides one screen."""
+        if not 0 <= layer < self.layer_count:
+            raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
+        size, length, band = self._band(scale)
+        return {
+            "generator": stream(self.seed, "atmosphere", self.epoch, layer, scale),
+            "size": size,
+            "length": length,
+            "r0": self.r0,
+            "outer_scale": self.outer_scale,
+            "band": band,
+            "weight": float(self.weights[layer]),
+            "fixed_modulus": self.fixed_modulus,
+        }
+
+    def kept_screens(self, kind: str, threads: int | None = None) -> np.ndarray:
+        """Return the screens of all layers, made once and kept for whoever asks next.
+
+        Parameters
+        ----------
+        kind : {"slopes", "low", "high"}
+            Packed slopes of the low screens, for rays; the low or the high screens as spline coefficients, for waves.
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
 
         Returns
         -------
         ndarray
-            Path [m], float32, shape [n_layer, size, size], not writable.
+            Shape [n_layer, size, size], not writable.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such kind.
+        DomainError
+            If they need more memory than there is.
         """
-        make, size = {"low": (self.low_screen, self.screen_size), "high": (self.high_screen, self.fine_size)}[scale]
+        kinds: dict[str, tuple[Callable[..., np.ndarray], Any]] = {
+            "slopes": (self.slope_screen, np.int32),
+            "low": (self.low_screen, np.float32),
+            "high": (self.high_screen, np.float32),
+        }
+        if kind not in kinds:
+            raise unknown_name("kind", kind, tuple(kinds))
+        make, dtype = kinds[kind]
+        size = self._band(kind)[0]
+        name = "fine_size" if kind == "high" else "screen_size"
         with _cache_lock:
-            if (scale, stencil) not in self._cache:
-                screens = np.empty((self.layer_count, size, size), dtype=np.float32)
+            if kind not in self._cache:
+                require_bytes(self.screen_bytes([kind]), f"{name} = {size} in {self.layer_count} layers")
+                screens = np.empty((self.layer_count, size, size), dtype=dtype)
                 for layer in range(self.layer_count):
-                    make(layer, stencil, threads=threads, out=screens[layer])
+                    make(layer, threads=threads, out=screens[layer])
                 screens.setflags(write=False)
-                self._cache[scale, stencil] = screens
-            return self._cache[scale, stencil]
+                self._cache[kind] = screens
+            return self._cache[kind]
 
     def release(self) -> None:
         """Forget the kept screens; they come back, byte for byte, when next asked for."""
@@ -359,9 +419,7 @@ class Atmosphere:
         shift = self.pupil_centers(np.array([*field, -1.0]), time)[layer]
         return np.asarray(x, dtype=np.float64) + shift[0], np.asarray(y, dtype=np.float64) + shift[1]
 
-    def path(
-        self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low", stencil: str = "spline"
-    ) -> np.ndarray:
+    def path(self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low") -> np.ndarray:
         """Return the path through one screen at screen coordinates, by plain NumPy.
 
         The screen is made anew at every call: this is the reference for the engines, not a tool for production.
@@ -374,8 +432,6 @@ class Atmosphere:
             Index of the layer.
         scale : str
             ``"low"`` or ``"high"``.
-        stencil : str
-            Stencil of the screen: ``"spline"`` interpolates by cubic B-spline, the others bilinearly.
 
         Returns
         -------
@@ -385,13 +441,8 @@ class Atmosphere:
         if scale not in _SCALES:
             raise unknown_name("scale", scale, _SCALES)
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-        pixel = self.screen_pixel if scale == "low" else self.fine_pixel
-        return evaluate(self._screen(layer, scale, stencil, None, None), pixel, x, y, stencil)
-
-
-def _uniform(seed: int, epoch: int, layer: int, name: str, count: int) -> np.ndarray:
-    """Return random numbers from 0 to 1 of the stream of one layer."""
-    return stream(seed, "atmosphere", epoch, layer, name).random(count)
+        make, pixel = {"low": (self.low_screen, self.screen_pixel), "high": (self.high_screen, self.fine_pixel)}[scale]
+        return evaluate(make(layer), pixel, x, y)
 
 
 def _size(value: int, name: str) -> int:
@@ -403,35 +454,3 @@ def _size(value: int, name: str) -> int:
 def _length(value: Any, name: str) -> float:
     array = metres(value, name)
     return require_positive(array.item() if array.size == 1 else value, name, "metres")
-
-
-def _layers(
-    site: Site,
-    altitudes: ArrayLike | None,
-    weights: ArrayLike | None,
-    wind_speeds: ArrayLike | None,
-    wind_directions: ArrayLike | None,
-    seed: int,
-    epoch: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return heights [m], weights of sum 1, wind speeds [m/s] and directions [rad] of the layers, checked."""
-    height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
-    count = len(height)
-    if wind_directions is None:
-        wind_directions = [2.0 * math.pi * _uniform(seed, epoch, n, "wind", 1)[0] for n in range(count)]
-    given = {
-        "altitudes": height,
-        "weights": np.array(site.weights if weights is None else weights, dtype=np.float64),
-        "wind_speeds": np.array(site.wind_speeds if wind_speeds is None else wind_speeds, dtype=np.float64),
-        "wind_directions": np.array(wind_directions, dtype=np.float64),
-    }
-    for name, values in given.items():
-        if values.shape != (count,) or count == 0:
-            raise DomainError(f"{name} of shape {values.shape}: expected one number for each of the {count} layers")
-        low = -math.inf if name == "wind_directions" else 0.0
-        if not np.all(np.isfinite(values) & (values >= low)):
-            raise DomainError(f"{name} = {values.tolist()}: expected finite numbers{' from 0' if low == 0.0 else ''}")
-    total = float(given["weights"].sum())
-    if total <= 0.0:
-        raise DomainError(f"weights = {given['weights'].tolist()}: expected at least one above 0")
-    return height, given["weights"] / total, given["wind_speeds"], given["wind_directions"]

@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
@@ -32,12 +31,14 @@ from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch, thread_count
 from ..raytrace.rays import field_direction
-from .atmosphere import Atmosphere
+from .aberration import ResidualWavefront
+from .atmosphere import SLOPE_LAG, Atmosphere
 from .fast_psf_kernels import combine_wavelengths, deposit_rays
-from .image_plane import ImagePlane, RenderedStars, focal_length, square_transfer
+from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length, square_transfer
+from .pupil_lattice import PupilLattice
 from .pupil_optics import PupilOptics, trace_pupils
 from .sample_packets import indices, samples, shared, to_packets
-from .turbulence import REFERENCE_WAVELENGTH, SPECTRUM_CONSTANT, diffraction_otf, structure_function
+from .turbulence import diffraction_otf, slope_variance, structure_function
 
 #: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
 PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
@@ -52,70 +53,6 @@ OVERSAMPLING, OVERSAMPLING_STILL = 4, 12
 _BATCH, _BATCH_BYTES = 32, 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
 _TABLE_SIZE = 4096
-
-
-@dataclass(frozen=True)
-class PupilLattice:
-    """Points of a square lattice that lie in an annular pupil, symmetric about its centre.
-
-    The gradient of the low screens has no modes beyond the cut-off, so on a lattice finer than half their wavelength
-    sums over the pupil of the gradient and its squares are exact but for the rim; random points would be noisier.
-
-    Attributes
-    ----------
-    spacing : float
-        Distance of neighbouring points [m].
-    column, row : ndarray of int, shape [n_pupil]
-        Indices of the points, from the first column and row.
-    origin : float
-        Coordinate of the first column and row [m].
-    """
-
-    spacing: float
-    column: np.ndarray
-    row: np.ndarray
-    origin: float
-
-    @classmethod
-    def fill(cls, diameter: float, obscuration: float, spacing: float) -> PupilLattice:
-        """Return the lattice of a given spacing [m] in an annulus of given diameter [m] and linear obscuration."""
-        count = 2 * math.ceil(0.5 * diameter / spacing)
-        origin = -0.5 * (count - 1) * spacing
-        line = origin + spacing * np.arange(count)
-        radius = np.hypot(line, line[:, None])
-        row, column = np.nonzero((radius < 0.5 * diameter) & (radius >= 0.5 * obscuration * diameter))
-        return cls(spacing, column, row, origin)
-
-    @property
-    def points(self) -> np.ndarray:
-        """Pupil coordinates [m], shape [n_pupil, 2]."""
-        return self.origin + self.spacing * np.stack([self.column, self.row], axis=-1)
-
-
-def low_slope_variance(r0: float, outer_scale: float, cutoff: float) -> float:
-    """Return the variance of one component of the gradient of the modes below a cut-off wavenumber.
-
-    It is half of the integral of ``(2 pi nu)^2 W(nu)`` over the disc of frequencies, in closed form.
-
-    Parameters
-    ----------
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    cutoff : float
-        Cut-off wavenumber [rad/m].
-
-    Returns
-    -------
-    float
-        Variance [rad^2].
-    """
-    low = outer_scale**-2
-    high = low + (cutoff / (2.0 * math.pi)) ** 2
-    integral = 6.0 * (high ** (1 / 6) - low ** (1 / 6)) + 1.2 * low * (high ** (-5 / 6) - low ** (-5 / 6))
-    scale = SPECTRUM_CONSTANT * (REFERENCE_WAVELENGTH / (2.0 * math.pi)) ** 2 * r0 ** (-5 / 3)
-    return 2.0 * math.pi**3 * scale * integral
 
 
 def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
@@ -138,7 +75,7 @@ def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: floa
         Path squared [m^2], not falling, shape of ``separation``.
     """
     rest = structure_function(separation, r0, outer_scale)
-    rest = rest - low_slope_variance(r0, outer_scale, cutoff) * separation**2
+    rest = rest - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
     return np.maximum.accumulate(np.maximum(rest, 0.0))
 
 
@@ -165,6 +102,8 @@ class FastPsfEngine:
         Cells of the fine grid to a pixel.
     projection : str
         Meaning of the field angles.
+    aberration : ResidualWavefront, optional
+        Added to the traced wavefront.
     threads : int, optional
         Number of threads; no byte depends on it.
     """
@@ -181,6 +120,7 @@ class FastPsfEngine:
         n_pupil: int | None = None,
         oversampling: int | None = None,
         projection: str = "zemax",
+        aberration: ResidualWavefront | None = None,
         threads: int | None = None,
     ) -> None:
         if n_pupil is None:
@@ -199,6 +139,7 @@ class FastPsfEngine:
         self._atmosphere = atmosphere
         self._oversampling = int(oversampling)
         self._projection = projection
+        self._aberration = aberration
         self._threads = threads
         self._place_pupil(n_pupil)
         center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
@@ -207,10 +148,11 @@ class FastPsfEngine:
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
         if atmosphere is None:
-            self._screens = np.zeros((1, 1), dtype=np.float32)
+            self._screens, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
         else:
-            screens = atmosphere.kept_screens("low", "gradient", threads)
+            screens = atmosphere.kept_screens("slopes", threads)
             self._screens = screens.reshape(len(screens), -1)
+            self._units = np.array([atmosphere.slope_unit(n) for n in range(len(screens))], dtype=np.float32)
 
     @property
     def batch(self) -> int:
@@ -232,6 +174,7 @@ class FastPsfEngine:
                     f" {diameter} m"
                 )
         self._lattice = PupilLattice.fill(diameter, obscuration, spacing)
+        self._weights = self._lattice.weights(diameter, obscuration)
 
     def _make_grid(self) -> None:
         """Lay out the fine grid and its frequencies."""
@@ -259,7 +202,7 @@ class FastPsfEngine:
             table *= np.exp(-0.5 * (2.0 * math.pi / self._wavelengths[:, None]) ** 2 * rest)
         return float(baseline[1]), table.astype(np.float32)
 
-    def render(self, fields: np.ndarray, offsets: np.ndarray) -> RenderedStars:
+    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
         """Render one batch of stars.
 
         Parameters
@@ -268,6 +211,8 @@ class FastPsfEngine:
             Field angles [rad].
         offsets : ndarray, shape [n_star, 2]
             Places of the reference points from the centre of the middle pixel [pixels].
+        recenter : callable, optional
+            As :func:`~pachon.wavefront.psf.make_psfs` takes it.
 
         Returns
         -------
@@ -281,6 +226,7 @@ class FastPsfEngine:
             self._focal_plane,
             self._projection,
             self._threads,
+            aberration=self._aberration,
         )
         n_star, n = len(fields), self._grid_size
         deposit = self._deposit(optics)
@@ -288,16 +234,30 @@ class FastPsfEngine:
         spectra = np.empty((*deposit.shape[:-1], n // 2 + 1), dtype=np.complex64)
         self._for_each(n_star, lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])))
         combined = self._combine(spectra, optics, offsets)
-        span = slice(0, self._plane.stamp_size * self._oversampling, self._oversampling)
-        stamps = np.empty((n_star, self._plane.stamp_size, self._plane.stamp_size))
-        self._for_each(
-            n_star, lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span])
-        )
         n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
         rays = np.maximum(optics.lit.sum(axis=(1, 2)), 1) * n_time
+        stamps = self._stamps(combined, rays)
+        if recenter is not None:
+            shift = recenter(stamps)
+            offsets = offsets - shift
+            # A move of the whole star is a ramp of phase; the rays need not be traced nor binned again.
+            turn = 1j * self._plane.pixel_size * shift[:, :, None]
+            combined *= np.exp(turn[:, 1] * self._ky).astype(np.complex64)[:, :, None]
+            combined *= np.exp(turn[:, 0] * self._kx).astype(np.complex64)[:, None, :]
+            stamps = self._stamps(combined, rays)
+        return RenderedStars(stamps, optics.lit.mean(axis=2), optics.reference, offsets)
+
+    def _stamps(self, combined: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Return the stamps of transforms of the fine grid, shape [n_star, stamp_size, stamp_size]."""
+        n, side = self._grid_size, self._plane.stamp_size
+        span = slice(0, side * self._oversampling, self._oversampling)
+        stamps = np.empty((len(combined), side, side))
+        self._for_each(
+            len(combined), lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span])
+        )
         # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
         stamps *= (self._oversampling**2 / rays)[:, None, None]
-        return RenderedStars(stamps, optics.lit.mean(axis=2), optics.reference)
+        return stamps
 
     def _for_each(self, count: int, job: Callable[[int], None]) -> None:
         with ThreadPoolExecutor(thread_count(self._threads)) as pool:
@@ -321,13 +281,14 @@ class FastPsfEngine:
         # Rays that were lost have no place to land; they carry no light either.
         landed = np.where(optics.lit[..., None], optics.displacement, 0.0) / self._cell
         displacement = np.stack([to_packets(landed[..., axis], np.float32) for axis in (0, 1)], axis=-2)
-        cells_per_slope = optics.jacobian.reshape(n_star, 4) / (pixel * self._cell)
+        cells_per_slope = optics.jacobian.reshape(n_star, 4) / self._cell
         image = np.zeros((n_star, n_wave * self._grid_size**2), dtype=np.float32)
         launch(
             deposit_rays,
             n_star,
             [
-                shared(self._screens, wp.float32),
+                shared(self._screens, wp.int32),
+                shared(self._units, wp.float32),
                 screen_size,
                 n_layer,
                 n_time,
@@ -337,7 +298,7 @@ class FastPsfEngine:
                 int(max(column.max(), row.max())) + 1,
                 shared(cells_per_slope.astype(np.float32), wp.float32),
                 shared(displacement, samples),
-                shared(to_packets(optics.lit, np.float32, fill="constant"), samples),
+                shared(to_packets(optics.lit * self._weights, np.float32, fill="constant"), samples),
                 self._grid_size,
                 wp.empty((n_star, len(lattice), 2), dtype=samples, device="cpu"),
                 shared(image, wp.float32),

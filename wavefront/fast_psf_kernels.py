@@ -11,79 +11,30 @@ wp.set_module_options(FORWARD_OPTIONS)
 
 
 @wp.func
-def corner_of(position: wp.float64, size: wp.int32):
-    """Take a screen coordinate [pixels] modulo the screen; return its sample and the fraction of a pixel beyond it."""
+def nearest_sample(position: wp.float64, size: wp.int32):
+    """Take a screen coordinate [pixels] modulo the screen and return the nearest sample."""
     # float64: a fraction of a pixel after a kilometre of wind would lose its digits in float32.
-    wrapped = position - wp.float64(size) * wp.floor(position / wp.float64(size))
-    corner = wp.int32(wrapped)
-    return corner % size, wp.float32(wrapped - wp.float64(corner))
+    shifted = position + wp.float64(0.5)
+    wrapped = shifted - wp.float64(size) * wp.floor(shifted / wp.float64(size))
+    return wp.int32(wrapped) % size
 
 
 @wp.func
-def patch_slope(c00: samples, c10: samples, c01: samples, c11: samples, fraction_x: wp.float32, fraction_y: wp.float32):
-    """Differences of path across a pixel, in x and y, on the bilinear patch of four corners (named by x, then y)."""
-    along_x = c10 - c00
-    along_y = c01 - c00
-    twist = (c11 - c01) - along_x
-    return along_x + twist * fraction_y, along_y + twist * fraction_x
-
-
-@wp.func
-def slope_inside(
-    screens: wp.array2d(dtype=wp.float32),
-    layer: wp.int32,
-    size: wp.int32,
-    corner: wp.int32,
-    offset: indices,
-    fraction_x: wp.float32,
-    fraction_y: wp.float32,
-):
-    """Read the patches under a packet that crosses no border of the screen."""
-    c00 = samples()
-    c10 = samples()
-    c01 = samples()
-    c11 = samples()
+def unpack(counts: indices, unit: wp.float32):
+    """Slopes along x and y [rad] from the lower and the upper 16 bits."""
+    x = samples()
+    y = samples()
     for i in range(LANES):
-        at = corner + offset[i]
-        c00[i] = screens[layer, at]
-        c10[i] = screens[layer, at + 1]
-        c01[i] = screens[layer, at + size]
-        c11[i] = screens[layer, at + size + 1]
-    return patch_slope(c00, c10, c01, c11, fraction_x, fraction_y)
-
-
-@wp.func
-def slope_across(
-    screens: wp.array2d(dtype=wp.float32),
-    layer: wp.int32,
-    size: wp.int32,
-    corner: wp.int32,
-    offset: indices,
-    fraction_x: wp.float32,
-    fraction_y: wp.float32,
-):
-    """Read the patches under a packet that may reach over a border of the screen, which is periodic."""
-    c00 = samples()
-    c10 = samples()
-    c01 = samples()
-    c11 = samples()
-    for i in range(LANES):
-        # columns and rows are added apart: a column past the border must not run on into the next row
-        x0 = (corner % size + offset[i] % size) % size
-        y0 = (corner // size + offset[i] // size) % size
-        x1 = (x0 + 1) % size
-        y1 = (y0 + 1) % size
-        c00[i] = screens[layer, y0 * size + x0]
-        c10[i] = screens[layer, y0 * size + x1]
-        c01[i] = screens[layer, y1 * size + x0]
-        c11[i] = screens[layer, y1 * size + x1]
-    return patch_slope(c00, c10, c01, c11, fraction_x, fraction_y)
+        x[i] = unit * wp.float32((counts[i] << 16) >> 16)
+        y[i] = unit * wp.float32(counts[i] >> 16)
+    return x, y
 
 
 @wp.kernel
 def deposit_rays(
     first: wp.int32,
-    screens: wp.array2d(dtype=wp.float32),
+    screens: wp.array2d(dtype=wp.int32),
+    unit: wp.array(dtype=wp.float32),
     screen_size: wp.int32,
     n_layer: wp.int32,
     n_time: wp.int32,
@@ -100,15 +51,15 @@ def deposit_rays(
 ):
     """Deposit all rays of one star, at every wavelength, on its fine grid.
 
-    The pupil points lie on the lattice of the screens, so at one time all of them share one fraction of a pixel and
-    differ by whole samples only: the bilinear weights are two numbers per layer and time.
+    The pupil points lie on the lattice of the screens, and the slopes are read at the nearest sample: that displaces a
+    layer as a whole by part of a pixel, another at every time, and is lost in the mean over the exposure.
 
-    Arguments: screens [layer, y * size + x] [m]; start [star, layer, 2]: screen coordinates of the first lattice point
-    at the first time [pixels]; step [layer, 2] [pixels per time step]; lattice [packet]: row * size + column of the
-    pupil points [pixels]; reach: the largest row or column, plus one; cells_per_slope [star, 4]: Jacobian, row by row,
-    over the screen's pixel and the cell of the grid; displacement [star, wave, packet, 2] by the optics [cells];
-    weight [star, wave, packet]; slope [star, packet, 2]: room for the differences of path across a pixel [m]; image
-    [star, (wave * size + y) * size + x], with the origin in the cell size // 2.
+    Arguments: screens [layer, y * size + x]: packed slopes; unit [layer] of their counts [rad]; start [star, layer, 2]:
+    screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per time step];
+    lattice [packet]: row * size + column of the pupil points [pixels]; reach: the largest row or column, plus one;
+    cells_per_slope [star, 4]: Jacobian, row by row, over the cell of the grid; displacement [star, wave, packet, 2] by
+    the optics [cells]; weight [star, wave, packet] of the light; slope [star, packet, 2]: room for the slopes of all
+    layers [rad]; image [star, (wave * size + y) * size + x], with the origin in the cell size // 2.
     """
     star = first + wp.tid()
     n_packet = lattice.shape[0]
@@ -124,32 +75,38 @@ def deposit_rays(
             slope[star, packet, 1] = samples()
         for layer in range(n_layer):
             time = wp.float64(t)
-            corner_x, fraction_x = corner_of(start[star, layer, 0] + time * step[layer, 0], screen_size)
-            corner_y, fraction_y = corner_of(start[star, layer, 1] + time * step[layer, 1], screen_size)
+            corner_x = nearest_sample(start[star, layer, 0] + time * step[layer, 0], screen_size)
+            corner_y = nearest_sample(start[star, layer, 1] + time * step[layer, 1], screen_size)
             corner = corner_y * screen_size + corner_x
+            counts = indices()
             # Two loops in place of one with a choice inside: the compiler vectorizes these.
-            if corner_x + reach < screen_size and corner_y + reach < screen_size:
+            if corner_x + reach <= screen_size and corner_y + reach <= screen_size:
                 for packet in range(n_packet):
-                    inside_x, inside_y = slope_inside(
-                        screens, layer, screen_size, corner, lattice[packet], fraction_x, fraction_y
-                    )
-                    slope[star, packet, 0] = slope[star, packet, 0] + inside_x
-                    slope[star, packet, 1] = slope[star, packet, 1] + inside_y
+                    offset = lattice[packet]
+                    for i in range(LANES):
+                        counts[i] = screens[layer, corner + offset[i]]
+                    slope_x, slope_y = unpack(counts, unit[layer])
+                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
             else:
                 for packet in range(n_packet):
-                    across_x, across_y = slope_across(
-                        screens, layer, screen_size, corner, lattice[packet], fraction_x, fraction_y
-                    )
-                    slope[star, packet, 0] = slope[star, packet, 0] + across_x
-                    slope[star, packet, 1] = slope[star, packet, 1] + across_y
+                    offset = lattice[packet]
+                    for i in range(LANES):
+                        # columns and rows are added apart: a column past the border must not run on into the next row
+                        x = (corner_x + offset[i] % screen_size) % screen_size
+                        y = (corner_y + offset[i] // screen_size) % screen_size
+                        counts[i] = screens[layer, y * screen_size + x]
+                    slope_x, slope_y = unpack(counts, unit[layer])
+                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
         for packet in range(n_packet):
             bend_x = slope[star, packet, 0]
             bend_y = slope[star, packet, 1]
-            x = bend_x * xx + bend_y * xy
-            y = bend_x * yx + bend_y * yy
+            moved_x = bend_x * xx + bend_y * xy
+            moved_y = bend_x * yx + bend_y * yy
             for wave in range(n_wave):
-                cell_x = x + displacement[star, wave, packet, 0]
-                cell_y = y + displacement[star, wave, packet, 1]
+                cell_x = moved_x + displacement[star, wave, packet, 0]
+                cell_y = moved_y + displacement[star, wave, packet, 1]
                 light = weight[star, wave, packet]
                 for i in range(LANES):
                     # No branch, so that the lanes stay together; light beyond the grid is left out.
@@ -158,8 +115,8 @@ def deposit_rays(
                     near_column = wp.clamp(column, 0, grid_size - 1)
                     near_row = wp.clamp(row, 0, grid_size - 1)
                     caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
-                    at = (wave * grid_size + near_row) * grid_size + near_column
-                    image[star, at] = image[star, at] + caught
+                    cell = (wave * grid_size + near_row) * grid_size + near_column
+                    image[star, cell] = image[star, cell] + caught
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-r"""The detector end of both PSF engines: the grid of a stamp, and what pixels and charge diffusion do to it.
+r"""The detector end of both PSF engines: the grid of a stamp, and what pixels, diffusion and jitter do to it.
 
 An image :math:`I(X)` on the focal plane has the transform :math:`\tilde I(k) = \int I(X) e^{-i k \cdot X} dX`, with k
 in radians per metre of the focal plane. A pupil baseline b belongs to :math:`k = (2 \pi / \lambda) J^{-T} b`, where J
@@ -8,6 +8,7 @@ is the Jacobian of the position on the focal plane with respect to the direction
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +28,14 @@ class ImagePlane:
         Side of a square pixel [m].
     diffusion : float
         Root mean square of the charge diffusion along each axis [m].
+    jitter : float
+        Root mean square along each axis of how far the pointing of the telescope moves images during an exposure [m].
     """
 
     stamp_size: int
     pixel_size: float
     diffusion: float
+    jitter: float = 0.0
 
     def __post_init__(self) -> None:
         if int(self.stamp_size) != self.stamp_size or self.stamp_size < 3:
@@ -40,6 +44,8 @@ class ImagePlane:
             raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
         if not (math.isfinite(self.diffusion) and self.diffusion >= 0.0):
             raise DomainError(f"diffusion = {self.diffusion!r}: expected a length in metres from 0")
+        if not (math.isfinite(self.jitter) and self.jitter >= 0.0):
+            raise DomainError(f"jitter = {self.jitter!r}: expected a length in metres from 0")
 
     @property
     def side(self) -> float:
@@ -57,7 +63,7 @@ class ImagePlane:
         return (np.arange(self.stamp_size) - self.middle) * self.pixel_size
 
     def transfer(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
-        """Return the transfer function of the detector: a square pixel and Gaussian charge diffusion.
+        """Return the transfer function of a square pixel, Gaussian charge diffusion and Gaussian pointing jitter.
 
         Parameters
         ----------
@@ -69,7 +75,12 @@ class ImagePlane:
         ndarray
             Real factor of each wavenumber, 1 at zero.
         """
-        return square_transfer(kx, ky, self.pixel_size) * np.exp(-0.5 * self.diffusion**2 * (kx * kx + ky * ky))
+        variance = self.diffusion**2 + self.jitter**2
+        return square_transfer(kx, ky, self.pixel_size) * np.exp(-0.5 * variance * (kx * kx + ky * ky))
+
+
+#: Tells where stars are seen on their stamps [n, ny, nx]: places (x, y) from the centre of the middle pixel [pixels].
+Recenter = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -84,11 +95,14 @@ class RenderedStars:
         Lit fraction of the pupil.
     reference : ndarray, shape [n_star, 3]
         Point of the CCD at the star's place on the stamp, telescope frame [m].
+    offset : ndarray, shape [n_star, 2]
+        Place (x, y) of the reference point from the centre of the middle pixel [pixels].
     """
 
     image: np.ndarray
     throughput: np.ndarray
     reference: np.ndarray
+    offset: np.ndarray
 
 
 def square_transfer(kx: np.ndarray, ky: np.ndarray, side: float) -> np.ndarray:

@@ -12,12 +12,16 @@ from ..models.errors import ConfigError, DomainError
 from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..models.units import metres, radians
+from .aberration import ResidualWavefront
 from .atmosphere import Atmosphere
 from .fast_psf import FastPsfEngine
-from .image_plane import ImagePlane
+from .image_plane import ImagePlane, Recenter, focal_length
+from .pupil_optics import trace_pupils
 from .wave_psf import WavePsfEngine
 
 ENGINES = ("fast", "wave")
+#: Kinds of screens that an engine keeps of an atmosphere, as its ``kept_screens`` names them.
+SCREENS = {"fast": ("slopes",), "wave": ("low", "high")}
 #: Value of :attr:`Psfs.flags` for a star none of whose light reaches the focal plane; its image is zero.
 DARK = 1
 
@@ -39,6 +43,8 @@ class Psfs:
     reference : ndarray, shape [n_star, 3]
         Where the chief ray of the middle wavelength meets the CCD, telescope frame [m]: the centre of pixel
         ``[size // 2, size // 2]`` plus the star's offset.
+    offset : ndarray, shape [n_star, 2]
+        Place (x, y) of that point from the centre of the middle pixel [pixels].
     throughput : ndarray, shape [n_star, n_wave]
         Lit fraction of the annular pupil.
     inside : ndarray, shape [n_star]
@@ -52,6 +58,7 @@ class Psfs:
     fields: np.ndarray
     wavelengths: np.ndarray
     reference: np.ndarray
+    offset: np.ndarray
     throughput: np.ndarray
     inside: np.ndarray
     flags: np.ndarray
@@ -64,12 +71,15 @@ def make_psfs(
     *,
     focal_plane: FocalPlane | None = None,
     atmosphere: Atmosphere | None = None,
+    aberration: ResidualWavefront | None = None,
     engine: str = "fast",
     seed: int = 0,
     stamp_size: int = 31,
     pixel_size: Any = 10e-6,
     diffusion: Any = 4e-6,
+    jitter: Any = 0.0,
     offsets: Any = None,
+    recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
     dispersion: Any = None,
     n_pupil: int | None = None,
     oversampling: int | None = None,
@@ -96,6 +106,8 @@ def make_psfs(
         CCD heights; the nominal flat plane if not given.
     atmosphere : Atmosphere, optional
         The exposure; none outside the atmosphere.
+    aberration : ResidualWavefront, optional
+        What active optics leaves uncorrected; none by default.
     engine : {"fast", "wave"}
         Geometric optics with filters, or Fourier optics (the truth, slow).
     seed : int
@@ -107,8 +119,15 @@ def make_psfs(
         Side of a pixel [m].
     diffusion : float or Quantity
         Root mean square of the charge diffusion along each axis [m].
+    jitter : float or Quantity
+        Root mean square of the telescope's pointing along each axis during the exposure [rad]: a Gaussian blur, the
+        same for all stars.
     offsets : array_like, shape [n_star, 2], optional
         Place of each star (x, y) from the centre of the middle pixel [pixels]; 0 by default.
+    recenter : callable, optional
+        Tells where stars are seen on their stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns
+        places (x, y) from the centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more,
+        moved by so much that it is seen at the centre; that is exact, unlike a shift of the pixels, and costs little.
     dispersion : array_like or Quantity, shape [n_wave, 2], optional
         Shift in field angle of each wavelength by the atmosphere [rad], such as
         :func:`~pachon.wavefront.refraction.dispersion_shift` gives.
@@ -137,6 +156,7 @@ def make_psfs(
     if engine not in ENGINES:
         raise ConfigError(f"engine = {engine!r}: expected one of {', '.join(ENGINES)}")
     angles = _table(radians(fields, "fields"), "fields", None)
+    telescope.check_field(angles[:, 0], angles[:, 1])
     lengths = metres(wavelengths, "wavelengths").reshape(-1)
     if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
         raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
@@ -144,12 +164,18 @@ def make_psfs(
     shifts = np.zeros((len(lengths), 2))
     if dispersion is not None:
         shifts = _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
-    plane = ImagePlane(stamp_size, float(metres(pixel_size, "pixel_size")), float(metres(diffusion, "diffusion")))
+    plane = ImagePlane(
+        stamp_size,
+        float(metres(pixel_size, "pixel_size")),
+        float(metres(diffusion, "diffusion")),
+        _on_detector(jitter, telescope, lengths),
+    )
     maker: FastPsfEngine | WavePsfEngine
     common: dict[str, Any] = {
         "dispersion": shifts,
         "focal_plane": focal_plane,
         "atmosphere": atmosphere,
+        "aberration": aberration,
         "projection": projection,
         "threads": threads,
     }
@@ -158,27 +184,41 @@ def make_psfs(
     else:
         maker = WavePsfEngine(telescope, lengths, plane, padding=padding, pupil_spacing=pupil_spacing, **common)
 
+    pixel_scale = plane.pixel_size / maker.focal_length
+    seen: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
     image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
     throughput = np.empty((len(angles), len(lengths)))
-    reference, inside = np.empty((len(angles), 3)), np.empty(len(angles))
+    reference, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
     for first in range(0, len(angles), maker.batch):
         part = slice(first, min(first + maker.batch, len(angles)))
-        stars = maker.render(angles[part], places[part])
+        stars = maker.render(angles[part], places[part], seen)
         inside[part] = stars.image.sum(axis=(1, 2))
         image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
-        throughput[part], reference[part] = stars.throughput, stars.reference
+        throughput[part], reference[part], offset[part] = stars.throughput, stars.reference, stars.offset
         if progress is not None:
             progress(part.stop)
     return Psfs(
         image=image,
-        pixel_scale=plane.pixel_size / maker.focal_length,
+        pixel_scale=pixel_scale,
         fields=angles,
         wavelengths=lengths,
         reference=reference,
+        offset=offset,
         throughput=throughput,
         inside=inside,
         flags=np.where(throughput.any(axis=1), 0, DARK),
     )
+
+
+def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
+    """Return how far an angle [rad] moves images on the detector [m], at the centre of the field."""
+    angle = radians(jitter, "jitter")
+    if angle.size != 1 or not (np.isfinite(angle) & (angle >= 0.0)).all():
+        raise DomainError(f"jitter = {jitter!r}: expected an angle in radians from 0")
+    if not angle.any():
+        return 0.0
+    center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)))
+    return float(angle.item() * focal_length(center.jacobian)[0])
 
 
 def _table(values: Any, name: str, count: int | None) -> np.ndarray:

@@ -22,6 +22,7 @@ from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
 from ..raytrace.pupil_kernels import trace_pupils as trace_pupils_kernel
 from ..raytrace.rays import Rays, RayStatus, field_direction
 from ..raytrace.trace import trace
+from .aberration import ResidualWavefront
 from .reference import distance_to_sphere
 
 #: Step of the central differences for the Jacobian [rad]: 20 arcsec, so that both rounding (1e-15 m / 1e-4) and the
@@ -137,6 +138,7 @@ def trace_pupils(
     focal_plane: FocalPlane | None = None,
     projection: str = "zemax",
     threads: int | None = None,
+    aberration: ResidualWavefront | None = None,
 ) -> PupilOptics:
     """Trace the same pupil points for many stars at several wavelengths, to the CCD under each star.
 
@@ -157,6 +159,8 @@ def trace_pupils(
         Meaning of the field angles.
     threads : int, optional
         Number of threads.
+    aberration : ResidualWavefront, optional
+        Added to the traced wavefront; reference points and zero of the path stay those of the telescope without it.
 
     Returns
     -------
@@ -171,8 +175,7 @@ def trace_pupils(
     wavelengths = np.atleast_1d(metres(wavelengths, "wavelengths"))
     pupil = np.asarray(pupil, dtype=np.float64)
     n_star, n_wave, n_pupil = len(fields), len(wavelengths), len(pupil)
-    for tx, ty in fields:
-        telescope.check_field(tx, ty)
+    telescope.check_field(fields[:, 0], fields[:, 1])
     direction = field_direction(fields[:, 0], fields[:, 1], projection)
     indices = np.array([refractive_indices(telescope, w) for w in wavelengths])
     middle = float(wavelengths[n_wave // 2])
@@ -181,13 +184,13 @@ def trace_pupils(
     reference = np.array(chief.position)
     if not np.isfinite(reference).all():
         bad = int(np.flatnonzero(~np.isfinite(reference).all(axis=1))[0])
-        raise DomainError(f"fields[{bad}] = {fields[bad]}: the chief ray does not reach the detector")
+        raise DomainError(f"{_named(fields[bad])}: the chief ray does not reach the detector")
     normal = np.zeros((n_star, 3))
     normal[:, 2] = 1.0
     if focal_plane is not None:
         if chief.ccd.min(initial=0) < 0:
             bad = int(np.flatnonzero(chief.ccd < 0)[0])
-            raise DomainError(f"fields[{bad}] = {fields[bad]}: the star lands between the CCDs")
+            raise DomainError(f"{_named(fields[bad])}: the star lands between the CCDs")
         on_detector = telescope.surfaces[-1].to_local(reference)
         offset = on_detector[:, :2] - focal_plane.camera.centers[chief.ccd]
         normal[:, :2] = -focal_plane.surfaces.gradient(chief.ccd, offset[:, 0], offset[:, 1])
@@ -242,16 +245,33 @@ def trace_pupils(
     if not np.array_equal(rotation, np.eye(3)):
         # The detector's own x and y; the third component, along its normal, is the tilt of a CCD times micrometres.
         offset = offset @ rotation[:2, :2]
+    path = trimmed(out_path) - chief_path[:, :, None]
+    jacobian = _jacobians(telescope, direction, middle, threads)
+    if aberration is not None:
+        # The path is minus the OPD, and light moves by the Jacobian times the gradient of the path, as behind a screen.
+        slopes = direction[:, :2] / -direction[:, 2:]
+        x, y = pupil.T
+        path -= aberration.opd(x, y, slopes)[:, None]
+        along_x, along_y = np.moveaxis(aberration.gradient(x, y, slopes), -1, 0)
+        for axis in range(2):
+            moved = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
+            offset[..., axis] -= moved[:, None]
     return PupilOptics(
         pupil=pupil,
         displacement=offset.astype(np.float32),
-        path=trimmed(out_path) - chief_path[:, :, None],
+        path=path,
         lit=trimmed(out_status) == RayStatus.OK,
-        jacobian=_jacobians(telescope, direction, middle, threads),
+        jacobian=jacobian,
         reference=reference,
         fields=fields,
         wavelengths=wavelengths,
     )
+
+
+def _named(field: np.ndarray) -> str:
+    """Return a field in degrees, as messages name a star."""
+    x, y = np.rad2deg(field)
+    return f"field = ({x:.6g}, {y:.6g}) deg"
 
 
 def _jacobians(telescope: Telescope, direction: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:

@@ -3,7 +3,8 @@ r"""Periodic phase screens: random von Karman optical path over a band of wavenu
 A screen is :math:`\psi(x) = \sum_k a_k e^{i k \cdot x}` over the modes of a periodic square, with
 :math:`\langle|a_k|^2\rangle = W(\nu) / L^2` (spectrum :math:`W` of the path, side :math:`L`). A wave gains the phase
 :math:`2 \pi \psi / \lambda`; a ray that comes down through the screen bends by the gradient of :math:`\psi`, with the
-plus sign, in the slopes of its travel. Sample ``[j, i]`` lies at ``x = i * pixel``, ``y = j * pixel``.
+plus sign, in the slopes of its travel; :func:`slope_screen` gives that gradient. Sample ``[j, i]`` lies at
+``x = i * pixel``, ``y = j * pixel``.
 
 Only the modes of the band are drawn, and the Fourier transform skips what they leave empty, so a screen of 8192 x 8192
 samples with modes up to a third of Nyquist costs little more than its own memory.
@@ -25,9 +26,7 @@ from .turbulence import path_spectrum, require_positive
 #:
 #: - ``samples``: not at all; the values are the path at the samples.
 #: - ``spline``: coefficients of a uniform cubic B-spline that goes through the samples.
-#: - ``bilinear``: for bilinear interpolation; each mode keeps its variance on average over all positions.
-#: - ``gradient``: for the gradient of the bilinear patch; each mode keeps the variance of its gradient on average.
-STENCILS = ("samples", "spline", "bilinear", "gradient")
+STENCILS = ("samples", "spline")
 # Blocks of the two Fourier passes: fixed, so that no byte depends on the number of threads, and small enough for the
 # cache of one core.
 _COLUMN_BLOCK = 64
@@ -56,17 +55,9 @@ def stencil_gain(kx: np.ndarray, ky: np.ndarray, stencil: str) -> np.ndarray:
     """
     if stencil not in STENCILS:
         raise unknown_name("stencil", stencil, STENCILS)
-    # Linear interpolation between samples keeps, on average over positions, (2 + cos k)/3 of a mode's power; a cubic
-    # B-spline of samples scales its amplitude by the same number.
-    mean_x, mean_y = (2.0 + np.cos(kx)) / 3.0, (2.0 + np.cos(ky)) / 3.0
     if stencil == "spline":
-        return 1.0 / (mean_x * mean_y)
-    if stencil == "bilinear":
-        return 1.0 / np.sqrt(mean_x * mean_y)
-    if stencil == "gradient":
-        power = 4.0 * np.sin(0.5 * kx) ** 2 * mean_y + 4.0 * np.sin(0.5 * ky) ** 2 * mean_x
-        square = kx * kx + ky * ky
-        return np.sqrt(np.where(square > 0.0, square, 1.0) / np.where(square > 0.0, power, 1.0))
+        # A B-spline of samples scales the amplitude of a mode by (2 + cos k)/3 along each axis.
+        return 9.0 / ((2.0 + np.cos(kx)) * (2.0 + np.cos(ky)))
     return np.ones(np.broadcast_shapes(kx.shape, ky.shape))
 
 
@@ -92,14 +83,30 @@ def band_modes(size: int, length: float, band: tuple[float, float]) -> tuple[int
         ``i = 0`` only those with j > 0, of which those with j < 0 are the complex conjugates.
     """
     per_index = 2.0 * math.pi / length
-    nyquist = (size - 1) // 2
-    reach = min(nyquist, math.floor(band[1] / per_index)) if math.isfinite(band[1]) else nyquist
+    reach = _reach(size, length, band)
     i = np.arange(reach + 1, dtype=np.float64)[:, np.newaxis]
     j = np.arange(-reach, reach + 1, dtype=np.float64)
     square = i * i + j * j
     inside = (square > (band[0] / per_index) ** 2) & (square <= (band[1] / per_index) ** 2)
     inside[0, : reach + 1] = False
     return reach, inside
+
+
+def working_bytes(size: int, length: float, band: tuple[float, float]) -> int:
+    """Return about how much memory the making of a screen takes for a while, beside the screen itself.
+
+    Arguments are those of :func:`band_modes`.
+    """
+    reach = _reach(size, length, band)
+    modes = (reach + 1) * (2 * reach + 1)
+    # First the modes in complex64 with their amplitudes, twice, and which are in the band; then the modes and their
+    # columns, of which slopes have the most.
+    return max(17 * modes, 9 * modes + 8 * (2 * reach + 1) * size)
+
+
+def _reach(size: int, length: float, band: tuple[float, float]) -> int:
+    nyquist = (size - 1) // 2
+    return min(nyquist, math.floor(band[1] / (2.0 * math.pi / length))) if math.isfinite(band[1]) else nyquist
 
 
 def _draw_modes(
@@ -176,6 +183,101 @@ def phase_screen(
     DomainError
         If a size, a length or the band is outside its range.
     """
+    modes = _modes(generator, size, length, r0, outer_scale, band, weight, stencil, fixed_modulus)
+    return _transform(modes, size, threads, out)
+
+
+def slope_screen(
+    generator: np.random.Generator,
+    *,
+    size: int,
+    length: float,
+    r0: float,
+    outer_scale: float,
+    band: tuple[float, float],
+    unit: float,
+    lag: float = 0.0,
+    weight: float = 1.0,
+    fixed_modulus: bool = False,
+    threads: int | None = None,
+    out: np.ndarray | None = None,
+) -> np.ndarray:
+    """Draw the slopes of the screen that :func:`phase_screen` draws from the same stream: both gradients, packed.
+
+    Parameters
+    ----------
+    generator, size, length, r0, outer_scale, band, weight, fixed_modulus, threads
+        As for :func:`phase_screen`.
+    unit : float
+        Slope of one count [rad]; slopes beyond 32767 counts are held there.
+    lag : float
+        Distance over which light feels the slope [m]: each mode of wavenumber k is multiplied by
+        ``sin(k lag / 2) / (k lag / 2)``, which makes a gradient the mean slope over so long a baseline.
+    out : ndarray, optional
+        Where to write the slopes: int32, shape [size, size].
+
+    Returns
+    -------
+    ndarray
+        Slopes at the samples, int32, shape [size, size], ``[y, x]``: the lower 16 bits hold the slope along x, the
+        upper 16 that along y, as signed counts.
+    """
+    modes = _modes(generator, size, length, r0, outer_scale, band, weight, "samples", fixed_modulus)
+    reach = len(modes) - 1
+    step = 2.0 * math.pi / length
+    i = np.arange(reach + 1, dtype=np.float32)[:, np.newaxis] * np.float32(step)
+    j = np.arange(-reach, reach + 1, dtype=np.float32) * np.float32(step)
+    for first in range(0, reach + 1, _COLUMN_BLOCK):
+        # 1e-9 of a count would be enough; the sinc of NumPy is sin(pi x)/(pi x).
+        part = slice(first, first + _COLUMN_BLOCK)
+        modes[part] *= np.sinc(np.hypot(i[part], j) * (0.5 * lag / math.pi)) / unit
+    columns = np.empty((2 * reach + 1, size), dtype=np.complex64)
+    packed = np.empty((size, size), dtype=np.int32) if out is None else out
+
+    def along_y(first: int) -> None:
+        part = slice(first, min(first + _COLUMN_BLOCK, reach + 1))
+        # The gradient along x and i times that along y, of the modes with i and of their conjugates with -i.
+        for sign in (1, -1):
+            here = modes[part] if sign == 1 else np.conj(modes[part, ::-1])
+            padded = np.zeros((len(here), size), dtype=np.complex64)
+            both = (1j * sign) * i[part] * here - j * here
+            padded[:, : reach + 1] = both[:, reach:]
+            if reach:
+                padded[:, -reach:] = both[:, :reach]
+            rows = np.arange(part.start, part.stop) * sign
+            if sign == -1 and part.start == 0:
+                padded, rows = padded[1:], rows[1:]
+            columns[rows] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
+
+    def along_x(first: int) -> None:
+        rows = slice(first, min(first + _ROW_BLOCK, size))
+        padded = np.zeros((rows.stop - first, size), dtype=np.complex64)
+        padded[:, : reach + 1] = columns[: reach + 1, rows].T
+        if reach:
+            padded[:, -reach:] = columns[reach + 1 :, rows].T
+        counts = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True).view(np.float32)
+        np.rint(counts, out=counts)
+        np.clip(counts, -32767.0, 32767.0, out=counts)
+        packed[rows] = counts.astype("<i2").view("<i4")
+
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        list(pool.map(along_y, range(0, reach + 1, _COLUMN_BLOCK)))
+        list(pool.map(along_x, range(0, size, _ROW_BLOCK)))
+    return packed
+
+
+def _modes(
+    generator: np.random.Generator,
+    size: int,
+    length: float,
+    r0: float,
+    outer_scale: float,
+    band: tuple[float, float],
+    weight: float,
+    stencil: str,
+    fixed_modulus: bool,
+) -> np.ndarray:
+    """Draw the modes [m] of a screen, complex64, shape [reach + 1, 2 reach + 1], index ``[i, reach + j]``."""
     length = require_positive(length, "length", "metres")
     if size < 4:
         raise DomainError(f"size = {size!r}: expected at least 4 samples on a side")
@@ -189,9 +291,7 @@ def phase_screen(
         spectrum = path_spectrum(np.hypot(part, j) / length, r0, outer_scale) * weight
         gain = stencil_gain(part * pixel_phase, j * pixel_phase, stencil)
         amplitude[first : first + _COLUMN_BLOCK] = np.sqrt(spectrum) * gain / length
-    modes = _draw_modes(generator, amplitude, inside, fixed_modulus)
-    del amplitude
-    return _transform(modes, size, threads, out)
+    return _draw_modes(generator, amplitude, inside, fixed_modulus)
 
 
 def _transform(modes: np.ndarray, size: int, threads: int | None, out: np.ndarray | None) -> np.ndarray:
@@ -221,39 +321,35 @@ def _transform(modes: np.ndarray, size: int, threads: int | None, out: np.ndarra
     return field
 
 
-def evaluate(screen: np.ndarray, pixel: float, x: np.ndarray, y: np.ndarray, stencil: str) -> np.ndarray:
+def evaluate(spline: np.ndarray, pixel: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the path at any place of a periodic screen.
 
     Parameters
     ----------
-    screen : ndarray
-        Screen made for the same stencil, shape [size, size].
+    spline : ndarray
+        Screen as spline coefficients, shape [size, size].
     pixel : float
         Distance of the samples [m].
     x, y : ndarray
         Places [m], of one shape.
-    stencil : str
-        ``"spline"`` reads the screen as cubic B-spline coefficients, the others by bilinear interpolation.
 
     Returns
     -------
     ndarray
         Path [m], float64, shape of ``x``.
     """
-    index_x, weight_x = _line_weights(np.asarray(x) / pixel, screen.shape[1], stencil)
-    index_y, weight_y = _line_weights(np.asarray(y) / pixel, screen.shape[0], stencil)
+    index_x, weight_x = _line_weights(np.asarray(x) / pixel, spline.shape[1])
+    index_y, weight_y = _line_weights(np.asarray(y) / pixel, spline.shape[0])
     result = np.zeros(np.shape(x))
     for row, row_weight in zip(index_y, weight_y, strict=True):
         for column, column_weight in zip(index_x, weight_x, strict=True):
-            result += row_weight * column_weight * screen[row, column]
+            result += row_weight * column_weight * spline[row, column]
     return result
 
 
-def _line_weights(place: np.ndarray, size: int, stencil: str) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _line_weights(place: np.ndarray, size: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return the periodic sample indices along one axis and their weights at places in pixels."""
     first = np.floor(place).astype(np.int64)
     u = place - first
-    if stencil == "spline":
-        weights = [(1 - u) ** 3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6, u**3 / 6]
-        return [(first + k) % size for k in (-1, 0, 1, 2)], weights
-    return [first % size, (first + 1) % size], [1 - u, u]
+    weights = [(1 - u) ** 3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6, u**3 / 6]
+    return [(first + k) % size for k in (-1, 0, 1, 2)], weights

@@ -199,6 +199,36 @@ def high_structure_function(separation: ArrayLike, r0: float, outer_scale: float
     return np.maximum(total - low.reshape(b.shape), 0.0)
 
 
+def slope_variance(r0: float, outer_scale: float, cutoff: float, lag: float = 0.0) -> float:
+    """Return the variance of one component of the slope of the modes at and below a cut-off wavenumber.
+
+    It is half of the integral of ``(k sinc(k lag / 2))^2 W`` over the disc of frequencies, ``k = 2 pi nu``.
+
+    Parameters
+    ----------
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    cutoff : float
+        Cut-off wavenumber [rad/m].
+    lag : float
+        Distance over which the slope is taken [m]; 0 for the gradient.
+
+    Returns
+    -------
+    float
+        Variance [rad^2].
+    """
+    # nu = sinh(t) / L0 spreads the knee of the spectrum at 1/L0 evenly over the nodes.
+    t, weight = _gauss_panels(math.asinh(cutoff / (2.0 * math.pi) * outer_scale), 8)
+    nu = np.sinh(t) / outer_scale
+    squared = (2.0 * math.pi * nu * np.sinc(nu * lag)) ** 2
+    return float(
+        np.sum(weight * np.cosh(t) / outer_scale * math.pi * nu * squared * path_spectrum(nu, r0, outer_scale))
+    )
+
+
 def _lens_area(distance: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:
     """Return the common area [m^2] of two discs whose centres are a distance apart [m]."""
     a, b = max(radius_a, radius_b), min(radius_a, radius_b)

@@ -1,98 +1,59 @@
-"""Kernels of the wave PSF engine: the path of the atmosphere at every pupil point, and the field of each wavelength."""
+"""Kernels of the wave PSF engine: the path of the atmosphere at every pupil point, the field of each wavelength."""
 
 from __future__ import annotations
 
 import warp as wp
 
 from ..raytrace.launch import FORWARD_OPTIONS
-from .sample_packets import LANES, indices, places, samples
+from .sample_packets import LANES, indices, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
 
 
 @wp.func
-def spline_weights(fraction: samples):
-    """Weights of the four samples about a place, of which it lies so far [pixels] beyond the second."""
-    sixth = wp.float32(1.0 / 6.0)
-    before = samples()
-    first = samples()
-    second = samples()
-    after = samples()
-    for i in range(LANES):
-        u = fraction[i]
-        v = wp.float32(1.0) - u
-        before[i] = v * v * v * sixth
-        first[i] = (wp.float32(4.0) + u * u * (wp.float32(3.0) * u - wp.float32(6.0))) * sixth
-        second[i] = (wp.float32(4.0) + v * v * (wp.float32(3.0) * v - wp.float32(6.0))) * sixth
-        after[i] = u * u * u * sixth
-    return before, first, second, after
-
-
-@wp.func
-def in_period(position: places, start: wp.float64, size: wp.int32):
-    """Add a start to positions [pixels], take them modulo the screen; return samples and fractions beyond them."""
-    sample = indices()
-    fraction = samples()
-    side = wp.float64(size)
-    for i in range(LANES):
-        wrapped = position[i] + start
-        wrapped = wrapped - side * wp.floor(wrapped / side)
-        whole = wp.int32(wrapped)
-        fraction[i] = wp.float32(wrapped - wp.float64(whole))
-        sample[i] = wp.where(whole >= size, whole - size, whole)
-    return sample, fraction
-
-
-@wp.func
-def spline_row(
-    screens: wp.array2d(dtype=wp.float32),
-    layer: wp.int32,
-    c0: wp.int32,
-    c1: wp.int32,
-    c2: wp.int32,
-    c3: wp.int32,
-    u0: wp.float32,
-    u1: wp.float32,
-    u2: wp.float32,
-    u3: wp.float32,
-):
-    """Weighted sum of four samples of a row."""
-    return u0 * screens[layer, c0] + u1 * screens[layer, c1] + u2 * screens[layer, c2] + u3 * screens[layer, c3]
-
-
-@wp.func
-def spline_path(
+def blend_rows(
     screens: wp.array2d(dtype=wp.float32),
     layer: wp.int32,
     size: wp.int32,
-    x: places,
-    y: places,
-    start_x: wp.float64,
-    start_y: wp.float64,
+    row: wp.int32,
+    weight: wp.vec4f,
+    column: wp.int32,
+    packets: wp.int32,
+    item: wp.int32,
+    blended: wp.array2d(dtype=wp.float32),
 ):
-    """Read a periodic screen of cubic B-spline coefficients at places x, y from a start [pixels]."""
-    column, fraction_x = in_period(x, start_x, size)
-    row, fraction_y = in_period(y, start_y, size)
-    u0, u1, u2, u3 = spline_weights(fraction_x)
-    v0, v1, v2, v3 = spline_weights(fraction_y)
-    end = size * size
-    path = samples()
-    for i in range(LANES):
-        c1 = column[i]
-        c0 = wp.where(c1 > 0, c1, size) - 1
-        c2 = wp.where(c1 + 1 < size, c1 + 1, 0)
-        c3 = wp.where(c2 + 1 < size, c2 + 1, 0)
-        r1 = row[i] * size
-        r0 = wp.where(r1 > 0, r1, end) - size
-        r2 = wp.where(r1 + size < end, r1 + size, 0)
-        r3 = wp.where(r2 + size < end, r2 + size, 0)
-        path[i] = (
-            v0[i] * spline_row(screens, layer, r0 + c0, r0 + c1, r0 + c2, r0 + c3, u0[i], u1[i], u2[i], u3[i])
-            + v1[i] * spline_row(screens, layer, r1 + c0, r1 + c1, r1 + c2, r1 + c3, u0[i], u1[i], u2[i], u3[i])
-            + v2[i] * spline_row(screens, layer, r2 + c0, r2 + c1, r2 + c2, r2 + c3, u0[i], u1[i], u2[i], u3[i])
-            + v3[i] * spline_row(screens, layer, r3 + c0, r3 + c1, r3 + c2, r3 + c3, u0[i], u1[i], u2[i], u3[i])
-        )
-    return path
+    """Interpolate a periodic screen of cubic B-spline coefficients in y, along a run of columns.
+
+    ``row`` is the second of the four rows that ``weight`` belongs to, ``column`` the first of the run.
+    """
+    before = ((row + size - 1) % size) * size
+    first = row * size
+    second = ((row + 1) % size) * size
+    after = ((row + 2) % size) * size
+    for packet in range(packets):
+        values = samples()
+        start = column + packet * LANES
+        # Two loops in place of one with a choice inside: the compiler vectorizes the first.
+        if start + LANES <= size:
+            for i in range(LANES):
+                at = start + i
+                values[i] = (
+                    weight[0] * screens[layer, before + at]
+                    + weight[1] * screens[layer, first + at]
+                    + weight[2] * screens[layer, second + at]
+                    + weight[3] * screens[layer, after + at]
+                )
+        else:
+            for i in range(LANES):
+                at = (start + i) % size
+                values[i] = (
+                    weight[0] * screens[layer, before + at]
+                    + weight[1] * screens[layer, first + at]
+                    + weight[2] * screens[layer, second + at]
+                    + weight[3] * screens[layer, after + at]
+                )
+        for i in range(LANES):
+            blended[item, packet * LANES + i] = values[i]
 
 
 @wp.func
@@ -129,45 +90,129 @@ def unit_circle(turns: samples):
     return cosine, sine
 
 
+@wp.func
+def lay_row(
+    screens: wp.array2d(dtype=wp.float32),
+    layer: wp.int32,
+    size: wp.int32,
+    scale: wp.int32,
+    item: wp.int32,
+    column: wp.array(dtype=wp.int32),
+    row: wp.array2d(dtype=wp.int32),
+    row_weight: wp.array2d(dtype=wp.vec4f),
+    sample: wp.array2d(dtype=indices),
+    column_weight: wp.array3d(dtype=samples),
+    run: wp.int32,
+    lit: wp.array2d(dtype=wp.int32),
+    blended: wp.array2d(dtype=wp.float32),
+    path: wp.array2d(dtype=samples),
+):
+    """Add one screen to the path along one row of the pupil; ``scale`` counts the screens of both scales."""
+    blend_rows(screens, layer, size, row[scale, item], row_weight[scale, item], column[scale], run, item, blended)
+    for packet in range(path.shape[1]):
+        if lit[item, packet] == 1:
+            at = sample[scale, packet]
+            before = column_weight[scale, 0, packet]
+            first = column_weight[scale, 1, packet]
+            second = column_weight[scale, 2, packet]
+            after = column_weight[scale, 3, packet]
+            here = samples()
+            for i in range(LANES):
+                k = at[i]
+                here[i] = (
+                    before[i] * blended[item, k]
+                    + first[i] * blended[item, k + 1]
+                    + second[i] * blended[item, k + 2]
+                    + after[i] * blended[item, k + 3]
+                )
+            path[item, packet] = path[item, packet] + here
+
+
 @wp.kernel
 def pupil_fields(
     first: wp.int32,
-    x: wp.array(dtype=places),
-    y: wp.array(dtype=places),
     low: wp.array2d(dtype=wp.float32),
     low_size: wp.int32,
+    low_run: wp.int32,
     high: wp.array2d(dtype=wp.float32),
     high_size: wp.int32,
+    high_run: wp.int32,
     n_layer: wp.int32,
-    start: wp.array2d(dtype=wp.float64),
-    pixels_per_meter: wp.vec2d,
+    column: wp.array(dtype=wp.int32),
+    row: wp.array2d(dtype=wp.int32),
+    row_weight: wp.array2d(dtype=wp.vec4f),
+    sample: wp.array2d(dtype=indices),
+    column_weight: wp.array3d(dtype=samples),
+    lit: wp.array2d(dtype=wp.int32),
     turns_per_meter: wp.array(dtype=wp.float32),
-    optics: wp.array2d(dtype=samples),
-    amplitude: wp.array2d(dtype=samples),
-    place: wp.array(dtype=indices),
-    field: wp.array2d(dtype=wp.vec2f),
+    optics: wp.array3d(dtype=samples),
+    amplitude: wp.array3d(dtype=samples),
+    blended: wp.array2d(dtype=wp.float32),
+    path: wp.array2d(dtype=samples),
+    field: wp.array3d(dtype=wp.vec2f),
 ):
-    """Write the complex field of every wavelength at one packet of pupil points.
+    """Write the complex field of every wavelength along one row of the pupil, at one time.
 
-    Arguments: x, y [packet]: pupil coordinates [m]; low, high [layer, y * size + x]: spline coefficients of path [m];
-    start [layer, 4]: coordinates of the pupil's centre on the low (0, 1) and the high (2, 3) screen [pixels];
-    pixels_per_meter of the low and the high screens; turns_per_meter [wave]; optics [wave, packet]: phase [turns];
-    amplitude [wave, packet]; place [packet] of the points in a field; field [wave, place].
+    The pupil is a square lattice along the axes of the screens, so interpolation is done row by row: first between the
+    rows of a screen, then along the row so gained.
+
+    Arguments: low, high [layer, y * size + x]: spline coefficients of path [m], of which a row of the pupil spans
+    ``run`` packets; screens are counted layer by layer, low before high: column [screen]: first column of the run; row
+    [screen, item] and row_weight [screen, item]: second of the four rows about a row of the pupil, and their weights;
+    sample [screen, packet]: first of the four columns about a point, counted along the run; column_weight
+    [screen, 4, packet]; lit [item, packet]: 1 where a packet holds light; turns_per_meter [wave]; optics
+    [wave, item, packet]: phase [turns]; amplitude [wave, item, packet]; blended [item, column], path [item, packet]:
+    room for a row of a screen and for the path [m]; field [wave, y, x], of which the pupil fills the first corner.
     """
-    packet = first + wp.tid()
-    path = samples()
+    item = first + wp.tid()
+    for packet in range(path.shape[1]):
+        path[item, packet] = samples()
     for layer in range(n_layer):
-        scale = pixels_per_meter[0]
-        path = path + spline_path(
-            low, layer, low_size, x[packet] * scale, y[packet] * scale, start[layer, 0], start[layer, 1]
+        scale = 2 * layer
+        lay_row(
+            low,
+            layer,
+            low_size,
+            scale,
+            item,
+            column,
+            row,
+            row_weight,
+            sample,
+            column_weight,
+            low_run,
+            lit,
+            blended,
+            path,
         )
-        scale = pixels_per_meter[1]
-        path = path + spline_path(
-            high, layer, high_size, x[packet] * scale, y[packet] * scale, start[layer, 2], start[layer, 3]
+        scale = scale + 1
+        lay_row(
+            high,
+            layer,
+            high_size,
+            scale,
+            item,
+            column,
+            row,
+            row_weight,
+            sample,
+            column_weight,
+            high_run,
+            lit,
+            blended,
+            path,
         )
-    at = place[packet]
-    for wave in range(turns_per_meter.shape[0]):
-        cosine, sine = unit_circle(path * turns_per_meter[wave] + optics[wave, packet])
-        light = amplitude[wave, packet]
-        for i in range(LANES):
-            field[wave, at[i]] = wp.vec2f(light[i] * cosine[i], light[i] * sine[i])
+    for packet in range(path.shape[1]):
+        if lit[item, packet] == 1:
+            for wave in range(turns_per_meter.shape[0]):
+                cosine, sine = unit_circle(path[item, packet] * turns_per_meter[wave] + optics[wave, item, packet])
+                light = amplitude[wave, item, packet]
+                for i in range(LANES):
+                    field[wave, item, packet * LANES + i] = wp.vec2f(light[i] * cosine[i], light[i] * sine[i])
+
+
+@wp.kernel
+def add_squares(first: wp.int32, parts: wp.array(dtype=samples), squares: wp.array(dtype=samples)):
+    """Add the squares of real and imaginary parts, side by side as a field holds them, to their sums over time."""
+    item = first + wp.tid()
+    squares[item] = squares[item] + wp.cw_mul(parts[item], parts[item])

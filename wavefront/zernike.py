@@ -77,19 +77,12 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
     DomainError
         If the obscuration or the index is out of range.
     """
-    if not 0 <= obscuration < 1:
-        raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
-    s = x * x + y * y
+    x, y, s, low = _annulus(x, y, obscuration)
     theta = np.arctan2(y, x)
-    low = obscuration**2
     nodes = (2 * s - 1 - low) / (1 - low)
     orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
-    degrees: dict[int, int] = {}
-    for n, m in orders:
-        degrees[abs(m)] = max(degrees.get(abs(m), 0), (n - abs(m)) // 2)
     radial: dict[int, np.ndarray] = {}
-    for m, top in degrees.items():
+    for m, top in _radial_degrees(orders).items():
         powers = np.polynomial.legendre.legvander(nodes, top) * (s ** (m / 2))[..., None]
         radial[m] = powers @ _radial_coefficients(m, top + 1, float(obscuration))
     out = np.empty((jmax, *x.shape))
@@ -102,6 +95,70 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
         else:
             out[row] = np.sqrt(2.0) * r * np.sin(-m * theta)
     return out
+
+
+def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
+    """Evaluate the gradients of annular Zernike polynomials 1 ... jmax.
+
+    A term is a polynomial in ``x^2 + y^2`` times the real or imaginary part of ``(x + iy)^m``, and is differentiated as
+    such: the result is exact, at the centre too.
+
+    Parameters
+    ----------
+    jmax : int
+        Highest Noll index.
+    x, y : ndarray
+        Pupil coordinates in units of the outer radius, one shape.
+    obscuration : float
+        Inner over outer radius, 0 <= obscuration < 1.
+
+    Returns
+    -------
+    ndarray, shape [jmax, 2, ...]
+        Derivatives along x and y, per outer radius.
+
+    Raises
+    ------
+    DomainError
+        If the obscuration or the index is out of range.
+    """
+    x, y, s, low = _annulus(x, y, obscuration)
+    nodes = (2 * s - 1 - low) / (1 - low)
+    orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
+    columns: dict[int, np.ndarray] = {}
+    for m, top in _radial_degrees(orders).items():
+        columns[m] = _radial_coefficients(m, top + 1, float(obscuration))
+    z = x + 1j * y
+    out = np.empty((jmax, 2, *x.shape))
+    for row, (n, signed) in enumerate(orders):
+        m = abs(signed)
+        series = columns[m][:, (n - m) // 2]
+        value = np.polynomial.legendre.legval(nodes, series)
+        # d/dx = 2x d/ds and d/dy = 2y d/ds of the radial part
+        slope = np.polynomial.legendre.legval(nodes, np.polynomial.legendre.legder(series)) * (4.0 / (1 - low))
+        # (x + iy)^m and its derivative along x; the one along y is i times that.
+        power, change = z**m, m * z ** max(m - 1, 0)
+        along_x, along_y = value * change + slope * x * power, 1j * value * change + slope * y * power
+        scale = 1.0 if m == 0 else np.sqrt(2.0)
+        for axis, derivative in enumerate((along_x, along_y)):
+            out[row, axis] = scale * (derivative.imag if signed < 0 else derivative.real)
+    return out
+
+
+def _annulus(x: np.ndarray, y: np.ndarray, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the coordinates as arrays of one shape, the square of the radius, and that of the inner rim."""
+    if not 0 <= obscuration < 1:
+        raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+    return x, y, x * x + y * y, obscuration**2
+
+
+def _radial_degrees(orders: list[tuple[int, int]]) -> dict[int, int]:
+    """Return how many radial polynomials, less one, each azimuthal order |m| needs."""
+    degrees: dict[int, int] = {}
+    for n, m in orders:
+        degrees[abs(m)] = max(degrees.get(abs(m), 0), (n - abs(m)) // 2)
+    return degrees
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import resolve
 from pachon.pipeline.run import run
 
-# Screens of 512 samples over 80 m, two seconds of exposure, two wavelengths.
+# Coarse screens, just as long as two CCDs so far apart need, two seconds of exposure, two wavelengths.
 SETTINGS = {
     "ccds": ["R22_S11", "R24_S12"],
     "wavelengths_nm": [560.0, 680.0],
     "stars": {"truth": 14, "observed": 12},
-    "atmosphere": {"screen_size": 512, "screen_length_m": 80.0, "exposure_s": 2.0, "time_step_s": 0.5},
+    "atmosphere": {"screen_size": 1024, "screen_length_m": 560.0, "exposure_s": 2.0, "time_step_s": 0.5},
     "psf": {"n_pupil": 60},
     "reconstruction": {"components": 4, "order": 1, "truth_order": 2},
 }

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,7 +13,8 @@ import pytest
 
 from pachon.models import prescription
 from pachon.models.prescription import bundled_names
-from pachon.pipeline import cli
+from pachon.models.site import DATA
+from pachon.pipeline import cli, memory
 from pachon.pipeline import run as run_module
 from pachon.pipeline.cli import main
 
@@ -82,6 +84,46 @@ def test_a_mistyped_key_names_file_key_and_what_is_allowed(capsys, in_folder):
     line = refused(capsys, "run", "mine.yaml")
     assert "mine.yaml: unknown key psf.engin" in line
     assert "did you mean engine?" in line
+
+
+LAYER = "  - {altitude: %g, weight: %g, wind_speed: %g}\n"
+
+
+@pytest.mark.parametrize(
+    ("config", "layers", "parts"),
+    [
+        ("", [(0, 1.2, 5), (5000, -0.2, 5)], ["windy.yaml: weights = (1.2, -0.2): expected fractions from 0"]),
+        ("", [(0, 0.6, 5), (5000, 0.3, 5)], ["windy.yaml: weights = (0.6, 0.3)", "that sum to 1, not 0.9"]),
+        ("", [(0, 0.6, 5), (5000, 0.4, 200)], ["mine.yaml: atmosphere.exposure_s = 15: ", "of at least 3029 "]),
+        ("  exposure_s: 90\n", [(0, 1, 10)], ["mine.yaml: atmosphere.exposure_s = 90: ", "at least 909 "]),
+        ("  time_step_s: 20\n", [(0, 1, 10)], ["atmosphere.time_step_s = 20: ", "atmosphere.exposure_s = 15"]),
+        ("  screen_size: 16\n  screen_length_m: 900\n", [(0, 1, 10)], ["atmosphere: cutoff = 0.0279253 rad/m"]),
+        ("  screen_size: 65537\n", [(0, 1, 10)], ["atmosphere: screen_size = 65537: expected a whole number"]),
+        ("  site: none.yaml\n", [], ["none.yaml: no such file"]),
+        ("  site: folder.yaml\n", [], ["folder.yaml: cannot be read"]),
+        ("  epoch: 1.5\n", [], ["mine.yaml: atmosphere.epoch = 1.5: expected a whole number"]),
+    ],
+)
+def test_a_bad_atmosphere_is_one_line_and_status_2(capsys, in_folder, config, layers, parts):
+    site = (DATA / "cerro_pachon.yaml").read_text()
+    rows = "".join(LAYER % layer for layer in layers)
+    (in_folder / "windy.yaml").write_text(re.sub(r"layers:\n(  - .*\n)*", f"layers:\n{rows}", site))
+    (in_folder / "folder.yaml").mkdir()
+    where = "" if "site:" in config else "  site: windy.yaml\n" if layers else ""
+    length = "" if "screen_length_m" in config else "  screen_length_m: 890\n"
+    (in_folder / "mine.yaml").write_text(f"ccds: R22_S11\natmosphere:\n{where}{length}{config}")
+    line = refused(capsys, "run", "mine.yaml", "--out", "out")
+    for part in parts:
+        assert part in line
+    assert not (in_folder / "out").exists()
+
+
+def test_screens_too_large_for_the_memory_are_one_line(capsys, in_folder, monkeypatch):
+    monkeypatch.setattr(memory, "available_bytes", lambda: 21_000_000_000)
+    (in_folder / "mine.yaml").write_text("atmosphere: {screen_size: 65536}\n")
+    line = refused(capsys, "run", "mine.yaml")
+    assert "atmosphere.screen_size = 65536: needs about 105 GB of memory, 21 GB are free; 16384 would do" in line
+    assert not (in_folder / "pachon_run").exists()
 
 
 def test_info_lists_models_and_shows_one(capsys):

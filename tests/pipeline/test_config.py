@@ -1,11 +1,14 @@
 """Configuration: every problem is one line with file, key, value and what was expected; resolving fills in all else."""
 
+import numpy as np
 import pytest
 
 from pachon.models.errors import ConfigError, PachonError
 from pachon.models.prescription import load_telescope, save_telescope
+from pachon.models.site import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
 from pachon.pipeline.experiment import DEFAULT_CCDS, prepare, resolve
+from pachon.wavefront.aberration import LARGEST_RMS, ResidualWavefront
 
 # Screens are not made by what is tested here, so their size costs nothing.
 SMALL = {"stars__truth": 30, "stars__observed": 25}
@@ -31,6 +34,10 @@ def written(tmp_path, text):
         ("atmosphere: {exposure_s: .nan}", ["atmosphere.exposure_s = NaN"]),
         ("atmosphere: 5", ["atmosphere = 5", "a mapping"]),
         ("stars: {truth: 0}", ["stars.truth = 0", "from 1"]),
+        ("atmosphere: {epoch: -1}", ["atmosphere.epoch = -1", "from 0"]),
+        ("active_optics: {residual_um: -0.1}", ["active_optics.residual_um = -0.1", "from 0"]),
+        ("active_optics: {residual_um: 200}", ["active_optics.residual_um = 200", "up to 2"]),
+        ("psf: {jitter_arcsec: -1}", ["psf.jitter_arcsec = -1", "from 0"]),
         ("psf: {engine: fats}", ['psf.engine = "fats"', "one of fast, wave"]),
         ("band: q", ['band = "q"', "u, g, r, i, z, y"]),
         ("wavelengths_nm: [600, red]", ['wavelengths_nm[1] = "red"', "a number"]),
@@ -159,6 +166,46 @@ def test_a_prescription_counts_by_its_content_wherever_it_lies(tmp_path):
         assert config.telescope == str((tmp_path / folder / "mine.yaml").resolve())
         hashes.append(prepare(config).config_hash)
     assert hashes[0] == hashes[1]
+
+
+def test_a_site_lies_beside_the_configuration_and_counts_by_its_content(tmp_path):
+    text = (SITES / "cerro_pachon.yaml").read_text()
+    hashes = []
+    for folder, r0 in (("a", "0.16 "), ("b", "0.16 "), ("c", "0.12 ")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "my_site.yaml").write_text(text.replace("r0: 0.16 ", f"r0: {r0}"))
+        path = tmp_path / folder / "run.yaml"
+        path.write_text("atmosphere: {site: my_site.yaml, outer_scale_m: 20}\n")
+        config = resolve(load_configuration(path), path.parent)
+        assert config.atmosphere.site == str((tmp_path / folder / "my_site.yaml").resolve())
+        # The site gives what the configuration leaves open.
+        assert (config.atmosphere.r0_m, config.atmosphere.outer_scale_m) == (float(r0), 20.0)
+        experiment = prepare(config)
+        assert experiment.atmosphere.r0 == float(r0)
+        hashes.append(experiment.config_hash)
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_visits_differ_in_air_and_aberration_and_not_in_the_telescope():
+    options = {"active_optics__residual_um": 0.2, "psf__jitter_arcsec": 0.05, **SMALL}
+    first, second = (
+        prepare(resolve(with_options(Configuration(), atmosphere__epoch=epoch, **options))) for epoch in (0, 1)
+    )
+    assert not np.allclose(first.atmosphere.velocities, second.atmosphere.velocities)
+    assert np.all(first.aberration.coefficients != second.aberration.coefficients)
+    np.testing.assert_array_equal(first.focal_plane.to_table(2)["z"], second.focal_plane.to_table(2)["z"])
+    assert first.config_hash != second.config_hash
+    expected = ResidualWavefront.draw(first.telescope, 0.2e-6, seed=1, epoch=1)
+    np.testing.assert_array_equal(second.aberration.coefficients, expected.coefficients)
+    assert first.jitter == pytest.approx(0.05 * np.pi / 648000)
+    # Off by default.
+    plain = prepare(resolve(with_options(Configuration(), **SMALL)))
+    assert plain.aberration is None
+    assert plain.jitter == 0.0
+    # The largest value that the file may have is the largest that can be drawn.
+    largest = prepare(resolve(with_options(Configuration(), **(options | {"active_optics__residual_um": 2.0}))))
+    assert largest.aberration is not None
+    assert LARGEST_RMS == 2e-6
 
 
 def test_differences_name_key_old_and_new():

@@ -183,6 +183,31 @@ def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run
     assert np.all((light > 0.86) & (light < 0.98))
 
 
+def test_visits_have_the_same_stars_and_other_noise(tiny):
+    """Without an atmosphere nothing but the noise tells two visits apart."""
+    options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
+    first, again, second = (
+        ccd_stage.compute_ccd(prepare(tiny(atmosphere__epoch=epoch, **options)), "R22_S11") for epoch in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(first.observed_images, again.observed_images)
+    np.testing.assert_array_equal(first.truth_images, second.truth_images)
+    for key in ("x", "y", "magnitude", "electrons"):
+        np.testing.assert_array_equal(getattr(first.observed, key), getattr(second.observed, key))
+    assert not np.any(np.all(first.observed_images == second.observed_images, axis=(1, 2)))
+
+
+def test_residual_aberration_and_jitter_reach_the_stars(tiny):
+    options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
+    plain, bent, shaken = (
+        ccd_stage.compute_ccd(prepare(tiny(**options, **more)), "R22_S11").truth
+        for more in ({}, {"active_optics__residual_um": 0.4}, {"psf__jitter_arcsec": 0.1})
+    )
+    # Near the axis the telescope is round; 0.4 um make several per cent, jitter only width.
+    assert np.abs(bent.e1 - plain.e1).max() > 0.02
+    assert np.all(shaken.fwhm > 1.3 * plain.fwhm)
+    assert np.all(np.hypot(shaken.e1, shaken.e2) < np.hypot(plain.e1, plain.e2) + 0.01)
+
+
 def test_without_an_atmosphere_the_optics_alone_make_the_psf(tmp_path, tiny, no_report):
     config = tiny(ccds=("R22_S11",), atmosphere__enabled=False, stars__truth=8, stars__observed=8)
     config = resolve(with_options(config, reconstruction__components=2))

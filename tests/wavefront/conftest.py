@@ -25,7 +25,10 @@ def polynomial_pupil(monkeypatch):
         if jacobian is None:
             jacobian = FOCAL_LENGTH * np.eye(2)
 
-        def trace(telescope, fields, wavelengths, pupil, focal_plane=None, projection="zemax", threads=None):
+        def trace(
+            telescope, fields, wavelengths, pupil, focal_plane=None, projection="zemax", threads=None, aberration=None
+        ):
+            assert aberration is None
             fields, wavelengths = np.atleast_2d(fields), np.atleast_1d(wavelengths)
             x, y = np.asarray(pupil).T / radius
             square = x * x + y * y
@@ -61,7 +64,7 @@ class SingleModes(Atmosphere):
 
     amplitude = 200e-6
 
-    def low_screen(self, layer, stencil="gradient", *, threads=None, out=None):
+    def low_screen(self, layer, stencil="spline", *, threads=None, out=None):
         wave = self.amplitude * np.sin(2 * np.pi * np.arange(self.screen_size) / self.screen_size)
         screen = np.zeros((self.screen_size, self.screen_size), dtype=np.float32) if out is None else out
         screen[...] = wave if layer % 2 == 0 else wave[:, None]
@@ -70,6 +73,16 @@ class SingleModes(Atmosphere):
     def high_screen(self, layer, stencil="spline", *, threads=None, out=None):
         screen = np.zeros((self.fine_size, self.fine_size), dtype=np.float32) if out is None else out
         screen[...] = 0.0
+        return screen
+
+    def slope_unit(self, layer):
+        return 2 * np.pi * self.amplitude / self.screen_length / 32767.0
+
+    def slope_screen(self, layer, *, threads=None, out=None):
+        wave = np.cos(2 * np.pi * np.arange(self.screen_size) / self.screen_size)
+        counts = np.rint(32767.0 * wave).astype(np.int32)
+        screen = np.zeros((self.screen_size, self.screen_size), dtype=np.int32) if out is None else out
+        screen[...] = counts & 0xFFFF if layer % 2 == 0 else (counts << 16)[:, None]
         return screen
 
     def slope(self, layer, x, y):
@@ -88,7 +101,7 @@ def single_modes():
         r0=50.0,
         cutoff=2.0,
         altitudes=[4000.0, 9000.0],
-        weights=[1.0, 1.0],
+        weights=[0.5, 0.5],
         wind_speeds=[30.0, 20.0],
         wind_directions=[0.3, 2.0],
         exposure=0.4,

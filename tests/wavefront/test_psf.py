@@ -185,7 +185,7 @@ def test_no_stars_and_no_light(lsst_r):
         ({"wavelengths": []}, DomainError, "wavelengths"),
         ({"wavelengths": [-1e-7]}, DomainError, "wavelengths"),
         ({"wavelengths": [5e-6]}, PachonError, "wavelength"),
-        ({"fields": [[0.1, 0.0]]}, DomainError, "field"),
+        ({"fields": [[0.0, 0.0], [0.1, 0.0]]}, DomainError, r"field = \(5.72958, 0\) deg: expected within"),
         ({"fields": [[np.nan, 0.0]]}, DomainError, "fields"),
         ({"fields": [[0.0, 0.0, 0.0]]}, DomainError, "fields of shape"),
         ({"offsets": [[0.0, 0.0], [1.0, 1.0]]}, DomainError, "offsets of shape"),

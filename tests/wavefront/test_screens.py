@@ -13,15 +13,15 @@ from scipy.optimize import brentq
 
 from pachon.models.errors import DomainError, UnknownNameError
 from pachon.models.random_streams import stream
-from pachon.wavefront.screens import STENCILS, evaluate, phase_screen, stencil_gain
+from pachon.wavefront.screens import STENCILS, evaluate, phase_screen, slope_screen, stencil_gain
 from pachon.wavefront.turbulence import long_exposure_fwhm, path_spectrum, path_variance, structure_function
 
 R0, L0 = 0.16, 25.0
-CUTOFF = 1.0 / R0
+CUTOFF = 1.4 / R0
 LOW, HIGH = (0.0, CUTOFF), (CUTOFF, math.inf)
 SIZE, LENGTH = 2048, 327.68
 PIXEL = LENGTH / SIZE
-FINE_SIZE, FINE_PIXEL = 2048, 0.02
+FINE_SIZE, FINE_PIXEL = 3072, 0.014
 RADIANS_PER_METRE = 2.0 * math.pi / 500e-9
 
 
@@ -51,14 +51,14 @@ def structure_along(field, pixel, separations, direction):
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (math.sqrt(0.5), math.sqrt(0.5))])
 def test_expected_structure_function_of_both_scales(direction):
-    """Low and high screens together follow theory from two fine pixels and two coarse pixels to the outer scale."""
+    """Low and high screens together follow theory from 4 cm to the outer scale."""
     b = np.array([0.04, 0.1, 0.16, 0.32, 0.64, 1.3, 2.6, 5.0, 10.0, 25.0])
     low = structure_along(screen(LOW, fixed_modulus=True), PIXEL, b, direction)
     high = structure_along(screen(HIGH, fixed_modulus=True), FINE_PIXEL, b, direction)
     ratio = (low + high) / structure_function(b, R0, L0)
-    # The project's requirement is 3 %; beyond the fine Nyquist limit 2 % are missing at two fine pixels, and at
-    # coarser separations the sum over modes is the integral to 0.5 %.
-    np.testing.assert_allclose(ratio, 1.0, atol=0.03)
+    # The project's requirement is 2 %; beyond the fine Nyquist limit 1.5 % are missing at 4 cm, and at coarser
+    # separations the sum over modes is the integral to 0.5 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.02)
     np.testing.assert_allclose(ratio[b >= 0.32], 1.0, atol=0.005)
 
 
@@ -88,7 +88,7 @@ def test_long_exposure_image_of_random_screens():
     mean_low, mean_high = 0.0, 0.0
     for seed in range(count):
         low = screen(LOW, seed=seed, size=size, length=size * pixel)
-        high = screen(HIGH, seed=seed, size=512, length=512 * FINE_PIXEL)
+        high = screen(HIGH, seed=seed, size=512, length=512 * 0.25 * pixel)
         mean_low = mean_low + coherence(wavenumber * low)[:21, :21] / count
         mean_high = mean_high + coherence(wavenumber * high)[:81:4, :81:4] / count
     otf = mean_low * mean_high  # the two scales are independent
@@ -161,53 +161,37 @@ def test_gaussian_modes_have_the_exponential_distribution_of_power():
     assert np.mean(ratio > 1.0) == pytest.approx(math.exp(-1.0), abs=0.005)
 
 
-def bilinear_gradient_power(field):
-    """Mean squared gradient [per pixel^2] of the bilinear patches over all positions: exact integral over each."""
-
-    def mean_square(difference, axis):
-        following = np.roll(difference, -1, axis=axis)
-        return np.mean(difference**2 + difference * following + following**2) / 3.0
-
-    field = field.astype(np.float64)
-    along_x, along_y = np.roll(field, -1, axis=1) - field, np.roll(field, -1, axis=0) - field
-    return mean_square(along_x, 0) + mean_square(along_y, 1)
+def unpacked(slopes):
+    return slopes.astype(np.int16).astype(np.float64), (slopes >> 16).astype(np.float64)
 
 
-@pytest.mark.parametrize("centre", [0.2, 1.0, 3.0, 6.0])
-def test_gradient_stencil_keeps_the_gradient_variance_of_every_ring_of_modes(centre):
-    ring = (centre - 0.05, centre + 0.05)
-    exact, kx, ky = power(screen(LOW, band=ring))
-    expected = np.sum(exact * (kx**2 + ky**2))
-    gradient = bilinear_gradient_power(screen(LOW, band=ring, stencil="gradient"))
-    # float32 screens: 1e-6.
-    assert gradient == pytest.approx(expected, rel=1e-5)
-    plain = bilinear_gradient_power(screen(LOW, band=ring))
-    assert plain < expected
+@pytest.mark.parametrize("size", [256, 250, 81])
+@pytest.mark.parametrize("lag", [0.0, 0.3])
+def test_slopes_are_the_gradient_of_the_screen_of_the_same_stream(size, lag):
+    """Brute force: the modes of the screen by NumPy's own transform, times i k and the sinc of the lag."""
+    length = 0.16 * size
+    spectrum = np.fft.fft2(screen(LOW, size=size, length=length).astype(np.float64))
+    k = 2.0 * math.pi * np.fft.fftfreq(size, 0.16)
+    seen = np.sinc(np.hypot(k, k[:, None]) * lag / (2.0 * math.pi))
+    exact = [np.fft.ifft2(1j * wavenumber * seen * spectrum).real for wavenumber in (k, k[:, None])]
+    unit = 8.0 * np.std(exact) / 32767.0
+    options = {"size": size, "length": length, "r0": R0, "outer_scale": L0, "band": LOW, "unit": unit, "lag": lag}
+    packed = slope_screen(stream(1, "test"), threads=1, **options)
+    for counts, slope in zip(unpacked(packed), exact, strict=True):
+        # Rounding to whole counts, and single precision of a slope of 4000 counts.
+        np.testing.assert_allclose(counts, slope / unit, atol=0.55)
+    for threads in (2, 3):
+        out = np.empty((size, size), dtype=np.int32)
+        again = slope_screen(stream(1, "test"), threads=threads, out=out, **options)
+        assert again is out
+        assert out.tobytes() == packed.tobytes()
 
 
-def test_gradient_stencil_at_random_places():
-    """The four-point gradient as a ray tracer reads it, restated, has the variance of the true gradient."""
-    field = screen(LOW, stencil="gradient").astype(np.float64)
-    exact, kx, ky = power(screen(LOW))
-    place = stream(5, "places").random((2, 400_000)) * SIZE
-    i, j = place.astype(int)
-    u, v = place - np.array([i, j])
-    right, up = (i + 1) % SIZE, (j + 1) % SIZE
-    slope_x = (1 - v) * (field[j, right] - field[j, i]) + v * (field[up, right] - field[up, i])
-    slope_y = (1 - u) * (field[up, i] - field[j, i]) + u * (field[up, right] - field[j, right])
-    # 400 000 samples: 0.3 % of scatter.
-    assert np.mean(slope_x**2) == pytest.approx(np.sum(exact * kx**2), rel=0.01)
-    assert np.mean(slope_y**2) == pytest.approx(np.sum(exact * ky**2), rel=0.01)
-
-
-def test_bilinear_stencil_keeps_the_variance():
-    place = stream(6, "places").random((2, 400_000)) * SIZE * PIXEL
-    high_place = place * FINE_PIXEL / PIXEL
-    for band, pixel, where in ((LOW, PIXEL, place), (HIGH, FINE_PIXEL, high_place)):
-        exact = np.sum(power(screen(band))[0])
-        read = evaluate(screen(band, stencil="bilinear"), pixel, *where, "bilinear")
-        # 400 000 places: 0.5 % of scatter where neighbours are correlated.
-        assert np.mean(read**2) == pytest.approx(exact, rel=0.02)
+def test_slopes_beyond_the_counts_are_held():
+    options = {"size": 256, "length": 40.96, "r0": R0, "outer_scale": L0, "band": LOW}
+    x, y = unpacked(slope_screen(stream(1, "test"), unit=1e-11, **options))
+    assert x.max() == y.max() == 32767
+    assert x.min() == y.min() == -32767
 
 
 def test_spline_goes_through_the_samples_and_through_the_sum_of_modes_between():
@@ -216,7 +200,7 @@ def test_spline_goes_through_the_samples_and_through_the_sum_of_modes_between():
     samples, spline = screen(LOW, **options), screen(LOW, stencil="spline", **options)
     pixel = length / size
     index = np.arange(size) * pixel
-    at_samples = evaluate(spline, pixel, index, np.full(size, 7 * pixel), "spline")
+    at_samples = evaluate(spline, pixel, index, np.full(size, 7 * pixel))
     rms = samples.std()
     np.testing.assert_allclose(at_samples, samples[7], atol=2e-6 * rms)  # float32
     spectrum = np.fft.fft2(samples.astype(np.float64)) / size**2
@@ -224,7 +208,7 @@ def test_spline_goes_through_the_samples_and_through_the_sum_of_modes_between():
     x, y = stream(7, "places").random((2, 200)) * length * 3.0 - length  # beyond the side too: periodic
     exact = np.einsum("ab,na,nb->n", spectrum, np.exp(1j * np.outer(y, k)), np.exp(1j * np.outer(x, k))).real
     # Modes reach 1 rad per pixel, where a cubic spline's error is 2e-3 of the mode; most power lies far below.
-    assert np.sqrt(np.mean((evaluate(spline, pixel, x, y, "spline") - exact) ** 2)) < 2e-4 * rms
+    assert np.sqrt(np.mean((evaluate(spline, pixel, x, y) - exact) ** 2)) < 2e-4 * rms
 
 
 @pytest.mark.parametrize("band", [LOW, HIGH])

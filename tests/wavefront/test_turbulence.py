@@ -16,6 +16,7 @@ from pachon.wavefront.turbulence import (
     long_exposure_otf,
     path_spectrum,
     path_variance,
+    slope_variance,
     structure_function,
 )
 
@@ -200,3 +201,13 @@ def test_bad_arguments_are_named(call, text):
     with pytest.raises(DomainError) as caught:
         call()
     assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.2])
+def test_slope_variance_is_the_integral_over_the_low_modes(lag):
+    def integrand(nu):
+        seen = 2.0 * math.pi * nu * np.sinc(nu * lag)
+        return 0.5 * seen**2 * path_spectrum(nu, 0.14, 23.0) * 2.0 * math.pi * nu
+
+    expected = quad(integrand, 0.0, 8.0 / (2.0 * math.pi), epsabs=0.0, epsrel=1e-11, limit=300)[0]
+    assert slope_variance(0.14, 23.0, 8.0, lag) == pytest.approx(expected, rel=1e-9)

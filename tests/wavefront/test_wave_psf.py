@@ -42,9 +42,11 @@ def test_against_a_plain_sum_over_the_pupil(polynomial_pupil):
     image = engine.render(np.zeros((1, 2)), offset).image[0]
 
     focal = math.sqrt(np.linalg.det(jacobian))
-    line = spacing * np.arange(-30, 31)
-    q = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    optics = telescope.trace(telescope, np.zeros((1, 2)), wavelengths, q @ jacobian / focal)
+    line = spacing * (np.arange(-30, 30) + 0.5)
+    pupil = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    optics = telescope.trace(telescope, np.zeros((1, 2)), wavelengths, pupil)
+    # direction cosines of the light at the focus
+    cosines = pupil @ np.linalg.inv(jacobian)
     node, weight = np.polynomial.legendre.leggauss(8)
     expected = np.zeros((9, 9))
     for wave, wavelength in enumerate(wavelengths):
@@ -53,8 +55,8 @@ def test_against_a_plain_sum_over_the_pupil(polynomial_pupil):
         field = np.exp(1j * k * optics.path[0, wave, lit])
         shift = jacobian @ dispersion[wave] + offset[0] * 5e-6
         x, y = ((plane.pixel_centers[:, None] + 2.5e-6 * node).ravel() - s for s in shift)
-        to_x = np.exp(-1j * k / focal * np.outer(x, q[lit, 0]))
-        to_y = np.exp(-1j * k / focal * np.outer(y, q[lit, 1]))
+        to_x = np.exp(-1j * k * np.outer(x, cosines[lit, 0]))
+        to_y = np.exp(-1j * k * np.outer(y, cosines[lit, 1]))
         square = np.abs((to_y * field) @ to_x.T) ** 2
         mean = np.einsum("iajb,a,b->ij", square.reshape(9, 8, 9, 8), weight / 2, weight / 2)
         expected += mean * (plane.pixel_size * spacing / (wavelength * focal)) ** 2
@@ -121,6 +123,15 @@ def test_layers_bend_light_by_their_gradient_where_it_crosses_them(polynomial_pu
         np.testing.assert_allclose(image, expected, atol=5e-3 * expected.max())
 
 
+def dots(telescope, engine, pupil, lit):
+    """Return what the pupil lets through at lattice points alone, and their places [m]."""
+    at = np.array([np.argmin(np.hypot(*(engine._lattice.points - point).T)) for point in pupil])
+    optics = telescope.trace(telescope, np.zeros((1, 2)), np.ones(len(lit)), engine._lattice.points)
+    optics.lit[...] = False
+    optics.lit[0][:, at] = lit
+    return optics, engine._lattice.points[at]
+
+
 def test_light_is_conserved(polynomial_pupil):
     """Parseval: each wavelength's mean intensity on its grid is its share of the lit points."""
     telescope = polynomial_pupil(defocus=1e-6)
@@ -128,37 +139,39 @@ def test_light_is_conserved(polynomial_pupil):
     wavelengths = np.array([550e-9, 700e-9])
     engine = WavePsfEngine(telescope, wavelengths, PLANE, dispersion=np.zeros((2, 2)), atmosphere=atmosphere, threads=1)
     rng = np.random.default_rng(0)
-    pupil = rng.uniform(-3, 3, (1000, 2))
-    place = rng.choice(engine._size**2, 1000, replace=False)
     lit = rng.random((2, 1000)) < np.array([[0.9], [0.5]])
-    intensity = engine._expose(np.zeros(2), pupil, place, np.zeros((2, 1000)), lit)
+    optics, _ = dots(telescope, engine, rng.uniform(-2.9, 2.9, (1000, 2)), lit)
+    intensity = engine._expose(np.zeros(2), optics)
     # Single-precision transforms.
-    np.testing.assert_allclose(intensity.mean(axis=(1, 2)), lit.sum(axis=1) / lit.sum(), rtol=1e-5)
+    share = optics.lit[0].sum(axis=1) / optics.lit.sum()
+    np.testing.assert_allclose(intensity.mean(axis=(1, 2)), share, rtol=1e-5)
 
 
-def test_phase_of_the_atmosphere_against_plain_numpy(polynomial_pupil):
-    """The field at scattered points of the pupil, read off the transform of a single point each."""
+@pytest.mark.parametrize("fine_pixel", [0.02, 0.0173])
+def test_phase_of_the_atmosphere_against_plain_numpy(polynomial_pupil, fine_pixel):
+    """The path between points of the pupil, read off the fringes of two at a time."""
     telescope = polynomial_pupil()
-    atmosphere = small_atmosphere(exposure=0.05)
+    atmosphere = small_atmosphere(exposure=0.05, fine_pixel=fine_pixel)
     engine = WavePsfEngine(telescope, ONE_WAVE, PLANE, dispersion=STILL, atmosphere=atmosphere, threads=1)
     field = np.array([0.02, -0.01])
     rng = np.random.default_rng(1)
-    pupil = rng.uniform(-4, 4, (20, 2))
-    path = np.zeros(20)
-    for layer in range(6):
-        x, y = atmosphere.screen_coordinates(
-            *pupil.T, layer, field=tuple(np.tan(field)), time=float(atmosphere.times[0])
-        )
-        for scale in ("low", "high"):
-            path += atmosphere.path(x, y, layer, scale=scale, stencil="spline")
-    # Two points interfere: intensity 2 + 2 cos(k (path_a - path_b) + the phase ramp of their distance).
-    for a, b in ((0, 1), (2, 3), (18, 19)):
-        place = np.array([5, 9])
-        intensity = engine._expose(field, pupil[[a, b]], place, np.zeros((1, 2)), np.ones((1, 2), dtype=bool))[0]
-        ramp = 2 * np.pi * np.arange(engine._size) * 4 / engine._size
-        expected = 1 + np.cos(2 * np.pi / 620e-9 * (path[a] - path[b]) + ramp)
+    for _ in range(8):
+        optics, pupil = dots(telescope, engine, rng.uniform(-2.9, 2.9, (2, 2)), np.ones((1, 2), dtype=bool))
+        path = np.zeros(2)
+        for layer in range(6):
+            x, y = atmosphere.screen_coordinates(
+                *pupil.T, layer, field=tuple(np.tan(field)), time=float(atmosphere.times[0])
+            )
+            for scale in ("low", "high"):
+                path += atmosphere.path(x, y, layer, scale=scale)
+        intensity = engine._expose(field, optics)[0]
+        # Intensity 1 + cos(k (path_a - path_b) - the phase ramp of their distance).
+        steps = np.rint((pupil[0] - pupil[1]) / engine._lattice.spacing)
+        line = 2 * np.pi * np.arange(engine._size) / engine._size
+        ramp = line * steps[0] + line[:, None] * steps[1]
+        expected = 1 + np.cos(2 * np.pi / 620e-9 * (path[0] - path[1]) - ramp)
         # Paths of 10 waves in single precision leave 1e-5 of a radian in every layer and scale.
-        np.testing.assert_allclose(intensity[0], expected, atol=2e-3)
+        np.testing.assert_allclose(intensity, expected, atol=2e-3)
 
 
 def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
@@ -179,7 +192,7 @@ def test_grid_is_padded_where_it_must_be(polynomial_pupil):
 
     def size(plane, atmosphere, **options):
         engine = WavePsfEngine(telescope, ONE_WAVE, plane, dispersion=STILL, atmosphere=atmosphere, **options)
-        return engine._size * engine._spacing
+        return engine._size * engine._lattice.spacing
 
     sharp = ImagePlane(31, 10e-6, 0.5e-6)
     assert size(PLANE, atmosphere) < 12.0

@@ -5,7 +5,7 @@ import pytest
 
 import pachon
 from pachon.models.errors import DomainError
-from pachon.wavefront.zernike import annular_zernikes, fit_zernikes, noll_to_nm
+from pachon.wavefront.zernike import annular_zernike_gradients, annular_zernikes, fit_zernikes, noll_to_nm
 
 EPS = 0.612
 
@@ -67,6 +67,34 @@ def test_galsim():
     assert np.allclose(ours, basis[1:], atol=1e-11)
 
 
+def test_gradients_of_closed_forms():
+    x, y = np.array([0.0, 0.8, -0.7, 0.1]), np.array([0.0, 0.1, 0.4, -0.9])
+    gradient = annular_zernike_gradients(8, x, y)
+    zero, one = 0 * x, 1 + 0 * x
+    closed = [
+        (zero, zero),
+        (2 * one, zero),
+        (zero, 2 * one),
+        (4 * np.sqrt(3) * x, 4 * np.sqrt(3) * y),
+        (2 * np.sqrt(6) * y, 2 * np.sqrt(6) * x),
+        (2 * np.sqrt(6) * x, -2 * np.sqrt(6) * y),
+        (6 * np.sqrt(8) * x * y, np.sqrt(8) * (3 * x**2 + 9 * y**2 - 2)),
+        (np.sqrt(8) * (9 * x**2 + 3 * y**2 - 2), 6 * np.sqrt(8) * x * y),
+    ]
+    assert np.allclose(gradient, closed, atol=1e-13)
+
+
+@pytest.mark.parametrize("eps", [0.0, EPS])
+def test_gradients_of_galsim(eps):
+    galsim = pytest.importorskip("galsim")
+    x, y = np.random.default_rng(1).uniform(-0.7, 0.7, (2, 30))
+    gradient = annular_zernike_gradients(37, x, y, eps)
+    for j in range(1, 38):
+        term = galsim.zernike.Zernike([0.0] * j + [1.0], R_outer=1.0, R_inner=eps)
+        # Rounding in both, of slopes up to 100.
+        assert np.allclose(gradient[j - 1], term.evalCartesianGrad(x, y), atol=1e-11)
+
+
 def test_fit_recovers_planted_coefficients(lsst_r):
     opd = pachon.wavefront_opd(lsst_r, (0.0, 0.0), 620e-9, grid=40)
     planted = np.random.default_rng(3).normal(0, 1e-7, 22)
@@ -88,8 +116,9 @@ def test_on_axis_the_lsst_has_rotational_terms_only(lsst_r):
 
 @pytest.mark.parametrize("eps", [-0.1, 1.0])
 def test_bad_obscuration(eps):
-    with pytest.raises(DomainError, match="obscuration"):
-        annular_zernikes(4, 0.5, 0.5, eps)
+    for function in (annular_zernikes, annular_zernike_gradients):
+        with pytest.raises(DomainError, match="obscuration"):
+            function(4, 0.5, 0.5, eps)
 
 
 def test_too_few_points(lsst_r):

@@ -1,0 +1,155 @@
+"""How elliptical does the atmosphere alone make stars, over what angle, and how does that fade with exposure time?
+
+Run: python benchmarks/atmosphere_exposure_times.py [--seeds N] [--stars N] [--folder FOLDER]
+
+This is Figure 6 of Jee & Tyson (2011): stars in one CCD (13.6 arcmin), the site's six layers, exposures of 1, 5, 15 and
+60 s that begin together, one wavelength, no optics (the f/1000 paraboloid of atmosphere_vs_galsim.py), no charge
+diffusion. It prints mean |e| and xi+, and draws xi+ for the four exposures and the whiskers of 15 s.
+
+The ground layer is done twice: at 0 km, where all stars of an exposure look through the very same air and so share one
+ellipticity, which lifts xi+ alike at all separations; and at 200 m, which changes little within a CCD, since stars 13
+arcmin apart see it 0.8 m apart, a tenth of the pupil. In the correlation with the mean of each exposure taken out the
+shared part is gone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from atmosphere_vs_galsim import ARCMIN, ARCSEC, SITE, ellipticity, ideal_telescope, pachon_stars, through_screens
+
+import pachon
+from pachon.models.random_streams import stream
+from pachon.wavefront.atmosphere import Atmosphere
+
+EXPOSURES = (1.0, 5.0, 15.0, 60.0)
+LIFTS = (0.0, 200.0)
+FIELD = 6.8 * ARCMIN
+PIXEL, STAMP = 0.2 * ARCSEC, 31
+BINS = {"min_sep": 0.2 * ARCMIN, "max_sep": 12.0 * ARCMIN, "n_bins": 10, "exact": True}
+WHISKER_STARS = 1500
+
+
+def exposed(longest: Atmosphere, exposure: float, lift: float) -> Atmosphere:
+    """Return the beginning of the longest exposure, in 300 steps or more of at most 0.05 s, with the ground lifted."""
+    count = max(300, round(exposure / 0.05))
+    return through_screens(
+        longest,
+        longest.kept_screens("slopes"),
+        exposure=exposure,
+        times=(np.arange(count) + 0.5) * (exposure / count),
+        altitudes=np.where(longest.altitudes == 0.0, lift, longest.altitudes),
+    )
+
+
+def ellipticities(atmosphere: Atmosphere, fields: np.ndarray) -> np.ndarray:
+    telescope = ideal_telescope()
+    plane = {"pixel_size": PIXEL * telescope.reference_sphere_radius, "stamp_size": STAMP}
+    return ellipticity(pachon_stars(telescope, atmosphere, fields, **plane), PIXEL)
+
+
+def study(seeds: int, stars: int) -> tuple[dict, np.ndarray]:
+    """Return the statistics of each (lift, exposure) with the seeds along the first axis, and the separations."""
+    fields = stream(0, "stars").uniform(-FIELD, FIELD, (stars, 2))
+    table: dict = {(lift, t): {"mean": [], "xi": [], "within": []} for lift in LIFTS for t in EXPOSURES}
+    for seed in range(seeds):
+        longest = Atmosphere.from_site(SITE, seed, exposure=max(EXPOSURES))
+        for (lift, t), row in table.items():
+            e = ellipticities(exposed(longest, t, lift), fields)
+            correlations = [
+                pachon.shear_correlation(*fields.T, e.real, e.imag, subtract_mean=subtract, **BINS)
+                for subtract in (False, True)
+            ]
+            row["mean"].append(np.mean(np.abs(e)))
+            row["xi"].append(correlations[0].xi_plus)
+            row["within"].append(correlations[1].xi_plus)
+        longest.release()
+        print(f"  seed {seed}: mean |e| in 15 s {table[0.0, 15.0]['mean'][-1]:.4f}", flush=True)
+    arrays = {key: {name: np.array(v) for name, v in row.items()} for key, row in table.items()}
+    return arrays, correlations[0].r_arcmin
+
+
+def average(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(values))
+
+
+def half_width(r: np.ndarray, xi: np.ndarray) -> float:
+    """Return the separation at which a correlation has fallen to half of its first bin [arcmin]."""
+    below = int(np.argmax(xi < 0.5 * xi[0]))
+    part = (xi[below - 1] - 0.5 * xi[0]) / (xi[below - 1] - xi[below])
+    return float(np.exp(np.log(r[below - 1]) + part * np.log(r[below] / r[below - 1])))
+
+
+def draw_correlations(table: dict, r: np.ndarray, path: Path) -> None:
+    figure, axes = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained")
+    titles = {"xi": "as observed", "within": "mean ellipticity of each exposure taken out"}
+    for panel, (name, title) in zip(axes, titles.items(), strict=True):
+        for lift, style in zip(LIFTS, ("o-", "s--"), strict=True):
+            for number, t in enumerate(EXPOSURES):
+                mean, error = average(table[lift, t][name])
+                label = f"{t:g} s" if lift == 0.0 else None
+                place = r * 1.03 ** (number - 1.5)
+                # Both sets look through the same screens: one set of error bars is enough.
+                error = error if lift == 0.0 else None
+                panel.errorbar(place, mean, error, fmt=style, color=f"C{number}", ms=3, lw=1, capsize=2, label=label)
+        panel.set_xscale("log")
+        panel.set(xlabel="separation [arcmin]", ylabel=r"$\xi_+$", title=title)
+        panel.set_xticks([0.2, 0.5, 1, 2, 5, 10], ["0.2", "0.5", "1", "2", "5", "10"])
+        panel.minorticks_off()
+    axes[0].set_yscale("log")
+    axes[0].plot([], [], "ks--", ms=3, lw=1, label="ground layer at 200 m")
+    axes[0].legend(title="exposure, ground layer at 0 km", fontsize=8, title_fontsize=8)
+    axes[1].axhline(0.0, color="0.6", lw=0.8)
+    axes[1].set_yscale("symlog", linthresh=1e-6)
+    figure.savefig(path, dpi=110)
+
+
+def draw_whiskers(path: Path) -> None:
+    fields = stream(1, "stars").uniform(-FIELD, FIELD, (WHISKER_STARS, 2))
+    longest = Atmosphere.from_site(SITE, 0, exposure=max(EXPOSURES))
+    e = ellipticities(exposed(longest, 15.0, 0.0), fields)
+    figure, axes = plt.subplots(1, 2, figsize=(12.0, 6.3), layout="constrained")
+    scale = 0.6 / 0.01  # arcminutes a unit of |e|
+    x, y = fields.T / ARCMIN
+    for panel, values, title in (
+        (axes[0], e, f"15 s: mean |e| {np.abs(e).mean():.2%}"),
+        (axes[1], e - e.mean(), f"less the mean ellipticity: mean |e| {np.abs(e - e.mean()).mean():.2%}"),
+    ):
+        half = 0.5 * scale * np.abs(values) * np.exp(0.5j * np.angle(values))
+        panel.plot([x - half.real, x + half.real], [y - half.imag, y + half.imag], color="k", lw=0.7)
+        panel.plot([-6.6, -6.6 + scale * 0.01], [7.1, 7.1], color="C3", lw=2)
+        panel.text(-5.8, 7.1, "1 %", color="C3", va="center")
+        panel.set(xlim=(-7.0, 7.0), ylim=(-7.0, 7.4), aspect="equal", title=title)
+        panel.set(xlabel="x [arcmin]", ylabel="y [arcmin]")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Ellipticity by the atmosphere alone against exposure time.")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--stars", type=int, default=400)
+    parser.add_argument("--folder", type=Path, help="where to draw the pictures")
+    arguments = parser.parse_args()
+    print(f"pachon {pachon.__version__}; {arguments.seeds} seeds, {arguments.stars} stars in one CCD")
+    table, r = study(arguments.seeds, arguments.stars)
+    near = int(np.argmin(np.abs(r - 1.0)))
+    print(
+        f"ground at  exposure  mean |e|            xi+ at {r[near]:.1f}'            the same, mean taken out  half at"
+    )
+    for (lift, t), row in table.items():
+        (mean, error), (xi, xi_error), (within, within_error) = (average(row[n]) for n in ("mean", "xi", "within"))
+        print(
+            f"{lift:5.0f} m  {t:6.0f} s  {mean:.4f} +- {error:.4f}   {xi[near]:.2e} +- {xi_error[near]:.0e}"
+            f"   {within[near]:.2e} +- {within_error[near]:.0e}   {half_width(r, within):.2f}'"
+        )
+    if arguments.folder:
+        draw_correlations(table, r, arguments.folder / "atmosphere_exposure_times.png")
+        draw_whiskers(arguments.folder / "atmosphere_whiskers.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""How much memory a run will need, so that one that will not fit is refused before anything is computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ..models.errors import ConfigError
+from ..raytrace.launch import thread_count
+from ..wavefront.memory import available_bytes, readable
+from ..wavefront.psf import SCREENS
+from .experiment import Experiment
+
+# Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
+# 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the
+# report, when the screens are gone.
+_BASE, _REPORT = 400_000_000, 600_000_000
+# What a thread of the wave engine holds: fields, intensities and spectra of a star at five wavelengths.
+_WAVE_THREAD = 150_000_000
+# Copies of the stamps of a CCD's stars that are held at once, in bytes a pixel.
+_STAMP_BYTES = 48
+
+
+def screen_bytes(experiment: Experiment) -> int:
+    """Return how much memory the screens of an experiment take."""
+    kinds = SCREENS.get(experiment.config.psf.engine, ())
+    return 0 if experiment.atmosphere is None else experiment.atmosphere.screen_bytes(kinds)
+
+
+def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
+    """Return about how much memory a run takes at its peak.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What is to be computed.
+    threads : int, optional
+        Number of threads; all processors by default.
+    """
+    config = experiment.config
+    stars = config.stars.truth + config.stars.observed
+    workers = thread_count(threads) if config.psf.engine == "wave" else 0
+    stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
+    return max(_REPORT, _BASE + screen_bytes(experiment) + workers * _WAVE_THREAD + stamps)
+
+
+def check_memory(experiment: Experiment, threads: int | None = None) -> None:
+    """Refuse a run that needs more memory than there is.
+
+    Raises
+    ------
+    ConfigError
+        Naming the key that asks for most of it, what is needed and what is free.
+    """
+    free, needed = available_bytes(), needed_bytes(experiment, threads)
+    if free is None or needed <= free:
+        return
+    short = f"needs about {readable(needed)} of memory, {readable(free)} are free"
+    rest = needed - screen_bytes(experiment)
+    stars = experiment.config.stars
+    if rest > free or experiment.atmosphere is None:
+        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {stars.observed}: {short}")
+    smaller = experiment.atmosphere
+    while smaller.screen_size > 16 and rest + screen_bytes(replace(experiment, atmosphere=smaller)) > free:
+        smaller = replace(smaller, screen_size=smaller.screen_size // 2)
+    raise ConfigError(
+        f"atmosphere.screen_size = {experiment.atmosphere.screen_size}: {short}; {smaller.screen_size} would do with"
+        f" {readable(rest + screen_bytes(replace(experiment, atmosphere=smaller)))}"
+    )

@@ -1,0 +1,108 @@
+"""The atmosphere against GalSim: its theory, its screens, and its photons through the same screens."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pachon.pipeline.shapes import fwhm
+from pachon.wavefront.atmosphere import Atmosphere
+
+galsim = pytest.importorskip("galsim")
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def study():
+    """The benchmark that compares the two atmospheres, as a module."""
+    spec = importlib.util.spec_from_file_location("atmosphere_vs_galsim", BENCHMARKS / "atmosphere_vs_galsim.py")
+    module = importlib.util.module_from_spec(spec)
+    # Its dataclasses look their module up by name.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+def test_screens_have_the_structure_function_of_galsims_von_karman_profile():
+    # A fixed modulus leaves no luck of the draw in the mean over a periodic screen.
+    air = Atmosphere.from_site(
+        "cerro_pachon",
+        4,
+        screen_size=1024,
+        screen_length=163.84,
+        exposure=5.0,
+        fine_size=1024,
+        fine_pixel=0.02,
+        fixed_modulus=True,
+    )
+    profile = galsim.VonKarman(lam=500.0, r0_500=0.16, L0=25.0)
+    layers = range(air.layer_count)
+    low = [air.low_screen(n, "samples").astype(float) for n in layers]
+    high = [air.high_screen(n, "samples").astype(float) for n in layers]
+    for lag in (2, 5, 20, 100):
+        path = sum(np.mean((np.roll(screen, -lag, axis=1) - screen) ** 2) for screen in low)
+        path += sum(np.mean((np.roll(screen, -8 * lag, axis=1) - screen) ** 2) for screen in high)
+        phase = path * (2.0 * math.pi / 500e-9) ** 2
+        # A screen of 164 m lacks the modes longer than itself, 0.2 % of the variance; the fine one those below 4 cm.
+        assert phase == pytest.approx(profile._structure_function(lag * 0.16), rel=0.01)
+
+
+def test_slopes_of_the_screens_are_as_strong_as_galsims(study):
+    """Both draw screens with the modes up to GalSim's own cut-off, 0.2/r0 cycles a metre."""
+    size = 1024
+    options = {"screen_size": size, "screen_length": 162.5, "exposure": 5.0}
+    theirs = study.galsim_layers(Atmosphere.from_site("cerro_pachon", 4, **options), 4)
+    cutoff = 2.0 * math.pi * theirs[0].kmax
+    air = Atmosphere.from_site("cerro_pachon", 4, cutoff=cutoff, **options)
+    axis = (np.arange(size) + 0.5) * air.screen_pixel
+    for layer in range(air.layer_count):
+        u, v = np.meshgrid(axis, axis)
+        gradient = 1e-9 * np.array(theirs[layer].wavefront_gradient(u, v, 0.0))
+        counts = air.slope_screen(layer)
+        unit = air.slope_unit(layer)
+        ours = np.mean((counts.astype(np.int16) * unit) ** 2) + np.mean(((counts >> 16) * unit) ** 2)
+        # Over the 40 000 modes that make slopes a screen's luck is 0.5 %. In the middle of a pixel GalSim's bilinear
+        # interpolation has lost some of the shortest modes: 4 % of the power of the slopes.
+        assert np.mean(np.sum(gradient**2, axis=0)) == pytest.approx(0.96 * ours, rel=0.02)
+
+
+def test_stars_through_galsims_own_screens(study):
+    """Light through the same air at the same time: any slip of sign, axis, wind or height would show."""
+    options = {"screen_size": 1024, "screen_length": 162.5, "exposure": 5.0, "time_step": 0.01}
+    air = Atmosphere.from_site("cerro_pachon", 4, **options)
+    fields = study.FIELD * np.array([[0.0, 0.0], [1.0, 0.3], [-0.7, 0.8], [0.2, -1.0], [-0.9, -0.6], [0.6, 0.9]])
+    layers = study.galsim_layers(air, 4)
+    photons = 500_000
+    images = study.galsim_stars(layers, fields, galsim.BaseDeviate(3), photons, exposure=5.0)
+    ours = study.pachon_stars(study.ideal_telescope(), study.through_galsim_screens(air, layers), fields)
+    e, theirs = study.ellipticity(ours), study.ellipticity(images)
+    # Photons leave 0.4 / sqrt(500 000) = 0.0006 in a component.
+    assert np.std(theirs) > 0.006
+    np.testing.assert_allclose(e, theirs, atol=0.0025)
+    # GalSim's second kick blurs 2 % more (docs/atmosphere.md); the widths of single stars are noisy by about 1 %.
+    assert np.mean(fwhm(ours, study.PIXEL) / fwhm(images, study.PIXEL)) == pytest.approx(0.98, abs=0.012)
+
+
+@pytest.mark.slow
+def test_atmosphere_alone_makes_the_same_stars_as_galsims(study):
+    comparison = study.compare(range(20), exposures=16, stars=8, photons=50_000)
+    width, width_error = comparison.ratio("fwhm")
+    variance, variance_error = comparison.ratio("variance")
+    # The comparison must be able to see what it is to exclude.
+    assert width_error < 0.005
+    assert variance_error < 0.12
+    assert width == pytest.approx(1.0, abs=0.015)
+    assert variance == pytest.approx(1.0, abs=0.15)
+    # Through the same screens no luck is left.
+    assert comparison.ratio("variance", "shared")[0] == pytest.approx(1.0, abs=0.15)
+    assert comparison.correlation > 0.99
+    for side in ("pachon", "galsim"):
+        xi = comparison.mean(side, "xi within")[0]
+        # The part that differs over the field: positive up to 2 arcmin, falling, and negative beyond its mean.
+        assert xi[0] > xi[2] > xi[4]
+        assert xi[1] > 0.0 > xi[-1]

@@ -1,0 +1,188 @@
+"""Memory: what the system leaves, what a run needs, and refusals before anything is computed."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pachon.models.errors import ConfigError
+from pachon.pipeline import memory as run_memory
+from pachon.pipeline import run as run_module
+from pachon.pipeline.cli import main
+from pachon.pipeline.config import Configuration, with_options
+from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.memory import check_memory, needed_bytes
+from pachon.wavefront.memory import available_bytes, readable
+
+GB = 1_000_000_000
+MEMINFO = "MemTotal:       24000000 kB\nMemFree:         100 kB\nMemAvailable:   20000000 kB\n"
+
+
+@pytest.fixture
+def system(tmp_path):
+    """Return a function that writes files as Linux has them, and the root they are under."""
+
+    def make(**files):
+        (tmp_path / "proc/self").mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            path = tmp_path / name.replace("__", "/")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return tmp_path
+
+    return make
+
+
+def write(root, folder, **files):
+    (root / folder).mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (root / folder / name.replace("_", ".", 1)).write_text(text)
+
+
+def test_without_limits_the_machine_decides(system):
+    assert available_bytes(system(proc__meminfo=MEMINFO)) == 20000000 * 1024
+
+
+def test_a_system_that_does_not_say_is_unknown(system):
+    assert available_bytes(system()) is None
+    assert available_bytes(system(proc__meminfo="MemAvailable: lots\n")) is None
+
+
+@pytest.mark.parametrize(
+    ("own", "above", "expected"),
+    [
+        ("max\n", "max\n", 20000000 * 1024),
+        # 3 GB less the 1 GB in use, of which 0.5 GB are cached files.
+        ("3000000000\n", "max\n", 2_500_000_000),
+        ("max\n", "2000000000\n", 1_500_000_000),
+        ("900000000\n", "max\n", 400_000_000),
+    ],
+)
+def test_limits_of_control_groups_and_of_those_above_them(system, own, above, expected):
+    root = system(proc__meminfo=MEMINFO, proc__self__cgroup="0::/job/step\n")
+    for folder, limit in (("job/step", own), ("job", above)):
+        where = f"sys/fs/cgroup/{folder}"
+        write(
+            root,
+            where,
+            memory_max=limit,
+            memory_current="1000000000\n",
+            memory_stat="anon 5\ninactive_file 500000000\n",
+        )
+    assert available_bytes(root) == expected
+
+
+def test_limits_of_the_first_version_and_of_a_container(system):
+    root = system(proc__meminfo=MEMINFO, proc__self__cgroup="9:name=systemd:/\n4:cpu,memory:/docker/abc\n0::/\n")
+    # Inside the container, its own group is the base.
+    write(
+        root,
+        "sys/fs/cgroup/memory",
+        memory_limit_in_bytes="4000000000\n",
+        memory_usage_in_bytes="1000000000\n",
+        memory_stat="inactive_file 1\ntotal_inactive_file 250000000\n",
+    )
+    assert available_bytes(root) == 3_250_000_000
+    # No limit is a very large one.
+    write(root, "sys/fs/cgroup/memory", memory_limit_in_bytes="9223372036854771712\n")
+    assert available_bytes(root) == 20000000 * 1024
+    # Used up, and more.
+    write(root, "sys/fs/cgroup/memory", memory_limit_in_bytes="500000000\n")
+    assert available_bytes(root) == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux says")
+def test_this_machine_has_some_memory():
+    # A test run needs a gigabyte itself; and nothing has a petabyte.
+    assert 1e8 < available_bytes() < 1e15
+
+
+def test_sizes_are_readable():
+    assert [readable(n) for n in (5e6, 123456789, 0.96e9, 2.34e9, 21.4e9, 109.9e9)] == [
+        "5.0 MB",
+        "123 MB",
+        "1.0 GB",
+        "2.3 GB",
+        "21 GB",
+        "110 GB",
+    ]
+
+
+def experiment(**options):
+    return prepare(resolve(with_options(Configuration(), ccds=("R22_S11",), **options)))
+
+
+def test_screens_are_most_of_what_is_needed():
+    default = needed_bytes(experiment())
+    # Six screens of 8192^2 samples of four bytes.
+    assert 6 * 8192**2 * 4 < default < 1.6 * 6 * 8192**2 * 4
+    larger = needed_bytes(experiment(atmosphere__screen_size=16384))
+    assert larger - default > 3 * 6 * 8192**2 * 4
+    wave = [needed_bytes(experiment(psf__engine="wave"), threads) for threads in (1, 5)]
+    assert default < wave[0] < wave[1]
+    # Without an atmosphere there are no screens.
+    assert needed_bytes(experiment(atmosphere__enabled=False)) < GB
+    # A stamp of 31 x 31 pixels in single precision, at least.
+    more = needed_bytes(experiment(stars__truth=1_000_000, atmosphere__enabled=False))
+    assert more > 1_000_000 * 61 * 61 * 4
+
+
+def test_what_does_not_fit_names_the_key_and_what_would(monkeypatch):
+    large = experiment(atmosphere__screen_size=65536)
+    monkeypatch.setattr(run_memory, "available_bytes", lambda: 21 * GB)
+    with pytest.raises(ConfigError) as caught:
+        check_memory(large)
+    expected = r"atmosphere.screen_size = 65536: needs about 1\d\d GB of memory, 21 GB are free; 16384 would do with "
+    assert re.match(expected + r"[\d.]+ GB$", str(caught.value))
+    check_memory(experiment(atmosphere__screen_size=16384))
+    monkeypatch.setattr(run_memory, "available_bytes", lambda: None)
+    check_memory(large)
+    monkeypatch.setattr(run_memory, "available_bytes", lambda: 2 * GB)
+    with pytest.raises(ConfigError, match=r"^stars.truth = 1000000, stars.observed = 40: needs about \d+ GB of"):
+        check_memory(experiment(stars__truth=1_000_000))
+
+
+def test_a_run_that_does_not_fit_leaves_nothing_and_a_finished_one_is_reported_again(
+    monkeypatch, capsys, tmp_path, tiny, finished_run
+):
+    monkeypatch.setattr(run_memory, "available_bytes", lambda: 1000)
+    folder = tmp_path / "out"
+    assert main(["run", str(finished_run / "config.yaml"), "--out", str(folder)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("pachon: error: stars.truth = 14, stars.observed = 12: needs about ")
+    assert err.count("\n") == 1
+    assert not folder.exists()
+    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr(run_module, "build_report", lambda *_: "")
+    shutil.copytree(finished_run, folder)
+    assert run_module.run(tiny(), folder, resume=True).computed == ()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="counts kibibytes, as Linux does")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"atmosphere__screen_size": 4096, "atmosphere__screen_length_m": 650.0},
+        {"atmosphere__screen_size": 8192},
+        {"atmosphere__screen_size": 4096, "psf__engine": "wave", "atmosphere__time_step_s": 7.5, "stars__truth": 41},
+    ],
+)
+def test_the_estimate_is_near_the_peak_of_a_run(options, tmp_path):
+    """Whole runs of one CCD in a process of their own; the report's pictures included."""
+    code = (
+        "import json, resource, sys; from pathlib import Path; from pachon.pipeline.run import run;"
+        "from pachon.pipeline.experiment import resolve;"
+        "from pachon.pipeline.config import Configuration, with_options;"
+        "options = json.loads(sys.argv[1]);"
+        "run(resolve(with_options(Configuration(), ccds=('R22_S11',), **options)), Path(sys.argv[2]), threads=2);"
+        "print(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    arguments = [sys.executable, "-c", code, json.dumps(options), str(tmp_path / "out")]
+    peak = int(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
+    # Never less than what is needed, nor so much more that a run that fits is refused.
+    assert 1.0 <= np.divide(needed_bytes(experiment(**options), threads=2), peak) < 1.25

@@ -1,0 +1,191 @@
+r"""What active optics leaves uncorrected: a small random aberration of each exposure, on top of the traced one.
+
+Wavefront sensors in the four corners of the LSST's focal plane keep mirrors and camera in place, "within the <~ 0.2 um
+accuracy" of the reconstructed wavefront (Jee & Tyson 2011, sec. 2, after Manuel et al. 2010), with errors that are
+random from one exposure to the next (their sec. 6). The OPD that is left is taken as
+
+.. math:: W(p, \theta) = \sum_j (c_j + g_j \cdot \theta) Z_j(p),
+
+annular Zernikes of the entrance pupil whose coefficients are constant over the field but for a linear part: the first
+three terms of a double Zernike expansion. That is what shifted and tilted elements do to first order: a decentre brings
+coma that is constant over the field, a tilted camera defocus that is linear.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..models.errors import DomainError
+from ..models.random_streams import stream
+from ..models.telescope import Telescope
+from ..models.units import metres
+from .zernike import annular_zernike_gradients, annular_zernikes, noll_to_nm
+
+#: Accuracy that Jee & Tyson (2011) quote for the LSST's active optics [m].
+PAPER_RMS = 0.2e-6
+#: Largest rms that can be drawn [m], ten times the paper's: beyond it a blur of 1.5 arcsec leaves the stamps.
+LARGEST_RMS = 10.0 * PAPER_RMS
+#: Noll indices that are drawn by default: from defocus to the second spherical aberration. Tilt moves stars only.
+DEFAULT_TERMS = tuple(range(4, 23))
+#: Part of the variance, averaged over the field, that is linear in the field angle. Four sensors at the corners of a
+#: square within the field, of equal and independent errors, give a plane with as much variance in its slopes as in
+#: its mean.
+LINEAR_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualWavefront:
+    """An aberration added to the traced wavefront.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape [n_term]
+        OPD of the Noll terms j = 4, 5, ... on the axis [m]: positive where the wavefront leads, as
+        :func:`~pachon.wavefront.zernike.fit_zernikes` gives them.
+    pupil_diameter : float
+        Outer diameter of the entrance pupil [m].
+    pupil_obscuration : float
+        Inner over outer diameter.
+    field_gradient : ndarray, shape [n_term, 2], optional
+        Change of the coefficients along the field slopes x and y [m/rad]; none by default.
+    """
+
+    coefficients: np.ndarray
+    pupil_diameter: float
+    pupil_obscuration: float
+    field_gradient: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        values = metres(self.coefficients, "coefficients")
+        gradient = np.asarray(self.field_gradient, dtype=np.float64)
+        gradient = gradient if gradient.size else np.zeros((values.size, 2))
+        if values.ndim != 1 or not np.isfinite(values).all():
+            raise DomainError(
+                f"coefficients of shape {values.shape}: expected a list of finite lengths in metres, from Noll's j = 4"
+            )
+        if gradient.shape != (len(values), 2) or not np.isfinite(gradient).all():
+            raise DomainError(
+                f"field_gradient of shape {gradient.shape}: expected finite numbers, shape ({len(values)}, 2)"
+            )
+        if not (math.isfinite(self.pupil_diameter) and self.pupil_diameter > 0.0):
+            raise DomainError(f"pupil_diameter = {self.pupil_diameter!r}: expected a positive length in metres")
+        if not 0.0 <= self.pupil_obscuration < 1.0:
+            raise DomainError(f"pupil_obscuration = {self.pupil_obscuration!r}: expected 0 <= obscuration < 1")
+        for name, array in (("coefficients", values.copy()), ("field_gradient", gradient.copy())):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def draw(
+        cls,
+        telescope: Telescope,
+        rms: Any = PAPER_RMS,
+        seed: int = 0,
+        epoch: int = 0,
+        *,
+        terms: Iterable[int] = DEFAULT_TERMS,
+        linear_share: float = LINEAR_SHARE,
+    ) -> ResidualWavefront:
+        """Draw the aberration of one exposure.
+
+        Every term is Gaussian and independent of the others. Variances fall as n^(-11/3) with the radial degree n, as
+        those of the turbulence do (Noll 1976) that the wavefront sensors see in their own exposures; the paper says
+        how large the error is, not how it is spread over the terms.
+
+        Parameters
+        ----------
+        telescope : Telescope
+            Gives the pupil and the radius of the field.
+        rms : float or Quantity
+            Root mean square of the OPD over pupil, field of view and exposures [m], 0 to 2 um; 0.2 um in the paper.
+        seed : int
+            Seed of the run.
+        epoch : int
+            Number of the exposure; each has its own aberration.
+        terms : iterable of int
+            Noll indices to draw, from 4.
+        linear_share : float
+            Part of the variance that is linear over the field, 0 to 1; 0 gives every star the same aberration.
+
+        Returns
+        -------
+        ResidualWavefront
+
+        Raises
+        ------
+        DomainError
+            If an argument is outside its range.
+        """
+        size = metres(rms, "rms")
+        if size.size != 1 or not 0.0 <= size.item() <= LARGEST_RMS:
+            raise DomainError(f"rms = {rms!r}: expected 0 to {LARGEST_RMS:g} m of wavefront error")
+        if not 0.0 <= linear_share <= 1.0:
+            raise DomainError(f"linear_share = {linear_share!r}: expected 0 to 1")
+        for name, number in (("seed", seed), ("epoch", epoch)):
+            if not (isinstance(number, int | np.integer) and number >= 0):
+                raise DomainError(f"{name} = {number!r}: expected a whole number from 0")
+        chosen = sorted(set(terms))
+        if not chosen or chosen[0] < 4:
+            raise DomainError(f"terms = {chosen}: expected Noll indices from 4 (piston and tilt are no aberration)")
+        variance = np.array([float(noll_to_nm(j)[0]) ** (-11.0 / 3.0) for j in chosen])
+        sigma = size.item() * np.sqrt(variance / variance.sum())
+        # The mean square of a slope along x over a disc is a quarter of the square of its radius.
+        per_radian = math.sqrt(2.0 * linear_share) / telescope.field_radius
+        coefficients, gradient = np.zeros(chosen[-1] - 3), np.zeros((chosen[-1] - 3, 2))
+        for j, scale in zip(chosen, sigma, strict=True):
+            normal = scale * stream(seed, "active optics", epoch, j).standard_normal(3)
+            coefficients[j - 4] = math.sqrt(1.0 - linear_share) * normal[0]
+            gradient[j - 4] = per_radian * normal[1:]
+        return cls(coefficients, telescope.pupil_diameter, telescope.pupil_obscuration, gradient)
+
+    def at(self, slopes: ArrayLike) -> np.ndarray:
+        """Return the coefficients [m] at field slopes [..., 2] of the light's travel, shape [..., n_term]."""
+        place = np.asarray(slopes, dtype=np.float64)
+        gradient = self.field_gradient
+        return self.coefficients + place[..., :1] * gradient[:, 0] + place[..., 1:] * gradient[:, 1]
+
+    def opd(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
+        """Return the OPD over the pupil, of mean zero over the annulus.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape [n_pupil]
+            Entrance-pupil coordinates [m].
+        slopes : ndarray, shape [..., 2]
+            Slopes (tx, ty) of the light's travel [rad]; on the axis by default.
+
+        Returns
+        -------
+        ndarray, shape [..., n_pupil]
+            OPD [m], positive where the wavefront leads.
+        """
+        return _combined(self.at(slopes), self._basis(annular_zernikes, x, y))
+
+    def gradient(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
+        """Return the derivatives of the OPD along the pupil's x and y [rad], shape [..., n_pupil, 2].
+
+        Arguments are those of :meth:`opd`.
+        """
+        radius = 0.5 * self.pupil_diameter
+        basis = self._basis(annular_zernike_gradients, x, y) / radius
+        return _combined(self.at(slopes), np.moveaxis(basis, 1, -1))
+
+    def _basis(self, terms: Any, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the terms, or what else is wanted of them, from j = 4 on."""
+        radius = 0.5 * self.pupil_diameter
+        return terms(3 + len(self.coefficients), np.divide(x, radius), np.divide(y, radius), self.pupil_obscuration)[3:]
+
+
+def _combined(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the sum of the terms, always in the same order: a star's bytes must not depend on its neighbours."""
+    total = np.zeros(coefficients.shape[:-1] + basis.shape[1:])
+    extra = (np.newaxis,) * (basis.ndim - 1)
+    for j, term in enumerate(basis):
+        total += coefficients[(..., j, *extra)] * term
+    return total
