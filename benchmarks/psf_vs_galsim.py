@@ -39,7 +39,7 @@ import pachon
 from pachon.wavefront.atmosphere import Atmosphere
 from pachon.wavefront.fast_psf import PUPIL_POINTS
 
-PIXEL, STAMP, STARS = 0.2 * ARCSEC, 31, 32
+PIXEL, STAMP, STARS = 0.2 * ARCSEC, 31, 64
 FINE = {"n_pupil": 1300}
 FINE_STEP = 0.005
 
@@ -110,7 +110,10 @@ def main() -> None:
         }
         print("noise of a component of e with GalSim's photons, variance x photons:")
         counts = (samples // 4, samples, 4 * samples)
-        products = [n * noise_of_photons(layers, fields[:8], n, 24) for n in counts]
+        products = [
+            n * noise_of_photons(layers, fields[:8], n, repeats)
+            for n, repeats in zip(counts, (160, 80, 40), strict=True)
+        ]
         print("   " + ", ".join(f"{n} photons: {p:.3f}" for n, p in zip(counts, products, strict=True)))
         constant = float(np.mean(products))
         rng = galsim.BaseDeviate(5)

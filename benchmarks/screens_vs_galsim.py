@@ -3,10 +3,10 @@
 Run: python benchmarks/screens_vs_galsim.py [--size N] [--length METRES]
 
 Layer by layer the two take turns in one process, so that both see the same machine. Both make the modes that geometric
-shooting wants and no more, each with its own cut-off (pachon's, 1.4/r0 rad/m, is the higher one, so it holds twice the
-modes). GalSim's screens hold the path in double precision; pachon's hold both slopes, in 16 bits each, as its fast
-engine reads them. pachon's high screen of each layer, which only its wave engine reads, is timed apart and then counted
-in. GalSim works on one thread; pachon is shown on one and on two. Ratios are GalSim's time over pachon's.
+shooting wants and no more, each up to its own cut-off (printed; pachon's is the higher one). GalSim's screens hold the
+path in double precision; pachon's hold both slopes, in 16 bits each, as its fast engine reads them. pachon's high
+screen of each layer, which only its wave engine reads, is timed apart and then counted in. GalSim works on one thread;
+pachon is shown on one and on two. Ratios are GalSim's time over pachon's.
 """
 
 import argparse
@@ -27,6 +27,11 @@ def timed(job) -> float:
     return time.perf_counter() - start
 
 
+def galsim_cutoff(atmosphere: Atmosphere) -> float:
+    """What GalSim's PhaseScreenPSF asks for when photons are shot [cycles/m]: 0.2 over the Fried parameter."""
+    return 0.2 / (atmosphere.r0 * (WAVELENGTH / 500.0) ** 1.2)
+
+
 def galsim_screen(atmosphere: Atmosphere, layer: int) -> None:
     screen = galsim.AtmosphericScreen(
         screen_size=atmosphere.screen_length,
@@ -38,8 +43,7 @@ def galsim_screen(atmosphere: Atmosphere, layer: int) -> None:
         vy=atmosphere.velocities[layer, 1],
         rng=galsim.BaseDeviate(layer + 1),
     )
-    # What PhaseScreenPSF asks for when photons are shot: kcrit over the Fried parameter at the wavelength.
-    screen.instantiate(kmax=0.2 / (atmosphere.r0 * (WAVELENGTH / 500.0) ** 1.2))
+    screen.instantiate(kmax=galsim_cutoff(atmosphere))
     assert screen.npix == atmosphere.screen_size, "GalSim rounds its screens up to 2^n or 3 x 2^n samples"
 
 
@@ -54,6 +58,9 @@ def main() -> None:
     print(
         f"pachon {pachon.__version__}, GalSim {galsim.__version__}; {atmosphere.layer_count} screens of"
         f" {arguments.size}^2 over {arguments.length:g} m, high screens of {atmosphere.fine_size}^2"
+    )
+    print(
+        f"modes up to {atmosphere.cutoff:.2f} rad/m (pachon), {2.0 * np.pi * galsim_cutoff(atmosphere):.2f} rad/m (GalSim)"
     )
     out = np.empty((arguments.size, arguments.size), dtype=np.int32)
     times: dict[str, list[float]] = {name: [] for name in ("galsim", "one", "two", "high", "high two")}

@@ -19,7 +19,7 @@ from .shapes import Shapes, fwhm, measure_shapes
 from .stamps import center_stamps, observe_stamps
 from .star_field import StarField, make_star_field
 
-#: A star is drawn on a stamp this many pixels larger than the one kept: room to shift it onto the centre of a pixel.
+#: An observed star is drawn on a stamp so many pixels larger than the one kept: room to shift it onto a pixel's centre.
 _SHIFT_ROOM = 10
 #: Stars keep this many pixels from the rim: a ray that meets a CCD 20 um higher up lands micrometres farther in or out.
 _RIM = 2
@@ -29,10 +29,54 @@ _MARGIN = 20
 _PROVISIONAL_FWHM = 0.6 * ARCSEC
 
 
-def compute_ccd(
+@dataclass(frozen=True)
+class Exposed:
+    """Noise-free stars.
+
+    Attributes
+    ----------
+    image : ndarray, shape [n, ny, nx]
+        Stamps of unit sum.
+    pixel_scale : float
+        Angle of a pixel [rad].
+    fields : ndarray, shape [n, 2]
+        Field angles [rad].
+    light : ndarray, shape [n]
+        Light of each star over what an unvignetted pupil lets through.
+    """
+
+    image: np.ndarray
+    pixel_scale: float
+    fields: np.ndarray
+    light: np.ndarray
+
+
+@dataclass(frozen=True)
+class CcdExposure:
+    """The stars of one CCD as the telescope shows them, before noise.
+
+    Attributes
+    ----------
+    name : str
+        Name of the CCD.
+    places : StarField
+        Positions of the stars; their magnitudes are provisional.
+    truth : Exposed
+        PSFs for the truth, each seen at the centre of a pixel.
+    observed : Exposed
+        PSFs of the stars that will be observed, where they fall on their pixels.
+    """
+
+    name: str
+    places: StarField
+    truth: Exposed
+    observed: Exposed
+
+
+def expose_ccd(
     experiment: Experiment, name: str, *, threads: int | None = None, advance: Callable[[int], None] | None = None
-) -> CcdProduct:
-    """Make the stars of one CCD, look at them, and model the PSF from what was seen.
+) -> CcdExposure:
+    """Make the PSFs of the stars of one CCD: nearly all of the work, on all threads.
 
     Parameters
     ----------
@@ -51,25 +95,46 @@ def compute_ccd(
         If a stage fails: one line that starts with the name of the CCD.
     """
     try:
-        return _compute(experiment, name, threads, advance)
+        places = _star_field(experiment, name, _PROVISIONAL_FWHM)
+        truth = _truth(experiment, places.truth, threads, advance)
+        pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
+        size = experiment.stamp_size + _SHIFT_ROOM
+        observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, advance, size=size)
+        if not observed.light.min() > 0.0:
+            raise DomainError("no light reaches some of its stars: expected a CCD within the field of the telescope")
+        return CcdExposure(name, places, truth, observed)
     except PachonError as error:
         raise type(error)(f"CCD {name}: {error}") from None
 
 
-def _compute(
-    experiment: Experiment, name: str, threads: int | None, advance: Callable[[int], None] | None
-) -> CcdProduct:
+def model_ccd(experiment: Experiment, exposure: CcdExposure) -> CcdProduct:
+    """Look at the stars of one CCD through noise, and model the PSF from what was seen.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Telescope, focal plane, atmosphere and settings.
+    exposure : CcdExposure
+        The stars.
+
+    Raises
+    ------
+    PachonError
+        If a stage fails: one line that starts with the name of the CCD.
+    """
+    try:
+        return _model(experiment, exposure.name, exposure.places, exposure.truth, exposure.observed)
+    except PachonError as error:
+        raise type(error)(f"CCD {exposure.name}: {error}") from None
+
+
+def _model(experiment: Experiment, name: str, places: StarField, truth: Exposed, observed: Exposed) -> CcdProduct:
     config = experiment.config
     n_components = config.reconstruction.components
     bounds = _bounds(experiment, name)
-    places = _star_field(experiment, name, _PROVISIONAL_FWHM)
-    truth, truth_shapes, truth_images = _truth(experiment, places.truth, threads, advance)
-
+    truth_images = truth.image.astype(np.float64)
+    truth_shapes = measure_shapes(truth_images, truth.pixel_scale, experiment.weight_fwhm)
     # Places do not depend on the limits of magnitude, which in turn need to know how much light the stars lose.
-    pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
-    observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, advance)
-    if not observed.light.min() > 0.0:
-        raise DomainError("no light reaches some of its stars: expected a CCD within the field of the telescope")
     width = effective_fwhm(truth.image, truth.pixel_scale)
     stars = _star_field(experiment, name, width, least_light=float(observed.light.min()))
     electrons = stars.electrons * observed.light
@@ -140,7 +205,7 @@ def _noise_key(experiment: Experiment, name: str) -> tuple[int, *tuple[str | int
 
 def _truth(
     experiment: Experiment, positions: np.ndarray, threads: int | None, advance: Callable[[int], None] | None
-) -> tuple[_Exposed, Shapes, np.ndarray]:
+) -> Exposed:
     """Make noise-free PSFs whose centroid is the centre of a pixel.
 
     The atmosphere moves a star by a part of a pixel. The engine draws the truth at the place that undoes this; it is
@@ -151,11 +216,8 @@ def _truth(
         moved = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
         return np.nan_to_num(np.stack([moved.x, moved.y], axis=1))
 
-    truth = _expose(experiment, positions, np.zeros_like(positions), threads, advance, recenter=seen_at)
-    edge = _SHIFT_ROOM // 2
-    images = truth.image[:, edge:-edge, edge:-edge].astype(np.float64)
-    images /= images.sum(axis=(1, 2), keepdims=True)
-    return truth, measure_shapes(images, truth.pixel_scale, experiment.weight_fwhm), images
+    nothing = np.zeros_like(positions)
+    return _expose(experiment, positions, nothing, threads, advance, size=experiment.stamp_size, recenter=seen_at)
 
 
 def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
@@ -168,23 +230,16 @@ def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
     return float(np.sqrt(pixels / 2.266) * pixel_scale)
 
 
-@dataclass(frozen=True)
-class _Exposed:
-    image: np.ndarray
-    pixel_scale: float
-    fields: np.ndarray
-    #: Light of each star over what an unvignetted pupil lets through.
-    light: np.ndarray
-
-
 def _expose(
     experiment: Experiment,
     positions: np.ndarray,
     offsets: np.ndarray,
     threads: int | None,
     advance: Callable[[int], None] | None,
+    *,
+    size: int,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
-) -> _Exposed:
+) -> Exposed:
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
     told = 0
@@ -204,7 +259,7 @@ def _expose(
         atmosphere=experiment.atmosphere,
         aberration=experiment.aberration,
         engine=config.psf.engine,
-        stamp_size=experiment.stamp_size + _SHIFT_ROOM,
+        stamp_size=size,
         pixel_size=experiment.pixel_size,
         diffusion=experiment.diffusion,
         jitter=experiment.jitter,
@@ -215,7 +270,7 @@ def _expose(
         threads=threads,
         progress=tell,
     )
-    return _Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.throughput.mean(axis=1))
+    return Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.throughput.mean(axis=1))
 
 
 def _centered(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> tuple[Shapes, np.ndarray]:

@@ -97,9 +97,11 @@ class AtmosphereConfig(_Section):
 class PsfConfig(_Section):
     """How point-spread functions are made."""
 
-    engine: Literal["fast", "wave"] = Field("fast", description="fast (geometric and filters) or wave (Fourier optics)")
+    engine: Literal["fast", "wave", "long_exposure"] = Field(
+        "fast", description="fast (geometric and filters), wave (Fourier optics), long_exposure (mean over turbulence)"
+    )
     n_pupil: Annotated[int, Field(strict=True, ge=10)] | None = Field(
-        None, description="pupil points of the fast engine"
+        None, description="pupil points of the fast and the long_exposure engine"
     )
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")

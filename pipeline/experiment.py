@@ -23,6 +23,7 @@ from ..raytrace.rays import field_direction
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere import Atmosphere
 from ..wavefront.fast_psf import PUPIL_POINTS, PUPIL_POINTS_STILL
+from ..wavefront.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from ..wavefront.pupil_optics import chief_rays
 from ..wavefront.refraction import dispersion_shift
 from .config import BandName, Configuration, digest
@@ -39,6 +40,7 @@ _WAVELENGTHS = 5
 # ellipticity, and on pixels fine enough for a weight of 0.3".
 _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "pixel_um": 10.0, "stamp": 31, "diffusion_pixels": 0.4}
 _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "pixel_um": 2.5, "stamp": 61, "diffusion_pixels": 0.0}
+_ENGINE_DEFAULTS: dict[str, dict[str, float]] = {"long_exposure": {"n_pupil": PUPIL_POINTS_LONG}}
 _T = TypeVar("_T")
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -184,7 +186,11 @@ def resolve(config: Configuration, folder: Path | None = None) -> Configuration:
                 atmosphere.model_copy(update={"site": site_name}),
                 {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
             ),
-            "psf": _filled(config.psf, _WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE),
+            "psf": _filled(
+                config.psf,
+                (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
+                | _ENGINE_DEFAULTS.get(config.psf.engine, {}),
+            ),
             "reconstruction": _filled(
                 config.reconstruction, {"weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3}
             ),
@@ -287,6 +293,8 @@ def _check(config: Configuration, telescope: Telescope) -> None:
                 f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
                 f"stars.{kind} = {count}"
             )
+    if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:
+        raise ConfigError("psf.engine = long_exposure: expected atmosphere.enabled = true, whose mean it takes")
     if config.atmosphere.time_step_s > config.atmosphere.exposure_s:
         raise ConfigError(
             f"atmosphere.time_step_s = {config.atmosphere.time_step_s:g}: expected at most the exposure, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,8 +17,8 @@ from trimesh.exchange.gltf import export_glb
 
 from ..raytrace.launch import thread_count
 from ..wavefront.psf import SCREENS
-from .ccd_product import CcdProduct, product_path, read_product, write_product
-from .ccd_stage import compute_ccd
+from .ccd_product import product_path, read_product, write_product
+from .ccd_stage import CcdExposure, expose_ccd, model_ccd
 from .config import Configuration
 from .experiment import Experiment, prepare
 from .memory import check_memory
@@ -120,22 +121,31 @@ def _compute(
     if not names:
         return
     config = experiment.config
-    if experiment.atmosphere is not None:
-        wanted = SCREENS.get(config.psf.engine, ())
+    wanted = SCREENS.get(config.psf.engine, ())
+    if experiment.atmosphere is not None and wanted:
         with reporter.stage(f"atmosphere: {experiment.atmosphere.layer_count} screens"):
             for kind in wanted:
                 experiment.atmosphere.kept_screens(kind, threads)
     stars = config.stars.truth + config.stars.observed
-    with reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names)) as stage:
+    reported = reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names))
+    # Modelling runs on one thread only; it goes on beside the PSFs of the next CCD.
+    with reported as stage, ThreadPoolExecutor(1) as modeller:
+        unfinished: Future[None] | None = None
         for i, name in enumerate(names, start=1):
-            product = compute_ccd(experiment, name, threads=threads, advance=stage.advance)
-            _write(experiment, folder, product)
+            exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
+            if unfinished is not None:
+                unfinished.result()
+            unfinished = modeller.submit(_finish, experiment, folder, exposure)
+            if thread_count(threads) == 1 or i == len(names):
+                unfinished.result()
             stage.line(f"{name} ({i} of {len(names)})")
     if experiment.atmosphere is not None:
         experiment.atmosphere.release()
 
 
-def _write(experiment: Experiment, folder: Path, product: CcdProduct) -> None:
+def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
+    """Model one CCD and write its product."""
+    product = model_ccd(experiment, exposure)
     config = experiment.config
     cards = [
         ("TELESCOP", experiment.telescope.name, "prescription"),

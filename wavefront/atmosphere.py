@@ -33,7 +33,7 @@ _cache_lock = threading.Lock()
 DEFAULT_CUTOFF = 1.4
 #: Distance over which rays feel the slope of the low screens [m]: a gradient proper lets waves of a metre bend light
 #: more than they do where it interferes over baselines of some tenths of a metre.
-SLOPE_LAG = 0.0
+SLOPE_LAG = 0.2
 _SCALES = ("low", "high")
 # Beyond these a slip of the pen would fill the memory: 10 million steps, screens of 17 GB.
 _MOST_STEPS = 10_000_000

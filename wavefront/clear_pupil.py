@@ -14,14 +14,14 @@ from ..raytrace.launch import launch
 from ..raytrace.packed import pack_surfaces, refractive_indices
 from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
 from ..raytrace.trace_kernels import trace_rays
-from .long_exposure_kernels import find_edges
+from .clear_pupil_kernels import find_edges
 from .sample_packets import shared
 
 # Spokes to a ring: the phase of a blur goes round the pupil some three times faster than across its ring.
 _SPOKES_TO_A_RING = 3.2
 # Polynomials of a higher degree along the ring than these have say nothing new.
 _MOST_RINGS = 12
-# Rays on a spoke from which the rims of apertures are found: with one more, ellipticities change by 3e-5 at the most.
+# Rays on a spoke from which the rims of apertures are found, by parabolas.
 _EDGE_RINGS = 3
 
 

@@ -42,15 +42,15 @@ from .turbulence import diffraction_otf, slope_variance, structure_function
 
 #: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
 PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
-#: Side of the fine periodic grid over that of the stamp. Wings come back round from 1.5 stamp radii out: on a stamp of
-#: 6 arcsec they make the edge 1.5 times and the corners 2.2 times as bright as they should be, at 1e-4 of the peak,
-#: and change ellipticities by 3e-6. A margin of 2 leaves 1.1 and 1.2 times.
-GRID_MARGIN = 1.25
+#: Side of the fine periodic grid over that of the stamp, with and without an atmosphere, whose wings come back round.
+#: With 1.25 they would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they should
+#: be, at 1e-4 of the peak; with 2 they leave 1.1 and 1.2 times.
+GRID_MARGIN, GRID_MARGIN_STILL = 2.0, 1.25
 #: Cells to a pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
 #: the mean over many rays; an undisturbed spot may be no larger than one cell of a quarter of a pixel.
-OVERSAMPLING, OVERSAMPLING_STILL = 4, 12
+OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
 # Stars of one batch, fewer where their grids would fill more than this many bytes.
-_BATCH, _BATCH_BYTES = 32, 1 << 25
+_BATCH, _BATCH_BYTES = 128, 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
 _TABLE_SIZE = 4096
 
@@ -179,7 +179,8 @@ class FastPsfEngine:
     def _make_grid(self) -> None:
         """Lay out the fine grid and its frequencies."""
         self._cell = self._plane.pixel_size / self._oversampling
-        size = math.ceil(GRID_MARGIN * self._plane.stamp_size * self._oversampling)
+        margin = GRID_MARGIN_STILL if self._atmosphere is None else GRID_MARGIN
+        size = math.ceil(margin * self._plane.stamp_size * self._oversampling)
         # even, for the half plane of frequencies of a real transform
         self._grid_size = 2 * scipy.fft.next_fast_len(-(-size // 2), real=True)
         self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)

@@ -44,9 +44,10 @@ PUPIL_POINTS = 80
 #: Side of the periodic image over that of the stamp, as for the fast engine: wings that come round change ellipticities
 #: by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
 GRID_MARGIN = 1.25
-# What atmosphere and detector leave of the frequencies that are left out: 2e-6 of the peak of the image in all.
+# What atmosphere and detector leave of a frequency that is left out; with pixels of 10 um all of these together make
+# 2e-6 of the peak of the image.
 _NEGLIGIBLE = 1e-5
-# What they may leave of a baseline as long as the clear ring of the pupil is wide, where strips along rims would overlap.
+# What they may leave of a baseline as long as the pupil's ring is wide, where the strips along its rims would meet.
 _LARGEST_LEFT = 1e-3
 # Stars of one batch, fewer where the room for their waves would fill more than this many bytes.
 _BATCH, _BATCH_BYTES = 256, 1 << 24
@@ -190,8 +191,8 @@ class LongExposureEngine:
         k = 2.0 * math.pi / self.period
         inside = column**2 + row[:, None] ** 2 <= reach**2
         # Only one half of the plane is added up: columns m > 0 stand for -m too, and row 0 is added for +0 and -0.
-        scale = inside * np.where(column > 0, 2.0, 1.0) * np.where(row > 0, 1.0, 0.5)[:, None]
-        scale *= (plane.pixel_size / self.period) ** 2
+        scale = np.where(column > 0, 2.0, 1.0) * np.where(row > 0, 1.0, 0.5)[:, None]
+        scale = np.where(inside, (plane.pixel_size / self.period) ** 2 * scale, 0.0)
         detector = [scale * plane.transfer(k * column, sign * k * row[:, None]) for sign in (1.0, -1.0)]
         self._detector = np.stack(detector).reshape(2, n_row, n_packet, LANES).astype(np.float32)
         angle = k * np.outer(plane.pixel_centers, row)

@@ -1,89 +1,14 @@
-"""Kernels of the long-exposure engine: the clear pupil of each star, its transform, and the pixels."""
+"""Kernels of the long-exposure engine: points over the clear pupil of each star, their transform, and the pixels."""
 
 from __future__ import annotations
 
 import warp as wp
 
 from ..raytrace.launch import FORWARD_OPTIONS
-from ..raytrace.trace_kernels import APERTURE, ROTATION, STOPPED, VERTEX, PackedSurfaces
 from .sample_packets import LANES, samples
 from .wave_psf_kernels import unit_circle
 
 wp.set_module_options(FORWARD_OPTIONS)
-
-
-@wp.func
-def distance_on_surface(
-    surfaces: PackedSurfaces, s: wp.int32, position: wp.array3d(dtype=wp.float64), ray: wp.int32
-) -> wp.float64:
-    """Distance of a ray from the centre of the clear aperture of surface ``s``, in the surface's own x and y [m]."""
-    x = position[s, 0, ray] - surfaces.numbers[s, VERTEX]
-    y = position[s, 1, ray] - surfaces.numbers[s, VERTEX + 1]
-    z = position[s, 2, ray] - surfaces.numbers[s, VERTEX + 2]
-    r = ROTATION
-    along_x = surfaces.numbers[s, r] * x + surfaces.numbers[s, r + 3] * y + surfaces.numbers[s, r + 6] * z
-    along_y = surfaces.numbers[s, r + 1] * x + surfaces.numbers[s, r + 4] * y + surfaces.numbers[s, r + 7] * z
-    along_x = along_x - surfaces.numbers[s, APERTURE]
-    along_y = along_y - surfaces.numbers[s, APERTURE + 1]
-    return wp.sqrt(along_x * along_x + along_y * along_y)
-
-
-@wp.kernel
-def find_edges(
-    first: wp.int32,
-    surfaces: PackedSurfaces,
-    position: wp.array3d(dtype=wp.float64),
-    radius: wp.array(dtype=wp.float64),
-    n_spoke: wp.int32,
-    edges: wp.array3d(dtype=wp.float64),
-):
-    """Find between which radii one spoke of the pupil of one star is clear.
-
-    Where a ray crosses a surface is nearly linear in its place in the pupil, and so is its distance from the rim of
-    the aperture there; each surface's rim is found between the two rays on either side of it by linear interpolation.
-
-    Arguments: position [surface, 3, (star * n_ring + ring) * n_spoke + spoke]: telescope frame [m]; radius [ring]:
-    rising, of the rays in the pupil [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.
-    """
-    item = first + wp.tid()
-    star = item // n_spoke
-    spoke = item % n_spoke
-    n_ring = radius.shape[0]
-    zero = wp.float64(0.0)
-    inside = radius[0]
-    outside = radius[n_ring - 1]
-    for s in range(surfaces.kinds.shape[0]):
-        if surfaces.kinds[s, STOPPED] == 1:
-            from_hole = zero
-            from_rim = zero
-            hole = radius[0]
-            rim = radius[n_ring - 1]
-            cut = int(0)
-            for ring in range(n_ring):
-                distance = distance_on_surface(surfaces, s, position, (star * n_ring + ring) * n_spoke + spoke)
-                beyond_hole = distance - surfaces.numbers[s, APERTURE + 2]
-                before_rim = surfaces.numbers[s, APERTURE + 3] - distance
-                last = wp.max(ring - 1, 0)
-                step = radius[ring] - radius[last]
-                # Comparisons are such that a ray that missed the surface, a NaN, is outside of the rim.
-                if beyond_hole < zero:
-                    hole = radius[n_ring - 1]
-                elif from_hole < zero:
-                    hole = radius[ring] - step * beyond_hole / (beyond_hole - from_hole)
-                if cut == 0 and not before_rim >= zero:
-                    cut = int(1)
-                    rim = radius[last]
-                    if before_rim < zero and ring > 0:
-                        rim = radius[last] + step * from_rim / (from_rim - before_rim)
-                from_hole = beyond_hole
-                from_rim = before_rim
-            inside = wp.max(inside, hole)
-            outside = wp.min(outside, rim)
-    if inside >= outside:
-        inside = wp.float64(0.5) * (inside + outside)
-        outside = inside
-    edges[star, spoke, 0] = inside
-    edges[star, spoke, 1] = outside
 
 
 @wp.func

@@ -16,12 +16,13 @@ from .aberration import ResidualWavefront
 from .atmosphere import Atmosphere
 from .fast_psf import FastPsfEngine
 from .image_plane import ImagePlane, Recenter, focal_length
+from .long_exposure import LongExposureEngine
 from .pupil_optics import trace_pupils
 from .wave_psf import WavePsfEngine
 
-ENGINES = ("fast", "wave")
+ENGINES = ("fast", "wave", "long_exposure")
 #: Kinds of screens that an engine keeps of an atmosphere, as its ``kept_screens`` names them.
-SCREENS = {"fast": ("slopes",), "wave": ("low", "high")}
+SCREENS = {"fast": ("slopes",), "wave": ("low", "high"), "long_exposure": ()}
 #: Value of :attr:`Psfs.flags` for a star none of whose light reaches the focal plane; its image is zero.
 DARK = 1
 
@@ -108,10 +109,11 @@ def make_psfs(
         The exposure; none outside the atmosphere.
     aberration : ResidualWavefront, optional
         What active optics leaves uncorrected; none by default.
-    engine : {"fast", "wave"}
-        Geometric optics with filters, or Fourier optics (the truth, slow).
+    engine : {"fast", "wave", "long_exposure"}
+        Geometric optics with filters, Fourier optics (the truth, slow), or the mean over all turbulence (quickest, best
+        with many stars a call; it needs an atmosphere, of which it takes the Fried parameter and the outer scale only).
     seed : int
-        Accepted so that a call reads alike for every engine. Neither of these draws a random number: those of the
+        Accepted so that a call reads alike for every engine. None of these draws a random number: those of the
         exposure hang on the atmosphere's own seed.
     stamp_size : int
         Pixels on a side of a stamp.
@@ -132,7 +134,7 @@ def make_psfs(
         Shift in field angle of each wavelength by the atmosphere [rad], such as
         :func:`~pachon.wavefront.refraction.dispersion_shift` gives.
     n_pupil, oversampling : int, optional
-        Fast engine: about how many pupil points, and cells of the fine grid to a pixel.
+        About how many pupil points (fast and long_exposure), and cells of the fine grid to a pixel (fast).
     padding, pupil_spacing : bool, float, optional
         Wave engine: whether to keep all baselines, and the distance of pupil points [m].
     projection : {"zemax", "gnomonic", "postel"}
@@ -149,7 +151,7 @@ def make_psfs(
     Raises
     ------
     ConfigError
-        If there is no such engine or projection.
+        If there is no such engine or projection, or the engine needs an atmosphere.
     DomainError
         If an argument is outside its range or of the wrong shape, or a star falls between the CCDs.
     """
@@ -170,7 +172,7 @@ def make_psfs(
         float(metres(diffusion, "diffusion")),
         _on_detector(jitter, telescope, lengths),
     )
-    maker: FastPsfEngine | WavePsfEngine
+    maker: FastPsfEngine | WavePsfEngine | LongExposureEngine
     common: dict[str, Any] = {
         "dispersion": shifts,
         "focal_plane": focal_plane,
@@ -181,6 +183,8 @@ def make_psfs(
     }
     if engine == "fast":
         maker = FastPsfEngine(telescope, lengths, plane, n_pupil=n_pupil, oversampling=oversampling, **common)
+    elif engine == "long_exposure":
+        maker = LongExposureEngine(telescope, lengths, plane, n_pupil=n_pupil, **common)
     else:
         maker = WavePsfEngine(telescope, lengths, plane, padding=padding, pupil_spacing=pupil_spacing, **common)
 

@@ -68,8 +68,8 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
         (copied / name).unlink()
     (copied / ".ccd_R24_S12.fits.partial").write_bytes(b"SIMPLE")
     done = []
-    real = run_module.compute_ccd
-    monkeypatch.setattr(run_module, "compute_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))
+    real = run_module.expose_ccd
+    monkeypatch.setattr(run_module, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))
     result = run(tiny(), copied, resume=True)
     assert done == ["R24_S12"]
     assert result.kept == ("R22_S11",)
@@ -86,18 +86,18 @@ def test_a_damaged_product_is_computed_again(finished_run, copied, tiny, no_repo
 
 
 def test_an_interrupted_run_keeps_the_ccds_that_were_finished(finished_run, tmp_path, monkeypatch, tiny, no_report):
-    real = run_module.compute_ccd
+    real = run_module.expose_ccd
 
     def interrupted(experiment, name, **options):
         if name == "R24_S12":
             raise KeyboardInterrupt
         return real(experiment, name, **options)
 
-    monkeypatch.setattr(run_module, "compute_ccd", interrupted)
+    monkeypatch.setattr(run_module, "expose_ccd", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(tiny(), tmp_path / "out")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["ccd_R22_S11.fits", "config.yaml"]
-    monkeypatch.setattr(run_module, "compute_ccd", real)
+    monkeypatch.setattr(run_module, "expose_ccd", real)
     assert run(tiny(), tmp_path / "out", resume=True).kept == ("R22_S11",)
     assert contents(tmp_path / "out") == contents(finished_run)
 
@@ -183,12 +183,16 @@ def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run
     assert np.all((light > 0.86) & (light < 0.98))
 
 
+def computed(config):
+    """The product of the one CCD of a configuration."""
+    experiment = prepare(config)
+    return ccd_stage.model_ccd(experiment, ccd_stage.expose_ccd(experiment, config.ccds[0]))
+
+
 def test_visits_have_the_same_stars_and_other_noise(tiny):
     """Without an atmosphere nothing but the noise tells two visits apart."""
     options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
-    first, again, second = (
-        ccd_stage.compute_ccd(prepare(tiny(atmosphere__epoch=epoch, **options)), "R22_S11") for epoch in (0, 0, 1)
-    )
+    first, again, second = (computed(tiny(atmosphere__epoch=epoch, **options)) for epoch in (0, 0, 1))
     np.testing.assert_array_equal(first.observed_images, again.observed_images)
     np.testing.assert_array_equal(first.truth_images, second.truth_images)
     for key in ("x", "y", "magnitude", "electrons"):
@@ -199,7 +203,7 @@ def test_visits_have_the_same_stars_and_other_noise(tiny):
 def test_residual_aberration_and_jitter_reach_the_stars(tiny):
     options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
     plain, bent, shaken = (
-        ccd_stage.compute_ccd(prepare(tiny(**options, **more)), "R22_S11").truth
+        computed(tiny(**options, **more)).truth
         for more in ({}, {"active_optics__residual_um": 0.4}, {"psf__jitter_arcsec": 0.1})
     )
     # Near the axis the telescope is round; 0.4 um make several per cent, jitter only width.
