@@ -29,13 +29,14 @@ from pathlib import Path
 import galsim
 import matplotlib.pyplot as plt
 import numpy as np
+import scipy.fft
 
 import pachon
 from pachon.models.random_streams import stream
 from pachon.models.surface import Conic, Interaction, Plane, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.pipeline.shapes import fwhm
-from pachon.wavefront.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere import SLOPE_LAG, Atmosphere
 
 ARCSEC = math.radians(1.0 / 3600.0)
 ARCMIN = 60.0 * ARCSEC
@@ -161,20 +162,22 @@ def summary(fields: np.ndarray, first: np.ndarray, second: np.ndarray, width: np
 
 
 def through_galsim_screens(atmosphere: Atmosphere, layers: galsim.PhaseScreenList) -> Atmosphere:
-    """Return an atmosphere that sees GalSim's screens: its own gradient in the middle of its pixels."""
-    pixel = atmosphere.screen_pixel
-    size = atmosphere.screen_size
-    axis = (np.arange(size) - size // 2 + 0.5) * pixel
+    """Return an atmosphere that sees GalSim's screens: the slopes that pachon would make of their modes."""
+    size, pixel = atmosphere.screen_size, atmosphere.screen_pixel
+    axis = (np.arange(size) - size // 2) * pixel
+    kx, ky = 2.0 * math.pi * np.fft.rfftfreq(size, pixel), 2.0 * math.pi * np.fft.fftfreq(size, pixel)[:, None]
+    lag = np.sinc(np.hypot(kx, ky) * SLOPE_LAG / (2.0 * math.pi))
     cutoff = 2.0 * math.pi * layers.makePSF(**galsim_exposure()).screen_kmax
-    origin = np.full((len(layers), 2), -axis[0])
     screens = np.empty((len(layers), size, size), dtype=np.int32)
-    seen = through_screens(atmosphere, screens, offsets=origin, cutoff=cutoff)
+    seen = through_screens(atmosphere, screens, offsets=np.full((len(layers), 2), -axis[0]), cutoff=cutoff)
     for number, layer in enumerate(layers):
-        for row, y in enumerate(axis):
-            # GalSim's wavefronts are in nanometres.
-            slopes = 1e-9 * np.array(layer.wavefront_gradient(axis, np.full(size, y), 0.0))
-            x_counts, y_counts = np.rint(slopes / seen.slope_unit(number)).astype(np.int32)
-            screens[number, row] = (y_counts << 16) | (x_counts & 0xFFFF)
+        # GalSim's wavefronts are in nanometres, and at its own samples nothing is interpolated.
+        spectrum = scipy.fft.rfft2(1e-9 * layer.wavefront(*np.meshgrid(axis, axis), 0.0)) * lag
+        x_counts, y_counts = (
+            np.rint(scipy.fft.irfft2(1j * k * spectrum, s=(size, size)) / seen.slope_unit(number)).astype(np.int32)
+            for k in (kx, ky)
+        )
+        screens[number] = (y_counts << 16) | (x_counts & 0xFFFF)
     return seen
 
 

@@ -41,8 +41,8 @@ from .turbulence import diffraction_otf, structure_function
 
 #: Pupil points by default: 16 spokes of 5 rings.
 PUPIL_POINTS = 80
-#: Side of the periodic image over that of the stamp, as for the fast engine: wings that come round change ellipticities
-#: by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
+#: Side of the periodic image over that of the stamp: wings that come round make the edge of a stamp of 6 arcsec 1.4
+#: times as bright as it should be, and change ellipticities by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
 GRID_MARGIN = 1.25
 # What atmosphere and detector leave of a frequency that is left out; with pixels of 10 um all of these together make
 # 2e-6 of the peak of the image.

@@ -12,13 +12,10 @@ Fourier transform of the lattice has its points at regular steps of :math:`J^{-1
 modulus is averaged over time steps; its transform is the optical transfer function (OTF) at the differences of lattice
 points, the baselines, and the pixels are sums over these.
 
-Transforms are those of SciPy in single precision. On 480 to 512 points a side MKL takes half its time, FFTW 0.7 and
-ducc0 0.9 to 1.3 times (``benchmarks/fft_libraries.py``); half of a star's time goes into them, so that MKL would win a
-quarter, at the price of a library of 200 MB for one make of processor and of bytes that depend on it.
-
-A long exposure through an atmosphere has no OTF left at baselines beyond 1.5 m, and charge diffusion leaves none in any
-case. The grid then needs no padding to twice the pupil: it is so wide that baselines up to 1.5 m are free of those that
-come round.
+Transforms are those of SciPy in single precision. On 480 to 512 points a side FFTW and MKL take half its time and ducc0
+as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. The price
+would be a library of hundreds of megabytes for one make of processor (MKL) or under another licence (FFTW), whose choice
+of algorithm, and so the last bits, depends on the machine or on a timing.
 """
 
 from __future__ import annotations

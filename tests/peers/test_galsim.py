@@ -81,8 +81,8 @@ def test_stars_through_galsims_own_screens(study):
     # Photons leave 0.4 / sqrt(500 000) = 0.0006 in a component.
     assert np.std(theirs) > 0.006
     np.testing.assert_allclose(e, theirs, atol=0.0025)
-    # GalSim's second kick blurs 2 % more (docs/atmosphere.md); the widths of single stars are noisy by about 1 %.
-    assert np.mean(fwhm(ours, study.PIXEL) / fwhm(images, study.PIXEL)) == pytest.approx(0.98, abs=0.012)
+    # The two kicks differ in width by half a per cent; the mean of six noisy widths is good to as much.
+    assert np.mean(fwhm(ours, study.PIXEL) / fwhm(images, study.PIXEL)) == pytest.approx(1.0, abs=0.015)
 
 
 @pytest.mark.slow

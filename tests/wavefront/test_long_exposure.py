@@ -6,6 +6,8 @@ from scipy.optimize import brentq
 
 import pachon
 from pachon.models.errors import ConfigError, DomainError
+from pachon.pipeline.config import Configuration
+from pachon.pipeline.experiment import resolve
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront import long_exposure
 from pachon.wavefront.aberration import ResidualWavefront
@@ -13,7 +15,7 @@ from pachon.wavefront.atmosphere import Atmosphere
 from pachon.wavefront.clear_pupil import SpokePupil, clear_edges
 from pachon.wavefront.fast_psf import FastPsfEngine
 from pachon.wavefront.image_plane import ImagePlane
-from pachon.wavefront.long_exposure import LongExposureEngine
+from pachon.wavefront.long_exposure import PUPIL_POINTS, LongExposureEngine
 from pachon.wavefront.psf import DARK, make_psfs
 from pachon.wavefront.pupil_optics import fields_at, trace_pupils
 from pachon.wavefront.turbulence import diffraction_otf, long_exposure_fwhm, structure_function
@@ -404,6 +406,14 @@ def test_needs_turbulence(lsst_r):
         engine_for(lsst_r, plane=ImagePlane(31, 2e-6, 0.0), atmosphere=air(r0=2.0))
     with pytest.raises(DomainError, match="n_pupil = 5"):
         engine_for(lsst_r, n_pupil=5)
+
+
+def test_in_a_run():
+    config = resolve(Configuration.model_validate({"psf": {"engine": "long_exposure"}}))
+    assert config.psf.n_pupil == PUPIL_POINTS == 80
+    given = {"psf": {"engine": "long_exposure"}, "atmosphere": {"enabled": False}}
+    with pytest.raises(ConfigError, match=r"psf\.engine = long_exposure: expected atmosphere\.enabled = true"):
+        resolve(Configuration.model_validate(given))
 
 
 def test_large_stamps(lsst_r):

@@ -1,0 +1,175 @@
+"""What does a run cost? Seconds and bytes against CCDs, stars, wavelengths, time steps, layers and screens.
+
+    python benchmarks/cost_model.py [--rounds 3] [--threads 1]
+
+Times stars over the field with one thing changed at a time, screens of two sizes, and the modelling of one CCD with two
+numbers of stars; fits by least squares (relative errors)
+
+    star   = base + wave * W + read * T * P * L + bin * T * P * W        (T time steps, P pupil points, L layers)
+    screen = pixel * N^2                                                 (N samples on a side)
+    model  = base + star * S                                             (S noise-free stars of one CCD)
+
+prints how far the fit is from each measurement, and predicts the paper's size and a survey from it.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import pachon
+from pachon.pipeline.ccd_product import product_path, write_product
+from pachon.pipeline.ccd_stage import expose_ccd, model_ccd
+from pachon.pipeline.config import Configuration, with_options
+from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.run_folder import stamp_of
+
+LAYERS = {
+    n: {"altitudes": a, "weights": w, "wind_speeds": s}
+    for n, a, w, s in (
+        (1, [5000.0], [1.0], [10.0]),
+        (3, [0.0, 5000.0, 15000.0], [0.5, 0.3, 0.2], [5.0, 10.0, 20.0]),
+    )
+}
+# wavelengths, time steps, pupil points (asked for), layers
+STARS = [
+    (5, 300, 334, 6),
+    (1, 300, 334, 6),
+    (5, 60, 334, 6),
+    (1, 60, 334, 6),
+    (5, 300, 334, 1),
+    (5, 300, 334, 3),
+    (5, 300, 188, 6),
+    (3, 600, 334, 6),
+]
+POINTS = {334: 332, 188: 160}
+SURVEY_DEG2, FIELD_DEG2, CCDS, TRUTH, OBSERVED = 20_000.0, 9.6, 189, 800, 40
+
+
+def time_stars(telescope, focal_plane, rounds, threads, count=96):
+    """Return seconds of a star for each entry of STARS: the least of some rounds, taken in turns."""
+    rng = np.random.default_rng(2)
+    radius, angle = 0.028 * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    fields = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    atmospheres = {}
+    for _, steps, _, layers in STARS:
+        profile = LAYERS.get(layers, {})
+        atmospheres[steps, layers] = pachon.Atmosphere.from_site(
+            "cerro_pachon", 1, time_step=15.0 / steps, screen_size=4096, screen_length=650.0, **profile
+        )
+    least = np.full(len(STARS), np.inf)
+    for _ in range(rounds + 1):
+        for i, (waves, steps, points, layers) in enumerate(STARS):
+            atmosphere = atmospheres[steps, layers]
+            atmosphere.kept_screens("slopes")
+            start = time.perf_counter()
+            pachon.make_psfs(
+                telescope,
+                fields,
+                np.linspace(545e-9, 703e-9, waves),
+                atmosphere=atmosphere,
+                n_pupil=points,
+                threads=threads,
+            )
+            least[i] = min(least[i], (time.perf_counter() - start) / count)
+    return least
+
+
+def fit_stars(seconds):
+    """Return the four coefficients [s] and what they make of each measurement."""
+    waves, steps, points, layers = np.array([(w, t, POINTS[p], n) for w, t, p, n in STARS], dtype=float).T
+    terms = np.stack([np.ones(len(STARS)), waves, steps * points * layers, steps * points * waves], axis=1)
+    coefficients = np.linalg.lstsq(terms / seconds[:, None], np.ones(len(STARS)), rcond=None)[0]
+    return coefficients, terms @ coefficients
+
+
+def time_screens(threads):
+    """Return seconds of a sample of a slope screen."""
+    seconds = {}
+    for size in (2048, 4096):
+        atmosphere = pachon.Atmosphere.from_site(
+            "cerro_pachon", 3, screen_size=size, screen_length=size * 1300 / 8192, exposure=5.0
+        )
+        start = time.perf_counter()
+        atmosphere.kept_screens("slopes", threads)
+        seconds[size] = (time.perf_counter() - start) / (6 * size**2)
+    return seconds
+
+
+def time_models():
+    """Return seconds to model a CCD and bytes of its product for two numbers of noise-free stars."""
+    figures = {}
+    for truth in (100, 400):
+        options = {
+            "ccds": ("R22_S11",),
+            "stars__truth": truth,
+            "atmosphere__exposure_s": 1.0,
+            "atmosphere__screen_size": 2048,
+            "atmosphere__screen_length_m": 325.0,
+        }
+        experiment = prepare(resolve(with_options(Configuration(), **options)))
+        exposure = expose_ccd(experiment, "R22_S11")
+        start = time.perf_counter()
+        product = model_ccd(experiment, exposure)
+        with tempfile.TemporaryDirectory() as folder:
+            write_product(Path(folder), product, stamp_of(experiment), [])
+            seconds = time.perf_counter() - start
+            figures[truth] = seconds, product_path(Path(folder), "R22_S11").stat().st_size
+    (s1, b1), (s2, b2) = figures.values()
+    return {"seconds": (s1 - (s2 - s1) / 3, (s2 - s1) / 300), "bytes": (b1 - (b2 - b1) / 3, (b2 - b1) / 300)}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    telescope = pachon.load_telescope("lsst_v3.3_r")
+    focal_plane = pachon.FocalPlane.from_budget("lsst", seed=1)
+    print(f"pachon {pachon.__version__}, {options.threads} thread(s)")
+    seconds = time_stars(telescope, focal_plane, options.rounds, options.threads)
+    (base, wave, read, binned), fitted = fit_stars(seconds)
+    print("stars: W  T   P   L   measured  fitted [ms]")
+    for (w, t, p, n), measured, model in zip(STARS, seconds, fitted, strict=True):
+        print(f"       {w}  {t:3d} {POINTS[p]} {n}   {1e3 * measured:7.2f}  {1e3 * model:7.2f}")
+    print(
+        f"star = {1e3 * base:.2f} ms + {1e3 * wave:.3f} ms W + {1e9 * read:.2f} ns T P L + {1e9 * binned:.2f} ns T P W"
+    )
+    screens = time_screens(options.threads)
+    print(
+        "screen = "
+        + ", ".join(f"{1e9 * s:.1f} ns a sample (N = {n})" for n, s in screens.items())
+        + ", 4 bytes a sample"
+    )
+    models = time_models()
+    (model_base, model_star), (file_base, file_star) = models["seconds"], models["bytes"]
+    print(f"model of a CCD = {model_base:.2f} s + {1e3 * model_star:.2f} ms S (one thread)")
+    print(f"product of a CCD = {file_base / 1e6:.2f} MB + {file_star / 1e3:.2f} kB S")
+    star = base + 5 * wave + 300 * 332 * (6 * read + 5 * binned)
+    exposure = 6 * 8192**2 * screens[4096] + CCDS * (TRUTH + OBSERVED) * star
+    modelling = CCDS * (model_base + TRUTH * model_star)
+    size = CCDS * (file_base + TRUTH * file_star)
+    fields = SURVEY_DEG2 / FIELD_DEG2
+    print(f"paper's size, {CCDS} CCDs x ({TRUTH} + {OBSERVED}) stars, {options.threads} thread(s):")
+    print(f"  {exposure:.0f} s of PSFs and screens + {modelling:.0f} s of models on one thread beside them")
+    print(f"  {size / 1e9:.2f} GB of products, {6 * 8192**2 * 4 / 2**30:.2f} GiB of screens")
+    core_hours = (exposure * options.threads + modelling) / 3600
+    print(f"one exposure of each of {fields:.0f} fields ({SURVEY_DEG2:.0f} square degrees):")
+    print(f"  {fields * core_hours:.0f} core hours, {fields * size / 1e12:.1f} TB")
+    print(
+        json.dumps(
+            {
+                "star_s": [base, wave, read, binned],
+                "screen_s": screens,
+                "model_s": models["seconds"],
+                "product_bytes": models["bytes"],
+            }
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
