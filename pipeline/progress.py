@@ -40,6 +40,7 @@ class Stage:
         self._check = check
         self._task = task
         self._say = say
+        self._start = time.perf_counter()
 
     def advance(self, count: int = 1) -> None:
         """Tell that so many more items are done."""
@@ -51,6 +52,12 @@ class Stage:
         """Write one line, where there are no bars to see."""
         if self._say:
             print(text, file=sys.stderr, flush=True)
+
+    def step(self, name: str, done: int, total: int) -> None:
+        """Write that one more part is done, and for how long the rest will take, where there are no bars to see."""
+        left = (time.perf_counter() - self._start) / done * (total - done)
+        rest = f", about {left:.0f} s left" if left < 100.0 else f", about {left / 60.0:.0f} min left"
+        self.line(f"{name} ({done} of {total}{rest if done < total else ''})")
 
 
 class Reporter:

@@ -138,7 +138,7 @@ def _compute(
             unfinished = modeller.submit(_finish, experiment, folder, exposure)
             if thread_count(threads) == 1 or i == len(names):
                 unfinished.result()
-            stage.line(f"{name} ({i} of {len(names)})")
+            stage.step(name, i, len(names))
     if experiment.atmosphere is not None:
         experiment.atmosphere.release()
 

@@ -13,9 +13,9 @@ modulus is averaged over time steps; its transform is the optical transfer funct
 points, the baselines, and the pixels are sums over these.
 
 Transforms are those of SciPy in single precision. On 480 to 512 points a side FFTW and MKL take half its time and ducc0
-as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. The price
-would be a library of hundreds of megabytes for one make of processor (MKL) or under another licence (FFTW), whose choice
-of algorithm, and so the last bits, depends on the machine or on a timing.
+as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. They
+would cost hundreds of megabytes for one make of processor (MKL) or another licence (FFTW), and bytes that depend on the
+machine or on a timing.
 """
 
 from __future__ import annotations

@@ -76,6 +76,19 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
     assert contents(copied) == contents(finished_run)
 
 
+def test_ccds_computed_apart_make_the_run_that_one_machine_makes(finished_run, tmp_path, tiny, no_report):
+    """As a cluster does it: each machine some CCDs in a folder of its own, brought together and resumed."""
+    together = tmp_path / "together"
+    together.mkdir()
+    for name in ("R22_S11", "R24_S12"):
+        run(tiny(ccds=(name,)), tmp_path / name)
+        shutil.copy(tmp_path / name / f"ccd_{name}.fits", together)
+        shutil.copy(tmp_path / name / "config.yaml", together)
+    result = run(tiny(), together, resume=True)
+    assert result.computed == ()
+    assert contents(together) == contents(finished_run)
+
+
 def test_a_damaged_product_is_computed_again(finished_run, copied, tiny, no_report):
     path = copied / "ccd_R22_S11.fits"
     data = bytearray(path.read_bytes())

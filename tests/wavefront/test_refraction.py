@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from astropy import units as u
 
+import pachon
 from pachon.models.errors import DomainError
 from pachon.models.site import Weather
+from pachon.pipeline.shapes import fwhm
 from pachon.wavefront.refraction import air_refractivity, dispersion_shift
 
 ARCSEC = math.radians(1.0 / 3600.0)
@@ -90,6 +92,45 @@ def test_against_galsim_and_erfa():
 
     expected = np.array([bend(wave) - bend(600e-9) for wave in waves])
     np.testing.assert_allclose(ours, expected, rtol=0.01, atol=1e-10)
+
+
+def test_bands_from_u_to_y():
+    """Jee & Tyson (2011), Fig. 3 and section 2: what each filter spreads from edge to edge at 45 degrees."""
+    galsim = pytest.importorskip("galsim")
+    kilopascal = 101.325 / 760.0
+    air = {"pressure": 520.0 * kilopascal, "temperature": 278.15, "H2O_pressure": 8.0 * kilopascal}
+    zenith_angle = math.radians(45.0)
+    spread = {}
+    for band in "ugrizy":
+        low, high = pachon.load_telescope(f"lsst_v3.3_{band}").band
+        (shift,) = dispersion_shift([low], high, zenith_angle, 0.0, PACHON)
+        blue, red = galsim.dcr.get_refraction(np.array([low * 1e9, high * 1e9]), zenith_angle * galsim.radians, **air)
+        spread[band] = np.hypot(*shift) / ARCSEC
+        assert spread[band] == pytest.approx((blue - red) / ARCSEC, rel=1e-3)
+    assert list(spread.values()) == sorted(spread.values(), reverse=True)
+    # "Less than ~0.3 arcsec" in r and i: the edges of our r, 545 and 703 nm, lie 0.318 apart.
+    assert spread["i"] < 0.15
+    assert spread["r"] < 0.32
+    assert spread["u"] > 2.0 * spread["r"]
+
+
+def test_dispersion_elongates_the_image_at_45_degrees():
+    """Second moments of an image of 0.7 arcsec grow by about 9 % along the zenith; e stays below 0.04."""
+    telescope = pachon.load_telescope("lsst_v3.3_r")
+    wavelengths = np.linspace(*telescope.band, 5)
+    atmosphere = pachon.Atmosphere.from_site("cerro_pachon", 1, r0=0.12)
+    shift = dispersion_shift(wavelengths, wavelengths[2], math.radians(45.0), 0.5 * math.pi, PACHON)
+    round_, long_ = (
+        pachon.make_psfs(telescope, [[0.0, 0.0]], wavelengths, atmosphere=atmosphere, engine="long_exposure", **options)
+        for options in ({}, {"dispersion": shift})
+    )
+    assert fwhm(round_.image, round_.pixel_scale)[0] / ARCSEC == pytest.approx(0.7, abs=0.03)
+    # The variance of a band spread evenly over so much, against that of a Gaussian of 0.7 arcsec.
+    added = (shift[0, 1] - shift[-1, 1]) ** 2 / 12.0
+    assert added / (0.7 * ARCSEC / 2.3548) ** 2 == pytest.approx(0.09, abs=0.01)
+    shapes = pachon.measure_shapes(long_.image, long_.pixel_scale, 0.7 * ARCSEC)
+    assert -0.04 < shapes.e1[0] < -0.005
+    assert abs(shapes.e2[0]) < 1e-3
 
 
 def test_no_shift_at_the_zenith_nor_at_the_reference():
