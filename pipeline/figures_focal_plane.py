@@ -30,6 +30,8 @@ from .figures import (
 _HEIGHT_MAP = "RdBu_r"
 #: More CCDs than this are many: each is small on the page.
 _MANY = 30
+#: Whiskers on one CCD, and a fifth of them where CCDs are many: more make one dark mass.
+_MOST_WHISKERS = 200
 
 
 def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
@@ -51,12 +53,13 @@ def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: f
         axes = figure.add_subplot()
         edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
         limits = (-edge, edge, -edge, edge)
-        image = _draw_heights(axes, focal_plane, limits, 900)
+        image = draw_heights(axes, focal_plane, limits, 900)
         draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
         draw_outlines(axes, camera, indices, "black", 1.4)
         draw_field_circle(axes, field_radius * 1e3, "")
         frame_axes(axes, limits)
-        axes.set_title(f"CCD heights; framed: the {len(used)} CCDs of this run; dashed: edge of the field of view")
+        framed = f"; framed: the {len(used)} CCDs of this run" if used else ""
+        axes.set_title(f"CCD heights{framed}; dashed: edge of the field of view")
         bar = figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02)
         bar.set_label("height along +z, towards the sky [µm]")
         return png_bytes(figure)
@@ -98,15 +101,16 @@ def whiskers_figure(
         else:
             figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9, "compressed")
             panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-        image, bounds = None, _height_range(focal_plane)
+        image, bounds = None, height_range(focal_plane)
+        most = _MOST_WHISKERS if len(products) <= _MANY else _MOST_WHISKERS // 5
         for i, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
-            image = _draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
+            image = draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
             draw_outlines(axes, focal_plane.camera, range(len(focal_plane.camera)), "0.5", 0.5)
             draw_field_circle(axes, field_radius * 1e3, "")
             for product in products:
-                _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5)
+                _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, most)
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
-            axes.set_title(_TITLES[kind], loc="left")
+            axes.set_title(_titled(_TITLES[kind], products, kind, most), loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
         if image is not None:
             bar = figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30)
@@ -124,17 +128,18 @@ def close_up_figure(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> 
     with styled():
         figure = new_figure(13.0, 3.35 * len(products) + 0.4)
         panels = figure.subplots(len(products), len(kinds), squeeze=False)
-        image, bounds = None, _height_range(focal_plane)
+        image, bounds = None, height_range(focal_plane)
         for last, row, product in zip(range(len(products) - 1, -1, -1), panels, products, strict=True):
             x, y = np.array(product.center) * 1e3
             limits = (x - 1.04 * half, x + 1.04 * half, y - 1.04 * half, y + 1.04 * half)
             for i, (axes, kind) in enumerate(zip(row, kinds, strict=True)):
-                image = _draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=bounds)
-                _draw_kind(axes, product, kind, scale, 1.2)
+                image = draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=bounds)
+                _draw_kind(axes, product, kind, scale, 1.2, _MOST_WHISKERS)
                 draw_outlines(axes, camera, [camera.ccd_index(product.name)], "0.4", 0.7)
                 frame_axes(axes, limits, x_label=last == 0, y_label=i == 0)
                 name = f"{product.name}: " if i == 0 else ""
-                axes.set_title(name + _SHORT_TITLES[kind], loc="left")
+                title = name + _SHORT_TITLES[kind]
+                axes.set_title(_titled(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left")
                 draw_key_whisker(axes, key, scale, 1.2)
         if image is not None:
             bar = figure.colorbar(image, ax=panels.ravel().tolist(), fraction=0.02, pad=0.01, aspect=40)
@@ -157,10 +162,25 @@ _SHORT_TITLES = {
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
 
-def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: float) -> None:
-    stars: Stars = product.truth if kind in ("truth", "away") else product.observed
+def _stars_of(product: CcdProduct, kind: str) -> Stars:
+    return product.truth if kind in ("truth", "away") else product.observed
+
+
+def _titled(title: str, products: Sequence[CcdProduct], kind: str, most: int) -> str:
+    """Return a title that says so where not every star has its whisker."""
+    step = max(_step(_stars_of(product, kind), most) for product in products)
+    return title if step == 1 else f"{title} (one star in {step})"
+
+
+def _step(stars: Stars, most: int) -> int:
+    return max(1, -(-len(stars) // most))
+
+
+def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: float, most: int) -> None:
+    stars = _stars_of(product, kind)
     e1, e2 = (stars.e1, stars.e2) if kind in ("truth", "observed") else (stars.residual_e1, stars.residual_e2)
-    draw_whiskers(axes, whiskers(stars.x * 1e3, stars.y * 1e3, e1, e2, scale), _COLORS[kind], width)
+    ends = whiskers(stars.x * 1e3, stars.y * 1e3, e1, e2, scale)
+    draw_whiskers(axes, ends[:: _step(stars, most)], _COLORS[kind], width)
 
 
 def _common_key(products: Sequence[CcdProduct]) -> float:
@@ -169,7 +189,7 @@ def _common_key(products: Sequence[CcdProduct]) -> float:
     return key_ellipticity(np.concatenate([np.hypot(s.e1, s.e2) for s in stars]))
 
 
-def _height_range(focal_plane: FocalPlane) -> float:
+def height_range(focal_plane: FocalPlane) -> float:
     """Return the largest height of any CCD, sign left off [um], a little rounded up; 1 where all is flat."""
     camera = focal_plane.camera
     offsets = np.linspace(-1.0, 1.0, 9) * camera.half_size * (1.0 - 1e-9)
@@ -179,7 +199,7 @@ def _height_range(focal_plane: FocalPlane) -> float:
     return float(np.ceil(largest)) if largest > 0 else 1.0
 
 
-def _draw_heights(
+def draw_heights(
     axes: Axes,
     focal_plane: FocalPlane,
     limits: tuple[float, float, float, float],
@@ -188,7 +208,7 @@ def _draw_heights(
     bounds: float | None = None,
 ) -> Any:
     """Draw the heights within limits [mm] as an image, gaps left white; the scale is that of the whole focal plane."""
-    bounds = _height_range(focal_plane) if bounds is None else bounds
+    bounds = height_range(focal_plane) if bounds is None else bounds
     left, right, bottom, top = limits
     step = max(right - left, top - bottom) / samples
     x = np.arange(left + 0.5 * step, right, step)
