@@ -27,16 +27,36 @@ def squared_distance(
 
 
 @wp.func
-def sign_change(before: wp.float64, after: wp.float64, bend: wp.float64) -> wp.float64:
-    """Where a parabola changes sign between two values, 0 to 1, or 0 if one is a NaN.
-
-    ``bend`` is half of its second difference over that distance.
-    """
-    t = wp.float64(0.0)
-    for _i in range(5):
-        # before + (after - before) t - bend t (1 - t) = 0: what bends is small, so that this closes in quickly.
-        t = before / (before - after + bend * (wp.float64(1.0) - t))
-    return wp.where(t >= wp.float64(0.0), wp.min(t, wp.float64(1.0)), wp.float64(0.0))
+def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
+    """Where the parabola through the values a, b, c at 0, 1, 2 lies below a square: from and to, equal if nowhere."""
+    zero = wp.float64(0.0)
+    two = wp.float64(2.0)
+    half = wp.float64(0.5)
+    low = zero
+    high = zero
+    bend = half * (a - two * b + c)
+    slope = b - a - bend
+    start = a - square
+    # A NaN fails both comparisons; a squared distance that runs linearly bends upwards, and how little does not matter.
+    if bend > zero:
+        inner = slope * slope - wp.float64(4.0) * bend * start
+        if inner > zero:
+            # The two roots without the difference of near-equal numbers.
+            far = -half * (slope + wp.where(slope < zero, -wp.sqrt(inner), wp.sqrt(inner)))
+            one = far / bend
+            other = wp.where(far == zero, zero, start / far)
+            low = wp.clamp(wp.min(one, other), zero, two)
+            high = wp.clamp(wp.max(one, other), zero, two)
+    elif bend <= zero:
+        end = c - square
+        if start < zero and end < zero:
+            high = two
+        elif start < zero:
+            high = two * start / (start - end)
+        elif end < zero:
+            low = two * start / (start - end)
+            high = two
+    return low, high
 
 
 @wp.kernel
@@ -69,26 +89,29 @@ def find_edges(
             a = squared_distance(surfaces, s, position, ray)
             b = squared_distance(surfaces, s, position, ray + n_spoke)
             c = squared_distance(surfaces, s, position, ray + 2 * n_spoke)
-            bend = half * (a - wp.float64(2.0) * b + c)
-            # Comparisons are such that a ray that missed the surface, a NaN, is beyond the rim.
-            square = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
-            rim = radius[2]
-            if not a < square:
-                rim = radius[0]
-            elif not b < square:
-                rim = radius[0] + step * sign_change(a - square, b - square, bend)
-            elif not c < square:
-                rim = radius[1] + step * sign_change(b - square, c - square, bend)
-            square = surfaces.numbers[s, APERTURE + 2] * surfaces.numbers[s, APERTURE + 2]
-            hole = radius[0]
-            if c < square:
-                hole = radius[2]
-            elif b < square:
-                hole = radius[1] + step * sign_change(b - square, c - square, bend)
-            elif a < square:
-                hole = radius[0] + step * sign_change(a - square, b - square, bend)
-            inside = wp.max(inside, hole)
-            outside = wp.min(outside, rim)
+            missed = a != a or b != b or c != c
+            low, high = within(a, b, c, surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3])
+            if missed:
+                # Rays that miss a surface pass beyond its rim: what is clear ends before the first of them.
+                rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
+                low = wp.float64(0.0)
+                high = wp.float64(0.0)
+                if a < rim:
+                    high = wp.where(b < rim, wp.float64(1.0), wp.float64(0.0))
+                elif c < rim:
+                    low = wp.where(b < rim, wp.float64(1.0), wp.float64(2.0))
+                    high = wp.float64(2.0)
+            inside = wp.max(inside, radius[0] + step * low)
+            outside = wp.min(outside, radius[0] + step * high)
+            hole = surfaces.numbers[s, APERTURE + 2] * surfaces.numbers[s, APERTURE + 2]
+            low, high = within(a, b, c, hole)
+            # A parabola may dip a little below zero where rays meet.
+            if hole > wp.float64(0.0) and high > low:
+                # The larger of the two pieces that the hole leaves.
+                if low > wp.float64(2.0) - high:
+                    outside = wp.min(outside, radius[0] + step * low)
+                else:
+                    inside = wp.max(inside, radius[0] + step * high)
     if inside >= outside:
         inside = half * (inside + outside)
         outside = inside

@@ -17,6 +17,7 @@ from pachon.wavefront.fast_psf import FastPsfEngine
 from pachon.wavefront.image_plane import ImagePlane
 from pachon.wavefront.long_exposure import PUPIL_POINTS, LongExposureEngine
 from pachon.wavefront.psf import DARK, make_psfs
+from pachon.wavefront.pupil_lattice import PupilLattice
 from pachon.wavefront.pupil_optics import fields_at, trace_pupils
 from pachon.wavefront.turbulence import diffraction_otf, long_exposure_fwhm, structure_function
 
@@ -435,3 +436,21 @@ def test_even_stamps_of_coarse_pixels(lsst_r):
     expected = fine[1:31, 1:31].reshape(15, 2, 15, 2).sum(axis=(1, 3))
     # Both leave out frequencies where 1e-5 is left.
     np.testing.assert_allclose(coarse[1:, 1:], expected, atol=2e-5 * expected.max())
+
+
+@pytest.mark.parametrize("field_deg", [(1.2, 1.2), (-1.2166, -1.6195), (-1.52, -1.27)])
+def test_clear_pupil_is_that_of_traced_rays_to_the_last_corner(lsst_r, field_deg):
+    """Against rays counted on a fine lattice, out to where a crescent at the rim, 2 % of the pupil, is all that is lit."""
+    fields = np.radians([field_deg])
+    lattice = PupilLattice.fill(lsst_r.pupil_diameter, lsst_r.pupil_obscuration, 0.04)
+    wavelength = np.array([620e-9])
+    lit = trace_pupils(lsst_r, fields, wavelength, lattice.points).lit[0, 0]
+    angle = 2.0 * np.pi * (np.arange(720) + 0.5) / 720
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    direction = field_direction(fields[:, 0], fields[:, 1])
+    edges = clear_edges(lsst_r, direction, unit, float(wavelength[0]))[0]
+    area = np.pi / 720 * np.sum(edges[:, 1] ** 2 - edges[:, 0] ** 2)
+    counted = lit.sum() * lattice.spacing**2
+    # Parabolas through three rays place the rims to a millimetre or so inside the field, to centimetres in its corners.
+    assert area == pytest.approx(counted, rel=3e-3, abs=0.05)
+    assert counted > 0.4
