@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from .models.prescription import save_telescope as save_telescope
     from .models.telescope import Telescope as Telescope
     from .pipeline.correlation import shear_correlation as shear_correlation
-    from .pipeline.pca import PsfModel as PsfModel
+    from .pipeline.psf_model import PsfModel as PsfModel
     from .pipeline.shapes import measure_shapes as measure_shapes
+    from .pipeline.star_catalogue import load_stars as load_stars
+    from .pipeline.star_selection import flag_stars as flag_stars
     from .raytrace.mesh import land_on_mesh as land_on_mesh
     from .raytrace.rays import Rays as Rays
     from .raytrace.rays import RayStatus as RayStatus
@@ -43,8 +45,10 @@ _HOMES = {
     "models.prescription": ("load_telescope", "save_telescope"),
     "models.telescope": ("Telescope",),
     "pipeline.correlation": ("shear_correlation",),
-    "pipeline.pca": ("PsfModel",),
+    "pipeline.psf_model": ("PsfModel",),
     "pipeline.shapes": ("measure_shapes",),
+    "pipeline.star_catalogue": ("load_stars",),
+    "pipeline.star_selection": ("flag_stars",),
     "raytrace.mesh": ("land_on_mesh",),
     "raytrace.rays": ("RayStatus", "Rays", "launch_rays"),
     "raytrace.trace": ("trace",),

@@ -14,9 +14,9 @@ import numpy as np
 from astropy.io import fits
 
 from ..models.errors import ProductError
-from .pca import PsfModel
 from .photometry import ARCSEC
 from .products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from .psf_model import PsfModel
 
 
 class _Unit(NamedTuple):

@@ -1,4 +1,4 @@
-"""The command line: ``pachon run | opd | info``.
+"""The command line: ``pachon run | reproduce | diagnose | attribute | opd | info``.
 
 Exit status 0: done; 2: bad input or a file that cannot be written, one line on standard error; 130: interrupted.
 """
@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from ..models.errors import ConfigError, PachonError
+from .command_diagnostics import attribute_command, diagnose_command
+from .command_options import Json, Threads
+from .command_options import name_list as _names
+from .command_options import wide_console as _console
 
 # Both live in typer or in click, as the version of typer has it; this way the right ones are caught.
 _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
@@ -29,10 +32,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print figures as JSON on standard output, and nothing else there.")]
-Threads = Annotated[int | None, typer.Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
-
 
 _INTERRUPTED = 130
 
@@ -164,13 +163,6 @@ def run_command(
         _show_run(result, sum(reporter.seconds.values()))
 
 
-def _names(text: str, option: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    if not names:
-        raise ConfigError(f"{option} = {text!r}: expected names separated by commas, such as R22_S11,R22_S12")
-    return names
-
-
 def _show_run(result: Any, seconds: float) -> None:
     from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
@@ -193,6 +185,62 @@ def _show_run(result: Any, seconds: float) -> None:
     console.print(table)
     console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
     print(f"report: {result.report.resolve()}")
+
+
+@app.command("reproduce")
+def reproduce_command(
+    figures: Annotated[
+        list[str] | None, typer.Argument(metavar="fig1 ... fig14 | table1 | all", help="Figures; all by default.")
+    ] = None,
+    scale: Annotated[str, typer.Option(help="small (a minute or two) or paper (189 CCDs, about an hour).")] = "small",
+    out: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("pachon_figures"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+    threads: Threads = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make figures of Jee & Tyson (2011) again, those that need no galaxies: what the paper says, what comes out here.
+
+    Each gives pictures (PNG), the numbers behind them (ECSV or FITS) and a verdict; `all` writes summary.json too.
+    Figures 9 and 11 to 14 show one run of the pipeline, in the sub-folder run: it is kept, and used again.
+
+    **Examples**
+
+    - `pachon reproduce`: all of them, small
+
+    - `pachon reproduce fig3 table1 --out figures`
+
+    - `pachon reproduce all --scale paper --out paper_figures`
+    """
+    from .interrupt import remembered_interrupts
+    from .products import json_text
+    from .progress import Reporter
+    from .reproduce import reproduce_at
+
+    try:
+        with remembered_interrupts() as check:
+            reporter = Reporter(quiet, check)
+            summary = reproduce_at(figures or ("all",), scale, out, seed=seed, threads=threads, reporter=reporter)
+    except KeyboardInterrupt:
+        raise _InterruptedRunError(
+            f"interrupted; what was finished is in {out}, and is used by the next call"
+        ) from None
+    if as_json:
+        print(json_text(summary))
+    elif not quiet:
+        _show_reproduced(summary, out)
+
+
+def _show_reproduced(summary: dict[str, Any], folder: Path) -> None:
+    console = _console()
+    table = Table(header_style="bold", padding=(0, 1), show_lines=True)
+    table.add_column("figure", no_wrap=True)
+    for name in ("paper", "here", "verdict"):
+        table.add_column(name, ratio=1)
+    for name, figure in summary["figures"].items():
+        table.add_row(name, figure["paper"], figure["here"], f"{figure['verdict']}: {figure['why']}")
+    console.print(table, markup=False, highlight=False)
+    print(f"figures: {folder.resolve()}")
 
 
 @app.command("opd")
@@ -290,6 +338,10 @@ def _show_opd(figures: dict[str, Any]) -> None:
     print(f"picture: {Path(figures['picture']).resolve()}")
 
 
+app.command("diagnose")(diagnose_command)
+app.command("attribute")(attribute_command)
+
+
 @app.command("info")
 def info_command(
     model: Annotated[str | None, typer.Argument(help="Bundled model, or path of a prescription.")] = None,
@@ -342,11 +394,6 @@ def info_command(
     for what, value in figure_rows(description):
         figures.add_row(what, value)
     console.print(figures)
-
-
-def _console() -> Console:
-    """Return a console that cuts no table short: a narrow terminal wraps its lines itself."""
-    return Console(width=max(Console().width, 132))
 
 
 def _pair(text: str, option: str) -> tuple[float, float]:

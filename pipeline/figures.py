@@ -24,6 +24,7 @@ from ..models.camera import Camera
 
 #: One colour for one thing, in every figure: blue and red for observed and residual are the paper's.
 TRUTH, OBSERVED, RESIDUAL, AWAY = "#3a3a3a", "#1f6fbf", "#c8322b", "#e08a00"
+LEFT_OUT = "#7a4fb5"
 _STYLE = {
     "font.size": 9.0,
     "axes.titlesize": 10.0,

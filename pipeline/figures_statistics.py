@@ -9,12 +9,13 @@ from matplotlib.axes import Axes
 
 from .ccd_product import CcdProduct, Stars
 from .correlation import Correlation
-from .figures import AWAY, OBSERVED, RESIDUAL, TRUTH, new_figure, png_bytes, styled
+from .figures import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH, new_figure, png_bytes, styled
 
 _LABELS = {
     "truth": (TRUTH, "o", "truth, where no star is"),
     "observed": (OBSERVED, "s", "observed stars"),
     "residual": (RESIDUAL, "D", "observed - model, at the stars"),
+    "left_out": (LEFT_OUT, "v", "observed - model fitted without the star"),
     "away": (AWAY, "^", "truth - model, where no star is"),
 }
 
@@ -62,7 +63,7 @@ def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
         for axes, sign in zip(panels, ("plus", "minus"), strict=True):
             for kind, correlation in correlated.items():
-                _draw_correlation(axes, correlation, sign, *_LABELS[kind])
+                draw_correlation(axes, correlation, sign, *_LABELS[kind])
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_xlabel("separation [arcmin]")
@@ -96,7 +97,8 @@ def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
         return png_bytes(figure)
 
 
-def _draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str, marker: str, label: str) -> None:
+def draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str, marker: str, label: str) -> None:
+    """Draw one correlation of a sign, ``plus`` or ``minus``, with error bars: negative values with open symbols."""
     r = correlation.r_arcmin
     xi, error = getattr(correlation, f"xi_{sign}"), getattr(correlation, f"error_{sign}")
     size = np.abs(xi)

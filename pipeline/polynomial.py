@@ -34,13 +34,18 @@ def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:
     """
     if order < 0:
         raise ConfigError(f"order = {order}: expected a polynomial order that is not negative")
+    along_u, along_v = (np.polynomial.legendre.legvander(t, order) for t in mapped(positions, extent).T)
+    columns = [along_u[:, total - m] * along_v[:, m] for total in range(order + 1) for m in range(total + 1)]
+    return np.stack(columns, axis=1)
+
+
+def mapped(positions: Any, extent: Extent) -> np.ndarray:
+    """Return positions [n, 2] mapped from the extent to [-1, 1]."""
     points = as_positions(positions)
     xmin, xmax, ymin, ymax = extent
     u = 2.0 * (points[:, 0] - xmin) / (xmax - xmin) - 1.0
     v = 2.0 * (points[:, 1] - ymin) / (ymax - ymin) - 1.0
-    along_u, along_v = (np.polynomial.legendre.legvander(t, order) for t in (u, v))
-    columns = [along_u[:, total - m] * along_v[:, m] for total in range(order + 1) for m in range(total + 1)]
-    return np.stack(columns, axis=1)
+    return np.stack([u, v], axis=1)
 
 
 def as_positions(positions: Any) -> np.ndarray:

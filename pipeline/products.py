@@ -51,6 +51,20 @@ def write_bytes(path: Path, data: bytes) -> None:
         raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those it lies in, where they are not there yet.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ProductError(f"cannot make the folder {folder}: {error.strerror}") from None
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file with sorted keys; numbers that are not finite become null."""
     write_bytes(path, (json_text(content) + "\n").encode())
@@ -107,7 +121,7 @@ class Stamp:
         return all(header.get(key) == value for key, value, _ in self.cards())
 
 
-def write_fits(path: Path, hdus: list[Any], stamp: Stamp, cards: list[tuple[str, Any, str]]) -> None:
+def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tuple[str, Any, str]]) -> None:
     """Write a FITS product with checksums and the stamp in the primary header.
 
     Parameters
@@ -116,8 +130,8 @@ def write_fits(path: Path, hdus: list[Any], stamp: Stamp, cards: list[tuple[str,
         File to write.
     hdus : list of ImageHDU and BinTableHDU
         Extensions, each with a name.
-    stamp : Stamp
-        Where the product comes from.
+    stamp : Stamp or None
+        Where the product comes from; None where it comes from no run.
     cards : list of (keyword, value, comment)
         More for the primary header.
 
@@ -128,7 +142,7 @@ def write_fits(path: Path, hdus: list[Any], stamp: Stamp, cards: list[tuple[str,
     """
     primary = fits.PrimaryHDU()
     parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
-    for keyword, value, comment in [*stamp.cards(), parts, *cards]:
+    for keyword, value, comment in [*(stamp.cards() if stamp else []), parts, *cards]:
         primary.header[keyword] = (value, comment)
     buffer = io.BytesIO()
     everything = fits.HDUList([primary, *hdus])
@@ -217,12 +231,17 @@ def column(table: fits.BinTableHDU, name: str) -> np.ndarray:
 
 def write_ecsv(path: Path, columns: dict[str, tuple[np.ndarray, str, str]], meta: dict[str, Any]) -> None:
     """Write an ECSV table, which people and astropy both read; the columns as in :func:`table_hdu`."""
+    text = io.StringIO()
+    described_table(columns, meta).write(text, format="ascii.ecsv")
+    write_bytes(path, text.getvalue().encode())
+
+
+def described_table(columns: dict[str, tuple[np.ndarray, str, str]], meta: dict[str, Any]) -> Table:
+    """Return an astropy table with units and descriptions; the columns as in :func:`table_hdu`."""
     table = Table(meta=meta)
     for key, (values, unit, description) in columns.items():
         table[key] = values
         table[key].description = description
         if unit:
             table[key].unit = u.Unit(unit)
-    text = io.StringIO()
-    table.write(text, format="ascii.ecsv")
-    write_bytes(path, text.getvalue().encode())
+    return table

@@ -27,20 +27,38 @@ def correlations(products: Sequence[CcdProduct]) -> dict[str, Correlation]:
     between CCDs cancels whatever the error of the model is; residuals away from the stars are what a galaxy sees. Both
     are always given.
     """
+    bins = separation_bins(products)
+    result = {}
+    for kind in KINDS:
+        x, y, e1, e2 = (np.concatenate(c) for c in zip(*(of_kind(p, kind) for p in products), strict=True))
+        result[kind] = shear_correlation(x, y, e1, e2, **bins)
+    return result
+
+
+def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
+    """Return the bins of separation of a run, as arguments: ``min_sep`` and ``max_sep`` [rad], and ``n_bins``."""
     everywhere = np.concatenate(
         [np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1
     )
     longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
     bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (_SHORTEST * _ARCMIN))))
-    result = {}
-    for kind in KINDS:
-        x, y, e1, e2 = (np.concatenate(c) for c in zip(*(_of_kind(p, kind) for p in products), strict=True))
-        result[kind] = shear_correlation(x, y, e1, e2, min_sep=_SHORTEST * _ARCMIN, max_sep=longest, n_bins=bins)
-    return result
+    return {"min_sep": _SHORTEST * _ARCMIN, "max_sep": longest, "n_bins": bins}
 
 
-def _of_kind(product: CcdProduct, kind: str) -> tuple[np.ndarray, ...]:
+def of_kind(product: CcdProduct, kind: str) -> tuple[np.ndarray, ...]:
+    """Return field angles x, y [rad] and what of the ellipticity there is correlated, e1 and e2.
+
+    Parameters
+    ----------
+    product : CcdProduct
+        One CCD.
+    kind : str
+        One of :data:`KINDS`, or ``left_out``: observed - model fitted without the star.
+    """
     stars: Stars = product.truth if kind in ("truth", "away") else product.observed
+    if kind == "left_out":
+        left_out = product.observed.left_out_e1, product.observed.left_out_e2
+        return stars.field_x, stars.field_y, stars.e1 - left_out[0], stars.e2 - left_out[1]
     e = (stars.e1, stars.e2) if kind in ("truth", "observed") else (stars.residual_e1, stars.residual_e2)
     return stars.field_x, stars.field_y, *e
 

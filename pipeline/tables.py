@@ -79,6 +79,70 @@ def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     ]
 
 
+DIAGNOSTICS_COLUMNS = ("residual", "mean e1", "mean e2", "rms e", "mean dT/T", "rms dT/T", "largest ξ+", "at [arcmin]")
+DIAGNOSTICS_CAPTION = (
+    "Ellipticity and size T = Q11 + Q22, less those of the model and, for T, over its own value; rms of one component. "
+    "Largest ξ+ of either sign from 10' to 3 deg, with the jackknife error over the CCDs."
+)
+
+
+def diagnostics_rows(overall: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row for each kind of residual, in the columns of :data:`DIAGNOSTICS_COLUMNS`."""
+
+    def power(key: str) -> str:
+        return _power(overall.get(key, math.nan))
+
+    names = {"residual": _NAMES["residual"], "left_out": "the same, star left out of the fit", "away": _NAMES["away"]}
+    return [
+        (
+            name,
+            *(power(f"{what}_{kind}") for what in ("mean_e1", "mean_e2", "rms_e", "mean_dt", "rms_dt")),
+            f"{power(f'largest_{kind}_xi_plus')} ± {power(f'largest_{kind}_error_plus')}",
+            f"{r:.1f}" if math.isfinite(r := overall[f"largest_{kind}_r_arcmin"]) else "-",
+        )
+        for kind, name in names.items()
+    ]
+
+
+ATTRIBUTION_COLUMNS = (
+    "off",
+    "rms e [%]",
+    "at stars",
+    "no star",
+    "ξ+ truth, below 10'",
+    "beyond",
+    "change",
+    "ξ+ no star, beyond",
+)
+ATTRIBUTION_CAPTION = (
+    "The same stars without one cause. rms of one component of the truth, and of the residuals at the stars and where "
+    "no star is; mean ξ+ below 10' and from there to 3 deg; change: full case less this one beyond 10', with the "
+    "jackknife error over the CCDs."
+)
+
+
+def attribution_rows(figures: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
+    """Return a row for each case of an attribution, in the columns of :data:`ATTRIBUTION_COLUMNS`."""
+
+    def change(each: dict[str, float]) -> str:
+        if "change_xi_plus_truth_long" not in each:
+            return "-"
+        value, error = _power(each["change_xi_plus_truth_long"]), _power(each["error_xi_plus_truth_long"])
+        return f"{value} ± {error}"
+
+    return [
+        (
+            "nothing" if case == "full" else case,
+            *(_bare_percent(each[k]) for k in ("rms_e_truth", "rms_residual_at_stars", "rms_residual_away")),
+            _power(each["xi_plus_truth_short"]),
+            _power(each["xi_plus_truth_long"]),
+            change(each),
+            _power(each["xi_plus_away_long"]),
+        )
+        for case, each in figures.items()
+    ]
+
+
 def percent(fraction: float) -> str:
     """Return a fraction in per cent, with more digits near all, and never rounded up to all."""
     if fraction < 0.99:

@@ -123,6 +123,114 @@ def test_quantities():
     np.testing.assert_allclose(q.xi_plus, c.xi_plus, rtol=1e-9)  # bin edges differ by rounding
 
 
+def grid_patches(x, y, side=3):
+    """Names of square patches, side by side, over one degree."""
+    column, row = (np.minimum((v / (60.0 * ARCMIN) * side).astype(int), side - 1) for v in (x, y))
+    return np.array([f"R{r}_S{c}" for r, c in zip(row, column, strict=True)])
+
+
+@pytest.mark.parametrize("cross", [False, True])
+def test_jackknife_is_delete_one_patch(cross):
+    x, y, e1, e2 = catalogue()
+    other = (0.3 * e2 + 0.01, 0.5 * e1) if cross else None
+    patch = grid_patches(x, y)
+    c = shear_correlation(x, y, e1, e2, patch=patch, other=other, **BINS)
+    left = []
+    for name in np.unique(patch):
+        k = patch != name
+        part = None if other is None else (other[0][k], other[1][k])
+        left.append(shear_correlation(x[k], y[k], e1[k], e2[k], other=part, **BINS))
+    for sign in ("plus", "minus"):
+        xi = np.array([getattr(d, f"xi_{sign}") for d in left])
+        expected = np.sqrt(8.0 / 9.0 * np.sum((xi - xi.mean(axis=0)) ** 2, axis=0))
+        # Sums of up to 1e4 products in another order, xi about 1e-4, errors about 1e-5.
+        np.testing.assert_allclose(getattr(c, f"error_{sign}"), expected, rtol=1e-9)
+    np.testing.assert_allclose(c.left_plus, [d.xi_plus for d in left], rtol=1e-9)
+    np.testing.assert_array_equal(c.left_pairs, [d.n_pairs for d in left])
+    assert c.n_patches == 9
+    assert left[0].n_patches == 0
+    assert left[0].left_plus.shape == (0, 8)
+
+
+def test_jackknife_takes_labels_not_their_numbers():
+    x, y, e1, e2 = catalogue()
+    patch = grid_patches(x, y)
+    names, number = np.unique(patch, return_inverse=True)
+    a = shear_correlation(x, y, e1, e2, patch=patch, **BINS)
+    b = shear_correlation(x, y, e1, e2, patch=7 * number + 3, **BINS)
+    assert len(names) == 9
+    assert a.error_plus.tobytes() == b.error_plus.tobytes()
+
+
+def test_patches_leave_the_correlation():
+    x, y, e1, e2 = catalogue()
+    plain = shear_correlation(x, y, e1, e2, **BINS)
+    c = shear_correlation(x, y, e1, e2, patch=grid_patches(x, y), **BINS)
+    np.testing.assert_array_equal(c.n_pairs, plain.n_pairs)
+    np.testing.assert_allclose(c.xi_plus, plain.xi_plus, rtol=1e-10)  # sums in another order
+    np.testing.assert_allclose(c.xi_minus, plain.xi_minus, rtol=1e-8, atol=1e-12)
+    assert np.all(c.error_plus > plain.error_plus)  # patches of a smooth field are not noise
+    again = shear_correlation(x, y, e1, e2, patch=grid_patches(x, y), **BINS)
+    assert c.error_plus.tobytes() == again.error_plus.tobytes()
+
+
+def test_jackknife_of_independent_patches():
+    # Each of 25 patches has its own constant ellipticity: the scatter of xi over 200 such fields, inside a patch.
+    edge = np.arange(5) * 60.0 * ARCMIN
+    results = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        x, y = (np.repeat(v.ravel(), 8) + rng.uniform(0.0, 5.0 * ARCMIN, 200) for v in np.meshgrid(edge, edge))
+        e1, e2 = (np.repeat(rng.normal(0.0, 0.01, 25), 8) for _ in range(2))
+        options = {"min_sep": 0.5 * ARCMIN, "max_sep": 8.0 * ARCMIN, "n_bins": 1}
+        results.append(shear_correlation(x, y, e1, e2, patch=np.repeat(np.arange(25), 8), **options))
+    scatter = np.std([c.xi_plus[0] for c in results])
+    claimed = np.sqrt(np.mean([c.error_plus[0] ** 2 for c in results]))
+    assert scatter / claimed == pytest.approx(1.0, abs=0.2)  # 200 fields: 5 % each, four sigma
+
+
+def test_no_jackknife_where_one_patch_holds_all_pairs():
+    # Two patches far apart: pairs between them are gone without either.
+    x = np.array([0.0, 1.0, 50.0, 51.0]) * ARCMIN
+    options = {"min_sep": 0.5 * ARCMIN, "max_sep": 60.0 * ARCMIN, "n_bins": 2}
+    c = shear_correlation(x, np.zeros(4), [0.1, 0.2, 0.1, 0.1], np.zeros(4), patch=[0, 0, 1, 1], **options)
+    np.testing.assert_array_equal(c.n_pairs, [2, 4])
+    # Without one patch only the pair of the other is left: 0.01 and 0.02, so sqrt((2 - 1) / 2 * 2 * 0.005^2).
+    assert c.error_plus[0] == pytest.approx(0.005, rel=1e-6)  # single precision
+    assert np.isnan(c.error_plus[1])
+    assert np.isfinite(c.xi_plus[1])
+
+
+def test_cross_correlation_counts_both_orders():
+    x, y, e1, e2 = catalogue(60)
+    f1, f2 = 0.01 + e2**2, -0.02 + 0.3 * e1
+    c = shear_correlation(x, y, e1, e2, other=np.stack([f1, f2]), **BINS)
+    edges = np.geomspace(BINS["min_sep"], BINS["max_sep"], 9)
+    i, j = np.triu_indices(60, 1)
+    bins = np.digitize(np.hypot(x[j] - x[i], y[j] - y[i]), edges) - 1
+    e, f = e1 + 1j * e2, f1 + 1j * f2
+    phase = np.exp(-4j * np.arctan2(y[j] - y[i], x[j] - x[i]))
+    both = 0.5 * (e[i] * f[j].conj() + f[i] * e[j].conj()).real
+    turned = 0.5 * ((e[i] * f[j] + f[i] * e[j]) * phase).real
+    for b in range(8):
+        assert c.n_pairs[b] == (bins == b).sum()
+        if c.n_pairs[b]:
+            assert c.xi_plus[b] == pytest.approx(both[bins == b].mean(), abs=1e-10)
+            assert c.xi_minus[b] == pytest.approx(turned[bins == b].mean(), abs=1e-10)
+
+
+def test_bad_patches():
+    x, y, e1, e2 = catalogue(10)
+    with pytest.raises(DomainError, match=r"patch has shape \(3,\)"):
+        shear_correlation(x, y, e1, e2, patch=[0, 1, 2], **BINS)
+    with pytest.raises(DomainError, match="of patch R22_S11, expected at least 2"):
+        shear_correlation(x, y, e1, e2, patch=["R22_S11"] * 10, **BINS)
+    with pytest.raises(DomainError, match="shapes"):
+        shear_correlation(x, y, e1, e2, other=(e1, e2[:5]), **BINS)
+    with pytest.raises(DomainError, match="other: 3 arrays given, expected two"):
+        shear_correlation(x, y, e1, e2, other=(e1, e2, e1), **BINS)
+
+
 def test_bad_arguments():
     x, y, e1, e2 = catalogue(10)
     with pytest.raises(DomainError, match="shapes"):

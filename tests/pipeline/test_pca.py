@@ -7,7 +7,7 @@ import pytest
 from astropy.io import fits
 
 from pachon.models.errors import ConfigError, DomainError, ProductError
-from pachon.pipeline.pca import PsfModel
+from pachon.pipeline.psf_model import PsfModel
 
 SIZE = 31
 EXTENT = (-20.0, 20.0, 100.0, 140.0)
@@ -211,7 +211,7 @@ def test_same_bytes_and_splitting():
 
 def test_bytes_do_not_depend_on_blas_threads():
     code = (
-        "import numpy as np, zlib; from pachon.pipeline.pca import PsfModel; g = np.random.default_rng(0);"
+        "import numpy as np, zlib; from pachon.pipeline.psf_model import PsfModel; g = np.random.default_rng(0);"
         "m = PsfModel.fit(1 + g.random((150, 31, 31)), g.random((150, 2)));"
         "print(zlib.crc32(m.components.tobytes() + m.polynomial.tobytes() + m.eigenvalues.tobytes()))"
     )

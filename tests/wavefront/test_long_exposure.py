@@ -440,7 +440,7 @@ def test_even_stamps_of_coarse_pixels(lsst_r):
 
 @pytest.mark.parametrize("field_deg", [(1.2, 1.2), (-1.2166, -1.6195), (-1.52, -1.27)])
 def test_clear_pupil_is_that_of_traced_rays_to_the_last_corner(lsst_r, field_deg):
-    """Against rays counted on a fine lattice, out to where a crescent at the rim, 2 % of the pupil, is all that is lit."""
+    """Against rays counted on a fine lattice, out to where a crescent of 2 % of the pupil is all that is lit."""
     fields = np.radians([field_deg])
     lattice = PupilLattice.fill(lsst_r.pupil_diameter, lsst_r.pupil_obscuration, 0.04)
     wavelength = np.array([620e-9])

@@ -1,0 +1,336 @@
+"""What each cause does to the PSF: the same stars once with everything, and once more with each cause switched off.
+
+Random numbers are common: heights, turbulence, wind, positions of the stars and the order in which their magnitudes
+are drawn stay what they were when another cause goes, so that a difference is the doing of that cause. Two things
+follow the PSF, as they do at a telescope: the faintest star is the one of the wanted signal-to-noise ratio, and photons
+are counted in other numbers.
+
+What the design of the telescope itself does has no switch here: the same beam without aberrations is no telescope that
+can be traced. Its share is seen from the other side, as what is left once heights and atmosphere are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..models.errors import ConfigError, unknown_name
+from ..wavefront.psf import SCREENS
+from .ccd_product import CcdProduct
+from .ccd_stage import CcdExposure, expose_ccd, model_ccd
+from .config import Configuration, to_yaml, with_options
+from .correlation import Correlation, jackknife_error
+from .diagnostics import LONGEST, correlate, correlation_columns
+from .experiment import Experiment, prepare, resolve
+from .figures_attribution import attribution_figure
+from .memory import check_memory
+from .products import write_bytes, write_ecsv, write_json
+from .progress import Reporter
+from .psf_model import PsfModel
+from .run_folder import CONFIG_NAME, stamp_of
+from .shapes import measure_shapes
+from .stamps import center_stamps
+from .summary import LONG_RANGE, run_figures
+
+FULL, NOISE = "full", "noise"
+_SWITCHES: dict[str, dict[str, Any]] = {
+    "global": {"focal_plane__global": False},
+    "raft": {"focal_plane__raft": False},
+    "ccd": {"focal_plane__ccd": False},
+    "tilt": {"focal_plane__tilt": False},
+    "potato_chip": {"focal_plane__potato_chip": False},
+    "heights": {"focal_plane__budget": "flat"},
+    "active_optics": {"active_optics__residual_um": 0.0},
+    "atmosphere": {"atmosphere__enabled": False},
+    "diffusion": {"psf__diffusion_pixels": 0.0},
+    NOISE: {},
+}
+#: All causes: five terms of the heights and these together, residual aberration, turbulence with refraction, charge
+#: diffusion, and the noise of the observed stars.
+CAUSES = tuple(_SWITCHES)
+#: Ranges of separation over which xi+ is averaged [arcmin].
+RANGES = {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, LONGEST)}
+_RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
+_XI = ("truth", "observed", "residual", "away")
+
+
+@dataclass(frozen=True)
+class Attribution:
+    """What came out with everything, and without each cause.
+
+    Attributes
+    ----------
+    figures : dict of str to dict
+        For ``full`` and for each cause that was off: rms of e and of its residuals, median FWHM, and xi+ of truth,
+        observed stars, residual at the stars and away from them, averaged over :data:`RANGES`; ``change_`` and a key
+        is what the cause does, the full case less this one, and ``error_`` and a key of xi+ its jackknife error over
+        the CCDs.
+    correlations : dict of str to dict of str to Correlation
+        Of each case.
+    """
+
+    figures: dict[str, dict[str, float]]
+    correlations: dict[str, dict[str, Correlation]]
+
+
+def causes_of(config: Configuration) -> tuple[str, ...]:
+    """Return the causes that are on in a resolved configuration, and can be switched off with its engine."""
+    return tuple(cause for cause in CAUSES if _why_not(config, cause) is None)
+
+
+def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Return causes each once, or all of :func:`causes_of` where none are given.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such cause.
+    ConfigError
+        If one is off in the configuration already, or cannot be switched off with its engine.
+    """
+    if causes is None:
+        return causes_of(config)
+    for cause in causes:
+        if cause not in _SWITCHES:
+            raise unknown_name("cause", cause, CAUSES)
+        problem = _why_not(config, cause)
+        if problem is not None:
+            raise ConfigError(f"{cause} cannot be switched off: {problem}")
+    return tuple(dict.fromkeys(causes))
+
+
+def attribute(
+    config: Configuration,
+    causes: Sequence[str] | None = None,
+    *,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> Attribution:
+    """Make the same stars with everything and without each cause, model them, and compare.
+
+    The engine ``long_exposure`` in the configuration averages over all turbulence: quick, and what is left is the
+    doing of optics and heights; the atmosphere is then no cause of ellipticity and cannot be switched off.
+
+    Parameters
+    ----------
+    config : Configuration
+        Resolved configuration, as :func:`~pachon.pipeline.experiment.resolve` gives it.
+    causes : sequence of str, optional
+        Of :data:`CAUSES`; all of :func:`causes_of` by default.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Who tells how far it is; nobody by default.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError
+        If a cause is none, see :func:`checked_causes`.
+    PachonError
+        If a case cannot be computed.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    chosen = checked_causes(config, causes)
+    full = prepare(config)
+    check_memory(full, threads)
+    correlations, figures = {}, {}
+    cases = [FULL, *(c for c in chosen if c != NOISE)]
+    for case in cases:
+        experiment = full if case == FULL else _without(full, case)
+        products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
+        for name, found in ((case, products), (NOISE, noiseless)):
+            if found:
+                correlations[name] = correlate(found)
+                figures[name] = _figures(found, correlations[name])
+    if full.atmosphere is not None:
+        full.atmosphere.release()
+    order = (FULL, *chosen)
+    for name in chosen:
+        figures[name] |= _changes(figures[FULL], figures[name], correlations[FULL], correlations[name])
+    return Attribution({n: figures[n] for n in order}, {n: correlations[n] for n in order})
+
+
+def write_attribution(result: Attribution, folder: Path, config: Configuration) -> tuple[str, ...]:
+    """Write the figures, the correlations, a picture and the configuration, and return the names of the files.
+
+    Parameters
+    ----------
+    result : Attribution
+        What to write.
+    folder : Path
+        Where; it exists.
+    config : Configuration
+        Resolved configuration of the full case.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be written.
+    """
+    stamp = stamp_of(prepare(config))
+    meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed}
+    cases = list(result.figures)
+    keys = list(dict.fromkeys(key for figures in result.figures.values() for key in figures))
+    columns = {"off": (np.array(cases), "", "cause that is switched off, or full")}
+    for key in keys:
+        values = np.array([result.figures[case].get(key, np.nan) for case in cases])
+        columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _meaning(key))
+    everything = {f"{case} {kind}": c for case, each in result.correlations.items() for kind, c in each.items()}
+    write_ecsv(folder / "attribution.ecsv", columns, {"what": "the same stars without one cause", **meta})
+    write_ecsv(folder / "correlations.ecsv", correlation_columns(everything), {"what": "xi of each case", **meta})
+    write_bytes(folder / "attribution.png", attribution_figure(result.figures, result.correlations))
+    write_json(folder / "attribution.json", {"figures": result.figures, **meta})
+    heading = (f"pachon {stamp.version}: the case with everything on.",)
+    write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
+    return "attribution.ecsv", "correlations.ecsv", "attribution.png", "attribution.json", CONFIG_NAME
+
+
+def _why_not(config: Configuration, cause: str) -> str | None:
+    """Return why a cause cannot be switched off, or None."""
+    plane = config.focal_plane
+    if cause in ("global", "raft", "ccd", "tilt", "potato_chip", "heights") and plane.budget == "flat":
+        return "focal_plane.budget = flat"
+    if cause == "heights" and not plane.terms:
+        return "all terms of focal_plane are off already"
+    if cause in ("global", "raft", "ccd", "tilt", "potato_chip") and cause not in plane.terms:
+        return f"focal_plane.{cause} = false"
+    if cause == "active_optics" and config.active_optics.residual_um == 0.0:
+        return "active_optics.residual_um = 0"
+    if cause == "atmosphere" and not config.atmosphere.enabled:
+        return "atmosphere.enabled = false"
+    if cause == "atmosphere" and config.psf.engine == "long_exposure":
+        return "psf.engine = long_exposure, which needs it"
+    if cause == "diffusion" and config.psf.diffusion_pixels == 0.0:
+        return "psf.diffusion_pixels = 0"
+    return None
+
+
+def _without(full: Experiment, cause: str) -> Experiment:
+    """Return the experiment with one cause off. All that a default filled in stays: pixels, stamps, weight."""
+    experiment = prepare(resolve(with_options(full.config, **_SWITCHES[cause])))
+    # Screens are the same and take their time.
+    same = experiment.atmosphere is not None
+    return replace(experiment, atmosphere=full.atmosphere) if same else experiment
+
+
+def _products(
+    experiment: Experiment, case: str, noiseless: bool, threads: int | None, reporter: Reporter
+) -> tuple[list[CcdProduct], list[CcdProduct]]:
+    """Return the products of all CCDs, and those of the same stars without noise where wanted."""
+    config = experiment.config
+    if experiment.atmosphere is not None:
+        for kind in SCREENS.get(config.psf.engine, ()):
+            experiment.atmosphere.kept_screens(kind, threads)
+    names = config.ccds or ()
+    stars = config.stars.truth + config.stars.observed
+    title = "everything on" if case == FULL else f"{case} off"
+    seen, unseen = [], []
+    with reporter.stage(title, total=stars * len(names)) as stage:
+        for name in names:
+            exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
+            product = _without_images(model_ccd(experiment, exposure))
+            seen.append(product)
+            if noiseless:
+                unseen.append(_without_images(_noiseless(experiment, exposure, product)))
+    return seen, unseen
+
+
+def _without_images(product: CcdProduct) -> CcdProduct:
+    """Return a product without its stamps, of which 189 CCDs have half a gigabyte."""
+    return replace(product, truth_images=product.truth_images[:0], observed_images=product.observed_images[:0])
+
+
+def _noiseless(experiment: Experiment, exposure: CcdExposure, product: CcdProduct) -> CcdProduct:
+    """Return the product of the same stars seen without noise: centred, measured and modelled as the noisy ones."""
+    scale, weight = exposure.observed.pixel_scale, experiment.weight_fwhm
+    images = exposure.observed.image.astype(np.float64)
+    first = measure_shapes(images, scale, weight)
+    stamps = center_stamps(images, first.x, first.y, size=experiment.stamp_size)
+    shapes = measure_shapes(stamps, scale, weight)
+    used = shapes.usable & np.isfinite(stamps).all(axis=(1, 2))
+    places = exposure.places
+    fit = experiment.config.reconstruction
+    model = PsfModel.fit(
+        stamps[used],
+        places.observed[used],
+        n_components=fit.components,
+        order=fit.order,
+        extent=product.model.extent,
+        clip_sigma=None,  # as for the truth: without noise, what stands out is the PSF
+    )
+    at_truth, at_stars, left_out = (
+        measure_shapes(m, scale, weight)
+        for m in (model.at(places.truth), model.at(places.observed), model.leave_one_out())
+    )
+    left_out_e1, left_out_e2 = np.full((2, len(used)), np.nan)
+    left_out_e1[used], left_out_e2[used] = left_out.e1, left_out.e2
+    observed = replace(
+        product.observed,
+        e1=shapes.e1,
+        e2=shapes.e2,
+        size=shapes.size,
+        flags=shapes.flags,
+        model_e1=at_stars.e1,
+        model_e2=at_stars.e2,
+        used=used,
+        left_out_e1=left_out_e1,
+        left_out_e2=left_out_e2,
+    )
+    truth = replace(product.truth, model_e1=at_truth.e1, model_e2=at_truth.e2)
+    return replace(product, truth=truth, observed=observed, model=model)
+
+
+def _figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
+    together = run_figures(products, correlated)["all"]
+    e = np.concatenate([[p.truth.e1, p.truth.e2] for p in products], axis=1)
+    figures = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
+    figures |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
+    for kind in _XI:
+        for name, bounds in RANGES.items():
+            xi = correlated[kind]
+            figures[f"xi_plus_{kind}_{name}"] = float(_averaged(xi, bounds, xi.n_pairs, xi.xi_plus))
+    return figures
+
+
+def _averaged(
+    correlation: Correlation, bounds: tuple[float, float], pairs: np.ndarray, xi_plus: np.ndarray
+) -> np.ndarray:
+    """Return the mean of xi+ [..., n_bins] over the pairs of a range [arcmin]; NaN where it has none."""
+    r = correlation.r_arcmin
+    inside = (r >= bounds[0]) & (r < bounds[1])
+    counts, values = pairs[..., inside], xi_plus[..., inside]
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
+
+
+def _changes(
+    full: Mapping[str, float],
+    case: Mapping[str, float],
+    with_all: Mapping[str, Correlation],
+    without: Mapping[str, Correlation],
+) -> dict[str, float]:
+    """Return the full case less this one; the stars are the same, so what both have in common is in no error."""
+    changes = {f"change_{key}": full[key] - case[key] for key in case}
+    for kind in _XI:
+        for name, bounds in RANGES.items():
+            one, other = with_all[kind], without[kind]
+            error = np.nan
+            if one.n_patches and one.n_patches == other.n_patches:
+                one_left, other_left = (_averaged(c, bounds, c.left_pairs, c.left_plus) for c in (one, other))
+                error = float(jackknife_error(one_left - other_left))
+            changes[f"error_xi_plus_{kind}_{name}"] = error
+    return changes
+
+
+def _meaning(key: str) -> str:
+    for start, words in (("change_", "full case less this one: "), ("error_", "jackknife error of the change: ")):
+        if key.startswith(start):
+            return words + _meaning(key.removeprefix(start))
+    if key.startswith("xi_plus_"):
+        low, high = RANGES[key.rpartition("_")[2]]
+        return f"mean xi+ of {key.split('_')[2]}, {low:g} to {high:g} arcmin"
+    return "median FWHM" if key == "fwhm_arcsec" else key.replace("_", " ") + ", one component"
