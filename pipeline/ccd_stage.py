@@ -13,8 +13,8 @@ from ..wavefront.psf import make_psfs
 from ..wavefront.pupil_optics import fields_at
 from .ccd_product import CcdProduct, ObservedStars, TruthStars
 from .experiment import Experiment
-from .psf_model import PsfModel
 from .photometry import ARCSEC, instrument_noise, limiting_magnitude, signal_to_noise, sky_electrons_per_pixel
+from .psf_model import PsfModel
 from .shapes import Shapes, fwhm, measure_shapes
 from .stamps import center_stamps, observe_stamps
 from .star_field import StarField, make_star_field
