@@ -33,7 +33,7 @@ import scipy.fft
 
 import pachon
 from pachon.models.random_streams import stream
-from pachon.models.surface import Conic, Interaction, Plane, Surface
+from pachon.models.surface import Annulus, Conic, Interaction, Plane, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.pipeline.shapes import fwhm
 from pachon.wavefront.atmosphere import SLOPE_LAG, Atmosphere
@@ -54,10 +54,11 @@ def ideal_telescope() -> Telescope:
     lsst = pachon.load_telescope("lsst_v3.3_r")
     length = 1000.0 * lsst.pupil_diameter
     origin, focus = (0.0, 0.0, 0.0), (0.0, 0.0, length)
+    clear = Annulus(0.5 * lsst.pupil_obscuration * lsst.pupil_diameter, 0.5 * lsst.pupil_diameter)
     return Telescope(
         name="paraboloid of f/1000",
         surfaces=(
-            Surface("M1", Interaction.MIRROR, Conic(2.0 * length, -1.0), origin, VACUUM),
+            Surface("M1", Interaction.MIRROR, Conic(2.0 * length, -1.0), origin, VACUUM, clear),
             Surface("Detector", Interaction.DETECTOR, Plane(), focus, VACUUM),
         ),
         stop_z=0.0,
