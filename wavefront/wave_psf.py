@@ -131,7 +131,7 @@ class WavePsfEngine:
             padding = self._atmosphere is None or left > _NEGLIGIBLE
         diameter = self._telescope.pupil_diameter
         longest = diameter if padding else LONGEST_BASELINE
-        self._lattice = PupilLattice.fill(diameter, 0.0, spacing)
+        self._lattice = PupilLattice.fill(diameter, self._telescope.pupil_obscuration, spacing)
         self._packets = -(-self._lattice.size // LANES)
         across = max(math.ceil((diameter + longest) / spacing), self._packets * LANES)
         # Multiples of 4 fill whole packets.
