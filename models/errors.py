@@ -14,6 +14,10 @@ class PrescriptionError(PachonError):
     """A prescription or site file is malformed."""
 
 
+class PrescriptionWarning(UserWarning):
+    """Something in a lens file that a lenient reader left out."""
+
+
 class ConfigError(PachonError):
     """A configuration file or option is malformed."""
 

@@ -6,7 +6,8 @@ negative after an odd number of mirrors, and so is the index ``n``. At each surf
     n' u' = n u - h c (n' - n)        h_next = h + u' t
 
 Seidel sums follow Welford, "Aberrations of Optical Systems" (1986), chapter 8, with ``A = n (h c + u)`` of the marginal
-ray, ``B`` the same of the chief ray, ``H = n (u hb - ub h)`` and the aspheric term ``a = k c^3 + 8 a_4``.
+ray, ``B`` the same of the chief ray, ``H = n (u hb - ub h)`` and the aspheric term ``a = k c^3 + 8 a_4``. Of shapes
+without symmetry of revolution the mean over azimuth counts.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np
     Returns
     -------
     ndarray, shape (n_surface,)
-        Radius [m] on each surface, detector left out.
+        Radius [m] on each mirror and lens surface.
     """
     rays = (0.5 * telescope.pupil_diameter, 0.0), (0.0, np.tan(field))
     trace = _trace(telescope, _wavelength(telescope, wavelength), *rays)
@@ -200,10 +201,8 @@ def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | Non
     s4 = -(lagrange**2) * c * flat
     # This form of the fifth sum stays finite where the marginal ray meets the surface at right angles (a = 0).
     s5 = -(b**3) * h * square + b * hb * c * (2 * h * b - hb * a) * flat
-    # Along s both the curvature and the coefficient of r^4 change sign.
-    conic = np.array([s.shape.conic for s in trace.surfaces])
-    a4 = -np.array([(*s.shape.coefficients, 0.0)[0] for s in trace.surfaces])
-    figure = (conic * c**3 + 8 * a4) * (n2 - n)
+    # The figure k c^3 + 8 a_4 of each surface; along s it changes sign.
+    figure = -8 * np.array([s.shape.fourth_order for s in trace.surfaces]) * (n2 - n)
     aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * figure
     contributions = np.stack([s1, s2, s3, s4, s5]) + aspheric
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
@@ -215,7 +214,7 @@ def _wavelength(telescope: Telescope, wavelength: Any) -> float:
 
 def _trace(telescope: Telescope, wavelength: float, first: tuple[float, float], second: tuple[float, float]) -> _Trace:
     """Trace two rays, each given by height [m] and slope in the plane of the entrance pupil."""
-    surfaces = tuple(s for s in telescope.surfaces if s.interaction != Interaction.DETECTOR)
+    surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
     for surface in surfaces:
         axis = surface.matrix[:, 2]
         if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:

@@ -7,7 +7,7 @@ detector. Camera teams often use the opposite sign: turn it round before a table
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from .ccd_surfaces import CcdSurfaces
 from .errors import DomainError, unknown_name
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
 from .height_fit import fit_heights
-from .units import metres
+from .units import metres, radians
 
 # Rims of tiles read back from a file land this far [m] outside by rounding (a float32 STL keeps 0.34 m to 15 nm).
 _MESH_MARGIN = 1e-7
@@ -182,6 +182,41 @@ class FocalPlane:
     def ccd_index(self, name: str) -> int:
         """Return the index of the CCD of that name."""
         return self.camera.ccd_index(name)
+
+    def with_moved(self, name: str, *, dz: Any = 0.0, rx: Any = 0.0, ry: Any = 0.0) -> FocalPlane:
+        """Return the focal plane with one CCD, or all CCDs of a raft, moved as a rigid body.
+
+        Angles are small: the surface is sheared by their tangents, which for 1e-3 rad is right to 1e-6 of its height.
+
+        Parameters
+        ----------
+        name : str
+            Name of a CCD or a raft.
+        dz : float or Quantity
+            Displacement along +z of the telescope frame [m].
+        rx, ry : float or Quantity
+            Rotation about the axes through the centre of the CCD or raft [rad], right-handed: a positive rx lifts the
+            side at larger y, a positive ry lowers that at larger x.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such CCD or raft.
+        DomainError
+            If a figure is not one finite number.
+        """
+        camera = self.camera
+        members = np.array([camera.ccd_index(n) for n in ((name,) if "_" in name else camera.ccds_of_raft(name))])
+        lift, turn_x, turn_y = metres(dz, "dz"), radians(rx, "rx"), radians(ry, "ry")
+        for label, value in (("dz", lift), ("rx", turn_x), ("ry", turn_y)):
+            if value.ndim or not np.isfinite(value):
+                raise DomainError(f"{name} {label} = {value.tolist()}: expected one finite number")
+        x, y = (camera.centers[members] - camera.centers[members].mean(axis=0)).T
+        polynomial = self.surfaces.polynomial.copy()
+        polynomial[members, 0] += lift + y * np.tan(turn_x) - x * np.tan(turn_y)
+        polynomial[members, 1] -= camera.half_size * np.tan(turn_y)
+        polynomial[members, 2] += camera.half_size * np.tan(turn_x)
+        return replace(self, surfaces=replace(self.surfaces, polynomial=polynomial))
 
     def height(self, x: Any, y: Any) -> np.ndarray:
         """Return the height of the CCD surface.

@@ -28,16 +28,31 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
+from .codev_reader import read_codev
 from .errors import PrescriptionError, unknown_name
+from .glass_catalogue import GlassCatalogue
 from .prescription_reader import read_telescope
 from .prescription_writer import telescope_to_yaml
 from .telescope import Telescope
 from .yaml_reader import read_yaml
+from .zemax_reader import read_zemax
+from .zemax_writer import catalogue_path, telescope_to_zemax
 
 DATA = Path(__file__).parent / "data"
-BUNDLED = (*(f"lsst_v3.3_{band}" for band in "ugrizy"), "lsst_v3.3_g_vacuum_zemax_check", "paul_baker")
+BUNDLED = (
+    *(f"lsst_v3.3_{band}" for band in "ugrizy"),
+    "lsst_v3.3_r_obstructed",
+    "lsst_v3.3_g_vacuum_zemax_check",
+    *(f"rubin_v3.14_{band}" for band in "ugrizy"),
+    "comcam_r",
+    "auxtel",
+    "decam",
+    "hsc",
+    "paul_baker",
+)
 
 
 def bundled_names() -> tuple[str, ...]:
@@ -45,13 +60,23 @@ def bundled_names() -> tuple[str, ...]:
     return BUNDLED
 
 
-def load_telescope(name_or_path: str | os.PathLike[str]) -> Telescope:
+def load_telescope(
+    name_or_path: str | os.PathLike[str],
+    *,
+    lenient: bool = False,
+    glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
+) -> Telescope:
     """Load a bundled prescription by name, or any prescription by the path of its file.
 
     Parameters
     ----------
     name_or_path : str or path
-        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file.
+        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, or of a ``.zmx`` (Zemax) or ``.seq``
+        (CODE V) file.
+    lenient : bool
+        Of a Zemax or CODE V file: warn about what is not understood instead of raising.
+    glass_catalogues : iterable of GlassCatalogue or path
+        AGF catalogues that a Zemax or CODE V file's glasses are looked up in, before the bundled one.
 
     Returns
     -------
@@ -71,13 +96,20 @@ def load_telescope(name_or_path: str | os.PathLike[str]) -> Telescope:
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
         return read_telescope(read_yaml(path))
+    if path.suffix.lower() == ".seq":
+        return read_codev(path, lenient=lenient, glass_catalogues=glass_catalogues)
+    if path.suffix.lower() == ".zmx":
+        return read_zemax(path, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
-        raise PrescriptionError(f"{path}: expected a prescription file that ends in .yaml")
+        raise PrescriptionError(f"{path}: expected a prescription file that ends in .yaml, .zmx or .seq")
     raise unknown_name("telescope", text, BUNDLED)
 
 
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
-    """Write a prescription file.
+    """Write a prescription file: YAML, or where the name ends in ``.zmx`` a Zemax lens file.
+
+    Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
+    it.
 
     Parameters
     ----------
@@ -89,12 +121,22 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     PrescriptionError
-        If the file cannot be written.
+        If the file cannot be written, or cannot hold the telescope.
     """
     target = Path(path)
+    if target.suffix.lower() == ".zmx":
+        lens, glasses = telescope_to_zemax(telescope)
+        if glasses:
+            _write_text(catalogue_path(target), glasses)
+        _write_text(target, lens)
+    else:
+        _write_text(target, telescope_to_yaml(telescope))
+
+
+def _write_text(target: Path, text: str) -> None:
     scratch = target.with_name(target.name + ".part")
     try:
-        scratch.write_text(telescope_to_yaml(telescope), encoding="utf-8")
+        scratch.write_text(text, encoding="utf-8")
         scratch.replace(target)
     except OSError as error:
         with contextlib.suppress(OSError):

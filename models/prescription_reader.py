@@ -7,27 +7,22 @@ from collections.abc import Callable
 from decimal import Decimal
 from typing import cast
 
+from .aperture_yaml import APERTURE_KEYS, read_aperture, read_obstructions
 from .errors import PrescriptionError
-from .glass import ConstantIndex, Medium, Sellmeier
-from .surface import (
-    IDENTITY,
-    Annulus,
-    Aperture,
-    Circle,
-    Conic,
-    EvenAsphere,
-    Interaction,
-    Matrix,
-    Plane,
-    Shape,
-    Sphere,
-    Surface,
-    Vector,
-)
+from .glass import Medium
+from .media_yaml import read_medium
+from .shape_yaml import read_shape, shape_keys
+from .surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from .telescope import VACUUM, Telescope, rotation_matrix
 from .yaml_reader import Section, as_number
 
-INTERACTIONS = {"mirror": Interaction.MIRROR, "refract": Interaction.REFRACT, "detector": Interaction.DETECTOR}
+INTERACTIONS = {
+    "mirror": Interaction.MIRROR,
+    "refract": Interaction.REFRACT,
+    "detector": Interaction.DETECTOR,
+    "baffle": Interaction.PASS,
+    "phase": Interaction.PHASE,
+}
 
 
 def _power_of_ten(exponent: int) -> Callable[[float], float]:
@@ -48,6 +43,7 @@ HEADER = (
     "stop",
     "pupil",
     "launch_distance",
+    "object_distance",
     "reference_sphere_radius",
     "field",
     "wavelengths",
@@ -55,15 +51,10 @@ HEADER = (
     "medium_before",
     "media",
     "groups",
+    "obstructions",
     "surfaces",
 )
-SURFACE_KEYS = ("name", "type", "shape", "x", "y", "z", "tilt", "rotation", "medium", "circle", "annulus", "centre")
-SHAPE_KEYS = {
-    "plane": (),
-    "sphere": ("radius",),
-    "conic": ("radius", "conic"),
-    "even_asphere": ("radius", "conic", "coefficients"),
-}
+SURFACE_KEYS = ("name", "type", "shape", "x", "y", "z", "tilt", "rotation", "medium", *APERTURE_KEYS)
 
 
 def read_telescope(top: Section) -> Telescope:
@@ -100,6 +91,7 @@ def read_telescope(top: Section) -> Telescope:
             pupil_diameter=length(pupil.number("diameter", positive=True)),
             pupil_obscuration=pupil.number("obscuration"),
             launch_distance=length(top.number("launch_distance", positive=True)),
+            object_distance=length(top.number("object_distance")) if "object_distance" in top else math.inf,
             reference_sphere_radius=length(top.number("reference_sphere_radius", positive=True)),
             field_radius=angle(field.number("radius", positive=True)),
             field_limit=angle(field.number("limit", positive=True)),
@@ -110,6 +102,7 @@ def read_telescope(top: Section) -> Telescope:
             groups=groups,
             group_frames=frames,
             camera=top.text("camera") if "camera" in top else None,
+            obstructions=read_obstructions(top),
         )
     except PrescriptionError as error:
         # Values of single keys carry their place already; what several keys say together does not.
@@ -121,19 +114,7 @@ def _read_media(media: Section, wavelength: Callable[[float], float]) -> dict[st
     for name in media.keys():  # noqa: SIM118 - a Section is no mapping
         if name == "vacuum":
             raise media.error(name, "another name: vacuum is defined already, with index 1")
-        section = media.section(name)
-        try:
-            if "n" in section:
-                section.allow("n")
-                found[name] = ConstantIndex(section.number("n"))
-            else:
-                section.allow("n", "B", "C", "range")
-                b, c, limits = section.numbers("B", 3), section.numbers("C", 3), section.numbers("range", 2)
-                found[name] = Sellmeier(
-                    cast(Vector, b), cast(Vector, c), cast("tuple[float, float]", tuple(map(wavelength, limits)))
-                )
-        except PrescriptionError as error:
-            raise section.placed(error) from None
+        found[name] = read_medium(media.section(name), wavelength)
     return found
 
 
@@ -176,8 +157,7 @@ def _read_surface(
     length: Callable[[float], float],
     angle: Callable[[float], float],
 ) -> Surface:
-    kind = section.choice("shape", tuple(SHAPE_KEYS))
-    section.allow(*SURFACE_KEYS, *SHAPE_KEYS[kind])
+    section.allow(*SURFACE_KEYS, *shape_keys(section))
     interaction = INTERACTIONS[section.choice("type", tuple(INTERACTIONS))]
     if interaction == Interaction.REFRACT:
         section.text("medium")
@@ -191,42 +171,11 @@ def _read_surface(
         return Surface(
             name=section.text("name"),
             interaction=interaction,
-            shape=_read_shape(section, kind, length),
+            shape=read_shape(section, length),
             vertex=(length(section.number("x", 0.0)), length(section.number("y", 0.0)), length(section.number("z"))),
             medium_after=_read_medium(section, "medium", media, medium_before),
-            aperture=_read_aperture(section, length),
+            aperture=read_aperture(section, length, angle),
             rotation=rotation,
         )
     except PrescriptionError as error:
         raise section.placed(error) from None
-
-
-def _read_shape(section: Section, kind: str, length: Callable[[float], float]) -> Shape:
-    if kind == "plane":
-        return Plane()
-    radius = length(section.number("radius"))
-    if kind == "sphere":
-        return Sphere(radius)
-    if kind == "conic":
-        return Conic(radius, section.number("conic"))
-    # A coefficient of r^n is a length over a length to the n.
-    unit = length(1.0)
-    coefficients = tuple(
-        a if unit == 1.0 else a * unit ** (1 - power)
-        for power, a in zip(range(4, 1000, 2), section.numbers("coefficients"), strict=False)
-    )
-    return EvenAsphere(radius, section.number("conic", 0.0), coefficients)
-
-
-def _read_aperture(section: Section, length: Callable[[float], float]) -> Aperture | None:
-    if "circle" in section and "annulus" in section:
-        raise section.error("circle", "circle or annulus, not both")
-    x, y = (length(v) for v in section.numbers("centre", 2, (0.0, 0.0)))
-    if "circle" in section:
-        return Circle(length(section.number("circle")), x, y)
-    if "annulus" in section:
-        inner, outer = (length(v) for v in section.numbers("annulus", 2))
-        return Annulus(inner, outer, x, y)
-    if "centre" in section:
-        raise section.error("centre", "a circle or an annulus beside it")
-    return None

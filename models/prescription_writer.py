@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import yaml
 
-from .glass import ConstantIndex, Medium
+from .aperture_yaml import aperture_angles, aperture_items, obstruction_lines
+from .glass import Medium
+from .media_yaml import medium_items, medium_wavelengths
 from .prescription_reader import ANGLES, INTERACTIONS, WAVELENGTHS
-from .surface import IDENTITY, Annulus, Circle, Conic, EvenAsphere, Plane, Sphere, Surface
+from .shape_yaml import shape_items
+from .surface import IDENTITY, Surface
 from .telescope import VACUUM, Telescope
 
-SHAPE_NAMES = {Plane: "plane", Sphere: "sphere", Conic: "conic", EvenAsphere: "even_asphere"}
 INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 
 
@@ -26,12 +30,19 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     glasses = [m for m in (s.medium_after for s in t.surfaces) if m != VACUUM]
     glasses = list(dict.fromkeys([*([t.medium_before] if t.medium_before != VACUUM else []), *glasses]))
     for glass in glasses:
-        waves += () if isinstance(glass, ConstantIndex) else glass.wavelength_range
-    angle, angles = _in_unit((t.field_radius, t.field_limit), "deg", ANGLES, "rad")
+        waves += medium_wavelengths(glass)
+    turns = [turn for s in t.surfaces for turn in aperture_angles(s.aperture)]
+    angle, angles = _in_unit((t.field_radius, t.field_limit, *turns), "deg", ANGLES, "rad")
+    shown_angles = dict(zip(turns, angles[2:], strict=True))
     wave, waves_out = _in_unit(waves, "um", WAVELENGTHS, "m")
     shown = dict(zip(waves, waves_out, strict=True))
     names: dict[Medium, str] = {VACUUM: "vacuum"}
-    names |= {glass: f"glass_{i}" for i, glass in enumerate(glasses, start=1)}
+    taken = {glass.name for glass in glasses}
+    numbered = (f"glass_{i}" for i in count(1))
+    for glass in glasses:
+        # A name of its own that no other medium has; without one, a number.
+        own = re.fullmatch(r"[A-Za-z][\w.-]*", glass.name) and glass.name not in names.values()
+        names[glass] = glass.name if own else next(n for n in numbered if n not in taken)
 
     def wave_list(values: tuple[float, ...]) -> str:
         return _list(shown[v] for v in values)
@@ -48,6 +59,8 @@ def telescope_to_yaml(telescope: Telescope) -> str:
         f"wavelengths: {{range: {wave_list(t.wavelength_range)}, default: {_number(shown[t.default_wavelength])}, "
         f"band: {wave_list(band)}}}",
     ]
+    if math.isfinite(t.object_distance):
+        lines.append(f"object_distance: {_number(t.object_distance)}")
     if t.camera is not None:
         lines.append(f"camera: {_text(t.camera)}")
     if t.medium_before != VACUUM:
@@ -55,11 +68,8 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     if glasses:
         lines.append("media:")
     for glass in glasses:
-        if isinstance(glass, ConstantIndex):
-            lines.append(f"  {names[glass]}: {{n: {_number(glass.n)}}}")
-        else:
-            span = wave_list(glass.wavelength_range)
-            lines.append(f"  {names[glass]}: {{B: {_list(glass.B)}, C: {_list(glass.C)}, range: {span}}}")
+        items = medium_items(glass, _number, _list, wave_list)
+        lines.append(f"  {names[glass]}: {{" + ", ".join(f"{key}: {value}" for key, value in items.items()) + "}")
     if t.groups:
         lines.append("groups:")
     for group, members in t.groups.items():
@@ -69,15 +79,17 @@ def telescope_to_yaml(telescope: Telescope) -> str:
         if (pivot, axes) != (first.vertex, first.rotation):
             listed = f"{{surfaces: {listed}, pivot: {_list(pivot)}, rotation: {_matrix(axes)}}}"
         lines.append(f"  {_text(group)}: {listed}")
+    lines += obstruction_lines(t.obstructions, _text)
     lines.append("surfaces:")
-    return "\n".join(lines + _surface_lines(t.surfaces, names)) + "\n"
+    return "\n".join(lines + _surface_lines(t.surfaces, names, lambda turn: _number(shown_angles[turn]))) + "\n"
 
 
-def _surface_lines(surfaces: tuple[Surface, ...], names: dict[Medium, str]) -> list[str]:
-    rows = [_surface_items(s, names) for s in surfaces]
+def _surface_lines(surfaces: tuple[Surface, ...], names: dict[Medium, str], angle: Callable[[float], str]) -> list[str]:
+    rows = [_surface_items(s, names, angle) for s in surfaces]
     # The first keys, which every surface has, are aligned so that the eye can run down a column.
     aligned = ("name", "type", "shape", "z")
-    width = {key: max(len(row[key]) for row in rows) for key in aligned}
+    # A sum of shapes is a list and breaks the column: it would push all others out of sight.
+    width = {key: max((len(row[key]) for row in rows if row[key][0] != "["), default=0) for key in aligned}
     lines = []
     for row in rows:
         keys = list(row)
@@ -90,30 +102,20 @@ def _surface_lines(surfaces: tuple[Surface, ...], names: dict[Medium, str]) -> l
     return lines
 
 
-def _surface_items(surface: Surface, names: dict[Medium, str]) -> dict[str, str]:
+def _surface_items(surface: Surface, names: dict[Medium, str], angle: Callable[[float], str]) -> dict[str, str]:
     x, y, z = surface.vertex
-    shape, aperture = surface.shape, surface.aperture
+    shape = shape_items(surface.shape, _number, _list)
     items = {
         "name": _text(surface.name),
         "type": INTERACTION_NAMES[surface.interaction],
-        "shape": SHAPE_NAMES[type(shape)],
+        "shape": shape["shape"],
         "z": _number(z),
     }
     items |= {key: _number(value) for key, value in (("x", x), ("y", y)) if value != 0}
     if surface.rotation != IDENTITY:
         items["rotation"] = _matrix(surface.rotation)
-    if not isinstance(shape, Plane):
-        items["radius"] = _number(shape.radius)
-    if isinstance(shape, (Conic, EvenAsphere)):
-        items["conic"] = _number(shape.conic)
-    if isinstance(shape, EvenAsphere):
-        items["coefficients"] = _list(shape.coefficients)
-    if isinstance(aperture, Circle):
-        items["circle"] = _number(aperture.radius)
-    elif isinstance(aperture, Annulus):
-        items["annulus"] = _list((aperture.inner, aperture.outer))
-    if aperture is not None and (aperture.x or aperture.y):
-        items["centre"] = _list((aperture.x, aperture.y))
+    items |= {key: value for key, value in shape.items() if key != "shape"}
+    items |= aperture_items(surface.aperture, _number, _list, angle)
     if surface.interaction == INTERACTIONS["refract"]:
         items["medium"] = names[surface.medium_after]
     return items

@@ -5,6 +5,7 @@ Telescope frame: right-handed, origin at the vertex of the primary, +z along the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,10 +16,14 @@ import numpy as np
 
 from .errors import DomainError, PrescriptionError, unknown_name
 from .glass import ConstantIndex, Medium
+from .obstruction import Obstruction
+from .shape import Shape, Sum
 from .surface import Interaction, Matrix, Surface, Vector, move_frame
 from .units import metres, radians
 
 VACUUM = ConstantIndex(1.0)
+#: Surfaces that leave light in the medium that it came through.
+_STAYING = {Interaction.MIRROR: "mirror", Interaction.PASS: "baffle", Interaction.PHASE: "phase screen"}
 
 
 def rotation_matrix(tilt: Any) -> np.ndarray:
@@ -65,7 +70,7 @@ class Telescope:
         Wavelength used where none is given [m].
     band : tuple of float, shape (2,), optional
         Edges of the pass band [m]; the wavelength range where not given.
-    medium_before : ConstantIndex or Sellmeier
+    medium_before : Medium
         Medium in front of the first surface.
     groups : mapping of str to tuple of str
         Names of surfaces that move together.
@@ -73,6 +78,11 @@ class Telescope:
         Frame of each group: its pivot [m] and axes. By default that of its first surface.
     camera : str, optional
         Name of the camera at the focus.
+    obstructions : tuple of Obstruction
+        Meshes that block light between the surfaces.
+    object_distance : float
+        Height of the plane of the object [m], telescope frame; infinite for the sky. At a finite distance a field angle
+        is that of the ray from the object through the centre of the entrance pupil.
     """
 
     name: str
@@ -94,6 +104,8 @@ class Telescope:
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict, hash=False)
     group_frames: Mapping[str, tuple[Vector, Matrix]] = field(default_factory=dict, hash=False)
     camera: str | None = None
+    obstructions: tuple[Obstruction, ...] = ()
+    object_distance: float = math.inf
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.surfaces]
@@ -103,8 +115,9 @@ class Telescope:
             raise PrescriptionError(f"surface name {repeated!r} occurs more than once: expected unique names")
         medium = self.medium_before
         for surface in self.surfaces:
-            if surface.interaction == Interaction.MIRROR and surface.medium_after != medium:
-                raise PrescriptionError(f"surface {surface.name!r}: expected a mirror to stay in the medium before it")
+            what = _STAYING.get(surface.interaction)
+            if what and surface.medium_after != medium:
+                raise PrescriptionError(f"surface {surface.name!r}: expected a {what} to stay in the medium before it")
             medium = surface.medium_after
         for group, members in self.groups.items():
             if group in names:
@@ -121,6 +134,9 @@ class Telescope:
             raise PrescriptionError(f"stop_z = {self.stop_z!r}: expected a finite number")
         if not 0 <= self.pupil_obscuration < 1:
             raise PrescriptionError(f"pupil_obscuration = {self.pupil_obscuration!r}: expected 0 <= value < 1")
+        if math.isnan(self.object_distance) or self.object_distance == self.stop_z:
+            raise PrescriptionError(f"object_distance = {self.object_distance!r}: expected a number other than stop_z")
+        self._check_obstructions()
         low, high = self.wavelength_range
         if not 0 < low < high < np.inf:
             raise PrescriptionError(f"wavelength_range = {self.wavelength_range!r}: expected 0 < shortest < longest")
@@ -132,6 +148,22 @@ class Telescope:
         frames = {g: self.group_frames.get(g) or self._surface_frame(m[0]) for g, m in self.groups.items()}
         object.__setattr__(self, "groups", MappingProxyType({g: tuple(m) for g, m in self.groups.items()}))
         object.__setattr__(self, "group_frames", MappingProxyType(frames))
+
+    def _check_obstructions(self) -> None:
+        acting = [s.name for s in self.surfaces if s.interaction != Interaction.PASS]
+        named = [o.name for o in self.obstructions]
+        for repeated in {n for n in named if named.count(n) > 1}:
+            raise PrescriptionError(f"obstruction {repeated!r} occurs more than once: expected unique names")
+        for obstruction in self.obstructions:
+            for name in obstruction.before or ():
+                if name not in acting:
+                    wrong = unknown_name("mirror, lens surface or detector", name, acting)
+                    raise PrescriptionError(f"obstruction {obstruction.name!r}: before: {wrong}")
+            if obstruction.height > self.launch_distance:
+                raise PrescriptionError(
+                    f"obstruction {obstruction.name!r} reaches z = {obstruction.height:.6g} m: expected it below "
+                    f"launch_distance = {self.launch_distance:.6g} m, where rays start"
+                )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mapping proxy cannot be pickled: hand over plain dictionaries.
@@ -162,6 +194,29 @@ class Telescope:
             if surface.name == name:
                 return surface
         raise unknown_name(f"surface of {self.name}", name, self.surface_names)
+
+    def with_shape(self, name: str, shape: Shape) -> Telescope:
+        """Return the telescope with another shape of one surface; this one stays as it is.
+
+        Raises
+        ------
+        UnknownNameError
+            If no surface has the name.
+        """
+        changed = replace(self.surface(name), shape=shape)
+        return replace(self, surfaces=tuple(changed if s.name == name else s for s in self.surfaces))
+
+    def with_figure(self, name: str, figure: Shape) -> Telescope:
+        """Return the telescope with a figure, a bending mode or a figure error, added to the sag of one surface.
+
+        Raises
+        ------
+        UnknownNameError
+            If no surface has the name.
+        """
+        shape = self.surface(name).shape
+        parts = shape.parts if isinstance(shape, Sum) else (shape,)
+        return self.with_shape(name, Sum((*parts, figure)))
 
     def perturbed(
         self,
@@ -228,6 +283,17 @@ class Telescope:
                 if members.issuperset(inner):
                     frames[group] = move_frame(*frames[group], rotation=rotation, about=centre, shift=dr)
         return replace(self, surfaces=surfaces, group_frames=frames)
+
+    def with_obstructions(self, *obstructions: Obstruction) -> Telescope:
+        """Return the telescope with more meshes in the light's way.
+
+        Raises
+        ------
+        PrescriptionError
+            If a name occurs already, an obstruction names a surface that is none of its own, or rises above where rays
+            start.
+        """
+        return replace(self, obstructions=(*self.obstructions, *obstructions))
 
     def check_wavelength(self, wavelength: Any) -> np.ndarray:
         """Return the wavelength [m] as a float64 array.

@@ -8,22 +8,31 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..models.errors import PrescriptionError
-from ..models.surface import Annulus, Aperture, Circle
+from ..models.aperture import Annulus, Aperture, Circle, Complement
+from ..models.shape_mesh import MeshSurface
+from ..models.surface import Interaction
 from ..models.telescope import Telescope
 from .launch import start_warp
-from .trace_kernels import KINDS, NUMBERS, PackedSurfaces
+from .packed_apertures import pack_apertures
+from .packed_figures import pack_figures, split_shape
+from .packed_meshes import pack_meshes
+from .packed_obstructions import blocked_ways, pack_obstructions
+from .surface_kernels import FAR
+from .trace_kernels import FIGURED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
 
 
-def _clear_region(aperture: Aperture | None) -> tuple[float, float, float, float]:
-    """Return centre x, y, inner and outer radius [m] of the clear region."""
+def clear_ring(aperture: Aperture | None) -> tuple[float, float, float, float] | None:
+    """Return centre x, y, inner and outer radius [m] of a clear region; None where it is neither a disc nor a ring."""
     if aperture is None:
         return (0.0, 0.0, 0.0, np.inf)
     if isinstance(aperture, Circle):
         return (aperture.x, aperture.y, 0.0, aperture.radius)
     if isinstance(aperture, Annulus):
         return (aperture.x, aperture.y, aperture.inner, aperture.outer)
-    raise PrescriptionError(f"aperture {type(aperture).__name__} cannot be traced")
+    if isinstance(aperture, Complement) and isinstance(aperture.part, Circle):
+        # A disc in the way leaves a ring without end.
+        return (aperture.part.x, aperture.part.y, aperture.part.radius, float(FAR))
+    return None
 
 
 @lru_cache(maxsize=64)
@@ -33,17 +42,37 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
     surfaces = telescope.surfaces
     numbers = np.empty((len(surfaces), NUMBERS))
     kinds = np.empty((len(surfaces), KINDS), dtype=np.int32)
-    coefficients = np.zeros((len(surfaces), max([1, *(len(s.shape.coefficients) for s in surfaces)])))
+    shapes = [split_shape(s.shape, screen=s.interaction == Interaction.PHASE) for s in surfaces]
+    coefficients = np.zeros((len(surfaces), max([1, *(len(shape.base.coefficients) for shape in shapes)])))
+    blocked = blocked_ways(telescope)
+    general: list[Aperture | None] = []
     for row, s in enumerate(surfaces):
-        terms = s.shape.coefficients
+        base, terms = shapes[row].base, shapes[row].base.coefficients
         turned = not np.array_equal(s.matrix, np.eye(3))
         coefficients[row, : len(terms)] = terms
-        numbers[row] = [s.shape.curvature, s.shape.conic, *s.vertex, *s.matrix.ravel(), *_clear_region(s.aperture)]
-        kinds[row] = [int(s.interaction), len(terms), turned, s.aperture is not None]
+        ring = clear_ring(s.aperture)
+        general.append(s.aperture if ring is None else None)
+        stopped = 2 if ring is None else int(s.aperture is not None)
+        frame = (*s.vertex, *s.matrix.ravel())
+        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), shapes[row].first_curvature]
+        kinds[row] = [
+            int(s.interaction),
+            len(terms),
+            turned,
+            stopped,
+            bool(blocked[row].any()),
+            2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
+        ]
     packed = PackedSurfaces()
+    unusual = kinds[:, FIGURED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
+    packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
     packed.numbers = wp.array(numbers, dtype=wp.float64, device=device)
     packed.kinds = wp.array(kinds, dtype=wp.int32, device=device)
     packed.coefficients = wp.array(coefficients, dtype=wp.float64, device=device)
+    packed.figures = pack_figures(shapes, device)
+    packed.meshes = pack_meshes(surfaces, device)
+    packed.apertures = pack_apertures(general, device)
+    packed.obstructions = pack_obstructions(telescope, device)
     return packed
 
 

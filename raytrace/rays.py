@@ -128,7 +128,8 @@ def launch_rays(
     Returns
     -------
     Rays
-        Rays in phase: they start on one plane perpendicular to their direction, before the first surface.
+        Rays in phase: they start on one plane perpendicular to their direction, before the first surface, or at one
+        point of the object where that is at a finite distance.
 
     Raises
     ------
@@ -140,13 +141,84 @@ def launch_rays(
     wavelength = check_wavelength(wavelength)
     telescope.check_wavelength(wavelength)
     px, py = np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y"))
-    v = field_direction(tx, ty, projection)
+    points = np.stack([px.ravel(), py.ravel()], axis=-1)
+    return launch_bundles(telescope, field_direction(tx, ty, projection)[None], wavelength, points)
+
+
+def launch_bundles(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
+    """Launch the light of several field points through points of the entrance pupil, whatever the object's distance.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    directions : ndarray, shape [n_direction, 3]
+        Unit vectors in which the chief rays travel, as :func:`field_direction` gives them.
+    wavelength : float
+        Vacuum wavelength [m].
+    pupil : ndarray, shape [n_pupil, 2] or [n_direction, n_pupil, 2]
+        Entrance-pupil coordinates [m]: the same for all directions, or its own for each.
+
+    Returns
+    -------
+    Rays
+        ``n_direction * n_pupil`` rays, direction by direction; those of one direction are in phase.
+    """
+    if not np.isfinite(telescope.object_distance):
+        return parallel_rays(telescope, directions, wavelength, pupil)
+    start = object_points(telescope, directions)
+    x, y = np.moveaxis(np.broadcast_to(pupil, (len(directions), *pupil.shape[-2:])), -1, 0)
+    through = np.stack([x, y, np.full(x.shape, telescope.stop_z)])
+    reach = through - start.T[:, :, None]
+    # The plane of the pupil may lie behind the object: the light goes down all the same.
+    reach *= -np.sign(reach[2]) / np.linalg.norm(reach, axis=0)
+    position = np.repeat(start.T, x.shape[1], axis=1)
+    return Rays(position.T, reach.reshape(3, -1).T, np.zeros(x.size), wavelength)
+
+
+def object_points(telescope: Telescope, directions: np.ndarray) -> np.ndarray:
+    """Return the points [m] of an object at a finite distance that chief rays of given directions [n, 3] come from."""
+    height = telescope.object_distance - telescope.stop_z
+    return directions * (height / directions[:, 2:]) + [0.0, 0.0, telescope.stop_z]
+
+
+def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
+    """Launch a plane wave from each of several directions through points of the entrance pupil.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    directions : ndarray, shape [n_direction, 3]
+        Unit vectors in which the light travels, as :func:`field_direction` gives them.
+    wavelength : float
+        Vacuum wavelength [m].
+    pupil : ndarray, shape [n_pupil, 2] or [n_direction, n_pupil, 2]
+        Entrance-pupil coordinates [m]: the same for all directions, or its own for each.
+
+    Returns
+    -------
+    Rays
+        ``n_direction * n_pupil`` rays, direction by direction; those of one direction are in phase.
+
+    Raises
+    ------
+    DomainError
+        If the telescope's object is at a finite distance, which :func:`launch_bundles` knows.
+    """
+    if np.isfinite(telescope.object_distance):
+        raise DomainError(
+            f"{telescope.name}: object at {telescope.object_distance:.6g} m: expected an object at infinity; "
+            "rays and wavefronts of single field points can be had, this cannot"
+        )
     # Components are kept contiguous (structure of arrays), as the kernels read them.
-    points = np.stack([px.ravel(), py.ravel(), np.full(px.size, telescope.stop_z)])
+    v = np.ascontiguousarray(directions.T)[:, :, None]
+    x, y = np.moveaxis(pupil if pupil.ndim == 3 else pupil[None], -1, 0)
+    points = np.stack([x, y, np.full(x.shape, telescope.stop_z)])
     back = v[0] * points[0] + v[1] * points[1] + v[2] * points[2] + telescope.launch_distance
     return Rays(
-        position=(points - v[:, None] * back).T,
-        direction=np.repeat(v[:, None], px.size, axis=1).T,
-        path_length=np.zeros(px.size),
+        position=(points - v * back).reshape(3, -1).T,
+        direction=np.repeat(v, x.shape[1], axis=2).reshape(3, -1).T,
+        path_length=np.zeros(back.size),
         wavelength=wavelength,
     )

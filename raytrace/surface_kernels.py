@@ -22,6 +22,9 @@ wp.set_module_options(FORWARD_OPTIONS)
 NEWTON_STEP = wp.constant(wp.float64(2.0e-8))
 NEWTON_LIMIT = wp.constant(20)
 
+#: No telescope is this large [m]: a distance beyond it, or a NaN, is a ray that missed.
+FAR = wp.constant(wp.float64(1.0e9))
+
 # Statuses are doubles within the kernels: a choice between lanes of one width stays a vector instruction.
 OK = wp.constant(wp.float64(0.0))
 VIGNETTED = wp.constant(wp.float64(1.0))

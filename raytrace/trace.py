@@ -52,6 +52,66 @@ class TraceResult:
         return self.status != RayStatus.OK
 
 
+@dataclass(frozen=True)
+class PacketTrace:
+    """Packets of rays as the kernels have them, before the first surface and after the last ones.
+
+    Attributes
+    ----------
+    start, start_direction : array of lanes, shape [3, n_packet]
+        Where the rays start [m], and where they go.
+    position, direction : array of lanes, shape [every, 3, n_packet]
+        Rays after each surface kept, telescope frame.
+    path : array of lanes, shape [every, n_packet]
+        Optical path [m].
+    status : array of lane_flags, shape [every, n_packet]
+        A :class:`~pachon.raytrace.rays.RayStatus` each.
+    """
+
+    start: wp.array
+    start_direction: wp.array
+    position: wp.array
+    direction: wp.array
+    path: wp.array
+    status: wp.array
+
+
+def trace_packets(telescope: Telescope, rays: Rays, every: int, *, threads: int | None = None) -> PacketTrace:
+    """Trace rays and leave them in packets, the last one filled up; ``every`` surfaces are kept, the last ones."""
+    packed = pack_surfaces(telescope)
+    count = packet_count(len(rays))
+    indices = wp.array(refractive_indices(telescope, rays.wavelength)[None], dtype=wp.float64, device="cpu")
+
+    def inputs(values: np.ndarray) -> wp.array:
+        return wp.array(to_packets(values), dtype=lanes, device="cpu", copy=False)
+
+    end = PacketTrace(
+        inputs(rays.position.T),
+        inputs(rays.direction.T),
+        wp.empty((every, 3, count), dtype=lanes, device="cpu"),
+        wp.empty((every, 3, count), dtype=lanes, device="cpu"),
+        wp.empty((every, count), dtype=lanes, device="cpu"),
+        wp.empty((every, count), dtype=lane_flags, device="cpu"),
+    )
+    launch(
+        trace_rays,
+        count,
+        [
+            packed,
+            indices,
+            end.start,
+            end.start_direction,
+            inputs(rays.path_length),
+            end.position,
+            end.direction,
+            end.path,
+            end.status,
+        ],
+        threads=threads,
+    )
+    return end
+
+
 @overload
 def trace(
     telescope: Telescope,
@@ -113,48 +173,20 @@ def trace(
         raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
     n = len(rays)
     every = len(telescope.surfaces) if surfaces == "all" else 1
-    packed = pack_surfaces(telescope)
-    index = refractive_indices(telescope, rays.wavelength)
-    indices = wp.array(index[None], dtype=wp.float64, device="cpu")
-    count = packet_count(n)
-
-    def inputs(values: np.ndarray) -> wp.array:
-        return wp.array(to_packets(values), dtype=lanes, device="cpu", copy=False)
-
-    position = wp.empty((every, 3, count), dtype=lanes, device="cpu")
-    direction = wp.empty((every, 3, count), dtype=lanes, device="cpu")
-    path = wp.empty((every, count), dtype=lanes, device="cpu")
-    status = wp.empty((every, count), dtype=lane_flags, device="cpu")
-    launch(
-        trace_rays,
-        count,
-        [
-            packed,
-            indices,
-            inputs(rays.position.T),
-            inputs(rays.direction.T),
-            inputs(rays.path_length),
-            position,
-            direction,
-            path,
-            status,
-        ],
-        threads=threads,
-    )
+    end = trace_packets(telescope, rays, every, threads=threads)
     names = telescope.surface_names if surfaces == "all" else telescope.surface_names[-1:]
-    positions = position.numpy().reshape(every, 3, -1)[:, :, :n]
-    directions = direction.numpy().reshape(every, 3, -1)[:, :, :n]
-    paths = path.numpy().reshape(every, -1)[:, :n]
-    statuses = status.numpy().reshape(every, -1)[:, :n]
+    positions = end.position.numpy().reshape(every, 3, -1)[:, :, :n]
+    directions = end.direction.numpy().reshape(every, 3, -1)[:, :, :n]
+    paths = end.path.numpy().reshape(every, -1)[:, :n]
+    statuses = end.status.numpy().reshape(every, -1)[:, :n]
     # Transposed views, not copies: the rays stay in structure-of-arrays order.
     results = [
         TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i]) for i, name in enumerate(names)
     ]
     if focal_plane is not None:
         last = results[-1]
-        landing = land_on_ccds(
-            telescope.surfaces[-1], focal_plane, last.position, last.direction, index=float(index[-2])
-        )
+        index = float(refractive_indices(telescope, rays.wavelength)[-2])
+        landing = land_on_ccds(telescope.surfaces[-1], focal_plane, last.position, last.direction, index=index)
         results[-1] = TraceResult(
             last.surface,
             landing.position,

@@ -335,3 +335,29 @@ def test_arrays_cannot_be_changed():
     fp = FocalPlane.from_budget("lsst", seed=1)
     with pytest.raises(ValueError, match="read-only"):
         fp.polynomial[0, 0] = 1.0
+
+
+def test_a_moved_raft_is_a_rigid_body_and_nothing_else_moves():
+    camera = lsst_camera()
+    plane = FocalPlane.from_budget(camera, seed=3)
+    moved = plane.with_moved("R21", dz=5e-6, rx=1e-4, ry=-2e-4)
+    inside = [camera.ccd_index(n) for n in camera.ccds_of_raft("R21")]
+    centre = camera.centers[inside].mean(axis=0)
+    rng = np.random.default_rng(0)
+    x, y = (camera.centers + rng.uniform(-0.9, 0.9, (189, 2)) * camera.half_size).T
+    change = moved.height(x, y) - plane.height(x, y)
+    # A point at (dx, dy) of a plane turned by rx about x and ry about y rises by dy tan rx - dx tan ry.
+    expected = 5e-6 + (y - centre[1]) * np.tan(1e-4) - (x - centre[0]) * np.tan(-2e-4)
+    outside = np.setdiff1d(np.arange(189), inside)
+    assert np.abs(change[inside] - expected[inside]).max() < 1e-18
+    assert (change[outside] == 0.0).all()
+    one = plane.with_moved("R21_S11", dz=1e-6)
+    assert (one.height(*camera.centers.T) != plane.height(*camera.centers.T)).sum() == 1
+
+
+def test_moves_of_unknown_rafts_and_by_no_number_are_refused():
+    plane = FocalPlane.flat()
+    with pytest.raises(UnknownNameError, match="R00"):
+        plane.with_moved("R00", dz=1e-6)
+    with pytest.raises(DomainError, match=r"R22 dz = nan: expected one finite number"):
+        plane.with_moved("R22", dz=np.nan)

@@ -179,7 +179,7 @@ surfaces:
 def test_unknown_names_offer_the_nearest():
     with pytest.raises(UnknownNameError, match=r"unknown telescope 'lsst_v3\.3_R2': did you mean lsst_v3\.3_r"):
         load_telescope("lsst_v3.3_R2")
-    with pytest.raises(UnknownNameError, match=r"expected one of lsst_v3\.3_u"):
+    with pytest.raises(UnknownNameError, match=r"expected one of \d+ names such as lsst_v3\.3_u"):
         load_telescope("hubble")
 
 
@@ -187,7 +187,7 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
     with pytest.raises(PrescriptionError, match=r"^nowhere/mine\.yaml: no such file$"):
         load_telescope("nowhere/mine.yaml")
     with pytest.raises(PrescriptionError, match=r"expected a prescription file that ends in \.yaml"):
-        load_telescope(tmp_path / "lens.zmx")
+        load_telescope(tmp_path / "lens.txt")
     (tmp_path / "folder.yaml").mkdir()
     with pytest.raises(PrescriptionError, match="cannot be read"):
         load_telescope(tmp_path / "folder.yaml")
@@ -218,7 +218,7 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
         (
             "type: mirror",
             "type: mirrr",
-            "type = 'mirrr': expected one of mirror, refract, detector (did you mean mirror?)",
+            "type = 'mirrr': expected one of mirror, refract, detector, baffle",
         ),
         ("medium: silica", "medium: silca", "surfaces[L1_entrance].medium = 'silca': expected one of vacuum, silica"),
         ("medium: vacuum", "medium: [1]", "surfaces[L1_exit].medium = [1]: expected a text"),
@@ -237,7 +237,7 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
         (
             "launch_distance: 15.0",
             "lunch_distance: 15",
-            "unknown key lunch_distance = 15: did you mean launch_distance?",
+            "unknown key lunch_distance = 15: did you mean launch_distance",
         ),
         ("length: m,", "length: inch,", "units.length = 'inch': expected one of m, mm"),
         ("obscuration: 0.612", "obscuration: 1.5", "pupil_obscuration = 1.5: expected 0 <= value < 1"),
@@ -253,7 +253,7 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
         (
             "silica: {B: [0.69618302, ",
             "silica: {B: [",
-            "media.silica.B = [0.407925877, 0.897464057]: expected a list of 3",
+            "media.silica.B = (0.407925877, 0.897464057): expected 3",
         ),
         ("silica: {B", "vacuum: {B", "media.vacuum = "),
         ("default: 0.624", "default: 6.24", "default_wavelength = 6.24e-06: expected within the wavelength range"),

@@ -1,0 +1,244 @@
+"""Clear apertures of a surface: discs, rings, rectangles, polygons, spider vanes, and what set algebra makes of them.
+
+An aperture is the region of a surface's own x, y that light passes. What blocks light leaves its :class:`Complement`
+clear: ``Complement(Circle(1.1))`` for a camera body, ``Complement(Union((vane, vane, vane, vane)))`` for a spider. Each
+class says to which side its rim counts; for a complement it is the other side.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .errors import PrescriptionError
+
+
+def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(x, dtype=np.float64) - centre_x, np.asarray(y, dtype=np.float64) - centre_y
+
+
+def _turned(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return coordinates along axes turned by an angle [rad] from x towards y."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return x * cosine + y * sine, y * cosine - x * sine
+
+
+@dataclass(frozen=True)
+class Circle:
+    """Clear disc of the surface's own x, y [m]; its rim is not clear."""
+
+    radius: float
+    x: float = 0.0
+    y: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.radius) and self.radius > 0 and np.isfinite(self.x) and np.isfinite(self.y)):
+            raise PrescriptionError(f"circle = {self.radius!r} m: expected a positive radius and finite centre")
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies in the clear region."""
+        dx, dy = _shifted(x, y, self.x, self.y)
+        return dx**2 + dy**2 < self.radius**2
+
+
+@dataclass(frozen=True)
+class Annulus:
+    """Clear ring of the surface's own x, y [m]; its inner rim is clear, its outer is not."""
+
+    inner: float
+    outer: float
+    x: float = 0.0
+    y: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.inner < self.outer < np.inf and np.isfinite(self.x) and np.isfinite(self.y)):
+            raise PrescriptionError(
+                f"annulus = [{self.inner!r}, {self.outer!r}] m: expected 0 <= inner < outer and finite centre"
+            )
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies in the clear region."""
+        dx, dy = _shifted(x, y, self.x, self.y)
+        r2 = dx**2 + dy**2
+        return (r2 >= self.inner**2) & (r2 < self.outer**2)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Rectangle of a width along x and a height along y [m], turned by `angle` [rad] from x towards y; no rim."""
+
+    width: float
+    height: float
+    x: float = 0.0
+    y: float = 0.0
+    angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.width < np.inf and 0 < self.height < np.inf):
+            raise PrescriptionError(f"rectangle = [{self.width!r}, {self.height!r}] m: expected two positive lengths")
+        if not all(np.isfinite(v) for v in (self.x, self.y, self.angle)):
+            raise PrescriptionError(
+                f"rectangle at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle"
+            )
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies inside."""
+        along, across = _turned(*_shifted(x, y, self.x, self.y), self.angle)
+        return (np.abs(along) < 0.5 * self.width) & (np.abs(across) < 0.5 * self.height)
+
+
+@dataclass(frozen=True)
+class Vane:
+    """Strip of a width [m] from a point outwards, towards `angle` [rad] from x towards y, without end; no rim.
+
+    With ``both_ways`` it runs through the point to the other side as well.
+    """
+
+    width: float
+    x: float = 0.0
+    y: float = 0.0
+    angle: float = 0.0
+    both_ways: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.width < np.inf:
+            raise PrescriptionError(f"vane = {self.width!r} m: expected a positive width")
+        if not all(np.isfinite(v) for v in (self.x, self.y, self.angle)):
+            raise PrescriptionError(
+                f"vane from ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite point and angle"
+            )
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies inside."""
+        along, across = _turned(*_shifted(x, y, self.x, self.y), self.angle)
+        beside = np.abs(across) < 0.5 * self.width
+        return beside if self.both_ways else beside & (along > 0.0)
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """Polygon of at least three corners (x, y) [m] in either sense; the last is joined to the first.
+
+    Rims count half: of two polygons that share an edge, one contains it.
+    """
+
+    corners: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        corners = self.corners
+        if len(corners) < 3 or any(len(c) != 2 for c in corners) or not np.all(np.isfinite(np.array(corners))):
+            raise PrescriptionError(f"polygon of {len(corners)} corners: expected at least three finite (x, y) pairs")
+        crossing = _crossing_edges(np.array(corners, dtype=np.float64))
+        if crossing is not None:
+            first, second = crossing
+            raise PrescriptionError(
+                f"polygon = {len(corners)} corners: edge {first + 1}, from {corners[first]}, meets edge {second + 1}, "
+                f"from {corners[second]}: expected an outline that does not touch or cross itself"
+            )
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        start = np.array(self.corners, dtype=np.float64)
+        return start, np.roll(start, -1, axis=0)
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies inside: where a line towards +x crosses the outline an odd number of times.
+
+        See Shimrat (1962), Communications of the ACM 5, 434 (algorithm 112).
+        """
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        inside = np.zeros(x.shape, dtype=bool)
+        for (ax, ay), (bx, by) in zip(*self._edges, strict=True):
+            if ay != by:
+                inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) * ((bx - ax) / (by - ay)))
+        return inside
+
+
+def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
+    """Return the first pair of edges of a closed outline [n, 2] that touch where they should not, or None."""
+    n = len(corners)
+    start, end = corners, np.roll(corners, -1, axis=0)
+
+    def side(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Return on which side of the line from a to b points lie: 1 left, -1 right, 0 on it."""
+        along, beyond = np.moveaxis(b - a, -1, 0), np.moveaxis(p - a, -1, 0)
+        return np.sign(along[0] * beyond[1] - along[1] * beyond[0])
+
+    def beside(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Return whether a point of the line through a and b lies between them."""
+        return np.all((p >= np.minimum(a, b)) & (p <= np.maximum(a, b)), axis=-1)
+
+    for i in range(n):
+        if np.array_equal(start[i], end[i]):
+            return i, (i + 1) % n
+        # An edge and the next share a corner; they cross only where the next runs back over it.
+        j = (i + 1) % n
+        forward = (end[i] - start[i]) @ (end[j] - start[j])
+        if side(start[i], end[i], end[j]) == 0 and forward < 0:
+            return i, j
+        others = np.array([k for k in range(i + 2, n) if (k + 1) % n != i], dtype=int)
+        a, b, c, d = start[i], end[i], start[others], end[others]
+        one, two, three, four = side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b)
+        meet = (one * two < 0) & (three * four < 0)
+        meet |= (one == 0) & beside(a, b, c) | (two == 0) & beside(a, b, d)
+        meet |= (three == 0) & beside(c, d, a) | (four == 0) & beside(c, d, b)
+        if np.any(meet):
+            return i, int(others[np.argmax(meet)])
+    return None
+
+
+@dataclass(frozen=True)
+class Union:
+    """Points of at least one of several regions."""
+
+    parts: tuple[Aperture, ...]
+
+    def __post_init__(self) -> None:
+        _check_parts("union", self.parts)
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies in at least one part."""
+        return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
+
+
+@dataclass(frozen=True)
+class Intersection:
+    """Points of every one of several regions."""
+
+    parts: tuple[Aperture, ...]
+
+    def __post_init__(self) -> None:
+        _check_parts("intersection", self.parts)
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] lies in every part."""
+        return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
+
+
+@dataclass(frozen=True)
+class Complement:
+    """Points outside a region: what an obscuration leaves clear."""
+
+    part: Aperture
+
+    def __post_init__(self) -> None:
+        _check_parts("complement", (self.part,))
+
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return True where (x, y) [m] does not lie in the region."""
+        return np.logical_not(self.part.contains(x, y))
+
+
+Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
+
+
+def _check_parts(name: str, parts: tuple[Aperture, ...]) -> None:
+    if not isinstance(parts, tuple) or not parts:
+        raise PrescriptionError(f"{name} = {parts!r}: expected a tuple of at least one region")
+    for part in parts:
+        if not isinstance(part, Aperture):
+            raise PrescriptionError(f"{name} of {part!r}: expected a Circle, Annulus, Rectangle, Vane, Polygon or set")

@@ -1,0 +1,189 @@
+"""Annular Zernike polynomials in Noll order, orthonormal over an annulus.
+
+Mahajan (1981), J. Opt. Soc. Am. 71, 75: the radial polynomials for azimuthal order m are those of degree m, m + 2, ...
+made orthogonal over eps <= rho <= 1. They are built here by a QR factorisation on Gauss-Legendre nodes, which is exact
+for polynomials and needs no recursion; for eps = 0 they are Noll's (1976, J. Opt. Soc. Am. 66, 207).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from .errors import DomainError
+
+#: Names of the first terms, as optical shops call them.
+NOLL_NAMES = {
+    1: "piston",
+    2: "tilt x",
+    3: "tilt y",
+    4: "defocus",
+    5: "astigmatism 45",
+    6: "astigmatism 0",
+    7: "coma y",
+    8: "coma x",
+    9: "trefoil y",
+    10: "trefoil x",
+    11: "spherical",
+}
+
+
+def noll_to_nm(j: int) -> tuple[int, int]:
+    """Return radial degree n and signed azimuthal order m of Noll index j (m < 0: sine)."""
+    if int(j) != j or j < 1:
+        raise DomainError(f"Noll index = {j!r}: expected a whole number of at least 1")
+    n = int((np.sqrt(8 * j - 7) - 1) / 2)
+    k = j - n * (n + 1) // 2
+    m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k + 1) // 2) - 1
+    return n, m if j % 2 == 0 else -m
+
+
+@lru_cache(maxsize=64)
+def _radial_coefficients(m: int, count: int, obscuration: float) -> np.ndarray:
+    """Coefficients [count, count] of rho^m times powers of rho^2, unit mean square over the annulus (m = 0)."""
+    # In s = rho^2 the annulus has the constant weight ds / (1 - eps^2); degree 2(count - 1) + m is exact.
+    nodes, weights = np.polynomial.legendre.leggauss(count + m + 1)
+    low = obscuration**2
+    s = 0.5 * (1 - low) * nodes + 0.5 * (1 + low)
+    root = np.sqrt(0.5 * weights)
+    # Legendre polynomials over the interval keep the factorisation well conditioned for thin annuli.
+    basis = np.polynomial.legendre.legvander(nodes, count - 1) * (s ** (m / 2))[:, None] * root[:, None]
+    _, upper = np.linalg.qr(basis)
+    signs = np.sign(np.diag(upper))
+    return np.linalg.inv(upper * signs[:, None])
+
+
+def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
+    """Evaluate annular Zernike polynomials 1 ... jmax, orthonormal over the annulus (mean square one).
+
+    Parameters
+    ----------
+    jmax : int
+        Highest Noll index.
+    x, y : ndarray
+        Pupil coordinates in units of the outer radius, one shape.
+    obscuration : float
+        Inner over outer radius, 0 <= obscuration < 1.
+
+    Returns
+    -------
+    ndarray, shape [jmax, ...]
+
+    Raises
+    ------
+    DomainError
+        If the obscuration or the index is out of range.
+    """
+    x, y, s, low = _annulus(x, y, obscuration)
+    theta = np.arctan2(y, x)
+    nodes = (2 * s - 1 - low) / (1 - low)
+    orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
+    radial: dict[int, np.ndarray] = {}
+    for m, top in _radial_degrees(orders).items():
+        powers = np.polynomial.legendre.legvander(nodes, top) * (s ** (m / 2))[..., None]
+        radial[m] = powers @ _radial_coefficients(m, top + 1, float(obscuration))
+    out = np.empty((jmax, *x.shape))
+    for row, (n, m) in enumerate(orders):
+        r = radial[abs(m)][..., (n - abs(m)) // 2]
+        if m == 0:
+            out[row] = r
+        elif m > 0:
+            out[row] = np.sqrt(2.0) * r * np.cos(m * theta)
+        else:
+            out[row] = np.sqrt(2.0) * r * np.sin(-m * theta)
+    return out
+
+
+def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
+    """Evaluate the gradients of annular Zernike polynomials 1 ... jmax.
+
+    A term is a polynomial in ``x^2 + y^2`` times the real or imaginary part of ``(x + iy)^m``, and is differentiated as
+    such: the result is exact, at the centre too.
+
+    Parameters
+    ----------
+    jmax : int
+        Highest Noll index.
+    x, y : ndarray
+        Pupil coordinates in units of the outer radius, one shape.
+    obscuration : float
+        Inner over outer radius, 0 <= obscuration < 1.
+
+    Returns
+    -------
+    ndarray, shape [jmax, 2, ...]
+        Derivatives along x and y, per outer radius.
+
+    Raises
+    ------
+    DomainError
+        If the obscuration or the index is out of range.
+    """
+    x, y, s, low = _annulus(x, y, obscuration)
+    nodes = (2 * s - 1 - low) / (1 - low)
+    orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
+    columns: dict[int, np.ndarray] = {}
+    for m, top in _radial_degrees(orders).items():
+        columns[m] = _radial_coefficients(m, top + 1, float(obscuration))
+    z = x + 1j * y
+    out = np.empty((jmax, 2, *x.shape))
+    for row, (n, signed) in enumerate(orders):
+        m = abs(signed)
+        series = columns[m][:, (n - m) // 2]
+        value = np.polynomial.legendre.legval(nodes, series)
+        # d/dx = 2x d/ds and d/dy = 2y d/ds of the radial part
+        slope = np.polynomial.legendre.legval(nodes, np.polynomial.legendre.legder(series)) * (4.0 / (1 - low))
+        # (x + iy)^m and its derivative along x; the one along y is i times that.
+        power, change = z**m, m * z ** max(m - 1, 0)
+        along_x, along_y = value * change + slope * x * power, 1j * value * change + slope * y * power
+        scale = 1.0 if m == 0 else np.sqrt(2.0)
+        for axis, derivative in enumerate((along_x, along_y)):
+            out[row, axis] = scale * (derivative.imag if signed < 0 else derivative.real)
+    return out
+
+
+def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
+    """Return the radial polynomials of azimuthal order m as powers of rho^2, what stands beside rho^m.
+
+    Parameters
+    ----------
+    m : int
+        Azimuthal order, not negative.
+    count : int
+        How many, from degree m upwards in steps of two.
+    obscuration : float
+        Inner over outer radius, 0 <= obscuration < 1.
+
+    Returns
+    -------
+    ndarray, shape [count, count]
+        Coefficient of ``rho^(2 k)`` (row) of each polynomial (column).
+    """
+    if not 0 <= obscuration < 1:
+        raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
+    low = obscuration**2
+    # Legendre polynomials of (2 rho^2 - 1 - low) / (1 - low), one a column, by powers of rho^2.
+    node = np.polynomial.Polynomial([-(1 + low) / (1 - low), 2 / (1 - low)])
+    powers = np.zeros((count, count))
+    for degree in range(count):
+        series = np.polynomial.legendre.leg2poly([0.0] * degree + [1.0])
+        expanded = np.polynomial.Polynomial(series)(node)
+        powers[: degree + 1, degree] = expanded.coef
+    return powers @ _radial_coefficients(m, count, float(obscuration))
+
+
+def _annulus(x: np.ndarray, y: np.ndarray, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the coordinates as arrays of one shape, the square of the radius, and that of the inner rim."""
+    if not 0 <= obscuration < 1:
+        raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+    return x, y, x * x + y * y, obscuration**2
+
+
+def _radial_degrees(orders: list[tuple[int, int]]) -> dict[int, int]:
+    """Return how many radial polynomials, less one, each azimuthal order |m| needs."""
+    degrees: dict[int, int] = {}
+    for n, m in orders:
+        degrees[abs(m)] = max(degrees.get(abs(m), 0), (n - abs(m)) // 2)
+    return degrees

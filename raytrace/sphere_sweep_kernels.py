@@ -1,0 +1,122 @@
+"""The forward sweep to a reference sphere and the way back, packet by packet, while the packet is at hand.
+
+A module of its own: with one caller of the surface loop in a module the compiler puts all of it in line.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from .adjoint_kernels import INDEX, polynomial_response
+from .gradient_kernels import BACK_LOOPS
+from .launch import FORWARD_OPTIONS, kernel_pair
+from .packet import lane_flags, lanes, lanes_sqrt
+from .surface_kernels import ONE, ZERO
+from .trace_kernels import LOOPS, PackedSurfaces, statuses
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+#: Rows that this sweep adds: the path beyond that of the chief ray [m], and its derivative by the landing point (3).
+SPHERE_ROWS = 4
+
+
+@kernel_pair
+def sweep_sphere(special: bool, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that sweeps to the sphere and back."""
+    through_telescope = LOOPS[special]
+    back_through = BACK_LOOPS[special]
+
+    @wp.kernel(module=module)
+    def sweep_sphere(
+        first: wp.int32,
+        surfaces: PackedSurfaces,
+        indices: wp.array2d(dtype=wp.float64),
+        media: wp.array(dtype=wp.float64),
+        n_items: wp.int32,
+        start: wp.array2d(dtype=lanes),
+        start_direction: wp.array2d(dtype=lanes),
+        reference: wp.array2d(dtype=lanes),
+        radius: wp.float64,
+        position: wp.array3d(dtype=lanes),
+        direction: wp.array3d(dtype=lanes),
+        path_kept: wp.array2d(dtype=lanes),
+        status_kept: wp.array2d(dtype=lane_flags),
+        rows: wp.array2d(dtype=wp.int32),
+        polynomials: wp.array2d(dtype=wp.int32),
+        scales: wp.array(dtype=wp.float64),
+        sphere_row: wp.int32,
+        response: wp.array3d(dtype=lanes),
+        status_out: wp.array(dtype=lane_flags),
+    ):
+        """Sweep one of ``n_items`` equal parts of the packets; a packet's rays overwrite those of the one before.
+
+        ``reference`` holds, ray by ray, the centre of its sphere and the path of its chief ray to that [m]; the rows
+        that the sweep adds begin with ``sphere_row``.
+        """
+        item = first + wp.tid()
+        count = start.shape[1]
+        n_surfaces = surfaces.kinds.shape[0]
+        n = media[n_surfaces - 1]
+        for p in range(count * item / n_items, count * (item + 1) / n_items):
+            x, y, z, u, v, w, path, status = through_telescope(
+                surfaces,
+                indices,
+                0,
+                start[0, p],
+                start[1, p],
+                start[2, p],
+                start_direction[0, p],
+                start_direction[1, p],
+                start_direction[2, p],
+                lanes(ZERO),
+                item,
+                position,
+                direction,
+                path_kept,
+                status_kept,
+            )
+            status_out[p] = statuses(status)
+            x = x - reference[0, p]
+            y = y - reference[1, p]
+            z = z - reference[2, p]
+            # Beyond the image the sphere is at root - q.d, with root = sqrt((q.d)^2 - q.q + R^2).
+            along = wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
+            square = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+            root = lanes_sqrt(wp.cw_mul(along, along) - square + lanes(radius * radius))
+            ahead = root - along
+            ratio = wp.cw_div(along, root) - lanes(ONE)
+            ax = n * (wp.cw_mul(ratio, u) - wp.cw_div(x, root))
+            ay = n * (wp.cw_mul(ratio, v) - wp.cw_div(y, root))
+            az = n * (wp.cw_mul(ratio, w) - wp.cw_div(z, root))
+            response[0, sphere_row, p] = path + n * ahead - reference[3, p]
+            response[0, sphere_row + 1, p] = ax
+            response[0, sphere_row + 2, p] = ay
+            response[0, sphere_row + 3, p] = az
+            back_through(
+                surfaces,
+                media,
+                start,
+                start_direction,
+                position,
+                direction,
+                item,
+                ONE,
+                ax,
+                ay,
+                az,
+                n * wp.cw_mul(ratio, x),
+                n * wp.cw_mul(ratio, y),
+                n * wp.cw_mul(ratio, z),
+                rows,
+                0,
+                p,
+                response,
+            )
+            row = rows[n_surfaces - 1, INDEX]
+            if row >= 0:
+                # The index in front of the last surface acts up to the sphere.
+                response[0, row, p] = response[0, row, p] + ahead
+            for j in range(scales.shape[0]):
+                polynomial_response(polynomials, scales[j], j, 0, p, response)
+
+    return sweep_sphere
