@@ -25,7 +25,7 @@ from ..models.errors import DomainError
 from ..models.random_streams import stream
 from ..models.telescope import Telescope
 from ..models.units import metres
-from .zernike import annular_zernike_gradients, annular_zernikes, noll_to_nm
+from ..models.zernike_polynomials import annular_zernike_gradients, annular_zernikes, noll_to_nm
 
 #: Accuracy that Jee & Tyson (2011) quote for the LSST's active optics [m].
 PAPER_RMS = 0.2e-6

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,6 @@ DEFAULT_CUTOFF = 1.4
 #: Distance over which rays feel the slope of the low screens [m]: a gradient proper lets waves of a metre bend light
 #: more than they do where it interferes over baselines of some tenths of a metre.
 SLOPE_LAG = 0.2
-_SCALES = ("low", "high")
 # Beyond these a slip of the pen would fill the memory: 10 million steps, screens of 17 GB.
 _MOST_STEPS = 10_000_000
 _LARGEST_SIZE = 65536
@@ -191,7 +190,7 @@ class Atmosphere:
         for array in (height, fraction, velocities, offsets, times):
             array.setflags(write=False)
         size = _size(screen_size, "screen_size")
-        # Up to half the Nyquist limit: beyond, slopes read off a patch of four samples say little of where they are.
+        # Up to half the Nyquist limit: rays read slopes at the nearest sample, then at most an eighth of a wave away.
         split = min(DEFAULT_CUTOFF / fried, 0.5 * math.pi * size / length)
         atmosphere = cls(
             altitudes=height,
@@ -371,6 +370,62 @@ class Atmosphere:
                 self._cache[kind] = screens
             return self._cache[kind]
 
+    def seen_at(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
+        """Return the same air seen at other times: an atmosphere that shares the kept screens with this one.
+
+        Screens that either has made are kept for both, and :meth:`release` of either forgets them for both.
+
+        Parameters
+        ----------
+        times : array_like
+            Middles of equal time steps [s], rising.
+        exposure : float, optional
+            Length of the new exposure [s]; by default as many of this one's time steps as there are times.
+
+        Raises
+        ------
+        DomainError
+            If the times are not the middles of equal steps of the exposure, or a layer drifts farther in it than its
+            screen is long.
+        """
+        middles = np.array(times, dtype=np.float64)
+        if middles.ndim != 1 or len(middles) == 0 or not np.all(np.isfinite(middles)):
+            raise DomainError(f"times of shape {middles.shape}: expected a list of finite times in seconds")
+        if exposure is None:
+            exposure = self.exposure / len(self.times) * len(middles)
+        exposure = require_positive(exposure, "exposure", "seconds")
+        step = exposure / len(middles)
+        if not np.allclose(np.diff(middles), step, rtol=1e-6, atol=0.0):
+            raise DomainError(f"times: expected the middles of {len(middles)} equal steps of {step:g} s, rising")
+        check_drift(self.altitudes, np.hypot(*self.velocities.T), exposure, self.screen_length)
+        middles.setflags(write=False)
+        return self._through_the_same_screens(exposure=exposure, times=middles)
+
+    def at_altitudes(self, altitudes: ArrayLike) -> Atmosphere:
+        """Return the same layers at other altitudes: an atmosphere that shares the kept screens with this one.
+
+        Parameters
+        ----------
+        altitudes : array_like, shape [n_layer]
+            Distances of the layers along the line of sight [m].
+
+        Raises
+        ------
+        DomainError
+            If there are not as many as layers, or one is negative or not finite.
+        """
+        heights = np.array(altitudes, dtype=np.float64)
+        if heights.shape != self.altitudes.shape or not np.all(np.isfinite(heights) & (heights >= 0.0)):
+            raise DomainError(f"altitudes = {altitudes!r}: expected {self.layer_count} distances of 0 m or more")
+        heights.setflags(write=False)
+        return self._through_the_same_screens(altitudes=heights)
+
+    def _through_the_same_screens(self, **changes: Any) -> Atmosphere:
+        """Return a changed atmosphere that shares the kept screens: nothing that decides them may change."""
+        other = replace(self, **changes)
+        object.__setattr__(other, "_cache", self._cache)
+        return other
+
     def release(self) -> None:
         """Forget the kept screens; they come back, byte for byte, when next asked for."""
         with _cache_lock:
@@ -438,10 +493,11 @@ class Atmosphere:
         ndarray
             Path [m], float64, shape of ``x``.
         """
-        if scale not in _SCALES:
-            raise unknown_name("scale", scale, _SCALES)
+        scales = {"low": (self.low_screen, self.screen_pixel), "high": (self.high_screen, self.fine_pixel)}
+        if scale not in scales:
+            raise unknown_name("scale", scale, tuple(scales))
+        make, pixel = scales[scale]
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-        make, pixel = {"low": (self.low_screen, self.screen_pixel), "high": (self.high_screen, self.fine_pixel)}[scale]
         return evaluate(make(layer), pixel, x, y)
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from ..models.errors import DomainError
 from ..models.telescope import Telescope
 from ..raytrace.launch import launch
-from ..raytrace.packed import pack_surfaces, refractive_indices
+from ..raytrace.packed import clear_ring, pack_surfaces, refractive_indices
 from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
 from ..raytrace.trace_kernels import trace_rays
 from .clear_pupil_kernels import find_edges
@@ -89,7 +89,8 @@ def clear_edges(
 ) -> np.ndarray:
     """Return between which radii of the entrance pupil light passes all apertures.
 
-    On each spoke the clear part is taken to be one piece, as it is where apertures are discs and rings about the light.
+    On each spoke the clear part is taken to be one piece, as it is where apertures are discs and rings about the light:
+    spiders, other apertures and obstructions are refused.
 
     Parameters
     ----------
@@ -108,7 +109,13 @@ def clear_edges(
     -------
     ndarray, shape [n_star, n_spoke, 2]
         Inner and outer radius [m]; equal where a spoke is dark.
+
+    Raises
+    ------
+    DomainError
+        If something other than discs and rings stops the light.
     """
+    _check_rings(telescope)
     n_star, n_spoke = len(direction), len(unit)
     outer = 0.5 * telescope.pupil_diameter
     radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
@@ -153,3 +160,13 @@ def clear_edges(
         threads=threads,
     )
     return edges
+
+
+def _check_rings(telescope: Telescope) -> None:
+    other = [f"the aperture of {s.name}" for s in telescope.surfaces if clear_ring(s.aperture) is None]
+    other += [f"the obstruction {o.name}" for o in telescope.obstructions]
+    if other:
+        raise DomainError(
+            f"engine = 'long_exposure': expected nothing but discs and rings to stop light; {telescope.name} has "
+            f"{other[0]}{f' and {len(other) - 1} more' if other[1:] else ''} (use engine = 'fast' or 'wave')"
+        )

@@ -90,10 +90,10 @@ def find_edges(
             b = squared_distance(surfaces, s, position, ray + n_spoke)
             c = squared_distance(surfaces, s, position, ray + 2 * n_spoke)
             missed = a != a or b != b or c != c
-            low, high = within(a, b, c, surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3])
+            rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
+            low, high = within(a, b, c, rim)
             if missed:
                 # Rays that miss a surface pass beyond its rim: what is clear ends before the first of them.
-                rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
                 low = wp.float64(0.0)
                 high = wp.float64(0.0)
                 if a < rim:

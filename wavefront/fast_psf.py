@@ -230,14 +230,16 @@ class FastPsfEngine:
             aberration=self._aberration,
         )
         n_star, n = len(fields), self._grid_size
-        deposit = self._deposit(optics)
+        light = optics.lit * self._weights
+        deposit = self._deposit(optics, light)
         # One transform a star, so that its bytes do not depend on its neighbours.
         spectra = np.empty((*deposit.shape[:-1], n // 2 + 1), dtype=np.complex64)
         self._for_each(n_star, lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])))
         combined = self._combine(spectra, optics, offsets)
         n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
-        rays = np.maximum(optics.lit.sum(axis=(1, 2)), 1) * n_time
-        stamps = self._stamps(combined, rays)
+        # A dark star has no light to divide by.
+        total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * n_time
+        stamps = self._stamps(combined, total)
         if recenter is not None:
             shift = recenter(stamps)
             offsets = offsets - shift
@@ -245,11 +247,11 @@ class FastPsfEngine:
             turn = 1j * self._plane.pixel_size * shift[:, :, None]
             combined *= np.exp(turn[:, 1] * self._ky).astype(np.complex64)[:, :, None]
             combined *= np.exp(turn[:, 0] * self._kx).astype(np.complex64)[:, None, :]
-            stamps = self._stamps(combined, rays)
+            stamps = self._stamps(combined, total)
         return RenderedStars(stamps, optics.lit.mean(axis=2), optics.reference, offsets)
 
-    def _stamps(self, combined: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Return the stamps of transforms of the fine grid, shape [n_star, stamp_size, stamp_size]."""
+    def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""
         n, side = self._grid_size, self._plane.stamp_size
         span = slice(0, side * self._oversampling, self._oversampling)
         stamps = np.empty((len(combined), side, side))
@@ -257,15 +259,15 @@ class FastPsfEngine:
             len(combined), lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span])
         )
         # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
-        stamps *= (self._oversampling**2 / rays)[:, None, None]
+        stamps *= (self._oversampling**2 / light)[:, None, None]
         return stamps
 
     def _for_each(self, count: int, job: Callable[[int], None]) -> None:
         with ThreadPoolExecutor(thread_count(self._threads)) as pool:
             list(pool.map(job, range(count)))
 
-    def _deposit(self, optics: PupilOptics) -> np.ndarray:
-        """Return the rays of each star binned on the fine grid, shape [n_star, n_wave, grid_size, grid_size]."""
+    def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
+        """Return the rays of each star, with their light, on the fine grid, [n_star, n_wave, grid_size, grid_size]."""
         n_star, n_wave = optics.lit.shape[:2]
         atmosphere = self._atmosphere
         if atmosphere is None:
@@ -299,7 +301,7 @@ class FastPsfEngine:
                 int(max(column.max(), row.max())) + 1,
                 shared(cells_per_slope.astype(np.float32), wp.float32),
                 shared(displacement, samples),
-                shared(to_packets(optics.lit * self._weights, np.float32, fill="constant"), samples),
+                shared(to_packets(light, np.float32, fill="constant"), samples),
                 self._grid_size,
                 wp.empty((n_star, len(lattice), 2), dtype=samples, device="cpu"),
                 shared(image, wp.float32),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,9 +12,14 @@ from ..models.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..models.units import metres, radians
 from ..raytrace.packed import refractive_indices
-from ..raytrace.rays import RayStatus, launch_rays
+from ..raytrace.rays import RayStatus, field_direction, launch_rays
 from ..raytrace.trace import trace
-from .reference import distance_to_sphere
+from .reference import distance_to_sphere, reference_spheres
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from .zernike import ZernikeFit
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,33 @@ class OpdMap:
         """Highest minus lowest value over the lit points [m]."""
         return float(np.ptp(self.value[self.lit]))
 
+    @property
+    def without_tilt(self) -> np.ndarray:
+        """The map [m] less the piston and the tilts that fit its lit points best."""
+        if not self.lit.any():
+            raise DomainError(f"field = {self.field}: no light passes; expected a lit pupil")
+        plane = np.stack([np.ones_like(self.x), self.x, self.y], axis=-1)
+        terms, *_ = np.linalg.lstsq(plane[self.lit], self.value[self.lit], rcond=None)
+        return self.value - plane @ terms
+
+    def plot(self, zernikes: ZernikeFit | None = None, name: str = "") -> Figure:
+        """Draw the map, which must be on a square grid, with and without piston and tilt.
+
+        Parameters
+        ----------
+        zernikes : ZernikeFit, optional
+            Zernike terms to draw as bars below.
+        name : str
+            Name of the telescope, for the title.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        from .opd_picture import opd_figure
+
+        return opd_figure(self, zernikes, name)
+
 
 def pupil_grid(diameter: float, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the centres of n x n cells that tile the square about the entrance pupil, [y, x] order [m]."""
@@ -79,6 +111,34 @@ def pupil_grid(diameter: float, n: int) -> tuple[np.ndarray, np.ndarray]:
     u = ((np.arange(int(n)) + 0.5) / int(n) - 0.5) * diameter
     x, y = np.meshgrid(u, u)
     return x, y
+
+
+def pupil_points(
+    telescope: Telescope, pupil: tuple[Any, Any] | None, grid: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return entrance-pupil coordinates [m] as given, or those of a square grid, of 64 cells if neither is given.
+
+    Raises
+    ------
+    ConfigError
+        If both are given.
+    """
+    if pupil is not None and grid is not None:
+        raise ConfigError("pupil and grid are both given: expected one of them")
+    if pupil is None:
+        return pupil_grid(telescope.pupil_diameter, 64 if grid is None else grid)
+    x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
+    return x, y
+
+
+def sphere_radius_of(telescope: Telescope, sphere_radius: Any) -> float:
+    """Return the radius of the reference sphere [m]: the one given, or the telescope's own."""
+    if sphere_radius is None:
+        return telescope.reference_sphere_radius
+    radius = float(metres(sphere_radius, "sphere_radius"))
+    if not radius > 0:
+        raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
+    return radius
 
 
 def wavefront_opd(
@@ -137,45 +197,33 @@ def wavefront_opd(
     """
     if reference not in ("chief", "mean"):
         raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
-    if pupil is not None and grid is not None:
-        raise ConfigError("pupil and grid are both given: expected one of them")
-    if pupil is None:
-        x, y = pupil_grid(telescope.pupil_diameter, 64 if grid is None else grid)
-    else:
-        x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
-    radius = telescope.reference_sphere_radius
-    if sphere_radius is not None:
-        radius = float(metres(sphere_radius, "sphere_radius"))
-        if not radius > 0:
-            raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
-
-    # The chief ray goes last so that its packet cannot shift those of the map.
-    rays = launch_rays(telescope, field, wavelength, (np.append(x.ravel(), 0.0), np.append(y.ravel(), 0.0)), projection)
+    x, y = pupil_points(telescope, pupil, grid)
+    radius = sphere_radius_of(telescope, sphere_radius)
+    rays = launch_rays(telescope, field, wavelength, (x, y), projection)
+    angles = np.array([float(radians(field[0], "field x")), float(radians(field[1], "field y"))])
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
-    lit = (end.status[:-1] == RayStatus.OK) | (end.status[:-1] == RayStatus.GAP)
+    lit = (end.status == RayStatus.OK) | (end.status == RayStatus.GAP)
     if reference == "chief":
-        center = np.array(end.position[-1])
-        if end.status[-1] in (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED):
-            raise DomainError(f"field = {field!r}: the chief ray does not reach the image; use reference='mean'")
-        if end.ccd is not None and end.ccd[-1] < 0:
-            raise DomainError(f"field = {field!r}: the chief ray lands between the CCDs; expected a point on a CCD")
+        direction = field_direction(angles[0], angles[1], projection)[None]
+        chief = reference_spheres(telescope, angles[None], direction, rays.wavelength, radius, focal_plane, threads)
+        center = chief.center[0]
     else:
         if not lit.any():
             raise DomainError(f"field = {field!r}: no ray reaches the image")
-        center = end.position[:-1][lit].mean(axis=0)
+        center = end.position[lit].mean(axis=0)
     index = refractive_indices(telescope, rays.wavelength)[-2]
     path = end.path_length + index * distance_to_sphere(end.position, end.direction, center, radius)
-    zero = path[-1] if reference == "chief" else path[:-1][lit].mean()
-    value = np.where(lit, zero - path[:-1], np.nan)
+    zero = chief.path[0] if reference == "chief" else path[lit].mean()
+    value = np.where(lit, zero - path, np.nan)
     return OpdMap(
         value=value.reshape(x.shape),
         x=x,
         y=y,
         lit=lit.reshape(x.shape),
         wavelength=rays.wavelength,
-        field=(float(radians(field[0], "field x")), float(radians(field[1], "field y"))),
+        field=(float(angles[0]), float(angles[1])),
         center=center,
         radius=radius,
-        exit_direction=end.direction[:-1].reshape(*x.shape, 3),
-        landing=end.position[:-1].reshape(*x.shape, 3),
+        exit_direction=end.direction.reshape(*x.shape, 3),
+        landing=end.position.reshape(*x.shape, 3),
     )

@@ -1,4 +1,4 @@
-"""Point spread functions of many stars, by either engine."""
+"""Point spread functions of many stars, by any of the engines."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """What the optics alone do to the light of many stars: per pupil point, where it lands and with what path.
 
-This is the optical half of a PSF. Both engines take it: the fast one uses where the rays land, the wave one their
-path. It is traced on packets straight into the few numbers that are kept, so memory does not hold the rays.
+This is the optical half of a PSF. All engines take it: the fast and the long-exposure one use where the rays land, the
+wave engine their path. It is traced on packets straight into the few numbers that are kept, so memory does not hold the
+rays.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..raytrace.launch import launch
 from ..raytrace.packed import pack_surfaces, refractive_indices
 from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
 from ..raytrace.pupil_kernels import trace_pupils as trace_pupils_kernel
-from ..raytrace.rays import Rays, RayStatus, field_direction
+from ..raytrace.rays import RayStatus, field_direction, parallel_rays
 from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
 from .reference import distance_to_sphere
@@ -73,9 +74,7 @@ def chief_rays(
     threads: int | None = None,
 ) -> Any:
     """Trace the rays through the centre of the entrance pupil in given directions; vignetting does not stop them."""
-    center = np.array([0.0, 0.0, telescope.stop_z])
-    back = directions @ center + telescope.launch_distance
-    rays = Rays(center - back[:, None] * directions, directions, np.zeros(len(directions)), wavelength)
+    rays = parallel_rays(telescope, directions, wavelength, np.zeros((1, 2)))
     return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..models.air import filippenko_refractivity
 from ..models.errors import DomainError
 from ..models.site import Weather
 from ..models.units import metres, radians
@@ -53,13 +54,9 @@ def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
         raise DomainError(
             f"wavelength = {outside[0]:g} m: expected {low:g} to {high:g} m, which the index of air covers"
         )
-    wavenumber2 = (1e-6 / lam) ** 2
-    # Eq. 1: dry air at 15 C and 760 mm Hg; eq. 2: other temperatures and pressures; eq. 3: water vapour.
-    standard = 64.328 + 29498.1 / (146.0 - wavenumber2) + 255.4 / (41.0 - wavenumber2)
-    expansion = 1.0 + 0.003661 * weather.temperature_c
-    pressure = weather.pressure_mmhg
-    density = pressure * (1.0 + (1.049 - 0.0157 * weather.temperature_c) * 1e-6 * pressure) / (720.883 * expansion)
-    return 1e-6 * (standard * density - (0.0624 - 0.000680 * wavenumber2) / expansion * weather.water_vapour_mmhg)
+    return filippenko_refractivity(
+        (1e-6 / lam) ** 2, weather.pressure_mmhg, weather.temperature_c, weather.water_vapour_mmhg
+    )
 
 
 def dispersion_shift(

@@ -228,7 +228,7 @@ def slope_screen(
     i = np.arange(reach + 1, dtype=np.float32)[:, np.newaxis] * np.float32(step)
     j = np.arange(-reach, reach + 1, dtype=np.float32) * np.float32(step)
     for first in range(0, reach + 1, _COLUMN_BLOCK):
-        # 1e-9 of a count would be enough; the sinc of NumPy is sin(pi x)/(pi x).
+        # NumPy's sinc is sin(pi x)/(pi x).
         part = slice(first, first + _COLUMN_BLOCK)
         modes[part] *= np.sinc(np.hypot(i[part], j) * (0.5 * lag / math.pi)) / unit
     columns = np.empty((2 * reach + 1, size), dtype=np.complex64)
@@ -239,22 +239,15 @@ def slope_screen(
         # The gradient along x and i times that along y, of the modes with i and of their conjugates with -i.
         for sign in (1, -1):
             here = modes[part] if sign == 1 else np.conj(modes[part, ::-1])
-            padded = np.zeros((len(here), size), dtype=np.complex64)
-            both = (1j * sign) * i[part] * here - j * here
-            padded[:, : reach + 1] = both[:, reach:]
-            if reach:
-                padded[:, -reach:] = both[:, :reach]
-            rows = np.arange(part.start, part.stop) * sign
+            padded = _in_fft_order((1j * sign) * i[part] * here - j * here, size)
+            rows = reach + np.arange(part.start, part.stop) * sign
             if sign == -1 and part.start == 0:
                 padded, rows = padded[1:], rows[1:]
             columns[rows] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
 
     def along_x(first: int) -> None:
         rows = slice(first, min(first + _ROW_BLOCK, size))
-        padded = np.zeros((rows.stop - first, size), dtype=np.complex64)
-        padded[:, : reach + 1] = columns[: reach + 1, rows].T
-        if reach:
-            padded[:, -reach:] = columns[reach + 1 :, rows].T
+        padded = _in_fft_order(columns[:, rows].T, size)
         counts = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True).view(np.float32)
         np.rint(counts, out=counts)
         np.clip(counts, -32767.0, 32767.0, out=counts)
@@ -294,19 +287,24 @@ def _modes(
     return _draw_modes(generator, amplitude, inside, fixed_modulus)
 
 
+def _in_fft_order(modes: np.ndarray, size: int) -> np.ndarray:
+    """Return rows of modes of index -reach to reach as a transform of so many samples takes them, zeros between."""
+    reach = modes.shape[1] // 2
+    padded = np.zeros((len(modes), size), dtype=np.complex64)
+    padded[:, : reach + 1] = modes[:, reach:]
+    padded[:, size - reach :] = modes[:, :reach]
+    return padded
+
+
 def _transform(modes: np.ndarray, size: int, threads: int | None, out: np.ndarray | None) -> np.ndarray:
     """Return the real field of the modes ``[i, reach + j]``, transforming only columns and rows that hold any."""
-    count = modes.shape[0]
-    reach = count - 1
+    count = len(modes)
     columns = np.empty((count, size), dtype=np.complex64)
     field = np.empty((size, size), dtype=np.float32) if out is None else out
 
     def along_y(first: int) -> None:
         part = modes[first : first + _COLUMN_BLOCK]
-        padded = np.zeros((part.shape[0], size), dtype=np.complex64)
-        padded[:, : reach + 1] = part[:, reach:]
-        if reach:
-            padded[:, -reach:] = part[:, :reach]
+        padded = _in_fft_order(part, size)
         columns[first : first + _COLUMN_BLOCK] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
 
     def along_x(first: int) -> None:

@@ -7,10 +7,10 @@ import pytest
 from astropy import units as u
 
 from pachon.models.errors import DomainError
+from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.wavefront.aberration import LINEAR_SHARE, PAPER_RMS, ResidualWavefront
 from pachon.wavefront.psf import make_psfs
 from pachon.wavefront.pupil_optics import trace_pupils
-from pachon.wavefront.zernike import annular_zernikes
 
 WAVELENGTH = np.array([620e-9])
 FIELDS = np.radians([[0.0, 0.0], [0.8, 0.9], [-1.2, 0.3]])

@@ -37,6 +37,19 @@ def test_default_atmosphere_of_the_site():
     assert np.all((atmosphere.offsets >= 0.0) & (atmosphere.offsets < 1300.0))
 
 
+def test_layers_at_other_altitudes_share_their_screens():
+    air = small_atmosphere()
+    lifted = air.at_altitudes([200.0, *air.altitudes[1:]])
+    assert lifted.kept_screens("slopes") is air.kept_screens("slopes")
+    direction = np.array([0.01, 0.0, -1.0])
+    moved = lifted.pupil_centers(direction) - air.pupil_centers(direction)
+    # A layer h away is crossed at -h tan(angle) of the pupil's centre.
+    np.testing.assert_allclose(moved, [[-2.0, 0.0], *[[0.0, 0.0]] * 5], atol=1e-12)
+    for altitudes in ([0.0], [-1.0, *air.altitudes[1:]], [np.nan, *air.altitudes[1:]]):
+        with pytest.raises(DomainError, match="expected 6 distances of 0 m or more"):
+            air.at_altitudes(altitudes)
+
+
 def test_times_are_the_middles_of_even_steps():
     atmosphere = small_atmosphere(exposure=1.0, time_step=0.3)
     np.testing.assert_allclose(atmosphere.times, [0.125, 0.375, 0.625, 0.875])
@@ -164,6 +177,35 @@ def test_screens_are_kept_until_released(kind, size, dtype):
     np.testing.assert_array_equal(anew, screens)
     with pytest.raises(UnknownNameError, match="unknown kind"):
         atmosphere.kept_screens("fine")
+
+
+def test_the_same_air_at_other_times():
+    air = small_atmosphere(time_step=0.1)
+    part = air.seen_at(air.times[5:8])
+    np.testing.assert_array_equal(part.times, air.times[5:8])
+    assert part.exposure == pytest.approx(0.3)
+    # Screens made through either are kept for both, whoever comes first, and forgotten for both.
+    assert part.kept_screens("low") is air.kept_screens("low")
+    assert air.kept_screens("slopes") is part.kept_screens("slopes")
+    before = air.kept_screens("low")
+    part.release()
+    assert air.kept_screens("low") is not before
+    # A finer look at the whole of it is what the site gives for that step.
+    fine, anew = air.seen_at((np.arange(40) + 0.5) * 0.05, 2.0), small_atmosphere(time_step=0.05)
+    np.testing.assert_allclose(fine.times, anew.times, rtol=1e-14)
+    assert fine.exposure == anew.exposure
+    np.testing.assert_array_equal(fine.kept_screens("slopes"), anew.kept_screens("slopes"))
+    for times, exposure, text in [
+        ([], None, "expected a list of finite times"),
+        ([0.1, math.nan], None, "expected a list of finite times"),
+        ([0.05, 0.15, 0.35], None, "middles of 3 equal steps of 0.1 s"),
+        ([0.15, 0.05], None, "middles of 2 equal steps"),
+        (air.times, 3.0, "equal steps of 0.15 s"),
+        (air.times, -1.0, "exposure = -1.0"),
+        ((np.arange(9) + 0.5) * 10.0, 90.0, "screen_length = 81.92: expected more than"),
+    ]:
+        with pytest.raises(DomainError, match=text):
+            air.seen_at(times, exposure)
 
 
 def test_ground_lift_and_zenith_angle():

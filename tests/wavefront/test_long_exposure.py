@@ -1,11 +1,16 @@
 """The long-exposure engine: against brute force over the pupil, closed forms and the mean of the fast engine."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 import pachon
+from pachon.models.aperture import Circle, Complement, Vane
 from pachon.models.errors import ConfigError, DomainError
+from pachon.models.obstruction import Obstruction
+from pachon.models.surface import Interaction, Plane, Surface
 from pachon.pipeline.config import Configuration
 from pachon.pipeline.experiment import resolve
 from pachon.raytrace.rays import field_direction
@@ -454,3 +459,33 @@ def test_clear_pupil_is_that_of_traced_rays_to_the_last_corner(lsst_r, field_deg
     # Parabolas through three rays place the rims to a millimetre or so inside the field, to centimetres in its corners.
     assert area == pytest.approx(counted, rel=3e-3, abs=0.05)
     assert counted > 0.4
+
+
+def test_a_disc_in_the_way_leaves_the_clear_pupil_of_traced_rays(lsst_r):
+    """A camera body above M1, whose shadow runs over the pupil as the field grows."""
+    plane = Surface("body", Interaction.PASS, Plane(), (0.0, 0.0, 9.0), lsst_r.medium_before, Complement(Circle(2.75)))
+    shaded = replace(lsst_r, surfaces=(plane, *lsst_r.surfaces))
+    fields = np.radians([(1.0, 0.9)])
+    lattice = PupilLattice.fill(lsst_r.pupil_diameter, lsst_r.pupil_obscuration, 0.02)
+    angle = 2.0 * np.pi * (np.arange(720) + 0.5) / 720
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    direction = field_direction(fields[:, 0], fields[:, 1])
+    areas = []
+    for telescope in (lsst_r, shaded):
+        lit = trace_pupils(telescope, fields, np.array([620e-9]), lattice.points).lit[0, 0]
+        edges = clear_edges(telescope, direction, unit, 620e-9)[0]
+        areas.append(np.pi / 720 * np.sum(edges[:, 1] ** 2 - edges[:, 0] ** 2))
+        # Parabolas place rims to a millimetre, and spokes near a corner of two rims by more.
+        assert areas[-1] == pytest.approx(lit.sum() * lattice.spacing**2, rel=3e-3)
+    assert areas[1] < 0.98 * areas[0]
+
+
+def test_telescopes_with_spiders_or_obstructions_are_refused(lsst_r):
+    spider = Complement(Vane(0.1, both_ways=True))
+    plane = Surface("spider", Interaction.PASS, Plane(), (0.0, 0.0, 9.0), lsst_r.medium_before, spider)
+    vanes = replace(lsst_r, surfaces=(plane, *lsst_r.surfaces))
+    box = Obstruction("box", np.ones((1, 3, 3)))
+    solid = replace(lsst_r, obstructions=(box,))
+    for telescope, what in ((vanes, "the aperture of spider"), (solid, "the obstruction box")):
+        with pytest.raises(DomainError, match=f"engine = 'long_exposure': expected nothing but discs.* has {what} "):
+            engine_for(telescope).render(np.array([[0.01, 0.015]]), np.zeros((1, 2)))

@@ -5,7 +5,8 @@ import pytest
 
 import pachon
 from pachon.models.errors import DomainError
-from pachon.wavefront.zernike import annular_zernike_gradients, annular_zernikes, fit_zernikes, noll_to_nm
+from pachon.models.zernike_polynomials import annular_zernike_gradients, annular_zernikes, noll_to_nm
+from pachon.wavefront.zernike import fit_zernikes
 
 EPS = 0.612
 

@@ -1,0 +1,114 @@
+"""The kernel that traces the pupil of many field points and keeps the optical path difference alone.
+
+A module of its own: with one caller of the surface loop in a module the compiler puts all of it in line.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ..raytrace.launch import FORWARD_OPTIONS, kernel_pair
+from ..raytrace.packet import LANES, lane_flags, lanes, lanes_sqrt
+from ..raytrace.pupil_kernels import launched
+from ..raytrace.surface_kernels import OK, ONE, ZERO
+from ..raytrace.trace_kernels import LOOPS, PackedSurfaces
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+NAN = wp.constant(wp.float64(float("nan")))
+
+
+@kernel_pair
+def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that traces optical path differences."""
+    through_telescope = LOOPS[special]
+
+    @wp.kernel(module=module)
+    def trace_opds(
+        first: wp.int32,
+        surfaces: PackedSurfaces,
+        indices: wp.array2d(dtype=wp.float64),
+        work: wp.array(dtype=wp.int32),
+        pupil: wp.array2d(dtype=lanes),
+        place: wp.array(dtype=lane_flags),
+        pupil_z: wp.float64,
+        distance: wp.float64,
+        direction: wp.array2d(dtype=wp.float64),
+        start: wp.array2d(dtype=wp.float64),
+        sphere: wp.array2d(dtype=wp.float64),
+        radius: wp.float64,
+        no_position: wp.array3d(dtype=lanes),
+        no_direction: wp.array3d(dtype=lanes),
+        no_path: wp.array2d(dtype=lanes),
+        no_status: wp.array2d(dtype=lane_flags),
+        value: wp.array2d(dtype=wp.float64),
+        lit: wp.array(dtype=wp.int32),
+    ):
+        """Trace one packet of the pupil for one field point: item ``i`` of the work is field ``i // n_packets``.
+
+        ``place`` says which column of ``value`` belongs to each lane (-1: none). ``start`` [field, 3] is empty for
+        light that comes from infinity along ``direction`` [field, 3], else the point that it comes from. ``sphere``
+        [field, 4]: centre of the reference sphere, and optical path of its chief ray to it. ``value`` is that path less
+        the ray's, and stays as it was where the ray is not lit; it may be empty. ``lit`` [item] counts the lanes of the
+        packet that are.
+        """
+        item = work[first + wp.tid()]
+        n_packets = pupil.shape[1]
+        b = item / n_packets
+        p = item - b * n_packets
+        px = pupil[0, p]
+        py = pupil[1, p]
+        du = lanes(direction[b, 0])
+        dv = lanes(direction[b, 1])
+        dw = lanes(direction[b, 2])
+        x, y, z = launched(px, py, pupil_z, direction[b, 0], direction[b, 1], direction[b, 2], distance)
+        if start.shape[0] > 0:
+            x = lanes(start[b, 0])
+            y = lanes(start[b, 1])
+            z = lanes(start[b, 2])
+            du = px - x
+            dv = py - y
+            dw = lanes(pupil_z) - z
+            # The plane of the pupil may lie behind the object: the light goes down all the same.
+            scale = -wp.sign(pupil_z - start[b, 2]) * lanes(ONE)
+            scale = wp.cw_div(scale, lanes_sqrt(wp.cw_mul(du, du) + wp.cw_mul(dv, dv) + wp.cw_mul(dw, dw)))
+            du = wp.cw_mul(scale, du)
+            dv = wp.cw_mul(scale, dv)
+            dw = wp.cw_mul(scale, dw)
+        x, y, z, u, v, w, path, status = through_telescope(
+            surfaces,
+            indices,
+            0,
+            x,
+            y,
+            z,
+            du,
+            dv,
+            dw,
+            lanes(ZERO),
+            p,
+            no_position,
+            no_direction,
+            no_path,
+            no_status,
+        )
+        count = wp.int32(0)
+        for i in range(LANES):
+            count += wp.where(status[i] == OK, wp.int32(1), wp.int32(0))
+        lit[item] = count
+        if count == 0 or value.shape[0] == 0:
+            return
+        x = x - lanes(sphere[b, 0])
+        y = y - lanes(sphere[b, 1])
+        z = z - lanes(sphere[b, 2])
+        # Distance from here on to the sphere beyond the image: sqrt((q.d)^2 - |q|^2 + R^2) - q.d.
+        qd = wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
+        qq = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+        ahead = lanes_sqrt(wp.cw_mul(qd, qd) - qq + lanes(radius * radius)) - qd
+        opd = lanes(sphere[b, 3]) - (path + indices[0, surfaces.kinds.shape[0] - 1] * ahead)
+        for i in range(LANES):
+            at = place[p][i]
+            if status[i] == OK and at >= 0:
+                value[b, at] = opd[i]
+
+    return trace_opds
