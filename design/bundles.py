@@ -1,0 +1,206 @@
+"""Bundles: the rays of many field points through the same points of the pupil, traced in one batch to the detector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..models.errors import DomainError
+from ..models.telescope import Telescope
+from ..models.units import metres, radians
+from ..raytrace.packed import refractive_indices
+from ..raytrace.rays import RayStatus, field_direction, launch_bundles
+from ..raytrace.trace import trace
+from ..wavefront.reference import distance_to_sphere
+
+#: Rays traced at once where a figure reduces them: 15 doubles each, so some 60 MB.
+RAYS_AT_ONCE = 1 << 19
+#: Distances from the axis at which figures are given where no field is asked for, in units of the field's radius; for
+#: the LSST they are 0, 0.5, 1, 1.5 and 1.75 degrees.
+_RADII = np.array([0.0, 2.0, 4.0, 6.0, 7.0]) / 7.0
+
+
+@dataclass(frozen=True)
+class Bundles:
+    """Rays of one wavelength at the detector, bundle by bundle, in the detector's own frame.
+
+    Attributes
+    ----------
+    position : ndarray, shape [n_field, n_pupil, 3]
+        Where the rays meet the detector [m]; NaN where they do not.
+    direction : ndarray, shape [n_field, n_pupil, 3]
+        Unit directions of travel.
+    path : ndarray, shape [n_field, n_pupil]
+        Optical path from a plane perpendicular to the light in front of the telescope [m].
+    status : ndarray of int32, shape [n_field, n_pupil]
+        A :class:`~pachon.raytrace.rays.RayStatus` each.
+    chief_position, chief_direction : ndarray, shape [n_field, 3]
+        The ray through the centre of the entrance pupil; vignetting does not stop it. Where it does not reach the
+        detector, its position is NaN.
+    chief_path : ndarray, shape [n_field]
+        Its optical path [m].
+    index : float
+        Refractive index in front of the detector.
+    wavelength : float
+        Vacuum wavelength [m].
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    status: np.ndarray
+    chief_position: np.ndarray
+    chief_direction: np.ndarray
+    chief_path: np.ndarray
+    index: float
+    wavelength: float
+
+    def one(self, i: int) -> Bundles:
+        """Return the bundle of field ``i`` alone."""
+        k = slice(i, i + 1)
+        rays = (self.position[k], self.direction[k], self.path[k], self.status[k])
+        chief = (self.chief_position[k], self.chief_direction[k], self.chief_path[k])
+        return Bundles(*rays, *chief, self.index, self.wavelength)
+
+    @property
+    def lit(self) -> np.ndarray:
+        """Where light passes, shape [n_field, n_pupil] bool."""
+        return self.status == RayStatus.OK
+
+    def landing(self, defocus: float = 0.0) -> np.ndarray:
+        """Return where the rays meet the plane at a height [m] above the detector's own, shape [n_field, n_pupil, 2].
+
+        Exact at every height for a flat detector; for ``defocus = 0`` these are the landing points themselves.
+        """
+        return _at_height(self.position, self.direction, defocus)
+
+    def chief_landing(self, defocus: float = 0.0) -> np.ndarray:
+        """Return where the chief rays meet the plane at a height [m] above the detector's own, shape [n_field, 2]."""
+        return _at_height(self.chief_position, self.chief_direction, defocus)
+
+    def opd(self, radius: float, defocus: float = 0.0) -> np.ndarray:
+        """Return the optical path difference to spheres about the chief rays' landing points, NaN where undefined.
+
+        Parameters
+        ----------
+        radius : float
+            Radius of the reference spheres [m].
+        defocus : float
+            Height above the detector [m] of the plane whose landing points are the centres.
+
+        Returns
+        -------
+        ndarray, shape [n_field, n_pupil]
+            Path of the chief ray minus path of the ray [m]; vignetted rays have one too.
+        """
+        along = (defocus / self.chief_direction[:, 2:]) if defocus else 0.0
+        center = self.chief_position + along * self.chief_direction
+        chief = self.chief_path + self.index * distance_to_sphere(
+            self.chief_position, self.chief_direction, center, radius
+        )
+        path = self.path + self.index * distance_to_sphere(self.position, self.direction, center[:, None], radius)
+        return chief[:, None] - path
+
+
+def _at_height(position: np.ndarray, direction: np.ndarray, height: float) -> np.ndarray:
+    return position[..., :2] + height * direction[..., :2] / direction[..., 2:]
+
+
+def field_points(telescope: Telescope, fields: Any = None) -> np.ndarray:
+    """Return field angles [rad], shape [n, 2], that the telescope covers.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n, 2] or [2], optional
+        Field angles [rad]; five points from the axis to the edge of the field along +y where not given.
+
+    Raises
+    ------
+    DomainError
+        If the shape is another, or a point lies outside what the telescope covers.
+    """
+    if fields is None:
+        fields = np.stack([np.zeros(len(_RADII)), _RADII * telescope.field_radius], axis=-1)
+    points = np.atleast_2d(radians(fields, "fields"))
+    if points.ndim != 2 or points.shape[1] != 2 or not len(points):
+        raise DomainError(f"fields of shape {points.shape}: expected field angles x, y, shape [n, 2]")
+    telescope.check_field(points[:, 0], points[:, 1])
+    return points
+
+
+def wavelength_points(telescope: Telescope, wavelengths: Any = None) -> np.ndarray:
+    """Return wavelengths [m], shape [n], that the telescope covers; its default where none is given."""
+    values = np.atleast_1d(metres(telescope.default_wavelength if wavelengths is None else wavelengths, "wavelengths"))
+    if values.ndim != 1 or not len(values):
+        raise DomainError(f"wavelengths of shape {values.shape}: expected one wavelength or a list")
+    telescope.check_wavelength(values)
+    return values
+
+
+def trace_bundles(
+    telescope: Telescope,
+    fields: np.ndarray,
+    wavelength: float,
+    pupil: np.ndarray,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Bundles:
+    """Trace the rays of many field points through the same pupil points to the detector.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    pupil : ndarray, shape [n_pupil, 2]
+        Entrance-pupil coordinates [m].
+    projection : str
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+    """
+    directions = field_direction(fields[:, 0], fields[:, 1], projection)
+    # The chief ray goes along as one more point of the pupil.
+    rays = launch_bundles(telescope, directions, wavelength, np.concatenate([pupil, np.zeros((1, 2))]))
+    end = trace(telescope, rays, threads=threads)
+    detector = telescope.surfaces[-1]
+    position = detector.to_local(end.position).reshape(len(fields), -1, 3)
+    direction = (end.direction @ detector.matrix).reshape(len(fields), -1, 3)
+    path, status = end.path_length.reshape(len(fields), -1), end.status.reshape(len(fields), -1)
+    return Bundles(
+        position=position[:, :-1],
+        direction=direction[:, :-1],
+        path=path[:, :-1],
+        status=status[:, :-1],
+        chief_position=np.where(status[:, -1:] <= RayStatus.VIGNETTED, position[:, -1], np.nan),
+        chief_direction=direction[:, -1],
+        chief_path=path[:, -1],
+        index=float(refractive_indices(telescope, wavelength)[-2]),
+        wavelength=wavelength,
+    )
+
+
+def bundle_blocks(
+    telescope: Telescope,
+    fields: np.ndarray,
+    wavelength: float,
+    pupil: np.ndarray,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Iterator[tuple[slice, Bundles]]:
+    """Yield the bundles of some fields at a time, so that memory does not grow with the number of fields.
+
+    Parameters are those of :func:`trace_bundles`; each block comes with the slice of the fields it belongs to.
+    """
+    step = max(1, RAYS_AT_ONCE // (len(pupil) + 1))
+    for first in range(0, len(fields), step):
+        part = slice(first, min(first + step, len(fields)))
+        yield part, trace_bundles(telescope, fields[part], wavelength, pupil, projection, threads)

@@ -1,0 +1,105 @@
+"""What the pictures of design studies share: names and colours of fields, panels, scale bars, maps over the field."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.tri import Triangulation
+
+from ..wavefront.picture import new_figure
+
+#: Fields that a legend or a row of panels can hold; a figure of more is drawn against the distance from the axis.
+FEW = 12
+
+
+def field_label(field: np.ndarray) -> str:
+    """Return a field point [rad] as text in degrees: one number where it lies on the +y axis, else both."""
+    x, y = np.rad2deg(field)
+    if abs(x) < 1e-9 and y > -1e-9:
+        return f"{abs(y):.4g}°"
+    return f"({x:.4g}°, {y:.4g}°)"
+
+
+def field_colors(count: int) -> list[Any]:
+    """Return a colour for each field of a list, from dark at the axis to bright at the edge."""
+    return [matplotlib.colormaps["plasma"](0.05 + 0.78 * i / max(count - 1, 1)) for i in range(count)]
+
+
+def wavelength_colors(count: int) -> list[Any]:
+    """Return a colour for each wavelength of a list, from blue to red; one alone is blue."""
+    return [matplotlib.colormaps["turbo"](0.12 + 0.76 * i / max(count - 1, 1)) for i in range(count)]
+
+
+def panel_grid(count: int, width: float, height: float, most: int = 5) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels of a size [inches], at most so many in a row, and the axes that are to be used."""
+    columns = min(count, most)
+    if count > most:
+        # As even rows as can be.
+        columns = math.ceil(count / math.ceil(count / most))
+    rows = math.ceil(count / columns)
+    figure = new_figure(max(columns * width, 4.5), rows * height + 0.6)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return figure, list(panels[:count])
+
+
+def round_length(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive value."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= value * (1 + 1e-9))
+
+
+def draw_scale_bar(axes: Axes, length: float, label: str) -> None:
+    """Draw a bar of a length in data units at the lower left, and what it stands for; limits are set by then."""
+    left, right = axes.get_xlim()
+    low, high = axes.get_ylim()
+    x, y = left + 0.05 * (right - left), low + 0.05 * (high - low)
+    axes.plot([x, x + length], [y, y], color="black", linewidth=1.8, solid_capstyle="butt")
+    axes.annotate(label, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=7.5, va="bottom")
+
+
+def second_scale(axes: Axes, factor: float, label: str) -> None:
+    """Draw the horizontal axis once more above, in a unit of which so many make one of the axis below."""
+
+    def convert(x: Any) -> Any:
+        return x * factor
+
+    def back(x: Any) -> Any:
+        return x / factor
+
+    axes.secondary_xaxis("top", functions=(convert, back)).set_xlabel(label, fontsize=8)
+
+
+def draw_circle(axes: Axes, radius: float, color: str = "0.3", style: Any = "-", label: str | None = None) -> None:
+    """Draw a circle about the origin."""
+    axes.add_patch(Circle((0.0, 0.0), radius, fill=False, edgecolor=color, linewidth=0.8, linestyle=style, label=label))
+
+
+def bare_frame(axes: Axes, half: float) -> None:
+    """Set a square of a half-width about the origin, equal scales, a thin frame and no ticks."""
+    axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set_color("0.8")
+
+
+def spread_in_field(fields: np.ndarray) -> bool:
+    """Return whether field points are many enough, and not all on a line, to draw a map over the field."""
+    centered = fields - fields.mean(axis=0)
+    strengths = np.linalg.svd(centered, compute_uv=False)
+    return len(fields) > FEW and bool(strengths[-1] > 1e-3 * strengths[0])
+
+
+def draw_field_map(axes: Axes, fields: np.ndarray, values: np.ndarray, **style: Any) -> Any:
+    """Draw values at field points [rad] as a map in degrees, smooth between the points, and return its colours' key."""
+    x, y = np.rad2deg(fields).T
+    known = np.isfinite(values)
+    image = axes.tripcolor(Triangulation(x[known], y[known]), values[known], shading="gouraud", **style)
+    axes.set_aspect("equal")
+    return image

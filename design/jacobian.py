@@ -1,0 +1,211 @@
+"""From what surfaces answer for to what parameters do: every parameter is linear in the columns of a sweep back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..models.polar_polynomial import PolarPolynomial
+from ..models.telescope import Telescope
+from ..raytrace.gradient import Seeds, SurfaceResponse, Sweep, columns, polynomial_terms, respond
+from ..raytrace.rays import Rays
+from ..raytrace.sphere_sweep import SPHERE_ROWS, respond_to_sphere
+from ..wavefront.reference import sphere_distance_derivatives
+from .figures import figure_polynomial
+from .parameters import Parameter, apply, index_surfaces, twists, with_figures
+
+
+@dataclass(frozen=True)
+class ParameterColumns:
+    """Which columns a set of parameters needs, and with which weights.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        The telescope with all changes applied, whose derivatives these are.
+    parameters : tuple of Parameter
+        The parameters.
+    rows : ndarray of int, shape [n_surface + 1, 13]
+        Table of the columns, for :func:`~pachon.raytrace.gradient.respond`.
+    polynomials : tuple of (surface, scale, degree, rows)
+        Surfaces with figures that are polynomials, for the same.
+    figures : tuple of (surface, name)
+        Figures that are not; each has a row of its own behind all others.
+    helpers : int
+        So many rows come first that others are made of; those of a sphere follow, and then all that have weights.
+    weights : ndarray, shape [n_row, n_parameter]
+        Derivative of an output with respect to a parameter, per unit of each of these.
+    """
+
+    telescope: Telescope
+    parameters: tuple[Parameter, ...]
+    rows: np.ndarray
+    polynomials: tuple[tuple[int, float, int, np.ndarray], ...]
+    figures: tuple[tuple[int, str], ...]
+    helpers: int
+    weights: np.ndarray
+
+    @classmethod
+    def at(
+        cls, telescope: Telescope, parameters: tuple[Parameter, ...], values: np.ndarray | None = None
+    ) -> ParameterColumns:
+        """Return the columns for derivatives at given changes of the parameters; at none by default."""
+        values = np.zeros(len(parameters)) if values is None else values
+        moved = apply(telescope, dict(zip(parameters, values, strict=True)))
+        names = telescope.surface_names
+        figured = [(p, names.index(one.target), one) for p, one in enumerate(parameters) if one.kind == "figure"]
+        wanted = {(s, name) for _, s, _ in figured for name in ("sag", "hit")}
+        helpers = columns(telescope, wanted)
+        count = int(helpers.max()) + 1
+        first = count + SPHERE_ROWS
+
+        # Across a gap a motion counts by what the bodies on both sides do differently.
+        ends = np.zeros((len(parameters), 1, 6))
+        motion = -np.diff(twists(telescope, parameters, values), axis=1, prepend=ends, append=ends)
+        runs = {p: index_surfaces(telescope, one.target) for p, one in enumerate(parameters) if one.kind == "index"}
+        behind = {(s, "index") for run in runs.values() for s in run}
+        before = {(s + 1, "index") for run in runs.values() for s in run if s + 1 < len(names)}
+        gaps = {(int(g), "gap") for g in np.flatnonzero(motion.any(axis=(0, 2)))}
+        own = columns(telescope, behind | before | gaps, first)
+        rows = np.maximum(helpers, own)
+
+        # Where rays go, a shape has the figures that are not zero; to be differentiated by, all that are named.
+        shapes = {s.name: s.shape for s in with_figures(moved, parameters).surfaces}
+        used = max(first, int(own.max()) + 1)
+        terms: dict[int, dict[int, PolarPolynomial]] = {}
+        figures: list[tuple[int, int, str]] = []
+        for p, s, parameter in figured:
+            polynomial = figure_polynomial(shapes[parameter.target], parameter.name)
+            if polynomial is None:
+                figures.append((p, s, parameter.name))
+            else:
+                terms.setdefault(s, {})[p] = polynomial
+        blocks = []
+        for s, found in terms.items():
+            scale = _scale(telescope, s)
+            degree, weights = _polynomial_weights(found, len(parameters), scale)
+            present = weights.any(axis=1)
+            places = np.where(present, used + np.cumsum(present) - 1, -1).astype(np.int32)
+            blocks.append((s, scale, degree, places, weights[present]))
+            used += int(present.sum())
+
+        total = np.zeros((used + len(figures), len(parameters)))
+        for g in np.flatnonzero(motion.any(axis=(0, 2))):
+            total[rows[g, 7:]] = motion[:, g].T
+        for p, run in runs.items():
+            total[rows[run, 4], p] = 1.0
+            total[[rows[s + 1, 3] for s in run if s + 1 < len(names)], p] = 1.0
+        for *_, places, weights in blocks:
+            total[places[places >= 0]] = weights
+        for i, (p, _, _) in enumerate(figures):
+            total[used + i, p] = 1.0
+        listed = tuple(block[:4] for block in blocks)
+        return cls(moved, parameters, rows, listed, tuple((s, name) for _, s, name in figures), count, total[first:])
+
+    def responses(self, swept: Sweep, seeds: Seeds, *, threads: int | None = None) -> np.ndarray:
+        """Return all rows of every output and ray, shape [n_output, n_row, n]; times the weights they are derivatives.
+
+        Parameters
+        ----------
+        swept : Sweep
+            Rays through ``self.telescope``.
+        seeds : Seeds
+            The outputs.
+        threads : int, optional
+            Number of threads.
+        """
+        response = respond(swept, seeds, self.rows, polynomials=self.polynomials, threads=threads)
+        return self._with_figures(response, self.helpers + SPHERE_ROWS)
+
+    def to_sphere(
+        self, rays: Rays, center: np.ndarray, path: np.ndarray, radius: float, *, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows of the optical path to reference spheres, and the statuses of the rays.
+
+        Parameters are those of :func:`~pachon.raytrace.sphere_sweep.respond_to_sphere`. The first four of the rows
+        [n_row, n] are the path and its derivatives with respect to the landing point; all others have weights.
+        """
+        response, status = respond_to_sphere(
+            self.telescope,
+            rays,
+            center,
+            path,
+            radius,
+            self.rows,
+            self.helpers,
+            polynomials=self.polynomials,
+            threads=threads,
+        )
+        return self._with_figures(response, self.helpers)[0], status
+
+    def _with_figures(self, response: SurfaceResponse, first: int) -> np.ndarray:
+        """Return the rows from a first one on, those of figures that are no polynomials added."""
+        values = response.values[:, first:]
+        if not self.figures:
+            return values
+        shapes = with_figures(self.telescope, self.parameters).surfaces
+        extra = np.empty((len(values), len(self.figures), values.shape[2]))
+        for i, (s, name) in enumerate(self.figures):
+            f, fx, fy = shapes[s].shape.sag_derivative(name, *response.hit(s))
+            sag = response.sag(s)
+            extra[:, i] = sag[:, 0] * f + sag[:, 1] * fx + sag[:, 2] * fy
+        return np.concatenate([values, extra], axis=1)
+
+    def size_of_terms(self, swept: Sweep, seeds: Seeds, *, threads: int | None = None) -> np.ndarray:
+        """Return how large the terms are that a derivative sums up, rms over rays and outputs, shape [n_parameter].
+
+        A derivative far below them is rounding: the terms cancel.
+        """
+        terms = np.abs(self.responses(swept, seeds, threads=threads)).transpose(0, 2, 1) @ np.abs(self.weights)
+        return np.sqrt(np.mean(terms**2, axis=(0, 1)))
+
+    def derivatives(self, swept: Sweep, seeds: Seeds, *, threads: int | None = None) -> np.ndarray:
+        """Return the derivatives of every output and ray with respect to each parameter, [n_output, n, n_parameter]."""
+        return np.matmul(self.responses(swept, seeds, threads=threads).transpose(0, 2, 1), self.weights)
+
+
+def _scale(telescope: Telescope, surface: int) -> float:
+    """Return a length [m] in whose units a polynomial over a surface is of order 1: that of the pupil, near enough."""
+    aperture = telescope.surfaces[surface].aperture
+    outer = getattr(aperture, "outer", getattr(aperture, "radius", None))
+    return float(outer) if outer else 0.5 * telescope.pupil_diameter
+
+
+def _polynomial_weights(found: dict[int, PolarPolynomial], n: int, scale: float) -> tuple[int, np.ndarray]:
+    """Return the highest degree of the polynomials of some of ``n`` parameters, and their terms, [n_term, n]."""
+    degree = max(polynomial.degree for polynomial in found.values())
+    listed = polynomial_terms(degree)
+    weights = np.zeros((len(listed), n))
+    for p, polynomial in found.items():
+        for i, (m, k, imaginary) in enumerate(listed):
+            if m < polynomial.terms.shape[0] and k < polynomial.terms.shape[1]:
+                term = polynomial.terms[m, k] * scale ** (m + 2 * k)
+                weights[i, p] = -term.imag if imaginary else term.real
+    return degree, weights
+
+
+def sphere_seeds(swept: Sweep, center: np.ndarray, radius: float) -> tuple[Seeds, np.ndarray]:
+    """Return the seeds of the optical path to reference spheres, one output, and that path.
+
+    Parameters
+    ----------
+    swept : Sweep
+        Rays traced to the image.
+    center : ndarray, shape [3, n]
+        Centre of the sphere of each ray [m], telescope frame. The derivative of the path with respect to it is the
+        opposite of that with respect to the position.
+    radius : float
+        Radius of the spheres [m].
+
+    Returns
+    -------
+    seeds : Seeds
+        One output.
+    path : ndarray, shape [n]
+        Optical path to the sphere [m].
+    """
+    n = swept.indices[-2]
+    distance, by_position, by_direction = sphere_distance_derivatives(swept.position, swept.direction, center, radius)
+    seeds = Seeds(n * by_position[None], n * by_direction[None], np.ones(1), index=distance[None])
+    return seeds, swept.path + n * distance
