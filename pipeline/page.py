@@ -1,0 +1,49 @@
+"""Reports as one HTML file with everything in it, pictures included."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture of a report.
+
+    Attributes
+    ----------
+    title : str
+        Heading.
+    png : bytes
+        The picture.
+    shows : str
+        What is to be seen on it.
+    paper : str
+        What the paper shows in its place, with the figure's number; empty where it has none.
+    """
+
+    title: str
+    png: bytes
+    shows: str
+    paper: str = ""
+
+    @property
+    def source(self) -> str:
+        """The picture as a data URI."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
+
+
+def render(template: str, **content: Any) -> str:
+    """Return a page made from one of the templates; a name that the template needs and is not given is an error."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**content)
