@@ -32,9 +32,9 @@ import numpy as np
 import scipy.fft
 
 import pachon
+from pachon.models.aberration_free import without_aberration
 from pachon.models.random_streams import stream
-from pachon.models.surface import Annulus, Conic, Interaction, Plane, Surface
-from pachon.models.telescope import VACUUM, Telescope
+from pachon.models.telescope import Telescope
 from pachon.pipeline.shapes import fwhm
 from pachon.wavefront.atmosphere import SLOPE_LAG, Atmosphere
 
@@ -51,26 +51,7 @@ BINS = {"min_sep": 0.5 * ARCMIN, "max_sep": 10.0 * ARCMIN, "n_bins": 6}
 
 def ideal_telescope() -> Telescope:
     """Return a telescope with the LSST's pupil and no aberration to speak of."""
-    lsst = pachon.load_telescope("lsst_v3.3_r")
-    length = 1000.0 * lsst.pupil_diameter
-    origin, focus = (0.0, 0.0, 0.0), (0.0, 0.0, length)
-    clear = Annulus(0.5 * lsst.pupil_obscuration * lsst.pupil_diameter, 0.5 * lsst.pupil_diameter)
-    return Telescope(
-        name="paraboloid of f/1000",
-        surfaces=(
-            Surface("M1", Interaction.MIRROR, Conic(2.0 * length, -1.0), origin, VACUUM, clear),
-            Surface("Detector", Interaction.DETECTOR, Plane(), focus, VACUUM),
-        ),
-        stop_z=0.0,
-        pupil_diameter=lsst.pupil_diameter,
-        pupil_obscuration=lsst.pupil_obscuration,
-        launch_distance=1.5 * length,
-        reference_sphere_radius=length,
-        field_radius=0.01,
-        field_limit=0.01,
-        wavelength_range=lsst.wavelength_range,
-        default_wavelength=WAVELENGTH,
-    )
+    return without_aberration(pachon.load_telescope("lsst_v3.3_r"))
 
 
 def through_screens(atmosphere: Atmosphere, screens: np.ndarray, **changes) -> Atmosphere:

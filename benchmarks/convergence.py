@@ -31,10 +31,12 @@ class Field:
     def __init__(self, exposures, stars, size):
         self.telescope = pachon.load_telescope("lsst_v3.3_r")
         self.focal_plane = pachon.FocalPlane.from_budget("lsst", seed=1)
-        self.size, self.kept, self.fields = size, {}, []
+        self.air, self.fields = [], []
         rng = np.random.default_rng(5)
         centers = self.focal_plane.camera.centers
-        for _ in range(exposures):
+        for seed in range(exposures):
+            air = pachon.Atmosphere.from_site("cerro_pachon", seed, screen_size=size, screen_length=size * 1300 / 8192)
+            self.air.append(air)
             ccds = rng.choice(np.flatnonzero(np.hypot(*centers.T) < 0.31), stars, replace=False)
             self.fields.append(fields_at(self.telescope, centers[ccds] + rng.uniform(-0.018, 0.018, (stars, 2))))
 
@@ -42,13 +44,11 @@ class Field:
         """Return e1, e2, size of all stars and the seconds of a star."""
         measured, seconds = [], 0.0
         for seed, fields in enumerate(self.fields):
-            atmosphere = pachon.Atmosphere.from_site(
-                "cerro_pachon", seed, time_step=time_step, screen_size=self.size, screen_length=self.size * 1300 / 8192
-            )
-            # The modes do not depend on the time step; making them again would only take time.
-            atmosphere._cache.update(self.kept.get(seed, {}))
+            # The screens do not depend on the time step; making them again would only take time.
+            air = self.air[seed]
+            steps = round(air.exposure / time_step)
+            atmosphere = air.seen_at((np.arange(steps) + 0.5) * (air.exposure / steps), air.exposure)
             atmosphere.kept_screens("slopes")
-            self.kept[seed] = dict(atmosphere._cache)
             start = time.perf_counter()
             psfs = pachon.make_psfs(
                 self.telescope,

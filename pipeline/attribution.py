@@ -5,8 +5,14 @@ are drawn stay what they were when another cause goes, so that a difference is t
 follow the PSF, as they do at a telescope: the faintest star is the one of the wanted signal-to-noise ratio, and photons
 are counted in other numbers.
 
-What the design of the telescope itself does has no switch here: the same beam without aberrations is no telescope that
-can be traced. Its share is seen from the other side, as what is left once heights and atmosphere are off.
+The same beam without aberrations is no telescope that can be traced over the CCD heights. With the optics off, stars
+are therefore seen from the same places on the sky through a paraboloid so long that nothing the telescope does is left:
+neither its design, nor the heights, nor what active optics leaves. The design's own share is what the heights' case has
+more than that of the optics.
+
+The layer on the ground does most of the turbulence, and at exactly 0 m all stars of the field see the same part of it
+at the same moment: they share its ellipticity. Its case lifts it, with the same turbulence, so far that stars share it
+no more than they do the next layer.
 """
 
 from __future__ import annotations
@@ -19,24 +25,23 @@ from typing import Any
 import numpy as np
 
 from ..models.errors import ConfigError, unknown_name
-from ..wavefront.psf import SCREENS
-from .ccd_product import CcdProduct
-from .ccd_stage import CcdExposure, expose_ccd, model_ccd
+from ..models.site import load_site
+from .ccd_product import KINDS, CcdProduct
+from .ccd_stage import expose_ccd, model_ccd
 from .config import Configuration, to_yaml, with_options
 from .correlation import Correlation, jackknife_error
-from .diagnostics import LONGEST, correlate, correlation_columns
+from .diagnostics import correlation_columns
 from .experiment import Experiment, prepare, resolve
 from .figures_attribution import attribution_figure
 from .memory import check_memory
 from .products import write_bytes, write_ecsv, write_json
 from .progress import Reporter
-from .psf_model import PsfModel
 from .run_folder import CONFIG_NAME, stamp_of
-from .shapes import measure_shapes
-from .stamps import center_stamps
-from .summary import LONG_RANGE, run_figures
+from .summary import LONG_RANGE, LONGEST_ARCMIN, correlations, left_mean_xi_plus, mean_xi_plus, run_figures
 
-FULL, NOISE = "full", "noise"
+FULL, NOISE, OPTICS = "full", "noise", "optics"
+#: Height that the layer on the ground is lifted to [m]: about that of the next one over Cerro Pachon.
+GROUND_LIFT = 2500.0
 _SWITCHES: dict[str, dict[str, Any]] = {
     "global": {"focal_plane__global": False},
     "raft": {"focal_plane__raft": False},
@@ -45,15 +50,18 @@ _SWITCHES: dict[str, dict[str, Any]] = {
     "potato_chip": {"focal_plane__potato_chip": False},
     "heights": {"focal_plane__budget": "flat"},
     "active_optics": {"active_optics__residual_um": 0.0},
+    OPTICS: {},
     "atmosphere": {"atmosphere__enabled": False},
+    "ground_layer": {"atmosphere__ground_lift_m": GROUND_LIFT},
     "diffusion": {"psf__diffusion_pixels": 0.0},
     NOISE: {},
 }
-#: All causes: five terms of the heights and these together, residual aberration, turbulence with refraction, charge
-#: diffusion, and the noise of the observed stars.
+#: All causes: five terms of the heights and these together, residual aberration, all that the telescope does,
+#: turbulence with refraction, that all stars share the layer on the ground, charge diffusion, and the noise of the
+#: observed stars.
 CAUSES = tuple(_SWITCHES)
 #: Ranges of separation over which xi+ is averaged [arcmin].
-RANGES = {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, LONGEST)}
+RANGES = {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, LONGEST_ARCMIN)}
 _RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
 _XI = ("truth", "observed", "residual", "away")
 
@@ -137,21 +145,21 @@ def attribute(
     chosen = checked_causes(config, causes)
     full = prepare(config)
     check_memory(full, threads)
-    correlations, figures = {}, {}
+    correlated, figures = {}, {}
     cases = [FULL, *(c for c in chosen if c != NOISE)]
     for case in cases:
         experiment = full if case == FULL else _without(full, case)
         products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
         for name, found in ((case, products), (NOISE, noiseless)):
             if found:
-                correlations[name] = correlate(found)
-                figures[name] = _figures(found, correlations[name])
+                correlated[name] = correlations(found, KINDS)
+                figures[name] = _figures(found, correlated[name])
     if full.atmosphere is not None:
         full.atmosphere.release()
     order = (FULL, *chosen)
     for name in chosen:
-        figures[name] |= _changes(figures[FULL], figures[name], correlations[FULL], correlations[name])
-    return Attribution({n: figures[n] for n in order}, {n: correlations[n] for n in order})
+        figures[name] |= _changes(figures[FULL], figures[name], correlated[FULL], correlated[name])
+    return Attribution({n: figures[n] for n in order}, {n: correlated[n] for n in order})
 
 
 def write_attribution(result: Attribution, folder: Path, config: Configuration) -> tuple[str, ...]:
@@ -204,6 +212,13 @@ def _why_not(config: Configuration, cause: str) -> str | None:
         return "atmosphere.enabled = false"
     if cause == "atmosphere" and config.psf.engine == "long_exposure":
         return "psf.engine = long_exposure, which needs it"
+    if cause == OPTICS and not config.atmosphere.enabled:
+        return "atmosphere.enabled = false, nothing would be left"
+    if cause == "ground_layer":
+        if not config.atmosphere.enabled or config.psf.engine == "long_exposure":
+            return "no star sees turbulence"
+        if config.atmosphere.ground_lift_m > 0.0 or load_site(config.atmosphere.site).altitudes[0] > 0.0:
+            return "no layer is on the ground"
     if cause == "diffusion" and config.psf.diffusion_pixels == 0.0:
         return "psf.diffusion_pixels = 0"
     return None
@@ -212,9 +227,10 @@ def _why_not(config: Configuration, cause: str) -> str | None:
 def _without(full: Experiment, cause: str) -> Experiment:
     """Return the experiment with one cause off. All that a default filled in stays: pixels, stamps, weight."""
     experiment = prepare(resolve(with_options(full.config, **_SWITCHES[cause])))
-    # Screens are the same and take their time.
-    same = experiment.atmosphere is not None
-    return replace(experiment, atmosphere=full.atmosphere) if same else experiment
+    if full.atmosphere is not None and experiment.atmosphere is not None:
+        # Screens are the same and take their time.
+        experiment = replace(experiment, atmosphere=full.atmosphere.at_altitudes(experiment.atmosphere.altitudes))
+    return replace(experiment, air_alone=cause == OPTICS)
 
 
 def _products(
@@ -222,9 +238,7 @@ def _products(
 ) -> tuple[list[CcdProduct], list[CcdProduct]]:
     """Return the products of all CCDs, and those of the same stars without noise where wanted."""
     config = experiment.config
-    if experiment.atmosphere is not None:
-        for kind in SCREENS.get(config.psf.engine, ()):
-            experiment.atmosphere.kept_screens(kind, threads)
+    experiment.make_screens(threads)
     names = config.ccds or ()
     stars = config.stars.truth + config.stars.observed
     title = "everything on" if case == FULL else f"{case} off"
@@ -232,56 +246,15 @@ def _products(
     with reporter.stage(title, total=stars * len(names)) as stage:
         for name in names:
             exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
-            product = _without_images(model_ccd(experiment, exposure))
-            seen.append(product)
+            seen.append(_without_images(model_ccd(experiment, exposure)))
             if noiseless:
-                unseen.append(_without_images(_noiseless(experiment, exposure, product)))
+                unseen.append(_without_images(model_ccd(experiment, exposure, noisy=False)))
     return seen, unseen
 
 
 def _without_images(product: CcdProduct) -> CcdProduct:
     """Return a product without its stamps, of which 189 CCDs have half a gigabyte."""
     return replace(product, truth_images=product.truth_images[:0], observed_images=product.observed_images[:0])
-
-
-def _noiseless(experiment: Experiment, exposure: CcdExposure, product: CcdProduct) -> CcdProduct:
-    """Return the product of the same stars seen without noise: centred, measured and modelled as the noisy ones."""
-    scale, weight = exposure.observed.pixel_scale, experiment.weight_fwhm
-    images = exposure.observed.image.astype(np.float64)
-    first = measure_shapes(images, scale, weight)
-    stamps = center_stamps(images, first.x, first.y, size=experiment.stamp_size)
-    shapes = measure_shapes(stamps, scale, weight)
-    used = shapes.usable & np.isfinite(stamps).all(axis=(1, 2))
-    places = exposure.places
-    fit = experiment.config.reconstruction
-    model = PsfModel.fit(
-        stamps[used],
-        places.observed[used],
-        n_components=fit.components,
-        order=fit.order,
-        extent=product.model.extent,
-        clip_sigma=None,  # as for the truth: without noise, what stands out is the PSF
-    )
-    at_truth, at_stars, left_out = (
-        measure_shapes(m, scale, weight)
-        for m in (model.at(places.truth), model.at(places.observed), model.leave_one_out())
-    )
-    left_out_e1, left_out_e2 = np.full((2, len(used)), np.nan)
-    left_out_e1[used], left_out_e2[used] = left_out.e1, left_out.e2
-    observed = replace(
-        product.observed,
-        e1=shapes.e1,
-        e2=shapes.e2,
-        size=shapes.size,
-        flags=shapes.flags,
-        model_e1=at_stars.e1,
-        model_e2=at_stars.e2,
-        used=used,
-        left_out_e1=left_out_e1,
-        left_out_e2=left_out_e2,
-    )
-    truth = replace(product.truth, model_e1=at_truth.e1, model_e2=at_truth.e2)
-    return replace(product, truth=truth, observed=observed, model=model)
 
 
 def _figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
@@ -291,20 +264,8 @@ def _figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation])
     figures |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
     for kind in _XI:
         for name, bounds in RANGES.items():
-            xi = correlated[kind]
-            figures[f"xi_plus_{kind}_{name}"] = float(_averaged(xi, bounds, xi.n_pairs, xi.xi_plus))
+            figures[f"xi_plus_{kind}_{name}"] = mean_xi_plus(correlated[kind], *bounds)
     return figures
-
-
-def _averaged(
-    correlation: Correlation, bounds: tuple[float, float], pairs: np.ndarray, xi_plus: np.ndarray
-) -> np.ndarray:
-    """Return the mean of xi+ [..., n_bins] over the pairs of a range [arcmin]; NaN where it has none."""
-    r = correlation.r_arcmin
-    inside = (r >= bounds[0]) & (r < bounds[1])
-    counts, values = pairs[..., inside], xi_plus[..., inside]
-    with np.errstate(invalid="ignore"):
-        return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
 
 
 def _changes(
@@ -320,8 +281,7 @@ def _changes(
             one, other = with_all[kind], without[kind]
             error = np.nan
             if one.n_patches and one.n_patches == other.n_patches:
-                one_left, other_left = (_averaged(c, bounds, c.left_pairs, c.left_plus) for c in (one, other))
-                error = float(jackknife_error(one_left - other_left))
+                error = float(jackknife_error(left_mean_xi_plus(one, *bounds) - left_mean_xi_plus(other, *bounds)))
             changes[f"error_xi_plus_{kind}_{name}"] = error
     return changes
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from astropy.io import fits
 
-from ..models.errors import ProductError
+from ..models.errors import ProductError, unknown_name
 from .photometry import ARCSEC
 from .products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from .psf_model import PsfModel
@@ -26,6 +26,8 @@ class _Unit(NamedTuple):
 
 _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("arcsec", ARCSEC), _Unit("", 1.0)
 _MODEL, _TRUTH_MODEL = "PSF", "TRUEPSF"
+#: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
+KINDS = ("truth", "observed", "residual", "left_out", "away")
 _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "x": ("X", _MM, "detector x"),
     "y": ("Y", _MM, "detector y"),
@@ -40,8 +42,10 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "fwhm": ("FWHM", _SEC, "full width at half maximum"),
     "flags": ("FLAGS", _NONE, "shape flags, 0 is good"),
     "used": ("USED", _NONE, "whether the model was fitted to the star"),
+    "defects": ("DEFECTS", _NONE, "1 neighbour, 2 cosmic ray, 4 full, 8 unusable"),
     "model_e1": ("MODEL_E1", _NONE, "ellipticity of the model there"),
     "model_e2": ("MODEL_E2", _NONE, "ellipticity of the model there"),
+    "model_size": ("MODELSZ", _SEC, "weighted rms size of the model there"),
     "left_out_e1": ("LOO_E1", _NONE, "of the model fitted without the star"),
     "left_out_e2": ("LOO_E2", _NONE, "of the model fitted without the star"),
 }
@@ -65,6 +69,8 @@ class Stars:
         Flags of the shape measurement.
     model_e1, model_e2 : ndarray
         Ellipticity of the model at the position of the star.
+    model_size : ndarray
+        Weighted rms size of the model there [rad].
     """
 
     x: np.ndarray
@@ -77,6 +83,7 @@ class Stars:
     flags: np.ndarray
     model_e1: np.ndarray
     model_e2: np.ndarray
+    model_size: np.ndarray
 
     @property
     def residual_e1(self) -> np.ndarray:
@@ -119,6 +126,9 @@ class ObservedStars(Stars):
         Signal to noise of PSF photometry.
     used : ndarray of bool
         Whether the model was fitted to the star.
+    defects : ndarray of int
+        :class:`~pachon.pipeline.star_selection.StarFlag` bits that were found: such a star has no ellipticity here. 0
+        where none was looked for.
     left_out_e1, left_out_e2 : ndarray
         Ellipticity of the model at the star with the star left out of the fit; NaN where it was not used.
     """
@@ -127,6 +137,7 @@ class ObservedStars(Stars):
     electrons: np.ndarray
     snr: np.ndarray
     used: np.ndarray
+    defects: np.ndarray
     left_out_e1: np.ndarray
     left_out_e2: np.ndarray
 
@@ -165,6 +176,34 @@ class CcdProduct:
     observed_images: np.ndarray
     model: PsfModel
     truth_model: PsfModel
+
+    def stars(self, kind: str) -> TruthStars | ObservedStars:
+        """Return the places that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""
+        if kind not in KINDS:
+            raise unknown_name("kind", kind, KINDS)
+        return self.truth if kind in ("truth", "away") else self.observed
+
+    def ellipticity(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the components e1, e2 of one kind of ellipticity, at the places of :meth:`stars`.
+
+        Parameters
+        ----------
+        kind : str
+            Of the noise-free PSFs (``truth``) and of the stars (``observed``); observed - model at the stars
+            (``residual``) and with the model fitted without the star (``left_out``); truth - model where no star is
+            (``away``).
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such kind.
+        """
+        stars = self.stars(kind)
+        if kind in ("truth", "observed"):
+            return stars.e1, stars.e2
+        if kind == "left_out":
+            return stars.e1 - self.observed.left_out_e1, stars.e2 - self.observed.left_out_e2
+        return stars.residual_e1, stars.residual_e2
 
 
 _StarsKind = TypeVar("_StarsKind", bound=Stars)

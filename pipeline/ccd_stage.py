@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from ..models.aberration_free import without_aberration
 from ..models.errors import DomainError, PachonError
-from ..models.random_streams import stream
+from ..models.focal_plane import FocalPlane
+from ..models.telescope import Telescope
+from ..wavefront.aberration import ResidualWavefront
+from ..wavefront.image_plane import focal_length
 from ..wavefront.psf import make_psfs
-from ..wavefront.pupil_optics import fields_at
+from ..wavefront.pupil_optics import fields_at, trace_pupils
+from .ccd_observation import observe_ccd
 from .ccd_product import CcdProduct, ObservedStars, TruthStars
-from .experiment import Experiment
-from .photometry import ARCSEC, instrument_noise, limiting_magnitude, signal_to_noise, sky_electrons_per_pixel
-from .psf_model import PsfModel
+from .experiment import Experiment, truth_components
+from .photometry import ARCSEC, limiting_magnitude, signal_to_noise
+from .polynomial import term_count
+from .psf_input import snr_weights
+from .psf_model import CLIP_SIGMA, PsfModel
 from .shapes import Shapes, fwhm, measure_shapes
-from .stamps import center_stamps, observe_stamps
 from .star_field import StarField, make_star_field
 
 #: An observed star is drawn on a stamp so many pixels larger than the one kept: room to shift it onto a pixel's centre.
@@ -27,6 +34,9 @@ _RIM = 2
 _MARGIN = 20
 #: Sets magnitude limits until the PSF is known; positions do not depend on it.
 _PROVISIONAL_FWHM = 0.6 * ARCSEC
+#: Focal ratio of the paraboloid that stands for a telescope without aberrations: 1.75 deg from the axis its astigmatism
+#: is 1e-3 arcsec, and e stays under 3e-4, the stretch that a flat field has from tangents in place of angles.
+_PLAIN_RATIO = 1e5
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,31 @@ class CcdExposure:
     observed: Exposed
 
 
+def truth_places(experiment: Experiment, name: str) -> np.ndarray:
+    """Return the places of a CCD where a run has noise-free PSFs [m], shape [n, 2]; they depend on the seed alone."""
+    return _star_field(experiment, name, _PROVISIONAL_FWHM).truth
+
+
+def expose_places(experiment: Experiment, positions: np.ndarray, threads: int | None = None) -> Exposed:
+    """Make noise-free PSFs at positions on the detector [m], shape [n, 2], of any CCDs.
+
+    A star stands where the chief ray of the middle wavelength lands, at the centre of a pixel.
+
+    Raises
+    ------
+    DomainError
+        If no light reaches one of them.
+    """
+    exposed = _expose(experiment, positions, np.zeros_like(positions), threads, None, size=experiment.stamp_size)
+    _check_light(exposed, "some stars")
+    return exposed
+
+
+def _check_light(exposed: Exposed, whose: str) -> None:
+    if not exposed.light.min() > 0.0:
+        raise DomainError(f"no light reaches {whose}: expected a CCD within the field of the telescope")
+
+
 def expose_ccd(
     experiment: Experiment, name: str, *, threads: int | None = None, advance: Callable[[int], None] | None = None
 ) -> CcdExposure:
@@ -100,14 +135,13 @@ def expose_ccd(
         pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
         size = experiment.stamp_size + _SHIFT_ROOM
         observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, advance, size=size)
-        if not observed.light.min() > 0.0:
-            raise DomainError("no light reaches some of its stars: expected a CCD within the field of the telescope")
+        _check_light(observed, "some of its stars")
         return CcdExposure(name, places, truth, observed)
     except PachonError as error:
         raise type(error)(f"CCD {name}: {error}") from None
 
 
-def model_ccd(experiment: Experiment, exposure: CcdExposure) -> CcdProduct:
+def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
     """Look at the stars of one CCD through noise, and model the PSF from what was seen.
 
     Parameters
@@ -116,6 +150,8 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure) -> CcdProduct:
         Telescope, focal plane, atmosphere and settings.
     exposure : CcdExposure
         The stars.
+    noisy : bool
+        Without noise, what stands out is the PSF: no pixel is rejected, as for the truth.
 
     Raises
     ------
@@ -123,14 +159,14 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure) -> CcdProduct:
         If a stage fails: one line that starts with the name of the CCD.
     """
     try:
-        return _model(experiment, exposure.name, exposure.places, exposure.truth, exposure.observed)
+        return _model(experiment, exposure, noisy)
     except PachonError as error:
         raise type(error)(f"CCD {exposure.name}: {error}") from None
 
 
-def _model(experiment: Experiment, name: str, places: StarField, truth: Exposed, observed: Exposed) -> CcdProduct:
+def _model(experiment: Experiment, exposure: CcdExposure, noisy: bool) -> CcdProduct:
     config = experiment.config
-    n_components = config.reconstruction.components
+    name, places, truth, observed = exposure.name, exposure.places, exposure.truth, exposure.observed
     bounds = _bounds(experiment, name)
     truth_images = truth.image.astype(np.float64)
     truth_shapes = measure_shapes(truth_images, truth.pixel_scale, experiment.weight_fwhm)
@@ -138,26 +174,30 @@ def _model(experiment: Experiment, name: str, places: StarField, truth: Exposed,
     width = effective_fwhm(truth.image, truth.pixel_scale)
     stars = _star_field(experiment, name, width, least_light=float(observed.light.min()))
     electrons = stars.electrons * observed.light
-    exposure = config.atmosphere.exposure_s
-    sky = sky_electrons_per_pixel(stars.band, exposure, observed.pixel_scale)
-    noise = instrument_noise(exposure)
-    seen = observe_stamps(observed.image, electrons, sky, noise, stream(*_noise_key(experiment, name)))
-    observed_shapes, observed_images = _centered(experiment, seen, observed.pixel_scale)
-
-    used = observed_shapes.usable & np.isfinite(observed_images).all(axis=(1, 2))
+    snr = signal_to_noise(
+        stars.magnitude - 2.5 * np.log10(observed.light), stars.band, config.atmosphere.exposure_s, width
+    )
+    seen = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
+    fit, used = config.reconstruction, seen.used
+    least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
+    seen.require(max(least, term_count(fit.order or 0)))
     model = PsfModel.fit(
-        observed_images[used],
+        seen.images[used],
         stars.observed[used],
-        n_components=n_components,
-        order=config.reconstruction.order,
+        basis=fit.basis,
+        interpolation=fit.interpolation,
+        weights=snr_weights(fit.weights, snr[used]),
+        n_components=fit.components,
+        order=fit.order,
         extent=bounds,
+        clip_sigma=CLIP_SIGMA if noisy else None,
     )
     # Noise-free stars have no outliers: what stands out there is the PSF.
     truth_model = PsfModel.fit(
         truth_images,
         places.truth,
-        n_components=n_components,
-        order=config.reconstruction.truth_order,
+        n_components=truth_components(config),
+        order=fit.truth_order,
         extent=bounds,
         clip_sigma=None,
     )
@@ -173,7 +213,7 @@ def _model(experiment: Experiment, name: str, places: StarField, truth: Exposed,
         name=name,
         center=_center(experiment, name),
         pixel_scale=truth.pixel_scale,
-        noise=(sky, noise),
+        noise=seen.noise,
         truth=TruthStars(
             **_positions(places.truth, truth.fields),
             **_shapes(truth_shapes, at_truth),
@@ -181,26 +221,20 @@ def _model(experiment: Experiment, name: str, places: StarField, truth: Exposed,
         ),
         observed=ObservedStars(
             **_positions(stars.observed, observed.fields),
-            **_shapes(observed_shapes, at_stars),
+            **_shapes(seen.shapes, at_stars),
             magnitude=stars.magnitude,
             electrons=electrons,
-            snr=signal_to_noise(stars.magnitude - 2.5 * np.log10(observed.light), stars.band, exposure, width),
+            snr=snr,
+            defects=seen.defects,
             used=used,
             left_out_e1=left_out_e1,
             left_out_e2=left_out_e2,
         ),
         truth_images=truth_images.astype(np.float32),
-        observed_images=observed_images.astype(np.float32),
+        observed_images=seen.images.astype(np.float32),
         model=model,
         truth_model=truth_model,
     )
-
-
-def _noise_key(experiment: Experiment, name: str) -> tuple[int, *tuple[str | int, ...]]:
-    """Return what the photon noise of a CCD hangs on: each visit has its own, and the first the plain one."""
-    config = experiment.config
-    visit = (config.atmosphere.epoch,) if config.atmosphere.epoch else ()
-    return config.seed, "noise", name, *visit
 
 
 def _truth(
@@ -251,17 +285,18 @@ def _expose(
         told = done
 
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    seen = _seen_through(experiment)
     psfs = make_psfs(
-        experiment.telescope,
+        seen.telescope,
         fields,
         wavelengths,
-        focal_plane=experiment.focal_plane,
+        focal_plane=seen.focal_plane,
         atmosphere=experiment.atmosphere,
-        aberration=experiment.aberration,
+        aberration=seen.aberration,
         engine=config.psf.engine,
         stamp_size=size,
-        pixel_size=experiment.pixel_size,
-        diffusion=experiment.diffusion,
+        pixel_size=experiment.pixel_size * seen.magnification,
+        diffusion=experiment.diffusion * seen.magnification,
         jitter=experiment.jitter,
         offsets=offsets,
         recenter=recenter,
@@ -273,11 +308,24 @@ def _expose(
     return Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.throughput.mean(axis=1))
 
 
-def _centered(experiment: Experiment, images: np.ndarray, pixel_scale: float) -> tuple[Shapes, np.ndarray]:
-    """Shift stars to the centre of a pixel, cut the stamps, and measure the shapes there."""
-    first = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
-    stamps = center_stamps(images, first.x, first.y, size=experiment.stamp_size)
-    return measure_shapes(stamps, pixel_scale, experiment.weight_fwhm), stamps
+class _Seen(NamedTuple):
+    telescope: Telescope
+    focal_plane: FocalPlane | None
+    aberration: ResidualWavefront | None
+    magnification: float
+
+
+def _seen_through(experiment: Experiment) -> _Seen:
+    """Return what stars are seen through, and how much larger than on the camera's CCDs their images are."""
+    telescope = experiment.telescope
+    if not experiment.air_alone:
+        return _Seen(telescope, experiment.focal_plane, experiment.aberration, 1.0)
+    plain = without_aberration(telescope, _PLAIN_RATIO)
+    axis = np.zeros((1, 2))
+    here, there = (
+        focal_length(trace_pupils(t, axis, experiment.wavelengths, axis).jacobian)[0] for t in (telescope, plain)
+    )
+    return _Seen(plain, None, None, float(there / here))
 
 
 def _center(experiment: Experiment, name: str) -> tuple[float, float]:
@@ -325,4 +373,5 @@ def _shapes(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
         "flags": measured.flags,
         "model_e1": model.e1,
         "model_e2": model.e2,
+        "model_size": model.size,
     }

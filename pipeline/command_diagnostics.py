@@ -6,10 +6,23 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from ..models.errors import ConfigError
-from .command_options import Json, Threads, name_list, wide_console
+from .command_options import (
+    Ccds,
+    Config,
+    Json,
+    ObservedStars,
+    Quiet,
+    Raft,
+    Threads,
+    TruthStars,
+    interruptible,
+    name_list,
+    one_name_list,
+    resolved_configuration,
+    show_table,
+    wide_console,
+)
 
 
 def diagnose_command(
@@ -17,6 +30,9 @@ def diagnose_command(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to; by default diagnostics, in that of the run.")
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="End where a CCD has no product that can be read, and do not leave it out.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Look at the residuals of a run: ellipticity and size of each CCD, correlations, rho statistics, with jackknife.
@@ -35,7 +51,7 @@ def diagnose_command(
     from .diagnostics import diagnose
     from .products import json_text
 
-    result = diagnose(folder, out)
+    result = diagnose(folder, out, strict=strict)
     if as_json:
         print(json_text(result.as_dict()))
         return
@@ -45,41 +61,32 @@ def diagnose_command(
 def _show_diagnostics(result: Any) -> None:
     from .tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
 
-    console = wide_console()
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for name in DIAGNOSTICS_COLUMNS:
-        left = name == DIAGNOSTICS_COLUMNS[0]
-        table.add_column(name.replace("[", "\\["), justify="left" if left else "right", no_wrap=True)
-    for row in diagnostics_rows(result.overall):
-        table.add_row(*row)
-    console.print(table)
-    console.print(DIAGNOSTICS_CAPTION, style="dim", width=100)
+    show_table(DIAGNOSTICS_COLUMNS, diagnostics_rows(result.overall), DIAGNOSTICS_CAPTION)
     if result.missing:
-        console.print(f"{len(result.missing)} CCDs have no product yet: {', '.join(result.missing[:5])}", style="bold")
+        reason = next(iter(result.missing.values()))
+        wide_console().print(f"{len(result.missing)} CCDs are left out; the first: {reason}", style="bold")
     print(f"diagnostics: {result.folder.resolve()}")
 
 
 def attribute_command(
-    config: Annotated[
-        Path | None, typer.Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")
-    ] = None,
-    ccds: Annotated[str | None, typer.Option(help="CCDs, separated by commas: R22_S11,R22_S12.")] = None,
-    raft: Annotated[str | None, typer.Option(help="All CCDs of rafts: R22 or R22,R23.")] = None,
+    config: Config = None,
+    ccds: Ccds = None,
+    raft: Raft = None,
     causes: Annotated[
         str | None,
         typer.Option(
             help="Causes to switch off, separated by commas, of global, raft, ccd, tilt, potato_chip, heights, "
-            "active_optics, atmosphere, diffusion, noise; all that are on by default."
+            "active_optics, optics, atmosphere, ground_layer, diffusion, noise; all that are on by default."
         ),
     ] = None,
     average: Annotated[
         bool, typer.Option("--average", help="The mean over all turbulence: quick, and leaves optics and heights.")
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("pachon_attribution"),
-    truth_stars: Annotated[int | None, typer.Option(help="Noise-free PSFs on each CCD.")] = None,
-    observed_stars: Annotated[int | None, typer.Option(help="Observed stars on each CCD.")] = None,
+    truth_stars: TruthStars = None,
+    observed_stars: ObservedStars = None,
     threads: Threads = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Find what each cause does: the same stars with everything, and once more with each cause switched off.
@@ -94,25 +101,17 @@ def attribute_command(
     - `pachon attribute pachon_run/config.yaml --causes ccd,potato_chip,atmosphere --truth-stars 200`
     """
     from .attribution import attribute, checked_causes, write_attribution
-    from .config import Configuration, load_configuration, with_options
-    from .experiment import resolve
-    from .interrupt import remembered_interrupts
     from .products import json_text, make_folder
-    from .progress import Reporter
 
-    if ccds is not None and raft is not None:
-        raise ConfigError("--ccds and --raft: expected one of them")
-    names = name_list(ccds, "--ccds") if ccds is not None else name_list(raft, "--raft") if raft is not None else None
-    base = Configuration() if config is None else load_configuration(config)
+    names = one_name_list(ccds=ccds, raft=raft)
     engine = "long_exposure" if average else None
-    settings = with_options(
-        base, ccds=names, stars__truth=truth_stars, stars__observed=observed_stars, psf__engine=engine
+    resolved = resolved_configuration(
+        config, ccds=names, stars__truth=truth_stars, stars__observed=observed_stars, psf__engine=engine
     )
-    resolved = resolve(settings, None if config is None else config.parent)
     chosen = checked_causes(resolved, None if causes is None else name_list(causes, "--causes"))
     make_folder(out)
-    with remembered_interrupts() as check:
-        result = attribute(resolved, chosen, threads=threads, reporter=Reporter(quiet, check))
+    with interruptible(quiet) as reporter:
+        result = attribute(resolved, chosen, threads=threads, reporter=reporter)
     write_attribution(result, out, resolved)
     if as_json:
         print(json_text(result.figures))
@@ -125,12 +124,7 @@ def attribute_command(
 def _show_attribution(figures: dict[str, dict[str, float]]) -> None:
     from .tables import ATTRIBUTION_CAPTION, ATTRIBUTION_COLUMNS, attribution_rows
 
-    console = wide_console()
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for name in ATTRIBUTION_COLUMNS:
-        left = name == ATTRIBUTION_COLUMNS[0]
-        table.add_column(name.replace("[", "\\["), justify="left" if left else "right", no_wrap=True)
-    for row in attribution_rows(figures):
-        table.add_row(*row)
-    console.print(table)
-    console.print(ATTRIBUTION_CAPTION, style="dim", width=100)
+    show_table(ATTRIBUTION_COLUMNS, attribution_rows(figures), ATTRIBUTION_CAPTION)
+
+
+COMMANDS = {"diagnose": diagnose_command, "attribute": attribute_command}

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -30,6 +30,7 @@ Positive = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_i
 NotNegative = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False, ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
+Fraction = Annotated[float, BeforeValidator(_number), Field(strict=True, ge=0, le=1)]
 Switch = Annotated[bool, Field(strict=True)]
 BandName = Literal["u", "g", "r", "i", "z", "y"]
 
@@ -44,6 +45,17 @@ class StarsConfig(_Section):
     truth: Count = Field(100, description="noise-free PSFs on each CCD, where no observed star is")
     observed: Count = Field(40, description="observed stars on each CCD")
     snr_min: Positive = Field(30.0, description="faintest star by its signal-to-noise ratio")
+    neighbours: Fraction = Field(0.0, description="fraction of the observed stars with a neighbour on their stamp")
+    cosmic_rays: Fraction = Field(0.0, description="fraction of the observed stars that a cosmic ray crosses")
+    saturated: Fraction = Field(0.0, description="fraction of the observed stars, the brightest, with a saturated core")
+
+
+class MotionConfig(_Section):
+    """Motion of a raft or CCD as a rigid body."""
+
+    dz_um: Real = Field(0.0, description="along +z, towards the sky [um]")
+    rx_urad: Real = Field(0.0, description="about x; positive lifts the side at larger y [urad]")
+    ry_urad: Real = Field(0.0, description="about y; positive lowers the side at larger x [urad]")
 
 
 class FocalPlaneConfig(_Section):
@@ -57,6 +69,30 @@ class FocalPlaneConfig(_Section):
     ccd: Switch = Field(True, description="height of each CCD")
     tilt: Switch = Field(True, description="tilt of each CCD")
     potato_chip: Switch = Field(True, description="waves within each CCD")
+    global_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
+    raft_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
+    ccd_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
+    tilt_urad: NotNegative | None = Field(None, description="peak to valley in place of the budget's [urad]")
+    potato_chip_um: NotNegative | None = Field(None, description="peak to valley in place of the budget's [um]")
+    potato_chip_cycles: tuple[Positive, Positive] | None = Field(
+        None, description="fewest and most cycles along a CCD in place of 1 and 2"
+    )
+    moved: dict[str, MotionConfig] = Field(
+        default_factory=dict, description="rafts and CCDs moved besides: {R22: {dz_um: 5}, R21_S11: {rx_urad: 50}}"
+    )
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """Sizes in place of the budget's, as :class:`~pachon.models.height_budget.HeightBudget` has them, in SI."""
+        given = {
+            "global_height": self.global_um,
+            "raft_height": self.raft_um,
+            "ccd_height": self.ccd_um,
+            "ccd_tilt": self.tilt_urad,
+            "potato_chip": self.potato_chip_um,
+        }
+        sizes: dict[str, Any] = {key: value * 1e-6 for key, value in given.items() if value is not None}
+        return sizes | ({} if self.potato_chip_cycles is None else {"potato_chip_cycles": self.potato_chip_cycles})
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -112,8 +148,22 @@ class PsfConfig(_Section):
 class ReconstructionConfig(_Section):
     """How the PSF is measured and modelled."""
 
-    components: Count = Field(20, description="principal components kept on each CCD")
-    order: Whole = Field(3, description="order of the polynomials fitted to the observed stars")
+    flag_stars: Switch = Field(
+        False, description="leave out stars with neighbours, cosmic rays and saturated cores, as far as they are seen"
+    )
+    basis: Literal["pca", "pixels", "shapelets"] = Field(
+        "pca", description="what stars are described in: pca (eigen-PSFs), pixels (each on its own), shapelets"
+    )
+    components: Count | None = Field(None, description="components kept on each CCD, 20 by default; none of pixels")
+    interpolation: Literal["polynomial", "gp"] = Field(
+        "polynomial", description="over the CCD: polynomial, gp (Gaussian process over a polynomial trend)"
+    )
+    weights: Literal["equal", "snr", "softened"] = Field(
+        "equal", description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
+    )
+    order: Whole | None = Field(
+        None, description="order of the polynomials fitted to the observed stars, 3; 0 under a Gaussian process"
+    )
     truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")
 
@@ -125,6 +175,9 @@ class Configuration(_Section):
     telescope: str | None = Field(None, description="bundled model (pachon info lists them), or path of a prescription")
     ccds: tuple[str, ...] | None = Field(None, description="CCDs to compute")
     seed: Whole = Field(1, description="seed of all random numbers")
+    changes: dict[str, Real] = Field(
+        default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"
+    )
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()
@@ -136,6 +189,31 @@ class Configuration(_Section):
     def as_dict(self) -> dict[str, Any]:
         """Return the configuration as plain lists, mappings and numbers, keys as in the file."""
         return self.model_dump(mode="json", by_alias=True)
+
+
+def configuration_of(content: dict[str, Any], source: str) -> Configuration:
+    """Return the configuration that plain mappings describe; `source` names them in error messages.
+
+    Raises
+    ------
+    ConfigError
+        If there is an unknown key or a value out of range.
+    """
+    if isinstance(content.get("ccds"), str):
+        content = {**content, "ccds": [content["ccds"]]}
+    return _validated(content, source)
+
+
+def known_keys(model: type[BaseModel] = Configuration) -> tuple[str, ...]:
+    """Return all keys of a configuration, with dots between sections."""
+    keys: list[str] = []
+    for name, field in model.model_fields.items():
+        section = field.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            keys += [f"{field.alias or name}.{key}" for key in known_keys(section)]
+        else:
+            keys.append(field.alias or name)
+    return tuple(keys)
 
 
 def load_configuration(path: Path) -> Configuration:
@@ -151,9 +229,7 @@ def load_configuration(path: Path) -> Configuration:
     except PrescriptionError as error:
         raise ConfigError(str(error)) from None
     content = {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
-    if isinstance(content.get("ccds"), str):
-        content["ccds"] = [content["ccds"]]
-    return _validated(content, str(path))
+    return configuration_of(content, str(path))
 
 
 def with_options(config: Configuration, **options: Any) -> Configuration:
@@ -214,6 +290,7 @@ def _yaml_lines(section: _Section, names: list[str], indent: str) -> list[str]:
         field = type(section).model_fields[name]
         value = getattr(section, name)
         value = list(value) if isinstance(value, tuple) else value
+        value = section.model_dump(mode="json", include={name})[name] if isinstance(value, dict) else value
         text = yaml.safe_dump(value, default_flow_style=True, width=2**20, allow_unicode=True)
         text = text.removesuffix("...\n").strip()
         entry = f"{indent}{field.alias or name}: {text}"
@@ -241,7 +318,7 @@ def _validated(content: dict[str, Any], source: str) -> Configuration:
     try:
         return Configuration.model_validate(content)
     except ValidationError as error:
-        raise _first_problem(error, source) from None
+        raise first_problem(error, source, Configuration) from None
 
 
 _EXPECTED = {
@@ -259,8 +336,8 @@ _EXPECTED = {
 _LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
 
 
-def _first_problem(error: ValidationError, source: str) -> PachonError:
-    """Return the first problem as one line: file, key, value, what was expected."""
+def first_problem(error: ValidationError, source: str, model: type[BaseModel]) -> PachonError:
+    """Return the first problem of a file of that model as one line: file, key, value, what was expected."""
     # A misspelt key is the likelier cause of what else is wrong, so it goes first.
     problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
     problem = problems[0]
@@ -268,7 +345,7 @@ def _first_problem(error: ValidationError, source: str) -> PachonError:
     key = _dotted(problem["loc"])
     kind, context = problem["type"], problem.get("ctx", {})
     if kind == "extra_forbidden":
-        known = _known_keys(problem["loc"][:-1])
+        known = _known_keys(model, problem["loc"][:-1])
         near = get_close_matches(str(problem["loc"][-1]), known, n=2, cutoff=0.6)
         hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
         return ConfigError(f"{source}: unknown key {key} = {_shown(problem['input'])}: {hint}")
@@ -292,8 +369,11 @@ def _dotted(location: tuple[int | str, ...]) -> str:
     return ".".join(parts)
 
 
-def _known_keys(location: tuple[int | str, ...]) -> list[str]:
-    model: Any = Configuration
+def _known_keys(model: Any, location: tuple[int | str, ...]) -> list[str]:
     for part in location:
+        if not hasattr(model, "model_fields"):
+            # A mapping of names to sections: all of one kind.
+            model = get_args(model)[-1]
+            continue
         model = model.model_fields[part].annotation
     return [field.alias or name for name, field in model.model_fields.items()]

@@ -6,7 +6,9 @@ is never without the other, nor without the residual of each star at the model f
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,26 +17,21 @@ import numpy as np
 from astropy.table import Table
 
 from ..models.errors import PachonError, ProductError
-from .ccd_product import CcdProduct, ObservedStars, Stars, product_path, read_product
+from .ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
 from .config import load_configuration
-from .correlation import Correlation, shear_correlation
+from .correlation import Correlation
 from .experiment import prepare
 from .figures_diagnostics import residual_map, rho_figure
 from .figures_statistics import correlation_figure
-from .products import described_table, make_folder, write_bytes, write_ecsv, write_json
+from .products import Stamp, described_table, make_folder, write_bytes, write_ecsv, write_json
 from .rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
-from .run_folder import CONFIG_NAME, stamp_of
-from .shapes import measure_shapes
-from .summary import LONG_RANGE, of_kind, separation_bins
+from .run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
+from .summary import LONG_RANGE, LONGEST_ARCMIN, correlations, patches, separation_bins
 
-#: What is correlated, in this order in tables and pictures.
-CORRELATED = ("truth", "observed", "residual", "left_out", "away")
 #: Residuals: at the stars, of stars left out, away from them.
 RESIDUALS = ("residual", "left_out", "away")
 #: Those of them whose size is known too.
 SIZED = ("residual", "away")
-#: The paper's claim of a residual below 1e-7 is for separations up to here [arcmin].
-LONGEST = 180.0
 FOLDER_NAME = "diagnostics"
 _MEANINGS = {
     "residual": "observed - model, at the stars",
@@ -53,21 +50,22 @@ class Diagnostics:
         Where the files are.
     files : tuple of str
         Their names.
-    missing : tuple of str
-        CCDs of the configuration that have no product yet.
+    missing : dict of str to str
+        CCDs of the configuration that have no product, or one that cannot be read, and why.
     table : Table
         A row for each CCD: means and rms of the residuals.
     overall : dict
         The same over all CCDs, and figures of the correlations; keys end in their unit.
     correlations : dict of str to Correlation
-        Of each of :data:`CORRELATED`. Errors by jackknife over the CCDs where there are two or more.
+        Of each of :data:`~pachon.pipeline.ccd_product.KINDS`, with errors by jackknife over the CCDs where there are
+        two or more.
     rho : dict of str to RhoStatistics
         At the stars (``residual``), and where no star is (``away``).
     """
 
     folder: Path
     files: tuple[str, ...]
-    missing: tuple[str, ...]
+    missing: dict[str, str]
     table: Table
     overall: dict[str, Any]
     correlations: dict[str, Correlation]
@@ -80,12 +78,12 @@ class Diagnostics:
             "ccd": {row["ccd"]: {k: row[k] for k in self.table.colnames[1:]} for row in self.table},
             "correlation": {kind: correlation_dict(c) for kind, c in self.correlations.items()},
             "rho": {kind: {name: correlation_dict(c) for name, c in rho.items()} for kind, rho in self.rho.items()},
-            "missing": list(self.missing),
+            "missing": self.missing,
             "files": list(self.files),
         }
 
 
-def diagnose(folder: Path, out: Path | None = None) -> Diagnostics:
+def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> Diagnostics:
     """Read the products of a run, and write tables and pictures of the residuals.
 
     Parameters
@@ -94,12 +92,14 @@ def diagnose(folder: Path, out: Path | None = None) -> Diagnostics:
         Folder of a run, finished or not.
     out : Path, optional
         Where to write; a folder ``diagnostics`` within the run's by default.
+    strict : bool
+        Whether a CCD without a product, or with one that cannot be read, is an error; else it is reported and left out.
 
     Raises
     ------
     PachonError
-        If this is no run, no CCD is finished, a product is damaged or of another configuration, or nothing can be
-        written.
+        If this is no run, no CCD is finished, the products are of another configuration, or nothing can be written;
+        with `strict`, if a single product is missing or damaged.
     """
     path = folder / CONFIG_NAME
     if not path.exists():
@@ -110,17 +110,21 @@ def diagnose(folder: Path, out: Path | None = None) -> Diagnostics:
     except PachonError as error:
         raise ProductError(f"{path}: no configuration that pachon run wrote ({error})") from None
     stamp, names = stamp_of(experiment), config.ccds or ()
-    missing = tuple(name for name in names if not product_path(folder, name).exists())
-    if len(missing) == len(names):
+    if not any(product_path(folder, name).exists() for name in names):
         raise ProductError(f"{folder}: none of its {len(names)} CCDs is finished")
-    products = [
-        read_product(product_path(folder, name), stamp, truth_images=False) for name in names if name not in missing
-    ]
-    samples = [{kind: _sample(p, kind, experiment.weight_fwhm) for kind in RESIDUALS} for p in products]
-    columns = _ccd_columns(products, samples)
-    correlated = correlate(products)
-    rho = {kind: _rho(products, samples, kind) for kind in SIZED}
-    overall = _overall(products, samples, correlated)
+    products, missing = [], {}
+    for name in names:
+        try:
+            products.append(_product(folder, name, stamp))
+        except ProductError as error:
+            missing[name] = str(error)
+            # Damage happens to single files; a folder without any that can be read has another reason.
+            if strict or len(missing) == len(names):
+                raise
+    columns = _ccd_columns(products)
+    correlated = correlations(products, KINDS)
+    rho = {kind: _rho(products, kind) for kind in SIZED}
+    overall = _overall(products, correlated)
 
     out = folder / FOLDER_NAME if out is None else out
     make_folder(out)
@@ -140,84 +144,41 @@ def diagnose(folder: Path, out: Path | None = None) -> Diagnostics:
     return result
 
 
-def correlate(products: Sequence[CcdProduct]) -> dict[str, Correlation]:
-    """Correlate each of :data:`CORRELATED` over all CCDs, with errors by jackknife over them where there are two.
+def _product(folder: Path, name: str, stamp: Stamp) -> CcdProduct:
+    """Return the product of a CCD; the error without one gives the reason, where the run has left one."""
+    path = product_path(folder, name)
+    if path.exists():
+        return read_product(path, stamp, truth_images=False)
+    reason = "has no product yet"
+    with suppress(OSError, ValueError, KeyError):
+        reason = json.loads((folder / SUMMARY_NAME).read_text())["not_modelled"][name]
+    raise ProductError(f"CCD {name}: {reason}")
 
-    The same bins as in the summary of a run.
-    """
-    bins = separation_bins(products)
-    result = {}
-    for kind in CORRELATED:
-        parts = [of_kind(p, kind) for p in products]
-        x, y, e1, e2 = (np.concatenate(c) for c in zip(*parts, strict=True))
-        result[kind] = shear_correlation(x, y, e1, e2, patch=_patches([len(p[0]) for p in parts]), **bins)
+
+def _growth(stars: Stars) -> np.ndarray:
+    """Return (T - T of the model)/T with T = Q11 + Q22, [n]."""
+    model = trace_of_moments(stars.model_size, stars.model_e1, stars.model_e2)
+    result: np.ndarray = 1.0 - model / trace_of_moments(stars.size, stars.e1, stars.e2)
     return result
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """Stars of one kind on one CCD with the model there, and what is left: T is Q11 + Q22 [rad^2]."""
-
-    stars: Stars
-    model_e1: np.ndarray
-    model_e2: np.ndarray
-    model_size: np.ndarray
-
-    @property
-    def residual(self) -> np.ndarray:
-        """Ellipticity less the model's, [2, n]."""
-        return np.stack([self.stars.e1 - self.model_e1, self.stars.e2 - self.model_e2])
-
-    @property
-    def growth(self) -> np.ndarray:
-        """(T - T of the model)/T, [n]."""
-        trace = trace_of_moments(self.stars.size, self.stars.e1, self.stars.e2)
-        result: np.ndarray = 1.0 - trace_of_moments(self.model_size, self.model_e1, self.model_e2) / trace
-        return result
+def _rho(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
+    stars = [p.stars(kind) for p in products]
+    keys = ("field_x", "field_y", "e1", "e2", "size", "model_e1", "model_e2", "model_size")
+    columns = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
+    return rho_statistics(*columns, patch=patches(stars), **separation_bins(products))
 
 
-def _sample(product: CcdProduct, kind: str, weight_fwhm: float) -> _Sample:
-    stars = product.truth if kind == "away" else product.observed
-    if kind == "left_out":
-        assert isinstance(stars, ObservedStars)
-        return _Sample(stars, stars.left_out_e1, stars.left_out_e2, np.full(len(stars), np.nan))
-    # A product keeps the ellipticity of the model and not its size, but it keeps the model without loss.
-    images = product.model.at(np.stack([stars.x, stars.y], axis=1))
-    return _Sample(stars, stars.model_e1, stars.model_e2, measure_shapes(images, product.pixel_scale, weight_fwhm).size)
-
-
-def _patches(counts: Sequence[int]) -> np.ndarray | None:
-    """Return the number of the CCD of each star; None where there is but one CCD."""
-    return np.repeat(np.arange(len(counts)), counts) if len(counts) > 1 else None
-
-
-def _rho(products: Sequence[CcdProduct], samples: Sequence[Mapping[str, _Sample]], kind: str) -> RhoStatistics:
-    chosen = [s[kind] for s in samples]
-
-    def of_stars(key: str) -> np.ndarray:
-        return np.concatenate([getattr(s.stars, key) for s in chosen])
-
-    def of_model(key: str) -> np.ndarray:
-        return np.concatenate([getattr(s, key) for s in chosen])
-
-    return rho_statistics(
-        *(of_stars(key) for key in ("field_x", "field_y", "e1", "e2", "size")),
-        *(of_model(key) for key in ("model_e1", "model_e2", "model_size")),
-        patch=_patches([len(s.stars) for s in chosen]),
-        **separation_bins(products),
-    )
-
-
-def _moments(samples: Sequence[_Sample], kind: str) -> dict[str, float]:
+def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
     """Return means and rms of the residuals of some CCDs together."""
-    e = np.concatenate([s.residual for s in samples], axis=1)
+    e = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
     figures = {
         f"mean_e1_{kind}": _mean(e[0]),
         f"mean_e2_{kind}": _mean(e[1]),
         f"rms_e_{kind}": float(np.sqrt(_mean(e**2))),
     }
     if kind in SIZED:
-        growth = np.concatenate([s.growth for s in samples])
+        growth = np.concatenate([_growth(p.stars(kind)) for p in products])
         figures |= {f"mean_dt_{kind}": _mean(growth), f"rms_dt_{kind}": float(np.sqrt(_mean(growth**2)))}
     return figures
 
@@ -227,9 +188,7 @@ def _mean(values: np.ndarray) -> float:
     return float(finite.mean()) if finite.size else np.nan
 
 
-def _ccd_columns(
-    products: Sequence[CcdProduct], samples: Sequence[Mapping[str, _Sample]]
-) -> dict[str, tuple[np.ndarray, str, str]]:
+def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, str, str]]:
     columns: dict[str, tuple[np.ndarray, str, str]] = {
         "ccd": (np.array([p.name for p in products]), "", "name of the CCD"),
         "x_mm": (np.array([round(p.center[0] * 1e3, 6) for p in products]), "mm", "centre on the detector"),
@@ -239,7 +198,7 @@ def _ccd_columns(
         "truth_psfs": (np.array([len(p.truth) for p in products]), "", "places where the PSF is known"),
     }
     for kind in RESIDUALS:
-        rows = [_moments([s[kind]], kind) for s in samples]
+        rows = [_moments([p], kind) for p in products]
         for key in rows[0]:
             what = {"mean": "mean", "rms_": "rms"}[key[:4]]
             of = "(T - T model)/T" if "_dt_" in key else "e1" if "_e1_" in key else "e2" if "_e2_" in key else "e1, e2"
@@ -248,21 +207,17 @@ def _ccd_columns(
     return columns
 
 
-def _overall(
-    products: Sequence[CcdProduct],
-    samples: Sequence[Mapping[str, _Sample]],
-    correlated: Mapping[str, Correlation],
-) -> dict[str, Any]:
+def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlation]) -> dict[str, Any]:
     figures: dict[str, Any] = {
         "ccds": len(products),
         "stars": sum(len(p.observed) for p in products),
         "truth_psfs": sum(len(p.truth) for p in products),
     }
     for kind in RESIDUALS:
-        figures |= _moments([s[kind] for s in samples], kind)
+        figures |= _moments(products, kind)
     for kind, correlation in correlated.items():
         r = correlation.r_arcmin
-        inside = np.flatnonzero((r >= LONG_RANGE) & (r <= LONGEST) & (correlation.n_pairs > 0))
+        inside = np.flatnonzero((r >= LONG_RANGE) & (r <= LONGEST_ARCMIN) & (correlation.n_pairs > 0))
         largest = inside[np.argmax(np.abs(correlation.xi_plus[inside]))] if len(inside) else None
         for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", correlation.error_plus)):
             figures[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -13,9 +13,11 @@ from typing import TypeVar
 import numpy as np
 from pydantic import BaseModel
 
+from ..design.changes import apply_changes
 from ..models.camera import Camera, load_camera
 from ..models.errors import ConfigError, PachonError
 from ..models.focal_plane import FocalPlane
+from ..models.height_budget import load_budget
 from ..models.prescription import bundled_names, load_telescope
 from ..models.site import Site, load_site
 from ..models.telescope import Telescope
@@ -24,11 +26,13 @@ from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere import Atmosphere
 from ..wavefront.fast_psf import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
+from ..wavefront.psf import SCREENS
 from ..wavefront.pupil_optics import chief_rays
 from ..wavefront.refraction import dispersion_shift
 from .config import BandName, Configuration, digest
 from .photometry import ARCSEC
 from .polynomial import term_count
+from .psf_fit import COMPONENTS
 from .screen_cover import check_screens
 
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
@@ -63,6 +67,9 @@ class Experiment:
         What active optics leaves uncorrected; None for nothing.
     site : Site
         Where the telescope stands.
+    air_alone : bool
+        Whether stars are seen through a beam without aberrations, from the same places on the sky: without what the
+        design of the telescope, the heights and active optics do.
     """
 
     config: Configuration
@@ -71,6 +78,7 @@ class Experiment:
     atmosphere: Atmosphere | None
     aberration: ResidualWavefront | None
     site: Site
+    air_alone: bool = False
 
     @property
     def camera(self) -> Camera:
@@ -121,6 +129,22 @@ class Experiment:
             math.radians(settings.parallactic_angle_deg),
             self.site.weather,
         )
+
+    @property
+    def screen_kinds(self) -> tuple[str, ...]:
+        """Kinds of screens that the engine keeps of the atmosphere; none where there is none."""
+        return () if self.atmosphere is None else SCREENS[self.config.psf.engine]
+
+    def make_screens(self, threads: int | None = None) -> None:
+        """Make all screens that the engine keeps, which the first star would else have to wait for.
+
+        Parameters
+        ----------
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+        """
+        for kind in self.screen_kinds:
+            _given(self.atmosphere).kept_screens(kind, threads)
 
     @cached_property
     def field_radius_on_detector(self) -> float:
@@ -192,11 +216,16 @@ def resolve(config: Configuration, folder: Path | None = None) -> Configuration:
                 | _ENGINE_DEFAULTS.get(config.psf.engine, {}),
             ),
             "reconstruction": _filled(
-                config.reconstruction, {"weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3}
+                config.reconstruction,
+                {
+                    "weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3,
+                    "components": None if config.reconstruction.basis == "pixels" else COMPONENTS,
+                    "order": 3 if config.reconstruction.interpolation == "polynomial" else 0,
+                },
             ),
         }
     )
-    _check(resolved, telescope)
+    _check(resolved, apply_changes(telescope, resolved.changes))
     check_screens(resolved, telescope, camera, site)
     return resolved
 
@@ -209,14 +238,19 @@ def prepare(config: Configuration) -> Experiment:
     PachonError
         If one of them cannot be made: one line that says where in the configuration.
     """
-    telescope = load_telescope(_given(config.telescope))
+    telescope = apply_changes(load_telescope(_given(config.telescope)), config.changes)
     camera = load_camera(_given(telescope.camera))
     site = load_site(config.atmosphere.site)
     plane = config.focal_plane
     if plane.budget == "flat":
         focal_plane = FocalPlane.flat(camera)
     else:
-        focal_plane = FocalPlane.from_budget(camera, seed=config.seed, terms=plane.terms, budget=plane.budget)
+        budget = replace(load_budget(plane.budget), **plane.sizes)
+        focal_plane = FocalPlane.from_budget(camera, seed=config.seed, terms=plane.terms, budget=budget)
+    for name, motion in plane.moved.items():
+        focal_plane = focal_plane.with_moved(
+            name, dz=motion.dz_um * 1e-6, rx=motion.rx_urad * 1e-6, ry=motion.ry_urad * 1e-6
+        )
     atmosphere = None
     air = config.atmosphere
     if air.enabled:
@@ -241,6 +275,12 @@ def prepare(config: Configuration) -> Experiment:
         rms = config.active_optics.residual_um * 1e-6
         aberration = ResidualWavefront.draw(telescope, rms, config.seed, air.epoch)
     return Experiment(config, telescope, focal_plane, atmosphere, aberration, site)
+
+
+def truth_components(config: Configuration) -> int:
+    """Return how many principal components describe the noise-free PSFs of a resolved configuration."""
+    components = config.reconstruction.components
+    return min(COMPONENTS, config.stars.truth - 1) if components is None else components
 
 
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
@@ -279,11 +319,17 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     if _given(config.psf.stamp) % 2 == 0:
         raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
     fit, stars = config.reconstruction, config.stars
+    if fit.basis == "pixels" and fit.components is not None:
+        raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
+    if fit.interpolation == "gp" and fit.weights != "equal":
+        raise ConfigError(f"reconstruction.weights = {fit.weights}: expected equal with interpolation = gp")
     for kind in ("observed", "truth"):
         count = getattr(stars, kind)
-        if fit.components > count - 1:
+        # The noise-free PSFs are always described by principal components.
+        components = truth_components(config) if kind == "truth" else fit.components
+        if components is not None and components > count - 1 and (kind == "truth" or fit.basis == "pca"):
             raise ConfigError(
-                f"reconstruction.components = {fit.components}: expected at most {count - 1}, one less than "
+                f"reconstruction.components = {components}: expected at most {count - 1}, one less than "
                 f"stars.{kind} = {count}"
             )
         key = "order" if kind == "observed" else "truth_order"
@@ -293,6 +339,10 @@ def _check(config: Configuration, telescope: Telescope) -> None:
                 f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
                 f"stars.{kind} = {count}"
             )
+    if config.focal_plane.budget == "flat" and config.focal_plane.sizes:
+        raise ConfigError(
+            "focal_plane.budget = flat: expected simulated or specification where sizes of its terms are given"
+        )
     if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:
         raise ConfigError("psf.engine = long_exposure: expected atmosphere.enabled = true, whose mean it takes")
     if config.atmosphere.time_step_s > config.atmosphere.exposure_s:

@@ -1,66 +1,24 @@
-"""What all figures share: drawing without global state, whiskers, CCD outlines, the bytes of a PNG.
+"""What figures of the focal plane share: whiskers, CCD outlines, what each colour means.
 
 Figures are in the detector's frame as the telescope's frame has it: x to the right, y up, in millimetres.
 """
 
 from __future__ import annotations
 
-import io
-import logging
 from collections.abc import Iterable
-from typing import Any, Literal
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
 from ..models.camera import Camera
+from ..wavefront.picture import BLUE, GREY, ORANGE, PURPLE, RED, figure_of
 
 #: One colour for one thing, in every figure: blue and red for observed and residual are the paper's.
-TRUTH, OBSERVED, RESIDUAL, AWAY = "#3a3a3a", "#1f6fbf", "#c8322b", "#e08a00"
-LEFT_OUT = "#7a4fb5"
-_STYLE = {
-    "font.size": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.labelsize": 9.0,
-    "axes.linewidth": 0.7,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-    "image.origin": "lower",
-    "image.interpolation": "nearest",
-    "text.usetex": False,
-    "svg.hashsalt": "pachon",
-}
-_DPI = 150
-# Matplotlib announces the building of its font cache, which no astronomer asked about.
-logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
-
-
-def styled() -> Any:
-    """Return the context in which figures are drawn: our style on top of matplotlib's own, not the user's."""
-    return matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE, "backend": "agg"})
-
-
-def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
-    """Return an empty figure of a size in inches that belongs to no window and no global state."""
-    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def png_bytes(figure: Figure) -> bytes:
-    """Return a figure as PNG, without the date and the version of what drew it."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
-    return buffer.getvalue()
+TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
 
 
 def ccd_corners(camera: Camera, indices: Iterable[int]) -> np.ndarray:
@@ -127,13 +85,6 @@ def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float)
         va="center",
         fontsize=8,
     )
-
-
-def figure_of(axes: Axes) -> Figure:
-    """Return the figure that axes belong to."""
-    figure = axes.get_figure(root=True)
-    assert isinstance(figure, Figure)
-    return figure
 
 
 def key_ellipticity(values: np.ndarray) -> float:

@@ -8,8 +8,9 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..wavefront.picture import new_figure, png_bytes, styled
 from .correlation import Correlation
-from .figures import AWAY, RESIDUAL, TRUTH, new_figure, png_bytes, styled
+from .figures import AWAY, RESIDUAL, TRUTH
 
 _FULL = "full"
 

@@ -11,6 +11,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 
 from ..models.camera import Camera
+from ..wavefront.picture import new_figure, png_bytes, styled
 from .figures import (
     ccd_corners,
     draw_key_whisker,
@@ -18,9 +19,6 @@ from .figures import (
     draw_whiskers,
     frame_axes,
     key_ellipticity,
-    new_figure,
-    png_bytes,
-    styled,
     whiskers,
 )
 from .figures_statistics import draw_correlation

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..models.focal_plane import FocalPlane
+from ..wavefront.picture import new_figure, png_bytes, styled
 from .ccd_product import CcdProduct, Stars
 from .figures import (
     AWAY,
@@ -21,9 +22,6 @@ from .figures import (
     draw_whiskers,
     frame_axes,
     key_ellipticity,
-    new_figure,
-    png_bytes,
-    styled,
     whiskers,
 )
 
@@ -162,13 +160,9 @@ _SHORT_TITLES = {
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
 
-def _stars_of(product: CcdProduct, kind: str) -> Stars:
-    return product.truth if kind in ("truth", "away") else product.observed
-
-
 def _titled(title: str, products: Sequence[CcdProduct], kind: str, most: int) -> str:
     """Return a title that says so where not every star has its whisker."""
-    step = max(_step(_stars_of(product, kind), most) for product in products)
+    step = max(_step(product.stars(kind), most) for product in products)
     return title if step == 1 else f"{title} (one star in {step})"
 
 
@@ -177,9 +171,8 @@ def _step(stars: Stars, most: int) -> int:
 
 
 def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: float, most: int) -> None:
-    stars = _stars_of(product, kind)
-    e1, e2 = (stars.e1, stars.e2) if kind in ("truth", "observed") else (stars.residual_e1, stars.residual_e2)
-    ends = whiskers(stars.x * 1e3, stars.y * 1e3, e1, e2, scale)
+    stars = product.stars(kind)
+    ends = whiskers(stars.x * 1e3, stars.y * 1e3, *product.ellipticity(kind), scale)
     draw_whiskers(axes, ends[:: _step(stars, most)], _COLORS[kind], width)
 
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.colors import SymLogNorm
 
+from ..wavefront.picture import new_figure, png_bytes, styled
 from .ccd_product import CcdProduct
-from .figures import AWAY, OBSERVED, TRUTH, new_figure, png_bytes, styled
+from .figures import AWAY, OBSERVED, TRUTH
 from .photometry import ARCSEC
 from .tables import percent
 

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..wavefront.picture import new_figure, png_bytes, styled
 from .ccd_product import CcdProduct, Stars
 from .correlation import Correlation
-from .figures import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH, new_figure, png_bytes, styled
+from .figures import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
 
 _LABELS = {
     "truth": (TRUTH, "o", "truth, where no star is"),

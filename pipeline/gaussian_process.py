@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
@@ -14,6 +15,11 @@ from ..models.errors import ConfigError
 _LENGTHS = (0.05, 20.0)
 _NOISES = (1e-10, 10.0)
 _VARIANCES = (1e-3, 1e6)
+_BOUNDS = (_VARIANCES, _LENGTHS, _NOISES)
+# The likelihood is first looked over at so many lengths, and so many ratios of the noise's variance to the process's,
+# and then only so many times above and below the best of these, which is several times their steps.
+_NEAR = 8.0
+_LENGTHS_TRIED, _RATIOS_TRIED = np.geomspace(*_LENGTHS, 25), np.geomspace(1e-8, 1e4, 49)
 
 
 def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, shared: bool) -> np.ndarray:
@@ -51,11 +57,18 @@ def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, sh
     result[:, 1] = 1.0
     groups = [np.arange(values.shape[1])] if shared else [np.array([k]) for k in range(values.shape[1])]
     largest = np.abs(values).max(initial=0.0)
+    squares = _squares(points, points)
+    spectra = [np.linalg.eigh(np.exp(-0.5 * squares / length**2)) for length in _LENGTHS_TRIED]
     for group in groups:
         power = float((rest[:, group] ** 2).mean())
         if np.sqrt(power) <= 1e-15 * largest:
             continue
-        kernel = ConstantKernel(1.0, _VARIANCES) * RBF(1.0, _LENGTHS) + WhiteKernel(0.1, _NOISES)
+        # From near the top a few steps are enough. Kept near it, they can neither end on a lower one nor be thrown to
+        # where the covariance is singular.
+        rough = _rough_kernel(spectra, rest[:, group] / np.sqrt(power))
+        near = [(max(v / _NEAR, low), min(v * _NEAR, high)) for v, (low, high) in zip(rough, _BOUNDS, strict=True)]
+        variance, length, noise = rough
+        kernel = ConstantKernel(variance, near[0]) * RBF(length, near[1]) + WhiteKernel(noise, near[2])
         process = GaussianProcessRegressor(kernel, alpha=0.0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a parameter on its bound is an answer: no noise, or nothing but noise
@@ -63,6 +76,34 @@ def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, sh
         found = process.kernel_
         result[group] = (power * found.k1.k1.constant_value, found.k1.k2.length_scale, power * found.k2.noise_level)
     return result
+
+
+def _rough_kernel(spectra: Sequence[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> tuple[float, float, float]:
+    """Return variance, length and noise of the largest likelihood on a grid of lengths and ratios.
+
+    With the eigenvalues l of the correlation matrix, values y along its eigenvectors and g the ratio of the noise to
+    the variance c, the logarithm of the likelihood of n values is, but for a constant,
+    -(n ln c + sum ln(l + g) + sum y^2/(l + g)/c)/2, and largest for c = sum y^2/(l + g)/n.
+
+    Parameters
+    ----------
+    spectra : sequence of tuple of array
+        Eigenvalues and eigenvectors of the correlation matrix for each of the lengths tried.
+    values : array
+        [n, k] of one kernel, of mean square 1.
+    """
+    count = values.shape[0]
+    best, found = -np.inf, (1.0, 1.0, 0.1)
+    for length, (eigenvalues, vectors) in zip(_LENGTHS_TRIED, spectra, strict=True):
+        power = ((vectors.T @ values) ** 2).mean(axis=1)
+        total = np.maximum(eigenvalues, 0.0)[:, None] + _RATIOS_TRIED
+        variances = (power[:, None] / total).mean(axis=0)
+        likelihood = -0.5 * (count * np.log(variances) + np.log(total).sum(axis=0))
+        top = int(np.argmax(likelihood))
+        if likelihood[top] > best:
+            best, found = float(likelihood[top]), (variances[top], length, variances[top] * _RATIOS_TRIED[top])
+    variance, length, noise = (float(np.clip(v, *b)) for v, b in zip(found, _BOUNDS, strict=True))
+    return variance, length, noise
 
 
 def krige(

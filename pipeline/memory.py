@@ -7,7 +7,6 @@ from dataclasses import replace
 from ..models.errors import ConfigError
 from ..raytrace.launch import thread_count
 from ..wavefront.memory import available_bytes, readable
-from ..wavefront.psf import SCREENS
 from .experiment import Experiment
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
@@ -22,8 +21,7 @@ _STAMP_BYTES = 48
 
 def screen_bytes(experiment: Experiment) -> int:
     """Return how much memory the screens of an experiment take."""
-    kinds = SCREENS.get(experiment.config.psf.engine, ())
-    return 0 if experiment.atmosphere is None else experiment.atmosphere.screen_bytes(kinds)
+    return 0 if experiment.atmosphere is None else experiment.atmosphere.screen_bytes(experiment.screen_kinds)
 
 
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:

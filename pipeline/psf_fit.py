@@ -8,15 +8,15 @@ import numpy as np
 import scipy.linalg
 
 from ..models.errors import ConfigError, DomainError
+from ..raytrace.single_thread import one_blas_thread
 from . import gaussian_process
 from .polynomial import as_positions, design_matrix, mapped
 from .psf_basis import BASES
 from .psf_input import as_extent, as_stamps, as_weights, check_apart, check_terms
-from .single_thread import one_blas_thread
 from .star_description import describe
 
 #: Components of principal components and of shapelets where no number is given (Jee & Tyson 2011, sec. 3).
-_COMPONENTS = 20
+COMPONENTS = 20
 #: Most components from which an automatic choice is made.
 _MOST_COMPONENTS = 65
 
@@ -125,7 +125,7 @@ def _component_count(basis: str, n_components: Any, n_stars: int, limit: int, n_
     most = limit if basis == "pca" else n_pixels - 1
     if n_components == "auto":
         return min(most, _MOST_COMPONENTS)
-    count = _COMPONENTS if n_components is None else n_components
+    count = COMPONENTS if n_components is None else n_components
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)):
         raise ConfigError(f"n_components = {n_components!r}: expected a whole number, 'auto' or None")
     if not 1 <= count <= most:

@@ -9,6 +9,9 @@ import numpy as np
 from ..models.errors import ConfigError, DomainError
 from .polynomial import Extent, term_count
 
+#: Signal-to-noise ratio above which softened weights grow no more.
+SOFTENING = 100.0
+
 
 def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the stamps as finite float64 numbers and the masks as bool, both [n, ny, nx].
@@ -69,6 +72,29 @@ def as_weights(weights: Any, n_stars: int) -> np.ndarray | None:
         first = int(np.flatnonzero(wrong)[0])
         raise DomainError(f"weights[{first}] = {values[first]}: expected a finite number that is not negative")
     return values
+
+
+def snr_weights(kind: str, snr: np.ndarray) -> np.ndarray | None:
+    """Return weights of stars in the polynomials by their signal-to-noise ratios, [n]; None for equal ones.
+
+    Parameters
+    ----------
+    kind : str
+        ``equal``; ``snr``: S/N squared, the inverse variance of the noise; ``softened``: 1/(1/S^2 + 1/100^2), since
+        what the polynomial itself leaves is not less for brighter stars.
+    snr : array
+        S, signal-to-noise ratio of each star, [n].
+
+    Raises
+    ------
+    ConfigError
+        If there is no such kind.
+    """
+    if kind == "equal":
+        return None
+    if kind not in ("snr", "softened"):
+        raise ConfigError(f"weights = {kind!r}: expected one of equal, snr, softened")
+    return snr**2 if kind == "snr" else 1.0 / (snr**-2.0 + SOFTENING**-2.0)
 
 
 def as_extent(extent: Any, positions: np.ndarray) -> Extent:

@@ -17,12 +17,15 @@ import numpy as np
 from astropy.io import fits
 
 from ..models.errors import ConfigError, ProductError
+from ..raytrace.single_thread import one_blas_thread
 from . import gaussian_process
 from .polynomial import Extent, design_matrix, mapped
 from .products import read_fits, write_fits
 from .psf_file import model_fields, model_hdus
 from .psf_fit import fit_fields, weighted
-from .single_thread import one_blas_thread
+
+#: Pixels of noisy stars that deviate by more standard deviations are rejected.
+CLIP_SIGMA = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,7 @@ class PsfModel:
         order: int | None = None,
         extent: Any = None,
         scale: float | None = None,
-        clip_sigma: float | None = 5.0,
+        clip_sigma: float | None = CLIP_SIGMA,
         max_iterations: int = 20,
         replacement: Literal["mean", "polynomial"] = "mean",
     ) -> PsfModel:

@@ -12,9 +12,9 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .ccd_product import CcdProduct
-from .config import to_yaml
+from .config import ReconstructionConfig, to_yaml
 from .correlation import Correlation
-from .experiment import Experiment
+from .experiment import Experiment, truth_components
 from .figures_focal_plane import close_up_figure, heights_figure, whiskers_figure
 from .figures_psf import eigen_figure, spectrum_figure, stamps_figure
 from .figures_statistics import correlation_figure, scatter_figure
@@ -22,6 +22,7 @@ from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
 _CLOSE_UPS = 3
+OBSERVED_COMPONENTS = "Eigen-PSFs of the observed stars"
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,17 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
         ccds=per_ccd(summary),
         pictures=pictures,
         configuration=to_yaml(experiment.config),
+        model=_model_words(experiment.config.reconstruction),
     )
+
+
+def _model_words(fit: ReconstructionConfig) -> str:
+    """Return how the PSF is modelled, in words."""
+    described = {"pca": "principal components a CCD", "shapelets": "shapelets a CCD", "pixels": "each pixel on its own"}
+    basis = described[fit.basis] if fit.components is None else f"{fit.components} {described[fit.basis]}"
+    process = "a Gaussian process over " if fit.interpolation == "gp" else ""
+    weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
+    return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}"
 
 
 def draw_pictures(
@@ -91,8 +102,10 @@ def draw_pictures(
     radius = experiment.field_radius_on_detector
     close = closest_middle_farthest(products)
     optics = not config.atmosphere.enabled
-    components = config.reconstruction.components
-    return [
+    components = truth_components(config)
+    jackknife = all(c.n_patches for c in correlated.values())
+    errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
+    pictures = [
         Picture(
             "Focal plane",
             heights_figure(plane, [p.name for p in products], radius),
@@ -131,7 +144,7 @@ def draw_pictures(
             "finer with n.",
         ),
         Picture(
-            "Eigen-PSFs of the observed stars",
+            OBSERVED_COMPONENTS,
             eigen_figure(close[0], truth=False),
             "The same CCD, from the stars that were observed: components beyond the first few are noise.",
             "The paper keeps 20 components for observed stars too.",
@@ -155,8 +168,8 @@ def draw_pictures(
         Picture(
             "Correlation of the ellipticity",
             correlation_figure(correlated),
-            "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are from the scatter "
-            "of the ellipticities alone, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
+            "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
+            f"{errors}, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
             "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
             "triangles, away from the stars, are what a galaxy sees. Where the CCDs lie in a row, long pairs all point "
             "along it, and an ellipticity common to the field does not average out of ξ-.",
@@ -173,6 +186,8 @@ def draw_pictures(
             "",
         ),
     ]
+    # Single pixels and shapelets look the same whatever the stars are.
+    return [p for p in pictures if config.reconstruction.basis == "pca" or p.title != OBSERVED_COMPONENTS]
 
 
 def closest_middle_farthest(products: Sequence[CcdProduct]) -> list[CcdProduct]:

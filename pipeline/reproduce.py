@@ -8,11 +8,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ..models.errors import ConfigError, ProductError, unknown_name
+from ..models.errors import ConfigError, unknown_name
 from . import reproduce_atmosphere as atmosphere
 from . import reproduce_optics as optics
 from . import reproduce_reconstruction as reconstruction
-from .products import write_json
+from .products import make_folder, write_json
 from .reproduce_parts import SCALES, Bench, Reproduced, Scale
 
 
@@ -130,10 +130,7 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
         If there is no such figure, or a file cannot be written.
     """
     chosen = chosen_figures(names)
-    try:
-        bench.folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ProductError(f"cannot make the folder {bench.folder}: {error.strerror}") from None
+    make_folder(bench.folder)
     made = {}
     for name in chosen:
         figure = FIGURES[name]

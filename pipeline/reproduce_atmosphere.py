@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ..models.aberration_free import without_aberration
 from ..models.prescription import load_telescope
 from ..models.random_streams import stream
 from ..models.site import load_site
@@ -20,7 +20,7 @@ from .correlation import Correlation, shear_correlation
 from .photometry import ARCSEC
 from .products import image_hdu, table_hdu
 from .reproduce_drawing import atmosphere_figure, dispersion_figure, screens_figure, speckles_figure
-from .reproduce_parts import Bench, EcsvData, FitsData, Reproduced, without_aberration
+from .reproduce_parts import Bench, EcsvData, FitsData, Reproduced
 from .shapes import fwhm, measure_shapes
 
 _SITE = "cerro_pachon"
@@ -154,13 +154,11 @@ def speckles(bench: Bench) -> Reproduced:
         steps = max(1, round(time / air.exposure * len(air.times)))
         new = air.times[before:steps]
         if len(new):
-            part = replace(air, times=new)
-            part._cache.update(air._cache)
             psfs = make_psfs(
                 telescope,
                 np.zeros((1, 2)),
                 [_SPECKLE_WAVELENGTH],
-                atmosphere=part,
+                atmosphere=air.seen_at(new),
                 engine="wave",
                 pixel_size=_SPECKLE_PIXEL * ARCSEC * telescope.reference_sphere_radius,
                 stamp_size=_SPECKLE_STAMP,
@@ -168,7 +166,6 @@ def speckles(bench: Bench) -> Reproduced:
                 pupil_spacing=bench.scale.speckle_spacing,
                 threads=bench.threads,
             )
-            air._cache.update(part._cache)
             total = total + len(new) * float(psfs.inside[0]) * psfs.image[0]
             before = steps
         images.append(total / total.sum())
@@ -296,10 +293,7 @@ def ellipticity(bench: Bench) -> Reproduced:
 def beginning(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
     """Return the beginning of a longer exposure, through the same screens, in 100 moments or more."""
     count = max(100, round(exposure / time_step))
-    air.kept_screens("slopes")
-    part = replace(air, exposure=exposure, times=(np.arange(count) + 0.5) * (exposure / count))
-    part._cache.update(air._cache)
-    return part
+    return air.seen_at((np.arange(count) + 0.5) * (exposure / count), exposure)
 
 
 def _atmosphere_ellipticity(bench: Bench, air: Atmosphere, fields: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from ..models.camera import Camera
 from ..models.focal_plane import FocalPlane
+from ..wavefront.picture import new_figure, png_bytes, styled
 from .figures import (
     OBSERVED,
     RESIDUAL,
@@ -22,9 +23,6 @@ from .figures import (
     draw_whiskers,
     frame_axes,
     key_ellipticity,
-    new_figure,
-    png_bytes,
-    styled,
     whiskers,
 )
 from .figures_focal_plane import draw_heights, height_range

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..design.encircled_energy import energy_curve
+from ..design.layout import outer_radius, ray_paths, surface_section
 from ..models.camera import Camera
 from ..models.first_order import first_order
 from ..models.focal_plane import FocalPlane
 from ..models.height_budget import SIMULATED, SPECIFICATION, TERMS
 from ..models.prescription import load_telescope
-from ..models.surface import Annulus, Circle, Surface
+from ..models.surface import Surface
 from ..models.telescope import Telescope
-from ..raytrace.rays import launch_rays
-from ..raytrace.trace import trace
 from ..wavefront.psf import make_psfs
 from ..wavefront.pupil_optics import fields_at
 from .figures_focal_plane import heights_figure
@@ -25,13 +25,13 @@ from .shapes import measure_shapes
 _LAYOUT_FIELDS = (-1.75, 0.0, 1.75)
 _LAYOUT_RAYS = 9
 _TOP = 8.5
+#: Surfaces without a rim, the detector, are drawn to here [m].
+_DETECTOR = 0.32
 #: Middle of the i band, at which peers have been asked for the same figure [m].
 _I_BAND = 750e-9
 _EE_PIXEL, _EE_STAMP = 0.5e-6, 161
 #: Pupil points farther apart would let the image come round within the stamp [m].
 _EE_SPACING = 0.09
-#: A pixel is cut into so many parts along each axis to find what of it is within a circle.
-_PARTS = 4
 _EE_CURVES = (0.0, 1.0, 1.4, 1.75)
 _EE_STAMPS = (0.0, 0.5, 1.0, 1.2, 1.75)
 #: Wavelength and weight of the optics alone [m], [rad].
@@ -84,14 +84,7 @@ def _numbers(paths: np.ndarray, axis: int) -> np.ndarray:
 
 def _profile(surface: Surface) -> np.ndarray:
     """Return points (y, z) of a surface in section [m], its rim to rim; a central hole breaks the line."""
-    aperture = surface.aperture
-    inner, outer = (aperture.inner, aperture.outer) if isinstance(aperture, Annulus) else (0.0, 0.32)
-    if isinstance(aperture, Circle):
-        outer = aperture.radius
-    arm = np.linspace(inner, outer, 60)
-    y = np.concatenate([-arm[::-1], [np.nan], arm])
-    local = np.stack([np.zeros_like(y), y, surface.shape.sag(0.0, y)], axis=-1)
-    return surface.to_telescope(local)[:, 1:]
+    return surface_section(surface, outer_radius(surface.aperture) if surface.aperture else _DETECTOR)[:, 1:]
 
 
 def _ray_paths(telescope: Telescope, angle: float) -> np.ndarray:
@@ -99,34 +92,8 @@ def _ray_paths(telescope: Telescope, angle: float) -> np.ndarray:
     outer = 0.5 * telescope.pupil_diameter
     arm = np.linspace(telescope.pupil_obscuration * outer * 1.01, 0.999 * outer, _LAYOUT_RAYS)
     y = np.concatenate([-arm[::-1], arm])
-    rays = launch_rays(telescope, (0.0, np.deg2rad(angle)), telescope.default_wavelength, (np.zeros_like(y), y))
-    met = trace(telescope, rays, "all")
-    back = (_TOP - rays.position[:, 2:]) / rays.direction[:, 2:]
-    points = np.stack([rays.position + back * rays.direction, *(m.position for m in met)], axis=1)
-    return points[~met[-1].vignetted][..., 1:]
-
-
-def encircled_energy(image: np.ndarray, inside: float, radii: np.ndarray) -> np.ndarray:
-    """Return the part of all light within radii about the centroid, light being even within a pixel.
-
-    Parameters
-    ----------
-    image : ndarray, shape [ny, nx]
-        Image of unit sum.
-    inside : float
-        Part of all light that the image holds.
-    radii : ndarray
-        Radii [pixels].
-    """
-    light = np.asarray(image, dtype=np.float64)
-    x, y = (np.indices(light.shape)[axis].astype(np.float64) for axis in (1, 0))
-    center_x, center_y = (light * x).sum(), (light * y).sum()
-    parts = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
-    squared = (x[..., None, None] + parts - center_x) ** 2 + (y[..., None, None] + parts[:, None] - center_y) ** 2
-    order = np.argsort(squared, axis=None, kind="stable")
-    each = np.broadcast_to(light[..., None, None] * (inside / _PARTS**2), squared.shape).ravel()[order]
-    within = np.cumsum(each) - 0.5 * each
-    return np.interp(radii, np.concatenate([[0.0], np.sqrt(squared.ravel()[order])]), np.concatenate([[0.0], within]))
+    field = (0.0, float(np.deg2rad(angle)))
+    return ray_paths(telescope, field, telescope.default_wavelength, (np.zeros_like(y), y), _TOP)[..., 1:]
 
 
 def encircled_energy_over_field(bench: Bench) -> Reproduced:
@@ -150,7 +117,7 @@ def encircled_energy_over_field(bench: Bench) -> Reproduced:
     )
     pixel = psfs.pixel_scale / ARCSEC
     radii = np.arange(0.0, 60.0, 0.5)
-    energy = np.array([encircled_energy(i, f, radii) for i, f in zip(psfs.image, psfs.inside, strict=True)])
+    energy = psfs.inside[:, None] * [np.interp(radii, *energy_curve(image)) for image in psfs.image]
     radius80 = np.array([np.interp(0.8, e, radii * pixel) for e in energy])
     place = {angle: int(np.argmin(np.abs(field - angle))) for angle in (*_EE_CURVES, *_EE_STAMPS)}
     inner = radius80[field <= 1.4 + 1e-9]

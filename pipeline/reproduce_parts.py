@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -13,8 +13,7 @@ import numpy as np
 
 from ..models.camera import Camera
 from ..models.focal_plane import FocalPlane
-from ..models.surface import Annulus, Conic, Interaction, Plane, Surface
-from ..models.telescope import VACUUM, Telescope
+from ..models.telescope import Telescope
 from .ccd_product import CcdProduct, product_path, read_product
 from .config import Configuration, digest, with_options
 from .correlation import Correlation
@@ -286,34 +285,8 @@ class Bench:
         experiment = prepare(self.configuration)
         names: Sequence[str] = self.configuration.ccds or ()
         if len(finished_ccds(folder, experiment)) < len(names):
-            run(self.configuration, folder, resume=True, threads=self.threads, reporter=self.reporter)
+            run(self.configuration, folder, resume=True, strict=True, threads=self.threads, reporter=self.reporter)
         stamp = stamp_of(experiment)
         products = [read_product(product_path(folder, name), stamp, truth_images=False) for name in names]
         correlated = correlations(products)
         return PipelineRun(experiment, products, correlated, run_figures(products, correlated))
-
-
-def without_aberration(telescope: Telescope) -> Telescope:
-    """Return a telescope with the same pupil and no aberration to speak of: one paraboloid of f/1000.
-
-    Its coma, 3 theta / (16 N^2), blurs a star 10 arcmin off the axis by 1e-4 arcsec.
-    """
-    length = 1000.0 * telescope.pupil_diameter
-    origin, focus = (0.0, 0.0, 0.0), (0.0, 0.0, length)
-    outer = 0.5 * telescope.pupil_diameter
-    # The mirror's own rims make the pupil: no engine obscures it otherwise.
-    ring = Annulus(telescope.pupil_obscuration * outer, outer)
-    return replace(
-        telescope,
-        name="paraboloid of f/1000",
-        surfaces=(
-            Surface("M1", Interaction.MIRROR, Conic(2.0 * length, -1.0), origin, VACUUM, ring),
-            Surface("Detector", Interaction.DETECTOR, Plane(), focus, VACUUM),
-        ),
-        stop_z=0.0,
-        launch_distance=1.5 * length,
-        reference_sphere_radius=length,
-        groups={},
-        group_frames={},
-        camera=None,
-    )

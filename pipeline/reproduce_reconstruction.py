@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .ccd_product import CcdProduct, Stars
+from .ccd_product import CcdProduct
 from .figures_focal_plane import whiskers_figure
 from .figures_psf import eigen_figure, spectrum_figure
 from .figures_statistics import correlation_figure, scatter_figure
@@ -14,7 +14,7 @@ from .products import image_hdu, table_hdu
 from .report import closest_middle_farthest
 from .reproduce_optics import optics_ellipticity
 from .reproduce_parts import Bench, Columns, EcsvData, FitsData, Reproduced
-from .summary import LONG_RANGE, mean_xi_plus
+from .summary import LONG_RANGE, LONGEST_ARCMIN, mean_xi_plus
 from .tables import percent
 
 #: With fewer PSFs than this the part of the variance in 20 components says little.
@@ -172,14 +172,14 @@ def correlation(bench: Bench) -> Reproduced:
         columns[f"r_{kind}_arcmin"] = (c.r_arcmin, "arcmin", "mean separation of the pairs")
         columns[f"xi_plus_{kind}"] = (c.xi_plus, "", "xi+")
         columns[f"xi_minus_{kind}"] = (c.xi_minus, "", "xi-")
-        columns[f"error_{kind}"] = (c.error_plus, "", "error of xi+ from the scatter of the ellipticities alone")
+        columns[f"error_{kind}"] = (c.error_plus, "", "error of xi+ by jackknife over the CCDs")
         columns[f"pairs_{kind}"] = (c.n_pairs, "", "pairs")
-    raw = mean_xi_plus(correlated["observed"], LONG_RANGE, 180.0)
-    at, away = (mean_xi_plus(correlated[k], LONG_RANGE, 180.0) for k in ("residual", "away"))
+    raw = mean_xi_plus(correlated["observed"], LONG_RANGE, LONGEST_ARCMIN)
+    at, away = (mean_xi_plus(correlated[k], LONG_RANGE, LONGEST_ARCMIN) for k in ("residual", "away"))
     near = mean_xi_plus(correlated["away"], 0.0, LONG_RANGE)
     every = len(made.products) == len(bench.camera)
     c = correlated["residual"]
-    inside = (c.r_arcmin >= LONG_RANGE) & (c.r_arcmin <= 180.0) & (c.n_pairs > 0)
+    inside = (c.r_arcmin >= LONG_RANGE) & (c.r_arcmin <= LONGEST_ARCMIN) & (c.n_pairs > 0)
     largest, error = float(np.abs(c.xi_plus[inside]).max()), float(np.median(c.error_plus[inside]))
     reached = abs(at) < 1e-7 and 1e-5 < raw < 9e-5
     return Reproduced(
@@ -214,10 +214,10 @@ def _rms(products: Sequence[CcdProduct], kind: str, keys: tuple[str, str]) -> fl
 
 def _star_columns(products: Sequence[CcdProduct], kind: str) -> Columns:
     """Return places and ellipticities of one kind: truth, observed, residual or away."""
-    stars: list[Stars] = [p.truth if kind in ("truth", "away") else p.observed for p in products]
-    keys = ("e1", "e2") if kind in ("truth", "observed") else ("residual_e1", "residual_e2")
-    every = ("x", "y", "field_x", "field_y", *keys)
-    x, y, field_x, field_y, e1, e2 = (np.concatenate([getattr(s, key) for s in stars]) for key in every)
+    stars = [p.stars(kind) for p in products]
+    places = ("x", "y", "field_x", "field_y")
+    x, y, field_x, field_y = (np.concatenate([getattr(s, key) for s in stars]) for key in places)
+    e1, e2 = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
     names = np.repeat([p.name for p in products], [len(s) for s in stars])
     return {
         "ccd": (names, "", "name of the CCD"),

@@ -15,8 +15,8 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
+from ..models.errors import DomainError, PachonError
 from ..raytrace.launch import thread_count
-from ..wavefront.psf import SCREENS
 from .ccd_product import product_path, read_product, write_product
 from .ccd_stage import CcdExposure, expose_ccd, model_ccd
 from .config import Configuration
@@ -25,7 +25,7 @@ from .memory import check_memory
 from .products import write_bytes, write_ecsv, write_json
 from .progress import Reporter
 from .report import build_report, draw_pictures
-from .run_folder import claim_folder, finished_ccds, stamp_of
+from .run_folder import SUMMARY_NAME, claim_folder, finished_ccds, stamp_of
 from .summary import correlations, run_figures
 
 _MESH_CELLS = 16
@@ -45,6 +45,8 @@ class RunResult:
         The content of ``summary.json``.
     kept, computed : tuple of str
         CCDs that were done before, and those done now.
+    not_modelled : dict of str to str
+        CCDs whose PSF cannot be modelled, and why not. No figure counts them.
     """
 
     folder: Path
@@ -52,6 +54,7 @@ class RunResult:
     summary: dict[str, Any]
     kept: tuple[str, ...]
     computed: tuple[str, ...]
+    not_modelled: dict[str, str]
 
 
 def run(
@@ -59,6 +62,7 @@ def run(
     folder: Path,
     *,
     resume: bool = False,
+    strict: bool = False,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> RunResult:
@@ -75,6 +79,9 @@ def run(
         Where to put the products; made if it is not there.
     resume : bool
         Keep CCDs that are finished already, and add to them.
+    strict : bool
+        Whether a CCD whose PSF cannot be modelled ends the run, which keeps what is finished; else it is reported and
+        left out.
     threads : int, optional
         Number of threads; all processors by default.
     reporter : Reporter, optional
@@ -83,7 +90,8 @@ def run(
     Raises
     ------
     PachonError
-        If the configuration does not hold together, or a product cannot be written.
+        If the configuration does not hold together, a product cannot be written, or no CCD can be modelled; with
+        `strict`, if one of them cannot.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = prepare(config)
@@ -96,14 +104,18 @@ def run(
     missing = tuple(name for name in names if name not in kept)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
-    _compute(experiment, folder, missing, threads, reporter)
+    failed = _compute(experiment, folder, missing, strict, threads, reporter)
+    names = tuple(name for name in names if name not in failed)
+    if not names:
+        name, reason = next(iter(failed.items()))
+        raise DomainError(f"none of {len(failed)} CCDs can be modelled; CCD {name}: {reason}")
     with reporter.stage("correlations"):
         stamp = stamp_of(experiment)
         # Pictures and figures need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
         products = [read_product(product_path(folder, name), stamp, truth_images=False) for name in names]
         correlated = correlations(products)
-        summary = {**_origin(experiment), **run_figures(products, correlated)}
-        write_json(folder / "summary.json", summary)
+        summary = {**_origin(experiment), **run_figures(products, correlated), "not_modelled": failed}
+        write_json(folder / SUMMARY_NAME, summary)
     with reporter.stage("focal plane"):
         _write_focal_plane(experiment, folder)
     with reporter.stage("report"):
@@ -111,41 +123,59 @@ def run(
         pictures = draw_pictures(experiment, products, correlated)
         write_bytes(report, build_report(experiment, summary, pictures).encode())
     write_json(folder / "timings.json", _timings(reporter, threads))
-    return RunResult(folder, report, summary, kept, missing)
+    return RunResult(folder, report, summary, kept, tuple(n for n in missing if n not in failed), failed)
 
 
 def _compute(
-    experiment: Experiment, folder: Path, names: tuple[str, ...], threads: int | None, reporter: Reporter
-) -> None:
-    """Compute and write the CCDs that are missing."""
+    experiment: Experiment,
+    folder: Path,
+    names: tuple[str, ...],
+    strict: bool,
+    threads: int | None,
+    reporter: Reporter,
+) -> dict[str, str]:
+    """Compute and write the CCDs that are missing; return those that cannot be modelled, and why not."""
+    failed: dict[str, str] = {}
     if not names:
-        return
+        return failed
     config = experiment.config
-    wanted = SCREENS.get(config.psf.engine, ())
-    if experiment.atmosphere is not None and wanted:
+    if experiment.atmosphere is not None and experiment.screen_kinds:
         with reporter.stage(f"atmosphere: {experiment.atmosphere.layer_count} screens"):
-            for kind in wanted:
-                experiment.atmosphere.kept_screens(kind, threads)
+            experiment.make_screens(threads)
     stars = config.stars.truth + config.stars.observed
     reported = reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names))
     # Modelling runs on one thread only; it goes on beside the PSFs of the next CCD.
     with reported as stage, ThreadPoolExecutor(1) as modeller:
-        unfinished: Future[None] | None = None
+        unfinished: list[tuple[str, Future[str | None]]] = []
         for i, name in enumerate(names, start=1):
             exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
-            if unfinished is not None:
-                unfinished.result()
-            unfinished = modeller.submit(_finish, experiment, folder, exposure)
+            begun, unfinished = unfinished, [(name, modeller.submit(_finish, experiment, folder, exposure, strict))]
             if thread_count(threads) == 1 or i == len(names):
-                unfinished.result()
+                begun, unfinished = begun + unfinished, []
+            for which, work in begun:
+                reason = work.result()
+                if reason is not None:
+                    failed[which] = reason
+                    reporter.line(left_out_line(which, reason))
             stage.step(name, i, len(names))
     if experiment.atmosphere is not None:
         experiment.atmosphere.release()
+    return failed
 
 
-def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
-    """Model one CCD and write its product."""
-    product = model_ccd(experiment, exposure)
+def left_out_line(name: str, reason: str) -> str:
+    """Return the line that tells of a CCD that is left out."""
+    return f"CCD {name} is left out, it cannot be modelled: {reason}"
+
+
+def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure, strict: bool) -> str | None:
+    """Model one CCD and write its product; return why it cannot be modelled, where that ends no run."""
+    try:
+        product = model_ccd(experiment, exposure)
+    except PachonError as error:
+        if strict:
+            raise
+        return str(error).removeprefix(f"CCD {exposure.name}: ")
     config = experiment.config
     cards = [
         ("TELESCOP", experiment.telescope.name, "prescription"),
@@ -156,6 +186,7 @@ def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None
         ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
     ]
     write_product(folder, product, stamp_of(experiment), cards)
+    return None
 
 
 def _origin(experiment: Experiment) -> dict[str, Any]:

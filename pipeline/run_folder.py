@@ -11,7 +11,7 @@ from .config import Configuration, differences, load_configuration, to_yaml
 from .experiment import Experiment
 from .products import Stamp, write_bytes
 
-CONFIG_NAME = "config.yaml"
+CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 
 
 def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..models.errors import DomainError
 from ..models.units import radians
-from .single_thread import one_blas_thread
+from ..raytrace.single_thread import one_blas_thread
 
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 

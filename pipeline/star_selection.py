@@ -72,13 +72,19 @@ class Selection:
         """
         left = int(self.good.sum())
         if left < least:
-            counts = ", ".join(
-                f"{int(((self.flags & flag) > 0).sum())} {str(flag.name).lower().replace('_', ' ')}"
-                for flag in StarFlag
-                if flag and (self.flags & flag).any()
+            raise DomainError(
+                f"{left} of {len(self.flags)} stars left ({told_flags(self.flags)}): expected at least {least}"
             )
-            raise DomainError(f"{left} of {len(self.flags)} stars left ({counts}): expected at least {least}")
         return self.good
+
+
+def told_flags(flags: np.ndarray) -> str:
+    """Return how many stars have each flag, in words: ``3 neighbour, 1 cosmic ray``."""
+    return ", ".join(
+        f"{int(((flags & flag) > 0).sum())} {str(flag.name).lower().replace('_', ' ')}"
+        for flag in StarFlag
+        if flag and (flags & flag).any()
+    )
 
 
 def flag_stars(

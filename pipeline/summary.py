@@ -8,31 +8,48 @@ from typing import Any
 import numpy as np
 
 from .ccd_product import CcdProduct, Stars
-from .correlation import Correlation, shear_correlation
+from .correlation import Correlation, jackknife_error, shear_correlation
 from .photometry import ARCSEC
 
 #: What is correlated: truth and truth - model where no star is, observed and observed - model at the stars.
-KINDS = ("truth", "observed", "residual", "away")
-_SHORTEST = 0.5  # arcmin
+CORRELATED = ("truth", "observed", "residual", "away")
+#: Pairs are counted from here on [arcmin].
+SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
 _ARCMIN = 60.0 * ARCSEC
-#: The paper's claim of a residual below 1e-7 is for separations from here on [arcmin].
+#: The paper's claim of a residual below 1e-7 is for separations from here on [arcmin],
 LONG_RANGE = 10.0
+#: and up to here [arcmin].
+LONGEST_ARCMIN = 180.0
 
 
-def correlations(products: Sequence[CcdProduct]) -> dict[str, Correlation]:
-    """Correlate ellipticities and residuals over all CCDs (Jee & Tyson 2011, Fig. 14), each of :data:`KINDS`.
+def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] = CORRELATED) -> dict[str, Correlation]:
+    """Correlate ellipticities and residuals over all CCDs (Jee & Tyson 2011, Fig. 14).
 
     Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
     between CCDs cancels whatever the error of the model is; residuals away from the stars are what a galaxy sees. Both
-    are always given.
+    are always given. Errors are by jackknife over the CCDs where there are two or more.
+
+    Parameters
+    ----------
+    products : sequence of CcdProduct
+        CCDs.
+    kinds : sequence of str
+        What is correlated, of :data:`~pachon.pipeline.ccd_product.KINDS`.
     """
     bins = separation_bins(products)
     result = {}
-    for kind in KINDS:
-        x, y, e1, e2 = (np.concatenate(c) for c in zip(*(of_kind(p, kind) for p in products), strict=True))
-        result[kind] = shear_correlation(x, y, e1, e2, **bins)
+    for kind in kinds:
+        stars = [p.stars(kind) for p in products]
+        x, y = (np.concatenate([getattr(s, key) for s in stars]) for key in ("field_x", "field_y"))
+        e1, e2 = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
+        result[kind] = shear_correlation(x, y, e1, e2, patch=patches(stars), **bins)
     return result
+
+
+def patches(stars: Sequence[Stars]) -> np.ndarray | None:
+    """Return the number of the CCD of each star, the patches of a jackknife; None where there is but one CCD."""
+    return np.repeat(np.arange(len(stars)), [len(s) for s in stars]) if len(stars) > 1 else None
 
 
 def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
@@ -41,26 +58,8 @@ def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
         [np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1
     )
     longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
-    bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (_SHORTEST * _ARCMIN))))
-    return {"min_sep": _SHORTEST * _ARCMIN, "max_sep": longest, "n_bins": bins}
-
-
-def of_kind(product: CcdProduct, kind: str) -> tuple[np.ndarray, ...]:
-    """Return field angles x, y [rad] and what of the ellipticity there is correlated, e1 and e2.
-
-    Parameters
-    ----------
-    product : CcdProduct
-        One CCD.
-    kind : str
-        One of :data:`KINDS`, or ``left_out``: observed - model fitted without the star.
-    """
-    stars: Stars = product.truth if kind in ("truth", "away") else product.observed
-    if kind == "left_out":
-        left_out = product.observed.left_out_e1, product.observed.left_out_e2
-        return stars.field_x, stars.field_y, stars.e1 - left_out[0], stars.e2 - left_out[1]
-    e = (stars.e1, stars.e2) if kind in ("truth", "observed") else (stars.residual_e1, stars.residual_e2)
-    return stars.field_x, stars.field_y, *e
+    bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * _ARCMIN))))
+    return {"min_sep": SHORTEST_ARCMIN * _ARCMIN, "max_sep": longest, "n_bins": bins}
 
 
 def ccd_figures(product: CcdProduct) -> dict[str, Any]:
@@ -74,6 +73,7 @@ def ccd_figures(product: CcdProduct) -> dict[str, Any]:
         "truth_psfs": len(truth),
         "stars": len(observed),
         "stars_used": int(observed.used.sum()),
+        "stars_with_defects": int((observed.defects != 0).sum()),
         "pixels_rejected": product.model.n_rejected,
         "fwhm_arcsec": _median(truth.fwhm) / ARCSEC,
         "mean_e_truth": _mean(np.hypot(truth.e1, truth.e2)),
@@ -120,6 +120,8 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
     for kind, correlation in correlated.items():
         for name, (low, high) in {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, np.inf)}.items():
             together[f"xi_plus_{kind}_{name}"] = mean_xi_plus(correlation, low, high)
+            left = left_mean_xi_plus(correlation, low, high)
+            together[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(left)) if len(left) else np.nan
     return {
         "all": together,
         "ccd": each,
@@ -139,10 +141,20 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
 
 def mean_xi_plus(correlation: Correlation, low: float, high: float) -> float:
     """Return the mean of xi+ over the pairs with separations from low to high [arcmin]; NaN where there are none."""
-    r = correlation.r_arcmin
-    inside = (r >= low) & (r < high) & (correlation.n_pairs > 0)
-    pairs = correlation.n_pairs[inside]
-    return float(np.sum(pairs * correlation.xi_plus[inside]) / pairs.sum()) if pairs.size else np.nan
+    return float(_over_pairs(correlation, low, high, correlation.n_pairs, correlation.xi_plus))
+
+
+def left_mean_xi_plus(correlation: Correlation, low: float, high: float) -> np.ndarray:
+    """Return :func:`mean_xi_plus` without each patch in turn, [n_patches], for its jackknife."""
+    return _over_pairs(correlation, low, high, correlation.left_pairs, correlation.left_plus)
+
+
+def _over_pairs(correlation: Correlation, low: float, high: float, pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
+    """Return the mean of xi [..., n_bins] over the pairs [..., n_bins] of a range [arcmin]."""
+    inside = (correlation.r_arcmin >= low) & (correlation.r_arcmin < high)
+    counts, values = pairs[..., inside], xi[..., inside]
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
 
 
 def _mean(values: np.ndarray) -> float:

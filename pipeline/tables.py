@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .summary import KINDS, LONG_RANGE
+from .summary import CORRELATED, LONG_RANGE
 
 _NAMES = {
     "truth": "truth",
@@ -34,9 +34,12 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("rms e residual, where no star is (no noise)", _percent(figures["rms_residual_away"])),
         ("truth's variance in the components, worst CCD", percent(figures["truth_variance_in_components"])),
     ]
-    for kind in KINDS:
-        short, far = (figures[f"xi_plus_{kind}_{name}"] for name in ("short", "long"))
-        rows.append((f"ξ+ of {_NAMES[kind]}, below / beyond {LONG_RANGE:g}'", f"{_power(short)} / {_power(far)}"))
+    for kind in CORRELATED:
+        near, far = (
+            f"{_power(figures[f'xi_plus_{kind}_{name}'])} ± {_power(figures[f'error_xi_plus_{kind}_{name}'])}"
+            for name in ("short", "long")
+        )
+        rows.append((f"ξ+ of {_NAMES[kind]}, below / beyond {LONG_RANGE:g}'", f"{near} / {far}"))
     return rows
 
 

@@ -3,17 +3,22 @@ import json
 import numpy as np
 import pytest
 from astropy.table import Table
+from scipy.special import j0
 
 from pachon.models.errors import ConfigError, UnknownNameError
 from pachon.pipeline import attribution
-from pachon.pipeline.attribution import CAUSES, FULL, NOISE, RANGES, attribute, causes_of, write_attribution
+from pachon.pipeline.attribution import CAUSES, FULL, NOISE, OPTICS, RANGES, attribute, causes_of, write_attribution
+from pachon.pipeline.ccd_product import KINDS
 from pachon.pipeline.ccd_stage import expose_ccd, model_ccd
 from pachon.pipeline.cli import main
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.correlation import shear_correlation
-from pachon.pipeline.diagnostics import correlate
 from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.photometry import ARCSEC
+from pachon.pipeline.shapes import measure_shapes
 from pachon.pipeline.stamps import center_stamps
+from pachon.pipeline.summary import correlations
+from pachon.wavefront.turbulence import structure_function
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +42,7 @@ def test_a_case_is_a_run_without_the_cause(tiny, attributed):
     products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1)) for name in names]
     e = np.concatenate([[p.truth.e1, p.truth.e2] for p in products], axis=1)
     assert attributed.figures["tilt"]["rms_e_truth"] == np.sqrt(np.mean(e**2))
-    for kind, expected in correlate(products).items():
+    for kind, expected in correlations(products, KINDS).items():
         assert attributed.correlations["tilt"][kind].xi_plus.tobytes() == expected.xi_plus.tobytes()
     assert attributed.figures["tilt"]["rms_e_truth"] != attributed.figures[FULL]["rms_e_truth"]
 
@@ -89,11 +94,12 @@ def test_without_noise_the_model_is_that_of_bright_stars(tiny):
     experiment = prepare(tiny(ccds=("R22_S11",)))
     exposure = expose_ccd(experiment, "R22_S11", threads=1)
     product = model_ccd(experiment, exposure)
-    quiet = attribution._noiseless(experiment, exposure, product)
+    quiet = model_ccd(experiment, exposure, noisy=False)
+    np.testing.assert_array_equal(quiet.truth.e1, product.truth.e1)
     stamps = center_stamps(exposure.observed.image, *_centroids(experiment, exposure), size=experiment.stamp_size)
     rng = np.random.default_rng(0)
     bright = rng.poisson(1e11 * np.maximum(stamps, 0.0)) / 1e11
-    shapes = attribution.measure_shapes(bright, exposure.observed.pixel_scale, experiment.weight_fwhm)
+    shapes = measure_shapes(bright, exposure.observed.pixel_scale, experiment.weight_fwhm)
     # Ten times that scatter; noisy stars of S/N 30 differ by 3e-2.
     np.testing.assert_allclose(quiet.observed.e1, shapes.e1, rtol=0.0, atol=3e-5)
     np.testing.assert_allclose(quiet.observed.e2, shapes.e2, rtol=0.0, atol=3e-5)
@@ -103,7 +109,7 @@ def test_without_noise_the_model_is_that_of_bright_stars(tiny):
 
 
 def _centroids(experiment, exposure):
-    first = attribution.measure_shapes(exposure.observed.image, exposure.observed.pixel_scale, experiment.weight_fwhm)
+    first = measure_shapes(exposure.observed.image, exposure.observed.pixel_scale, experiment.weight_fwhm)
     return first.x, first.y
 
 
@@ -113,6 +119,45 @@ def test_causes_do_what_they_should(attributed):
     sharper = attributed.figures["diffusion"]["fwhm_arcsec"]
     assert np.sqrt(full**2 - sharper**2) == pytest.approx(0.19, rel=0.2)
     assert attributed.figures["atmosphere"]["fwhm_arcsec"] < 0.75 * full
+
+
+def test_optics_off_leaves_the_air_alone(tiny):
+    """The mean over all turbulence is round: what ellipticity there is, the telescope makes."""
+    config = tiny(psf__engine="long_exposure", ccds=("R22_S11", "R24_S12"))
+    figures = attribute(config, ("heights", OPTICS), threads=1).figures
+    # Heights of some micrometres do most, the design a little.
+    assert figures["full"]["rms_e_truth"] > figures["heights"]["rms_e_truth"] > figures[OPTICS]["rms_e_truth"]
+    # A flat detector stretches the sky by 1/cos along the radius more than across: e = 2.2e-4 at 1.7 deg.
+    assert figures[OPTICS]["rms_e_truth"] < 3e-4
+    experiment = prepare(config)
+    alone = attribution._without(experiment, OPTICS)
+    full, air = (expose_ccd(e, "R24_S12", threads=1) for e in (experiment, alone))
+    np.testing.assert_array_equal(full.truth.fields, air.truth.fields)
+    assert air.truth.pixel_scale == pytest.approx(full.truth.pixel_scale, rel=1e-12)
+    np.testing.assert_allclose(air.truth.light, 1.0, rtol=1e-6)  # no rim of a camera in the way
+    # What air, diffusion (0.4 pixel rms) and pixel (rms 0.29 of its side, 0.2") make of a point: a Hankel transform.
+    # Of diffraction it knows the rims: each takes r times its diameter from the overlap of the pupil with itself.
+    r, angle = np.linspace(0.0, 4.0, 4001)[1:], np.linspace(0.0, 0.6, 601) * ARCSEC
+    outer, inner = 4.18, 0.61 * 4.18
+    pupil = np.maximum(1.0 - 4.0 * r * (outer + inner) / (2.0 * np.pi * (outer**2 - inner**2)), 0.0)
+    blur = np.hypot(0.4, 12.0**-0.5) * 0.2 * ARCSEC
+    image = np.zeros(len(angle))
+    for wavelength in (560e-9, 680e-9):
+        air = 0.5 * (2.0 * np.pi / wavelength) ** 2 * structure_function(r, 0.16, 25.0)
+        seen = pupil * np.exp(-air - 0.5 * (2.0 * np.pi * r / wavelength * blur) ** 2) * r
+        image += (j0(2.0 * np.pi * angle[:, None] * r / wavelength) * seen).sum(axis=1) / wavelength**2
+    expected = 2.0 * np.interp(0.5, image[::-1] / image[0], angle[::-1]) / ARCSEC
+    assert figures[OPTICS]["fwhm_arcsec"] == pytest.approx(expected, rel=0.01)
+
+
+def test_a_lifted_ground_layer_is_the_same_air(tiny):
+    full = prepare(tiny())
+    lifted = attribution._without(full, "ground_layer")
+    np.testing.assert_array_equal(lifted.atmosphere.altitudes[1:], full.atmosphere.altitudes[1:])
+    assert (full.atmosphere.altitudes[0], lifted.atmosphere.altitudes[0]) == (0.0, attribution.GROUND_LIFT)
+    asked = prepare(resolve(with_options(tiny(), atmosphere__ground_lift_m=attribution.GROUND_LIFT)))
+    np.testing.assert_array_equal(lifted.atmosphere.altitudes, asked.atmosphere.altitudes)
+    assert lifted.atmosphere.kept_screens("slopes") is full.atmosphere.kept_screens("slopes")
 
 
 def test_causes_that_are_off_are_no_causes(tiny):
@@ -129,6 +174,9 @@ def test_causes_that_are_off_are_no_causes(tiny):
         ({"psf__engine": "long_exposure"}, "atmosphere", "psf.engine = long_exposure"),
         ({"psf__diffusion_pixels": 0.0}, "diffusion", "psf.diffusion_pixels = 0"),
         ({}, "active_optics", "active_optics.residual_um = 0"),
+        ({"atmosphere__ground_lift_m": 200.0}, "ground_layer", "no layer is on the ground"),
+        ({"psf__engine": "long_exposure"}, "ground_layer", "no star sees turbulence"),
+        ({"atmosphere__enabled": False}, OPTICS, "nothing would be left"),
     ):
         with pytest.raises(ConfigError, match=message):
             attribute(tiny(**options), (cause,))

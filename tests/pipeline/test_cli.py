@@ -118,6 +118,24 @@ def test_a_bad_atmosphere_is_one_line_and_status_2(capsys, in_folder, config, la
     assert not (in_folder / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["run", "attribute"])
+def test_what_a_file_asks_for_in_vain_names_the_file(capsys, in_folder, command):
+    (in_folder / "mine.yaml").write_text("ccds: R22_S1l\n")
+    line = refused(capsys, command, "mine.yaml", "--out", "out")
+    assert line.startswith("pachon: error: mine.yaml: ")
+    assert "did you mean R22_S" in line
+    assert not (in_folder / "out").exists()
+
+
+def test_help_loads_nothing_that_computes():
+    code = (
+        "import sys; from pachon.pipeline.cli import main; main(['--help']);"
+        "print(sorted({'numpy', 'scipy', 'warp', 'astropy', 'matplotlib', 'pydantic'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_screens_too_large_for_the_memory_are_one_line(capsys, in_folder, monkeypatch):
     monkeypatch.setattr(memory, "available_bytes", lambda: 21_000_000_000)
     (in_folder / "mine.yaml").write_text("atmosphere: {screen_size: 65536}\n")

@@ -9,9 +9,9 @@ from astropy.table import Table
 from pachon.models.camera import load_camera
 from pachon.models.errors import ProductError
 from pachon.pipeline import diagnostics
-from pachon.pipeline.ccd_product import product_path, read_product
+from pachon.pipeline.ccd_product import KINDS, product_path, read_product
 from pachon.pipeline.cli import main
-from pachon.pipeline.diagnostics import CORRELATED, FOLDER_NAME, diagnose
+from pachon.pipeline.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.figures_diagnostics import residual_map, rho_figure
 from pachon.pipeline.rho_statistics import rho_statistics
 from pachon.pipeline.shapes import measure_shapes
@@ -58,6 +58,8 @@ def test_sizes_are_of_the_model_at_the_star(finished_run, diagnosed):
             model = measure_shapes(images, product.pixel_scale, 0.7 * ARCSEC)
             # The product was made with the same weight: its ellipticities of the model come out again.
             np.testing.assert_allclose(model.e1, stars.model_e1, rtol=0.0, atol=1e-12)
+            # Kept in arcseconds: there and back costs one rounding each.
+            np.testing.assert_allclose(model.size, stars.model_size, rtol=1e-14)
             # T from the semi-axes: sqrt(a b) = size, (a - b)/(a + b) = |e|.
             q = [(1 - np.hypot(*e)) / (1 + np.hypot(*e)) for e in ((stars.e1, stars.e2), (model.e1, model.e2))]
             trace, model_trace = (s**2 * (r + 1 / r) for s, r in zip((stars.size, model.size), q, strict=True))
@@ -78,7 +80,7 @@ def test_figures_of_the_whole_run_are_those_of_its_summary(finished_run, diagnos
         # Nine digits in the file are good to 5e-9; with patches sums go in another order.
         np.testing.assert_allclose(ours.xi_plus, xi, rtol=5e-9, atol=1e-13)
         assert ours.n_patches == 2
-    assert tuple(diagnosed.correlations) == CORRELATED
+    assert tuple(diagnosed.correlations) == KINDS
 
 
 def test_rho_one_is_the_correlation_of_the_residual(diagnosed):
@@ -131,10 +133,35 @@ def test_an_unfinished_run_of_one_ccd(run_copy):
     product_path(run_copy, CCDS[1]).unlink()
     result = diagnose(run_copy)
     assert result.folder == run_copy / FOLDER_NAME
-    assert result.missing == (CCDS[1],)
+    assert result.missing == {CCDS[1]: f"CCD {CCDS[1]}: has no product yet"}
     assert list(result.table["ccd"]) == [CCDS[0]]
     assert result.correlations["away"].n_patches == 0
     assert "scatter" in Table.read(result.folder / "correlations.ecsv")["error_plus"].description
+
+
+@pytest.mark.parametrize("spoilt", [b"", b"no FITS at all", None], ids=["empty", "no FITS", "cut short"])
+def test_a_damaged_product_is_left_out_and_the_others_stay_as_they_were(diagnosed, run_copy, no_pictures, spoilt):
+    path = product_path(run_copy, CCDS[0])
+    path.write_bytes(path.read_bytes()[:5000] if spoilt is None else spoilt)
+    result = diagnose(run_copy)
+    assert list(result.missing) == [CCDS[0]]
+    assert str(path) in result.missing[CCDS[0]]
+    assert list(result.table["ccd"]) == [CCDS[1]]
+    for key in ("mean_e1_residual", "rms_e_away", "rms_dt_away"):
+        assert result.table[key][0] == diagnosed.table[key][1]
+    with pytest.raises(ProductError, match=path.name):
+        diagnose(run_copy, strict=True)
+
+
+def test_why_a_ccd_was_not_modelled_is_told_again(run_copy, no_pictures, capsys):
+    product_path(run_copy, CCDS[1]).unlink()
+    summary = json.loads((run_copy / "summary.json").read_text())
+    (run_copy / "summary.json").write_text(json.dumps({**summary, "not_modelled": {CCDS[1]: "too few stars"}}))
+    assert diagnose(run_copy).missing == {CCDS[1]: f"CCD {CCDS[1]}: too few stars"}
+    assert main(["diagnose", str(run_copy)]) == 0
+    assert f"1 CCDs are left out; the first: CCD {CCDS[1]}: too few stars" in capsys.readouterr().out
+    assert main(["diagnose", str(run_copy), "--strict"]) == 2
+    assert capsys.readouterr().err == f"pachon: error: CCD {CCDS[1]}: too few stars\n"
 
 
 def test_bad_input_is_one_line(run_copy, tmp_path, capsys):
@@ -145,7 +172,7 @@ def test_bad_input_is_one_line(run_copy, tmp_path, capsys):
     whole = path.read_bytes()
     path.write_bytes(whole[:5000])
     with pytest.raises(ProductError, match=f"{path.name}: damaged"):
-        diagnose(run_copy)
+        diagnose(run_copy, strict=True)
     path.write_bytes(whole)
     config = run_copy / "config.yaml"
     config.write_text(config.read_text().replace("seed: 1 ", "seed: 2 "))

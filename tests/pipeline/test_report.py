@@ -11,14 +11,13 @@ import matplotlib
 import numpy as np
 import pytest
 
-from pachon.pipeline import figures
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.experiment import prepare
 from pachon.pipeline.figures import key_ellipticity, whiskers
-from pachon.pipeline.figures_opd import opd_figure
 from pachon.pipeline.report import build_report, closest_middle_farthest
 from pachon.pipeline.tables import percent
 from pachon.wavefront.opd import wavefront_opd
+from pachon.wavefront.picture import new_figure, png_bytes
 from pachon.wavefront.zernike import fit_zernikes
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -123,7 +122,7 @@ def test_the_ccds_shown_large_are_the_closest_the_middle_and_the_farthest(finish
 def test_figures_do_not_depend_on_the_users_matplotlib(lsst_r):
     opd = wavefront_opd(lsst_r, (0.0, 0.01), 620e-9, grid=32)
     fit = fit_zernikes(opd, 4.18, 0.612, 11)
-    plain = opd_figure(opd, opd.value, fit, "lsst")
+    plain = png_bytes(opd.plot(fit, "lsst"))
     with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black"}):
-        assert opd_figure(opd, opd.value, fit, "lsst") == plain
-    assert figures.new_figure(2, 2).canvas.manager is None
+        assert png_bytes(opd.plot(fit, "lsst")) == plain
+    assert new_figure(2, 2).canvas.manager is None

@@ -6,14 +6,18 @@ import shutil
 import numpy as np
 import pytest
 
-from pachon.models.errors import ConfigError, PachonError, ProductError
+from pachon.models.errors import ConfigError, DomainError, PachonError, ProductError
 from pachon.pipeline import ccd_stage, run_folder
 from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import read_product
+from pachon.pipeline.cli import main
 from pachon.pipeline.config import load_configuration, with_options
+from pachon.pipeline.correlation import shear_correlation
 from pachon.pipeline.experiment import prepare, resolve
 from pachon.pipeline.photometry import electrons
+from pachon.pipeline.progress import Reporter
 from pachon.pipeline.run import run
+from pachon.pipeline.summary import separation_bins
 
 CCDS = ("R22_S11", "R24_S12")
 CHANGES_EVERY_TIME = "timings.json"
@@ -153,6 +157,89 @@ def test_an_error_inside_a_ccd_names_it(tmp_path, monkeypatch, tiny, no_report):
     monkeypatch.setattr(ccd_stage, "make_psfs", fails)
     with pytest.raises(PachonError, match=r"^CCD R22_S11: something is off$"):
         run(tiny(), tmp_path / "out")
+
+
+@pytest.fixture
+def failing_ccd(monkeypatch):
+    """Let the first CCD be one that cannot be modelled."""
+    real = run_module.model_ccd
+
+    def fails(experiment, exposure):
+        if exposure.name == "R22_S11":
+            raise DomainError(f"CCD {exposure.name}: 3 of 12 stars left (9 neighbour): expected at least 5")
+        return real(experiment, exposure)
+
+    monkeypatch.setattr(run_module, "model_ccd", fails)
+    return "3 of 12 stars left (9 neighbour): expected at least 5"
+
+
+def test_a_ccd_that_cannot_be_modelled_is_left_out(finished_run, tmp_path, tiny, failing_ccd, monkeypatch, capsys):
+    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    out = tmp_path / "out"
+    result = run(tiny(), out, reporter=Reporter())
+    assert result.not_modelled == {"R22_S11": failing_ccd}
+    assert result.computed == ("R24_S12",)
+    assert f"CCD R22_S11 is left out, it cannot be modelled: {failing_ccd}\n" in capsys.readouterr().err
+    name = "ccd_R24_S12.fits"
+    assert (out / name).read_bytes() == (finished_run / name).read_bytes()
+    assert not (out / "ccd_R22_S11.fits").exists()
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["not_modelled"] == {"R22_S11": failing_ccd}
+    assert list(summary["ccd"]) == ["R24_S12"]
+    assert summary["all"]["ccds"] == 1
+    # That of the one CCD alone, as a run of it says.
+    alone = json.loads((finished_run / "summary.json").read_text())["ccd"]["R24_S12"]
+    assert summary["all"]["rms_residual_away"] == pytest.approx(alone["rms_residual_away"], rel=1e-8)
+    assert f"<li>CCD R22_S11: {failing_ccd}</li>" in (out / "report.html").read_text()
+
+
+def test_a_ccd_that_could_not_be_modelled_is_tried_again(
+    finished_run, tmp_path, tiny, no_report, failing_ccd, monkeypatch
+):
+    run(tiny(), tmp_path / "out", threads=1)
+    monkeypatch.setattr(run_module, "model_ccd", ccd_stage.model_ccd)
+    result = run(tiny(), tmp_path / "out", resume=True)
+    assert (result.kept, result.computed, result.not_modelled) == (("R24_S12",), ("R22_S11",), {})
+    assert contents(tmp_path / "out") == contents(finished_run)
+
+
+def test_strict_ends_at_a_ccd_that_cannot_be_modelled_and_keeps_the_others(
+    finished_run, settings_file, tmp_path, failing_ccd, capsys
+):
+    out = tmp_path / "out"
+    command = ["run", str(settings_file), "--out", str(out), "--quiet", "--strict", "--threads", "2"]
+    assert main(command) == 2
+    assert capsys.readouterr().err == f"pachon: error: CCD R22_S11: {failing_ccd}\n"
+    # The other CCD was on its way.
+    assert sorted(p.name for p in out.iterdir()) == ["ccd_R24_S12.fits", "config.yaml"]
+    assert (out / "ccd_R24_S12.fits").read_bytes() == (finished_run / "ccd_R24_S12.fits").read_bytes()
+
+
+def test_who_wants_no_progress_hears_of_a_ccd_left_out(settings_file, tmp_path, failing_ccd, no_report, capsys):
+    assert main(["run", str(settings_file), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert capsys.readouterr().err == f"pachon: CCD R22_S11 is left out, it cannot be modelled: {failing_ccd}\n"
+
+
+def test_a_run_of_which_no_ccd_can_be_modelled_is_one_line(tmp_path, tiny, failing_ccd):
+    with pytest.raises(DomainError, match=r"^none of 1 CCDs can be modelled; CCD R22_S11: 3 of 12 stars left"):
+        run(tiny(ccds=("R22_S11",)), tmp_path / "out")
+
+
+def test_errors_of_mean_correlations_are_their_jackknife(finished_run):
+    """Of two CCDs, what is left without one of them are the pairs within the other."""
+    summary = json.loads((finished_run / "summary.json").read_text())
+    products = [read_product(finished_run / f"ccd_{name}.fits") for name in CCDS]
+    bins = separation_bins(products)
+    for kind, stars in (("residual", [p.observed for p in products]), ("away", [p.truth for p in products])):
+        short = np.array(summary["correlation"][kind]["r_arcmin"]) < 10.0
+        left = []
+        for s in stars:
+            c = shear_correlation(s.field_x, s.field_y, s.e1 - s.model_e1, s.e2 - s.model_e2, **bins)
+            chosen = short & (c.n_pairs > 0)
+            left.append(np.average(c.xi_plus[chosen], weights=c.n_pairs[chosen]))
+        expected = np.sqrt(0.5 * np.sum((np.array(left) - np.mean(left)) ** 2))
+        # Sums in another order, of which the file has nine digits.
+        assert summary["all"][f"error_xi_plus_{kind}_short"] == pytest.approx(expected, rel=1e-7)
 
 
 def test_the_summary_holds_what_the_products_say(finished_run, tiny):
