@@ -1,0 +1,55 @@
+"""The examples of the documentation run, page by page, and its pictures are there."""
+
+import re
+import shutil
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+from pachon.models.prescription import DATA
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
+BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
+LENSES = Path(__file__).parents[1] / "data" / "zmx"
+GLASSES = DATA / "glasses.agf"
+#: Pages whose examples need files of the reader's own, and run with files of ours in other tests.
+WITH_FILES = {"psf_models.md", "zemax.md", "perturbations.md"}
+EXAMPLES = [name for name, text in PAGES.items() if BLOCK.search(text) and name not in WITH_FILES]
+
+
+def test_the_pages_that_users_begin_with_have_examples():
+    assert {"design_study.md", "design_figures.md", "derivatives.md"} <= set(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_run(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    with matplotlib.rc_context():
+        for block in BLOCK.findall(PAGES[name]):
+            exec(compile(block, name, "exec"), names)
+    assert capsys.readouterr().out
+    for picture in re.findall(r'savefig\("(.*?)"\)', PAGES[name]):
+        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_zemax_page_runs_on_a_lens(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(LENSES / "lens1.zmx", tmp_path / "lens.zmx")
+    shutil.copy(GLASSES, tmp_path / "schott.agf")
+    for block in BLOCK.findall(PAGES["zemax.md"]):
+        exec(compile(block, "zemax.md", "exec"), {})
+    assert (tmp_path / "again.zmx").stat().st_size > 500
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_pictures_and_links_are_there(name):
+    for target in re.findall(r"\]\(([^)#:]+)\)", PAGES[name]):
+        assert (DOCS / target).exists(), target
+
+
+def test_every_page_is_in_the_index():
+    listed = re.findall(r"<(\w+)>", PAGES["index.md"])
+    assert sorted(listed) == sorted(Path(name).stem for name in PAGES if name != "index.md")
