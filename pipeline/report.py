@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .ccd_product import CcdProduct
 from .config import ReconstructionConfig, to_yaml
@@ -18,38 +14,12 @@ from .experiment import Experiment, truth_components
 from .figures_focal_plane import close_up_figure, heights_figure, whiskers_figure
 from .figures_psf import eigen_figure, spectrum_figure, stamps_figure
 from .figures_statistics import correlation_figure, scatter_figure
+from .page import Picture, render
 from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
 _CLOSE_UPS = 3
 OBSERVED_COMPONENTS = "Eigen-PSFs of the observed stars"
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One picture of the report.
-
-    Attributes
-    ----------
-    title : str
-        Heading.
-    png : bytes
-        The picture.
-    shows : str
-        What is to be seen on it.
-    paper : str
-        What the paper shows in its place, with the figure's number; empty where it has none.
-    """
-
-    title: str
-    png: bytes
-    shows: str
-    paper: str
-
-    @property
-    def source(self) -> str:
-        """The picture as a data URI."""
-        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
 
 def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
@@ -64,14 +34,8 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
     pictures : sequence of Picture
         Pictures, as :func:`draw_pictures` gives them.
     """
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html").render(
+    return render(
+        "report.html",
         config=experiment.config,
         telescope=experiment.telescope,
         summary=summary,

@@ -17,15 +17,15 @@ BATOID = {
     "landing": "batoid within 1e-9 mm",
     "zernike": "batoid's rays and GalSim's annular Zernikes within 0.001 nm",
     "spot": "batoid within 1e-6 um",
-    "ee80": "Huygens integral over batoid's rays within 0.03 um",
+    "ee80": "Huygens integral over batoid's rays within 0.02 um",
     "distortion focal length": "batoid within 1e-9 m",
     "distortion axis focal length": "batoid within 3e-8 m",
     "distortion largest": "batoid within 1e-6 percent",
     "distortion rms": "batoid within 1e-5 um",
     "vignetting": "batoid within 1e-6",
     "defocus": "batoid within 0.05 nm",
-    "psf fwhm": "batoid's wavefronts and GalSim's von Karman turbulence within 0.002 arcsec",
-    "psf e": "batoid's wavefronts and GalSim's von Karman turbulence within 0.001",
+    "psf fwhm": "batoid's wavefronts and GalSim's von Karman turbulence within 0.0005 arcsec",
+    "psf e": "batoid's wavefronts and GalSim's von Karman turbulence within 0.0001",
 }
 ZEMAX = {
     "opd 500 nm field (0, 1.225) pupil (0.5, 0.5)": BATOID["opd"],

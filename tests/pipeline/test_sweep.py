@@ -264,3 +264,18 @@ def test_sweep_files_may_name_the_file_of_their_configuration(folder):
     (folder / "base.yaml").write_text("seed: 5\nccds: [R22_S11]\n")
     (folder / "two.yaml").write_text("base: base.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
     assert load_sweep(folder / "two.yaml").base == {"seed": 5, "ccds": ["R22_S11"]}
+
+
+def test_compensators_are_solved_at_every_point(folder):
+    text = SWEEP.replace("metrics:", "compensators: [Camera.dz_um]\nmetrics:").replace(
+        "latin_hypercube, points: 18", "grid"
+    )
+    text = text.replace("M2.dz_um: {nominal: 0, range: [-10, 10]}", "Camera.dz_um: {nominal: 0, values: [0, 10]}")
+    text = re.sub(r"  focal_plane.*\n|  R23_S11.*\n|  reconstruction.order.*\n", "", text)
+    (folder / "small.yaml").write_text(text)
+    assert main(["sweep", "small.yaml", "--quiet"]) == 0
+    with SweepStore(folder / "small.sweep") as store:
+        still, moved = (result.metrics for result in store.results())
+    # The camera goes back by what it was moved; the solver stops at 1e-9 of the mean square radius of the spots.
+    assert moved["solved Camera.dz_um"] - still["solved Camera.dz_um"] == pytest.approx(-10.0, abs=0.02)
+    assert moved["rms_e"] == pytest.approx(still["rms_e"], rel=1e-3)
