@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -339,8 +340,9 @@ class Sum(Shape):
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
         values = [part.parameters for part in self.parts]
-        return {name: values[i][inner] for name, (i, inner) in self._places().items()}
+        return {name: values[i][inner] for name, (i, inner) in self._places.items()}
 
+    @cached_property
     def _places(self) -> dict[str, tuple[int, str]]:
         """Return, for each name, the part and the name within it."""
         places: dict[str, tuple[int, str]] = {}
@@ -351,8 +353,9 @@ class Sum(Shape):
 
     def place(self, name: str) -> tuple[Shape, str]:
         """Return the part that a figure belongs to, and its name there."""
-        self._check_parameter(name)
-        i, inner = self._places()[name]
+        if name not in self._places:
+            raise unknown_name(f"figure of {type(self).__name__}", name, self._places)
+        i, inner = self._places[name]
         return self.parts[i], inner
 
     def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:  # noqa: D102
@@ -364,6 +367,6 @@ class Sum(Shape):
 
     def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
         self._check_parameter(name)
-        i, inner = self._places()[name]
+        i, inner = self._places[name]
         changed = self.parts[i].with_parameter(inner, value)
         return replace(self, parts=(*self.parts[:i], changed, *self.parts[i + 1 :]))

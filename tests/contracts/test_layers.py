@@ -1,4 +1,4 @@
-"""Imports point backwards only: models, raytrace, wavefront, design, pipeline."""
+"""Imports point backwards only: models, raytrace, wavefront, design, pipeline, studies, commands."""
 
 import ast
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LAYERS = ["models", "raytrace", "wavefront", "design", "pipeline"]
+LAYERS = ["models", "raytrace", "wavefront", "design", "pipeline", "studies", "commands"]
 FILES = [path for layer in LAYERS for path in sorted((ROOT / layer).rglob("*.py"))]
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from pachon.pipeline.cli import main
+from pachon.commands.cli import main
 
 MAGIC = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
 QUICK = {

@@ -9,6 +9,7 @@ import pytest
 from astropy import units as u
 
 import pachon
+from pachon.commands.cli import main
 from pachon.design.degrees_of_freedom import DegreesOfFreedom, Figure, Freedom, unit_size
 from pachon.design.degrees_of_freedom_file import load_degrees_of_freedom
 from pachon.design.sensitivity import sensitivity
@@ -19,7 +20,6 @@ from pachon.models.shape import EvenAsphere, Plane
 from pachon.models.shape_freeform import ZernikeSag
 from pachon.models.shape_grid import GridSag
 from pachon.models.shape_modes import GridModes
-from pachon.pipeline.cli import main
 
 ARCSEC = np.deg2rad(1.0 / 3600.0)
 FIELD, WAVELENGTH = (0.012, -0.021), 620e-9

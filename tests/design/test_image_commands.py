@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from pachon.pipeline.cli import main
+from pachon.commands.cli import main
 
 TWO = ["--field-deg", "0", "--field-deg", "1.2"]
 QUICK = {

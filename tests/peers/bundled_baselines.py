@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pachon.pipeline import baseline
-from pachon.pipeline.baseline_file import write_baseline
+from pachon.studies import baseline
+from pachon.studies.baseline_file import write_baseline
 
 FOLDER = Path(baseline.__file__).parent / "baselines"
 BATOID = {

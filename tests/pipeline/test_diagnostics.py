@@ -6,11 +6,11 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
+from pachon.commands.cli import main
 from pachon.models.camera import load_camera
 from pachon.models.errors import ProductError
 from pachon.pipeline import diagnostics
 from pachon.pipeline.ccd_product import KINDS, product_path, read_product
-from pachon.pipeline.cli import main
 from pachon.pipeline.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.figures_diagnostics import residual_map, rho_figure
 from pachon.pipeline.rho_statistics import rho_statistics

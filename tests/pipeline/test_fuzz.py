@@ -14,17 +14,17 @@ from pachon.models.errors import PachonError
 from pachon.models.prescription import DATA, load_telescope
 from pachon.pipeline.config import load_configuration, to_yaml
 from pachon.pipeline.experiment import prepare, resolve
-from pachon.pipeline.sweep import check_room, numbered_points
-from pachon.pipeline.sweep_design import point_count
-from pachon.pipeline.sweep_file import load_sweep
-from pachon.pipeline.sweep_point import check_sweep
 from pachon.raytrace.rays import launch_rays
 from pachon.raytrace.trace import trace
+from pachon.studies.sweep import check_room, numbered_points
+from pachon.studies.sweep_design import point_count
+from pachon.studies.sweep_file import load_sweep
+from pachon.studies.sweep_point import check_sweep
 
 hypothesis = pytest.importorskip("hypothesis")
 st = hypothesis.strategies
 
-SWEEP = (Path(__file__).parents[2] / "pipeline/examples/table1_small.yaml").read_text()
+SWEEP = (Path(__file__).parents[2] / "studies/examples/table1_small.yaml").read_text()
 CONFIG = to_yaml(resolve(load_configuration(Path(__file__).parents[2] / "docs/examples/optics_alone.yaml")))
 TELESCOPE = (DATA / "lsst_v3.3_r.yaml").read_text()
 FREEFORM = (DATA / "rubin_v3.14_r.yaml").read_text()

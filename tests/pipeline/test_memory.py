@@ -9,10 +9,10 @@ import sys
 import numpy as np
 import pytest
 
+from pachon.commands.cli import main
 from pachon.models.errors import ConfigError
 from pachon.pipeline import memory as run_memory
 from pachon.pipeline import run as run_module
-from pachon.pipeline.cli import main
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import prepare, resolve
 from pachon.pipeline.memory import check_memory, needed_bytes

@@ -6,11 +6,11 @@ import shutil
 import numpy as np
 import pytest
 
+from pachon.commands.cli import main
 from pachon.models.errors import ConfigError, DomainError, PachonError, ProductError
 from pachon.pipeline import ccd_stage, run_folder
 from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import read_product
-from pachon.pipeline.cli import main
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.correlation import shear_correlation
 from pachon.pipeline.experiment import prepare, resolve

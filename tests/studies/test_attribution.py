@@ -1,0 +1,236 @@
+import json
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from scipy.special import j0
+
+from pachon.commands.cli import main
+from pachon.models.errors import ConfigError, UnknownNameError
+from pachon.pipeline.ccd_product import KINDS
+from pachon.pipeline.ccd_stage import expose_ccd, model_ccd
+from pachon.pipeline.config import load_configuration, with_options
+from pachon.pipeline.correlation import shear_correlation
+from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.photometry import ARCSEC
+from pachon.pipeline.shapes import measure_shapes
+from pachon.pipeline.stamps import center_stamps
+from pachon.pipeline.summary import correlations
+from pachon.studies import attribution
+from pachon.studies.attribution import CAUSES, FULL, NOISE, OPTICS, RANGES, attribute, causes_of, write_attribution
+from pachon.wavefront.turbulence import structure_function
+
+
+@pytest.fixture(scope="module")
+def attributed(tiny):
+    return attribute(tiny(), ("tilt", "diffusion", "atmosphere", NOISE), threads=1)
+
+
+def test_the_full_case_is_the_run(finished_run, attributed):
+    summary = json.loads((finished_run / "summary.json").read_text())["all"]
+    full = attributed.figures[FULL]
+    for key in ("rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec"):
+        assert full[key] == pytest.approx(summary[key], rel=1e-8)  # nine digits in the file
+    # Below 10' the summary averages the same pairs; with patches sums go in another order.
+    for kind in ("truth", "observed", "residual", "away"):
+        assert full[f"xi_plus_{kind}_short"] == pytest.approx(summary[f"xi_plus_{kind}_short"], rel=1e-8)
+
+
+def test_a_case_is_a_run_without_the_cause(tiny, attributed):
+    experiment = prepare(resolve(with_options(tiny(), focal_plane__tilt=False)))
+    names = experiment.config.ccds
+    products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1)) for name in names]
+    e = np.concatenate([[p.truth.e1, p.truth.e2] for p in products], axis=1)
+    assert attributed.figures["tilt"]["rms_e_truth"] == np.sqrt(np.mean(e**2))
+    for kind, expected in correlations(products, KINDS).items():
+        assert attributed.correlations["tilt"][kind].xi_plus.tobytes() == expected.xi_plus.tobytes()
+    assert attributed.figures["tilt"]["rms_e_truth"] != attributed.figures[FULL]["rms_e_truth"]
+
+
+def test_changes_are_differences(attributed):
+    full = attributed.figures[FULL]
+    assert not any(key.startswith(("change_", "error_")) for key in full)
+    for case in ("tilt", "diffusion", "atmosphere", NOISE):
+        figures = attributed.figures[case]
+        for key in full:
+            assert figures[f"change_{key}"] == full[key] - figures[key]
+
+
+def test_error_of_a_change_is_its_own_jackknife():
+    rng = np.random.default_rng(0)
+    x = np.concatenate([k * 0.02 + rng.uniform(0.0, 0.004, 12) for k in range(3)])
+    y = rng.uniform(0.0, 0.004, 36)
+    patch = np.repeat(np.arange(3), 12)
+    bins = {"min_sep": 1e-4, "max_sep": 0.05, "n_bins": 8}
+    e, f = rng.normal(0.0, 0.02, (2, 2, 36))
+
+    def long_range(ellipticity, keep):
+        c = shear_correlation(x[keep], y[keep], *ellipticity[:, keep], **bins)
+        inside = (c.r_arcmin >= 10.0) & (c.r_arcmin < 180.0) & (c.n_pairs > 0)
+        return np.sum(c.n_pairs[inside] * c.xi_plus[inside]) / c.n_pairs[inside].sum()
+
+    left = [long_range(e, patch != k) - long_range(f, patch != k) for k in range(3)]
+    expected = np.sqrt(2.0 / 3.0 * np.sum((left - np.mean(left)) ** 2))
+    kinds = ("truth", "observed", "residual", "away")
+    keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in RANGES}
+    one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, patch=patch, **bins)) for v in (e, f))
+    changes = attribution._changes(keys, keys, one, other)
+    assert changes["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order
+    # Stars and their mates in the other case are the same: what both have in common is in no error.
+    assert attribution._changes(keys, keys, one, one)["error_xi_plus_away_long"] == 0.0
+
+
+def test_without_noise_the_truth_stays(attributed):
+    full, quiet = attributed.figures[FULL], attributed.figures[NOISE]
+    assert quiet["rms_e_truth"] == full["rms_e_truth"]
+    assert quiet["fwhm_arcsec"] == full["fwhm_arcsec"]
+    assert quiet["rms_residual_at_stars"] < full["rms_residual_at_stars"]
+    truth, same = attributed.correlations[FULL]["truth"], attributed.correlations[NOISE]["truth"]
+    assert truth.xi_plus.tobytes() == same.xi_plus.tobytes()
+
+
+def test_without_noise_the_model_is_that_of_bright_stars(tiny):
+    # The limit of ever brighter stars through the noisy path: photons of 1e11 electrons scatter by 3e-6 of the light.
+    experiment = prepare(tiny(ccds=("R22_S11",)))
+    exposure = expose_ccd(experiment, "R22_S11", threads=1)
+    product = model_ccd(experiment, exposure)
+    quiet = model_ccd(experiment, exposure, noisy=False)
+    np.testing.assert_array_equal(quiet.truth.e1, product.truth.e1)
+    stamps = center_stamps(exposure.observed.image, *_centroids(experiment, exposure), size=experiment.stamp_size)
+    rng = np.random.default_rng(0)
+    bright = rng.poisson(1e11 * np.maximum(stamps, 0.0)) / 1e11
+    shapes = measure_shapes(bright, exposure.observed.pixel_scale, experiment.weight_fwhm)
+    # Ten times that scatter; noisy stars of S/N 30 differ by 3e-2.
+    np.testing.assert_allclose(quiet.observed.e1, shapes.e1, rtol=0.0, atol=3e-5)
+    np.testing.assert_allclose(quiet.observed.e2, shapes.e2, rtol=0.0, atol=3e-5)
+    assert np.abs(product.observed.e1 - shapes.e1).max() > 3e-4
+    assert quiet.observed.used.all()
+    assert np.isfinite(quiet.observed.left_out_e1).all()
+
+
+def _centroids(experiment, exposure):
+    first = measure_shapes(exposure.observed.image, exposure.observed.pixel_scale, experiment.weight_fwhm)
+    return first.x, first.y
+
+
+def test_causes_do_what_they_should(attributed):
+    full = attributed.figures[FULL]["fwhm_arcsec"]
+    # Charge diffusion of 0.4 pixel of 0.2" adds 0.08" rms, 0.19" FWHM, about in quadrature to a seeing-limited core.
+    sharper = attributed.figures["diffusion"]["fwhm_arcsec"]
+    assert np.sqrt(full**2 - sharper**2) == pytest.approx(0.19, rel=0.2)
+    assert attributed.figures["atmosphere"]["fwhm_arcsec"] < 0.75 * full
+
+
+def test_optics_off_leaves_the_air_alone(tiny):
+    """The mean over all turbulence is round: what ellipticity there is, the telescope makes."""
+    config = tiny(psf__engine="long_exposure", ccds=("R22_S11", "R24_S12"))
+    figures = attribute(config, ("heights", OPTICS), threads=1).figures
+    # Heights of some micrometres do most, the design a little.
+    assert figures["full"]["rms_e_truth"] > figures["heights"]["rms_e_truth"] > figures[OPTICS]["rms_e_truth"]
+    # A flat detector stretches the sky by 1/cos along the radius more than across: e = 2.2e-4 at 1.7 deg.
+    assert figures[OPTICS]["rms_e_truth"] < 3e-4
+    experiment = prepare(config)
+    alone = attribution._without(experiment, OPTICS)
+    full, air = (expose_ccd(e, "R24_S12", threads=1) for e in (experiment, alone))
+    np.testing.assert_array_equal(full.truth.fields, air.truth.fields)
+    assert air.truth.pixel_scale == pytest.approx(full.truth.pixel_scale, rel=1e-12)
+    np.testing.assert_allclose(air.truth.light, 1.0, rtol=1e-6)  # no rim of a camera in the way
+    # What air, diffusion (0.4 pixel rms) and pixel (rms 0.29 of its side, 0.2") make of a point: a Hankel transform.
+    # Of diffraction it knows the rims: each takes r times its diameter from the overlap of the pupil with itself.
+    r, angle = np.linspace(0.0, 4.0, 4001)[1:], np.linspace(0.0, 0.6, 601) * ARCSEC
+    outer, inner = 4.18, 0.61 * 4.18
+    pupil = np.maximum(1.0 - 4.0 * r * (outer + inner) / (2.0 * np.pi * (outer**2 - inner**2)), 0.0)
+    blur = np.hypot(0.4, 12.0**-0.5) * 0.2 * ARCSEC
+    image = np.zeros(len(angle))
+    for wavelength in (560e-9, 680e-9):
+        air = 0.5 * (2.0 * np.pi / wavelength) ** 2 * structure_function(r, 0.16, 25.0)
+        seen = pupil * np.exp(-air - 0.5 * (2.0 * np.pi * r / wavelength * blur) ** 2) * r
+        image += (j0(2.0 * np.pi * angle[:, None] * r / wavelength) * seen).sum(axis=1) / wavelength**2
+    expected = 2.0 * np.interp(0.5, image[::-1] / image[0], angle[::-1]) / ARCSEC
+    assert figures[OPTICS]["fwhm_arcsec"] == pytest.approx(expected, rel=0.01)
+
+
+def test_a_lifted_ground_layer_is_the_same_air(tiny):
+    full = prepare(tiny())
+    lifted = attribution._without(full, "ground_layer")
+    np.testing.assert_array_equal(lifted.atmosphere.altitudes[1:], full.atmosphere.altitudes[1:])
+    assert (full.atmosphere.altitudes[0], lifted.atmosphere.altitudes[0]) == (0.0, attribution.GROUND_LIFT)
+    asked = prepare(resolve(with_options(tiny(), atmosphere__ground_lift_m=attribution.GROUND_LIFT)))
+    np.testing.assert_array_equal(lifted.atmosphere.altitudes, asked.atmosphere.altitudes)
+    assert lifted.atmosphere.kept_screens("slopes") is full.atmosphere.kept_screens("slopes")
+
+
+def test_causes_that_are_off_are_no_causes(tiny):
+    config = tiny()
+    assert causes_of(config) == tuple(c for c in CAUSES if c != "active_optics")
+    config = tiny(focal_plane__tilt=False, psf__diffusion_pixels=0.0, active_optics__residual_um=0.2)
+    assert not {"tilt", "diffusion"} & set(causes_of(config))
+    assert "active_optics" in causes_of(config)
+    assert not {"heights", "ccd"} & set(causes_of(tiny(focal_plane__budget="flat")))
+    assert "atmosphere" not in causes_of(tiny(psf__engine="long_exposure"))
+    for options, cause, message in (
+        ({"focal_plane__tilt": False}, "tilt", "focal_plane.tilt = false"),
+        ({"focal_plane__budget": "flat"}, "heights", "focal_plane.budget = flat"),
+        ({"psf__engine": "long_exposure"}, "atmosphere", "psf.engine = long_exposure"),
+        ({"psf__diffusion_pixels": 0.0}, "diffusion", "psf.diffusion_pixels = 0"),
+        ({}, "active_optics", "active_optics.residual_um = 0"),
+        ({"atmosphere__ground_lift_m": 200.0}, "ground_layer", "no layer is on the ground"),
+        ({"psf__engine": "long_exposure"}, "ground_layer", "no star sees turbulence"),
+        ({"atmosphere__enabled": False}, OPTICS, "nothing would be left"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            attribute(tiny(**options), (cause,))
+    with pytest.raises(UnknownNameError, match="did you mean tilt"):
+        attribute(config, ("tillt",))
+
+
+def test_files_hold_what_was_returned(tiny, attributed, tmp_path):
+    files = write_attribution(attributed, tmp_path, tiny())
+    assert load_configuration(tmp_path / "config.yaml") == tiny()
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(files)
+    table = Table.read(tmp_path / "attribution.ecsv")
+    assert list(table["off"]) == list(attributed.figures)
+    assert table["change_rms_e_truth"][1] == attributed.figures["tilt"]["change_rms_e_truth"]
+    assert np.isnan(table["change_rms_e_truth"][0])
+    assert all(column.description for column in table.itercols())
+    xi = Table.read(tmp_path / "correlations.ecsv")
+    rows = xi[xi["kind"] == "diffusion away"]
+    np.testing.assert_array_equal(rows["xi_plus"], attributed.correlations["diffusion"]["away"].xi_plus)
+    assert (tmp_path / "attribution.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(attribution, "attribution_figure", lambda *_: b"")
+    out = tmp_path / "out"
+    command = ["attribute", str(settings_file), "--out", str(out), "--average", "--threads", "1", "--quiet"]
+    assert main([*command, "--causes", "ccd,noise", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert list(figures) == ["ccd", "full", "noise"]
+    assert json.loads((out / "attribution.json").read_text())["figures"] == figures
+    assert main([*command[:-1], "--causes", "noise", "--ccds", "R22_S11"]) == 0
+    printed = capsys.readouterr()
+    assert "everything on" in printed.err
+    assert printed.out.endswith(f"attribution: {out.resolve()}\n")
+    assert main(["attribute", "--help"]) == 0
+    assert "pachon attribute " in capsys.readouterr().out.partition("Examples")[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--causes", "wind"], ["'wind'"]),
+        (["--causes", ","], ["--causes = ','"]),
+        (["--causes", "atmosphere", "--average"], ["atmosphere cannot be switched off", "long_exposure"]),
+        (["--raft", "R22", "--ccds", "R22_S11"], ["--ccds and --raft"]),
+        (["--ccds", "R22_S1l"], ["did you mean R22_S"]),
+    ],
+)
+def test_bad_input_is_one_line(settings_file, tmp_path, capsys, arguments, parts):
+    assert main(["attribute", str(settings_file), "--out", str(tmp_path / "out"), *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("pachon: error: ")
+    for part in parts:
+        assert part in err
+    assert not (tmp_path / "out").exists()
