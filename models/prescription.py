@@ -29,6 +29,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 from .codev_reader import read_codev
@@ -53,6 +54,10 @@ BUNDLED = (
     "hsc",
     "paul_baker",
 )
+
+
+#: Endings of files that a telescope is read from.
+ENDINGS = (".yaml", ".yml", ".zmx", ".seq")
 
 
 def bundled_names() -> tuple[str, ...]:
@@ -92,7 +97,7 @@ def load_telescope(
     """
     text = os.fspath(name_or_path)
     if text in BUNDLED:
-        return read_telescope(read_yaml(DATA / f"{text}.yaml"))
+        return _bundled(text)
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
         return read_telescope(read_yaml(path))
@@ -103,6 +108,12 @@ def load_telescope(
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"{path}: expected a prescription file that ends in .yaml, .zmx or .seq")
     raise unknown_name("telescope", text, BUNDLED)
+
+
+@cache
+def _bundled(name: str) -> Telescope:
+    # A telescope never changes, so that one serves all who ask; a sweep asks for it at every point.
+    return read_telescope(read_yaml(DATA / f"{name}.yaml"))
 
 
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -124,10 +125,17 @@ def load_site(name_or_path: str | os.PathLike[str]) -> Site:
         If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
     """
     text = os.fspath(name_or_path)
-    path = DATA / f"{text}.yaml" if text in BUNDLED else Path(text)
+    if text in BUNDLED:
+        return _bundled(text)
+    path = Path(text)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise unknown_name("site", text, BUNDLED)
     return _read_site(read_yaml(path))
+
+
+@cache
+def _bundled(name: str) -> Site:
+    return _read_site(read_yaml(DATA / f"{name}.yaml"))
 
 
 def _read_site(top: Section) -> Site:

@@ -83,15 +83,11 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
     for m, top in _radial_degrees(orders).items():
         powers = np.polynomial.legendre.legvander(nodes, top) * (s ** (m / 2))[..., None]
         radial[m] = powers @ _radial_coefficients(m, top + 1, float(obscuration))
+    angular = {m: np.cos(m * theta) if m > 0 else np.sin(-m * theta) for m in {m for _, m in orders} - {0}}
     out = np.empty((jmax, *x.shape))
     for row, (n, m) in enumerate(orders):
         r = radial[abs(m)][..., (n - abs(m)) // 2]
-        if m == 0:
-            out[row] = r
-        elif m > 0:
-            out[row] = np.sqrt(2.0) * r * np.cos(m * theta)
-        else:
-            out[row] = np.sqrt(2.0) * r * np.sin(-m * theta)
+        out[row] = np.sqrt(2.0) * r * angular[m] if m else r
     return out
 
 

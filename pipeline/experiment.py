@@ -18,7 +18,7 @@ from ..models.camera import Camera, load_camera
 from ..models.errors import ConfigError, PachonError
 from ..models.focal_plane import FocalPlane
 from ..models.height_budget import load_budget
-from ..models.prescription import bundled_names, load_telescope
+from ..models.prescription import ENDINGS, bundled_names, load_telescope
 from ..models.site import Site, load_site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
@@ -366,20 +366,20 @@ def _filled(section: _Model, defaults: Mapping[str, object]) -> _Model:
 
 def _band_of(name: str) -> BandName:
     """Return the band that the name of a model ends in, such as lsst_v3.3_i; r where it does not."""
-    ending = name.removesuffix(".yaml").removesuffix(".yml").rpartition("_")[2]
+    ending = Path(name).stem.rpartition("_")[2] if Path(name).suffix.lower() in ENDINGS else name.rpartition("_")[2]
     bands: dict[str, BandName] = {"u": "u", "g": "g", "r": "r", "i": "i", "z": "z", "y": "y"}
     return bands.get(ending, "r")
 
 
 def _absolute(name: str, folder: Path | None, bundled: Sequence[str]) -> str:
     """Return a bundled name as it is, and the path of a file as an absolute one."""
-    if name in bundled or Path(name).suffix.lower() not in (".yaml", ".yml"):
+    if name in bundled or Path(name).suffix.lower() not in ENDINGS:
         return name
     return str(((folder or Path()) / name).resolve())
 
 
 def _name_or_content(name: str, bundled: Sequence[str]) -> str:
     """Return a bundled name, or the hash of the file of that name."""
-    if name in bundled or Path(name).suffix.lower() not in (".yaml", ".yml"):
+    if name in bundled or Path(name).suffix.lower() not in ENDINGS:
         return name
     return hashlib.sha256(Path(name).read_bytes()).hexdigest()

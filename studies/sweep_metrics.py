@@ -93,27 +93,25 @@ def _border_jump(scene: _Scene) -> dict[str, float]:
     """Root mean square, per component, of the jump of e across the middles of borders between neighbours."""
     camera = scene.experiment.camera
     centers = camera.centers[[camera.ccd_index(name) for name in scene.names]]
-    half = camera.half_size
-
-    def terms(k: int, positions: np.ndarray) -> np.ndarray:
-        (x, y) = centers[k]
-        return design_matrix(positions, (x - half, x + half, y - half, y + half), _BORDER_ORDER)
-
+    pairs = np.array(sorted(cKDTree(centers).query_pairs(_NEIGHBOUR * camera.ccd_size))).reshape(-1, 2)
+    if not len(pairs):
+        return {"border_jump_e": np.nan}
+    middles = centers[pairs].mean(axis=1)
     first = np.cumsum([0, *map(len, scene.places)])
-    fits = []
+    # Ellipticity on either side of each border, carried there by a fit within the CCD.
+    sides = np.full((len(pairs), 2, 2), np.nan)
     for k, places in enumerate(scene.places):
-        each = slice(first[k], first[k + 1])
-        e = np.stack([scene.shapes.e1[each], scene.shapes.e2[each]], axis=1)
-        good = np.isfinite(e).all(axis=1)
-        basis = terms(k, places[good])
-        enough = len(basis) >= basis.shape[1]
-        fits.append(np.linalg.lstsq(basis, e[good], rcond=None)[0] if enough else np.full((basis.shape[1], 2), np.nan))
-    jumps = []
-    for pair in sorted(cKDTree(centers).query_pairs(_NEIGHBOUR * camera.ccd_size)):
-        middle = centers[list(pair)].mean(axis=0, keepdims=True)
-        one, other = (terms(k, middle)[0] @ fits[k] for k in pair)
-        jumps.append(one - other)
-    return {"border_jump_e": float(np.sqrt(np.nanmean(np.square(jumps)))) if jumps else np.nan}
+        stars = slice(first[k], first[k + 1])
+        e = np.stack([scene.shapes.e1[stars], scene.shapes.e2[stars]], axis=1)
+        good, borders = np.isfinite(e).all(axis=1), pairs == k
+        (x, y), half = centers[k], camera.half_size
+        extent = (x - half, x + half, y - half, y + half)
+        points = np.concatenate([places[good], middles[borders.any(axis=1)]])
+        terms = design_matrix(points, extent, _BORDER_ORDER)
+        if good.sum() >= terms.shape[1]:
+            sides[borders] = terms[good.sum() :] @ np.linalg.lstsq(terms[: good.sum()], e[good], rcond=None)[0]
+    jumps = sides[:, 0] - sides[:, 1]
+    return {"border_jump_e": float(np.sqrt(np.nanmean(np.square(jumps))))}
 
 
 def _xi_raw(scene: _Scene) -> dict[str, float]:

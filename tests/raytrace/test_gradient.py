@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.models.aperture import Circle
+from pachon.models.errors import DomainError
 from pachon.models.shape_freeform import ZernikeSag
+from pachon.models.shape_mesh import MeshSurface
 from pachon.models.surface import Conic, Interaction, Plane, Surface
 from pachon.models.telescope import VACUUM
 from pachon.raytrace.gradient import (
@@ -18,7 +21,8 @@ from pachon.raytrace.gradient import (
     respond,
     sweep,
 )
-from pachon.raytrace.sphere_sweep import respond_to_sphere
+from pachon.raytrace.rays import RayStatus, field_direction
+from pachon.raytrace.sphere_sweep import SphereSweep
 from pachon.wavefront.reference import distance_to_sphere, sphere_distance_derivatives
 
 RADIUS = 5.0
@@ -270,23 +274,55 @@ def test_polynomials(swept, crooked):
             assert np.abs(response.values[:, row] - expected).max() < 1e-13 * max(1.0, np.abs(expected).max())
 
 
-def test_one_go_is_two_sweeps(crooked, rays, swept, center, responses):
+@pytest.mark.parametrize("lit_only", [False, True])
+def test_one_go_is_two_sweeps(crooked, annulus_points, swept, center, responses, lit_only):
     rows = columns(crooked, {(0, "sag"), (0, "hit"), (5, "index"), (12, "index"), (1, "gap"), (13, "gap")})
     first = int(rows.max()) + 1
-    where = np.repeat(center[:, None], len(rays), axis=1)
-    zero = np.full(len(rays), 17.0)
-    one = [respond_to_sphere(crooked, rays, where, zero, RADIUS, rows, first, threads=n) for n in (1, 2, 5)]
+    stopped = replace(crooked, surfaces=(replace(crooked.surfaces[0], aperture=Circle(3.6)), *crooked.surfaces[1:]))
+    directions = field_direction(*np.transpose([(0.0, 0.01), FIELD]))
+    centers, zeros = np.stack([swept.position[:, 5], center], axis=1), np.array([3.0, 17.0])
+    pupil = np.stack(annulus_points(45, seed=4), axis=1)
+    one_go = SphereSweep(
+        stopped, directions, swept.indices, pupil, centers, zeros, RADIUS, rows, first, lit_only=lit_only
+    )
+    one = [one_go.respond(slice(0, 2), threads=n) for n in (1, 2, 5)]
     for response, status in one[1:]:
         assert np.array_equal(response.values, one[0][0].values)
         assert np.array_equal(status, one[0][1])
-    response, status = one[0]
-    assert np.array_equal(status, swept.status)
+    # A field point does not know of those before it.
+    response, status = one_go.respond(slice(1, 2))
+    assert np.array_equal(response.values, one[0][0].values[:, :, 1:])
+    assert np.array_equal(status, one[0][1][1:])
+    vignetted = status[0] == RayStatus.VIGNETTED
+    assert 5 < vignetted.sum() < 40
+    assert (status[0][~vignetted] == RayStatus.OK).all()
+    counts = np.where(vignetted & lit_only, 0.0, 1.0)
+    values = response.values[0, :, 0]
+    where = np.repeat(center[:, None], len(pupil), axis=1)
     distance, by_position, _ = sphere_distance_derivatives(swept.position, swept.direction, where, RADIUS)
-    assert np.allclose(response.values[0, first], swept.path + distance - 17.0, atol=2e-14)
-    assert np.allclose(response.values[0, first + 1 : first + 4], by_position, atol=1e-14)
-    for what, surface in (("sag", 0), ("hit", 0), ("index", 5), ("index", 12), ("gap", 1), ("gap", 13)):
+    assert np.allclose(values[first], counts * (swept.path + distance - 17.0), atol=2e-14)
+    assert np.allclose(values[first + 1 : first + 4], counts * by_position, atol=1e-14)
+    # The rays start where NumPy puts them, but for rounding of some ten metres.
+    assert np.allclose(response.hit(0)[:, 0], responses[1].hit(0), atol=2e-14)
+    for what, surface in (("sag", 0), ("index", 5), ("index", 12), ("gap", 1), ("gap", 13)):
         # The same arithmetic but for the order of a few sums.
-        assert np.allclose(getattr(response, what)(surface), getattr(responses[1], what)(surface), atol=2e-13)
+        expected = counts * getattr(responses[1], what)(surface)
+        assert np.allclose(getattr(response, what)(surface)[:, :, 0], expected, atol=2e-13)
+
+
+def test_a_mesh_is_refused(crooked):
+    x, y = np.meshgrid(np.linspace(-5.0, 5.0, 3), np.linspace(-5.0, 5.0, 3))
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(9)], axis=-1)
+    faces = [(i, i + 1, i + 4) for i in (0, 1, 3, 4)] + [(i, i + 4, i + 3) for i in (0, 1, 3, 4)]
+    meshed = crooked.with_shape("M3", MeshSurface(vertices, np.array(faces)))
+    point = np.zeros((1, 2))
+    with pytest.raises(DomainError, match="surface M3: expected a shape that can be differentiated, not a mesh"):
+        sweep(meshed, pachon.launch_rays(meshed, FIELD, WAVELENGTH, point.T))
+    rows = columns(meshed, ())
+    with pytest.raises(DomainError, match="surface M3: expected a shape that can be differentiated, not a mesh"):
+        SphereSweep(
+            meshed, np.array([[0.0, 0.0, -1.0]]), np.ones(15), point, np.zeros((3, 1)), np.zeros(1), 5.0, rows, 0
+        )
 
 
 def test_lost_rays_do_not_spoil_others(crooked, annulus_points):
