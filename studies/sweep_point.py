@@ -78,7 +78,9 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
     sections = {key.partition(".")[0] for key in keys if "." in key}
     for name, value in parameters.items():
         if name in keys:
-            _set(content, name.split("."), value)
+            # One wavelength is the whole band, and one CCD all there is.
+            alone = name in ("wavelengths_nm", "ccds")
+            _set(content, name.split("."), [value] if alone else value)
             continue
         body, _, quantity = name.partition(".")
         if body in _bodies():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -200,8 +200,9 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
     except OSError as error:
         raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
-        for leftover in (partial, *_beside(partial)):
-            leftover.unlink(missing_ok=True)
+        with suppress(OSError):
+            for leftover in (partial, *_beside(partial)):
+                leftover.unlink(missing_ok=True)
 
 
 def check_same_sweep(store: SweepStore, sweep: SweepFile) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -222,6 +223,8 @@ def dask_client(address: str, security: Any = None) -> Iterator[Any]:
     """
     if find_spec("distributed") is None:
         raise ConfigError("--scheduler needs the package distributed: pip install 'pachon[dask]'")
+    if not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d+", address):
+        raise ConfigError(f"--scheduler = {address}: expected an address such as tcp://host:8786 or tls://host:8786")
     with _quiet_dask():
         client = _connected(address, security)
         try:

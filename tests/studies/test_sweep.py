@@ -155,9 +155,13 @@ def cluster():
         process.wait()
 
 
-def test_a_dask_cluster_that_loses_a_worker_and_then_its_scheduler(folder, reference, cluster):
+def test_a_dask_cluster_that_loses_its_driver_a_worker_and_its_scheduler(folder, reference, cluster):
     driver = start("sweep", "small.yaml", "--scheduler", cluster["address"])
-    wait_for("small.sweep", 4, driver)
+    wait_for("small.sweep", 3, driver)
+    driver.kill()
+    driver.wait()
+    driver = start("sweep", "small.yaml", "--scheduler", cluster["address"], "--resume")
+    wait_for("small.sweep", 6, driver)
     cluster["workers"][0].kill()
     wait_for("small.sweep", 8, driver)
     cluster["scheduler"].kill()
@@ -236,6 +240,12 @@ def test_a_scheduler_that_does_not_answer_is_one_line(folder, capsys, monkeypatc
     assert len(error.splitlines()) == 1
 
 
+def test_an_address_that_is_none_is_one_line(folder, capsys):
+    pytest.importorskip("distributed")
+    assert main(["sweep", "small.yaml", "--scheduler", "login1:8786"]) == 2
+    assert "--scheduler = login1:8786: expected an address such as tcp://host:8786" in capsys.readouterr().err
+
+
 def test_workers_with_another_version_are_refused(monkeypatch):
     from pachon.studies import sweep_workers
 
@@ -264,6 +274,19 @@ def test_sweep_files_may_name_the_file_of_their_configuration(folder):
     (folder / "base.yaml").write_text("seed: 5\nccds: [R22_S11]\n")
     (folder / "two.yaml").write_text("base: base.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
     assert load_sweep(folder / "two.yaml").base == {"seed": 5, "ccds": ["R22_S11"]}
+
+
+def test_a_wavelength_is_a_parameter(folder):
+    text = "base: {ccds: [R22_S11], stars: {truth: 12}, psf: {engine: long_exposure}, reconstruction: {components: 5, "
+    text += (
+        "truth_order: 2}}\nparameters: {wavelengths_nm: {values: [560, 690]}}\ndesign: {kind: grid}\nmetrics: [fwhm]\n"
+    )
+    (folder / "small.yaml").write_text(text)
+    assert main(["sweep", "small.yaml", "--quiet"]) == 0
+    with SweepStore(folder / "small.sweep") as store:
+        blue, red = (result.metrics["fwhm_arcsec"] for result in store.results())
+    # Seeing falls as the wavelength to the power -1/5; optics and detector are there too, the outer scale takes more.
+    assert 0.9 < red / blue < (690 / 560) ** -0.2
 
 
 def test_compensators_are_solved_at_every_point(folder):
