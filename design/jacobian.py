@@ -9,11 +9,10 @@ import numpy as np
 from ..models.polar_polynomial import PolarPolynomial
 from ..models.telescope import Telescope
 from ..raytrace.gradient import Seeds, SurfaceResponse, Sweep, columns, polynomial_terms, respond
-from ..raytrace.rays import Rays
-from ..raytrace.sphere_sweep import SPHERE_ROWS, respond_to_sphere
+from ..raytrace.sphere_sweep import SPHERE_ROWS, SphereSweep
 from ..wavefront.reference import sphere_distance_derivatives
 from .figures import figure_polynomial
-from .parameters import Parameter, apply, index_surfaces, twists, with_figures
+from .parameters import Parameter, apply, figured_shapes, index_surfaces, twists
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class ParameterColumns:
         rows = np.maximum(helpers, own)
 
         # Where rays go, a shape has the figures that are not zero; to be differentiated by, all that are named.
-        shapes = {s.name: s.shape for s in with_figures(moved, parameters).surfaces}
+        shapes = figured_shapes(moved, parameters)
         used = max(first, int(own.max()) + 1)
         terms: dict[int, dict[int, PolarPolynomial]] = {}
         figures: list[tuple[int, int, str]] = []
@@ -118,36 +117,50 @@ class ParameterColumns:
         response = respond(swept, seeds, self.rows, polynomials=self.polynomials, threads=threads)
         return self._with_figures(response, self.helpers + SPHERE_ROWS)
 
-    def to_sphere(
-        self, rays: Rays, center: np.ndarray, path: np.ndarray, radius: float, *, threads: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows of the optical path to reference spheres, and the statuses of the rays.
+    def to_spheres(
+        self,
+        directions: np.ndarray,
+        indices: np.ndarray,
+        pupil: np.ndarray,
+        center: np.ndarray,
+        path: np.ndarray,
+        *,
+        lit_only: bool = False,
+    ) -> SphereSweep:
+        """Return the sweep of the rays of field points to their reference spheres, whose rows :meth:`of_path` takes.
 
-        Parameters are those of :func:`~pachon.raytrace.sphere_sweep.respond_to_sphere`. The first four of the rows
-        [n_row, n] are the path and its derivatives with respect to the landing point; all others have weights.
+        Parameters are those of :class:`~pachon.raytrace.sphere_sweep.SphereSweep`.
         """
-        response, status = respond_to_sphere(
+        return SphereSweep(
             self.telescope,
-            rays,
+            directions,
+            indices,
+            pupil,
             center,
             path,
-            radius,
+            self.telescope.reference_sphere_radius,
             self.rows,
             self.helpers,
-            polynomials=self.polynomials,
-            threads=threads,
+            self.polynomials,
+            lit_only=lit_only,
         )
-        return self._with_figures(response, self.helpers)[0], status
+
+    def of_path(self, response: SurfaceResponse) -> np.ndarray:
+        """Return the rows [n_row, n_field, n_pupil] of optical paths to reference spheres.
+
+        The first four are the path and its derivatives with respect to the landing point; all others have weights.
+        """
+        return self._with_figures(response, self.helpers)[0]
 
     def _with_figures(self, response: SurfaceResponse, first: int) -> np.ndarray:
         """Return the rows from a first one on, those of figures that are no polynomials added."""
         values = response.values[:, first:]
         if not self.figures:
             return values
-        shapes = with_figures(self.telescope, self.parameters).surfaces
-        extra = np.empty((len(values), len(self.figures), values.shape[2]))
+        shapes, names = figured_shapes(self.telescope, self.parameters), self.telescope.surface_names
+        extra = np.empty((len(values), len(self.figures), *values.shape[2:]))
         for i, (s, name) in enumerate(self.figures):
-            f, fx, fy = shapes[s].shape.sag_derivative(name, *response.hit(s))
+            f, fx, fy = shapes[names[s]].sag_derivative(name, *response.hit(s))
             sag = response.sag(s)
             extra[:, i] = sag[:, 0] * f + sag[:, 1] * fx + sag[:, 2] * fy
         return np.concatenate([values, extra], axis=1)
@@ -174,14 +187,15 @@ def _scale(telescope: Telescope, surface: int) -> float:
 
 def _polynomial_weights(found: dict[int, PolarPolynomial], n: int, scale: float) -> tuple[int, np.ndarray]:
     """Return the highest degree of the polynomials of some of ``n`` parameters, and their terms, [n_term, n]."""
-    degree = max(polynomial.degree for polynomial in found.values())
-    listed = polynomial_terms(degree)
-    weights = np.zeros((len(listed), n))
-    for p, polynomial in found.items():
-        for i, (m, k, imaginary) in enumerate(listed):
-            if m < polynomial.terms.shape[0] and k < polynomial.terms.shape[1]:
-                term = polynomial.terms[m, k] * scale ** (m + 2 * k)
-                weights[i, p] = -term.imag if imaginary else term.real
+    highest = max(len(p.terms) + 2 * p.terms.shape[1] for p in found.values())
+    terms = np.zeros((n, highest, highest), dtype=np.complex128)
+    for row, polynomial in found.items():
+        orders, powers = polynomial.terms.shape
+        terms[row, :orders, :powers] = polynomial.terms
+    degree = PolarPolynomial(np.abs(terms).max(axis=0)).degree
+    m, k, imaginary = np.array(polynomial_terms(degree)).T
+    term = terms[:, m, k].T * (scale ** (m + 2 * k))[:, None]
+    weights = np.where(imaginary[:, None], -term.imag, term.real)
     return degree, weights
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from ..models.changed_index import with_index_change
 from ..models.errors import ConfigError, DomainError, unknown_name
+from ..models.shape import Shape
 from ..models.surface import Interaction
 from ..models.telescope import Telescope, rotation_matrix
 from .figures import figure_unit, with_figure
@@ -143,9 +144,9 @@ def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> 
     addresses = [p.address for p in found]
     if not found:
         raise ConfigError("parameters = []: expected at least one, such as M2.dz")
-    for address in addresses:
-        if addresses.count(address) > 1:
-            raise ConfigError(f"parameter {address!r} occurs more than once: expected each once")
+    if len(set(addresses)) < len(addresses):
+        address = next(a for a in addresses if addresses.count(a) > 1)
+        raise ConfigError(f"parameter {address!r} occurs more than once: expected each once")
     return tuple(found)
 
 
@@ -164,6 +165,15 @@ def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
 
 def with_figures(telescope: Telescope, parameters: Iterable[Parameter]) -> Telescope:
     """Return the telescope with every figure that parameters name, zero where it was not there: the same optics."""
+    for target, shape in figured_shapes(telescope, parameters).items():
+        if shape is not telescope.surface(target).shape:
+            telescope = telescope.with_shape(target, shape)
+    return telescope
+
+
+def figured_shapes(telescope: Telescope, parameters: Iterable[Parameter]) -> dict[str, Shape]:
+    """Return the shapes of the surfaces whose figures parameters name, with all of these figures, by surface."""
+    shapes: dict[str, Shape] = {}
     names: dict[str, list[str]] = {}
     for parameter in parameters:
         if parameter.kind == "figure":
@@ -176,9 +186,8 @@ def with_figures(telescope: Telescope, parameters: Iterable[Parameter]) -> Teles
             if name not in known:
                 surface = replace(surface, shape=with_figure(surface, name))
                 known = set(surface.shape.parameters)
-        if surface is not telescope.surface(target):
-            telescope = telescope.with_shape(target, surface.shape)
-    return telescope
+        shapes[target] = surface.shape
+    return shapes
 
 
 def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter, float]) -> Telescope:
@@ -296,9 +305,12 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
         surface = telescope.surface(members[0])
         pivot, axes = (np.array(v) for v in telescope.group_frames.get(body, (surface.vertex, surface.rotation)))
         turn = axes @ rotation_matrix(tilt) @ axes.T
+        # Vector product with a vector from the left: a turn about where the pivot has gone to.
+        x, y, z = pivot + shift
+        about = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         # Those that moved before: a body whose frame went along turns about where it went, with it.
         for row, parameter in enumerate(parameters):
-            if result[row, places].any():
+            if parameter.kind == "motion" and result[row, places].any():
                 larger = telescope.groups.get(parameter.target, ())
                 along = body not in telescope.groups or set(members) <= set(larger)
                 for place in places:
@@ -319,7 +331,7 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
             # R = Rx Ry Rz: the axis of each factor is turned by those before it.
             earlier = np.where(np.arange(3) < axis - 3, tilt, 0.0)
             w = axes @ rotation_matrix(earlier)[:, axis - 3]
-            result[row, places, :3] = -np.cross(w, pivot + shift)
+            result[row, places, :3] = about @ w
             result[row, places, 3:] = w
         if motion.any():
             telescope = telescope.perturbed(body, shift=shift, tilt=tilt)

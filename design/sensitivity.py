@@ -178,22 +178,29 @@ def sensitivity(
     columns = ParameterColumns.at(telescope, chosen)
     zernikes = np.empty((len(points), n_zernike))
     matrix = np.empty((len(points), n_zernike, len(chosen)))
+    weighted, by_ray = pupil.weights * terms, np.ascontiguousarray(terms.T)
+
+    def products(rays: np.ndarray) -> np.ndarray:
+        """Return the products of the terms, summed over some rays, shape [n_zernike, n_zernike]."""
+        some = by_ray[rays]
+        return (some.T * pupil.weights[rays]) @ some
 
     def fit(block: WavefrontBlock) -> np.ndarray:
         part, lit = block.fields, block.status == RayStatus.OK
         _check_lit(lit, n_zernike, points[part])
-        # The normal equations of each field's fit are solved last, when little is left to solve for.
-        weighted = (lit * pupil.weights)[:, None, :] * terms
-        change = (weighted @ block.by_center) @ block.moved - (weighted @ block.rows) @ columns.weights
-        value = weighted @ block.value[..., None]
-        solved = np.linalg.solve(weighted @ terms.T, np.concatenate([change, value], axis=2))
+        # The normal equations of each field's fit: all that the pupil gives, less the few rays that are not lit.
+        normal = whole - np.stack([products(dark) for dark in ~lit])
+        value, change = block.project(weighted, columns.weights)
+        solved = np.linalg.solve(normal, np.concatenate([change, value[..., None]], axis=2))
         matrix[part], zernikes[part] = solved[..., :-1], solved[..., -1]
         matrix[part, 0] += block.piston
-        # How large the terms are that cancel where a parameter has no effect; one field point will do.
-        return np.abs(block.rows[-1]).max(axis=0) @ np.abs(columns.weights)
+        # How large the terms are that cancel where a parameter has no effect; some rays will do.
+        return np.abs(block.table[4:, -1, ::8]).max(axis=1)
 
     with one_blas_thread():
-        terms_size = np.max(FieldWavefronts(columns, points, w, pupil.points, projection, threads).map(fit), axis=0)
+        whole = products(np.arange(len(pupil)))
+        wavefronts = FieldWavefronts(columns, points, w, pupil.points, projection, threads, lit_only=True)
+        terms_size = np.max(wavefronts.map(fit), axis=0) @ np.abs(columns.weights)
     # A turn about the axis does nothing: what is left of it is rounding, and shown as zero.
     matrix[:, :, np.abs(matrix).max(axis=(0, 1)) < _ROUNDING * terms_size] = 0.0
     return Sensitivity(telescope.name, chosen, points, float(w), telescope.pupil_obscuration, matrix, zernikes)

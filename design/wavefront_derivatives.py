@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..models.errors import DomainError
-from ..raytrace.gradient import position_seeds, sweep
+from ..raytrace.gradient import Seeds, position_seeds, sweep
 from ..raytrace.launch import thread_count
 from ..raytrace.rays import RayStatus, field_direction, parallel_rays
 from .jacobian import ParameterColumns, sphere_seeds
@@ -33,14 +33,11 @@ class WavefrontBlock:
     ----------
     fields : slice
         Which of the field points.
-    value : ndarray, shape [n_field, n_pupil]
-        The wavefront [m], of vignetted rays too; 0 where a ray gets lost.
+    table : ndarray, shape [4 + n_row, n_field, n_pupil]
+        The paths less those of the chief rays [m], their derivatives with respect to the landing point (3), and the
+        rows that have weights; all 0 where a ray gets lost, and where it is vignetted if only lit ones were asked for.
     status : ndarray of int32, shape [n_field, n_pupil]
         A :class:`~pachon.raytrace.rays.RayStatus` each.
-    by_center : ndarray, shape [n_field, n_pupil, 3]
-        Derivative of the wavefront with respect to the centre of the sphere.
-    rows : ndarray, shape [n_field, n_pupil, n_row]
-        Derivatives of the paths, row by row of the columns.
     moved : ndarray, shape [n_field, 3, n_parameter]
         How the centres move.
     piston : ndarray, shape [n_field, n_parameter]
@@ -48,12 +45,47 @@ class WavefrontBlock:
     """
 
     fields: slice
-    value: np.ndarray
+    table: np.ndarray
     status: np.ndarray
-    by_center: np.ndarray
-    rows: np.ndarray
     moved: np.ndarray
     piston: np.ndarray
+
+    @property
+    def value(self) -> np.ndarray:
+        """The wavefront [m], shape [n_field, n_pupil]."""
+        return -self.table[0]
+
+    @property
+    def by_center(self) -> np.ndarray:
+        """Derivative of the wavefront with respect to the centre of the sphere, shape [n_field, n_pupil, 3]."""
+        return self.table[1:4].transpose(1, 2, 0)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Derivatives of the paths, row by row of the columns, shape [n_field, n_pupil, n_row]."""
+        return self.table[4:].transpose(1, 2, 0)
+
+    def project(self, terms: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return sums over the rays, times each of some terms, of wavefront and derivatives, these without piston.
+
+        Parameters
+        ----------
+        terms : ndarray, shape [n_term, n_pupil]
+            What the rays count.
+        weights : ndarray, shape [n_row, n_parameter]
+            Those of the columns.
+
+        Returns
+        -------
+        value : ndarray, shape [n_field, n_term]
+            Sums of the wavefront [m].
+        change : ndarray, shape [n_field, n_term, n_parameter]
+            Sums of its derivatives.
+        """
+        # The rays are summed up first, there are fewer rows than rays; all rows and field points in one product.
+        count, n_field, n_pupil = self.table.shape
+        sums = (terms @ self.table.reshape(-1, n_pupil).T).reshape(len(terms), count, n_field).transpose(2, 0, 1)
+        return -sums[..., 0], sums[..., 1:4] @ self.moved - sums[..., 4:] @ weights
 
 
 class FieldWavefronts:
@@ -73,6 +105,8 @@ class FieldWavefronts:
         Meaning of the field angles.
     threads : int, optional
         Number of threads; all processors by default.
+    lit_only : bool
+        Whether vignetted rays are left out, as zeros.
 
     Raises
     ------
@@ -88,51 +122,47 @@ class FieldWavefronts:
         pupil: np.ndarray,
         projection: str = "zemax",
         threads: int | None = None,
+        *,
+        lit_only: bool = False,
     ) -> None:
         telescope = columns.telescope
-        self._columns, self._wavelength, self._pupil, self._threads = columns, wavelength, pupil, thread_count(threads)
-        self._light = field_direction(fields[:, 0], fields[:, 1], projection)
-        chief = sweep(telescope, parallel_rays(telescope, self._light, wavelength, np.zeros((1, 2))), threads=1)
+        self._columns, self._threads, self._size = columns, thread_count(threads), (len(fields), len(pupil))
+        light = field_direction(fields[:, 0], fields[:, 1], projection)
+        chief = sweep(telescope, parallel_rays(telescope, light, wavelength, np.zeros((1, 2))), threads=1)
         if not chief.arrived.all():
             x, y = np.rad2deg(fields[~chief.arrived][0])
             raise DomainError(f"field = ({x:.6g}, {y:.6g}) deg: the chief ray does not reach the image")
-        self._centers = chief.position
-        seeds, self._zero = sphere_seeds(chief, self._centers, telescope.reference_sphere_radius)
-        self._moved = columns.derivatives(chief, position_seeds(chief), threads=1).transpose(1, 0, 2)
-        along = np.einsum("in,nip->np", seeds.position[0], self._moved)
-        self._piston = columns.derivatives(chief, seeds, threads=1)[0] - along
+        seeds, path = sphere_seeds(chief, chief.position, telescope.reference_sphere_radius)
+        self._rays = columns.to_spheres(light, chief.indices, pupil, chief.position, path, lit_only=lit_only)
+        # Landing points and paths together, four outputs.
+        axes, zero = position_seeds(chief), np.zeros((3, len(fields)))
+        both = Seeds(
+            np.concatenate([axes.position, seeds.position]),
+            np.concatenate([axes.direction, seeds.direction]),
+            np.append(axes.path, seeds.path),
+            index=np.concatenate([zero, seeds.index]),
+        )
+        derivatives = columns.derivatives(chief, both, threads=1)
+        self._moved = derivatives[:3].transpose(1, 0, 2)
+        self._piston = derivatives[3] - np.einsum("in,nip->np", seeds.position[0], self._moved)
 
     def map(self, work: Callable[[WavefrontBlock], Result]) -> list[Result]:
         """Return what a function makes of each block, in the order of the fields; blocks are worked on side by side."""
-        count, step = len(self._light), max(1, _RAYS_AT_ONCE // len(self._pupil))
-        # Each thread has a block; what is in it does not depend on where the blocks begin.
-        blocks = max(-(-count // step), min(self._threads, count))
+        count, step = self._size[0], max(1, _RAYS_AT_ONCE // self._size[1])
+        # The same blocks on any number of threads, so that sums are rounded the same way.
+        blocks = -(-count // step)
         bounds = [count * i // blocks for i in range(blocks + 1)]
         parts = [slice(*ends) for ends in pairwise(bounds)]
-        # The first one alone compiles the kernels.
-        first = [work(self.block(parts[0]))]
         if self._threads == 1 or blocks == 1:
-            return first + [work(self.block(part)) for part in parts[1:]]
+            return [work(self.block(part)) for part in parts]
         with ThreadPoolExecutor(self._threads) as pool:
-            return first + list(pool.map(lambda part: work(self.block(part)), parts[1:]))
+            return list(pool.map(lambda part: work(self.block(part)), parts))
 
     def block(self, part: slice) -> WavefrontBlock:
         """Return the block of some of the field points, worked out on one thread."""
-        telescope, count = self._columns.telescope, len(self._pupil)
-        rays = parallel_rays(telescope, self._light[part], self._wavelength, self._pupil)
-        spheres, zeros = (np.repeat(v[..., part], count, axis=-1) for v in (self._centers, self._zero))
-        radius = telescope.reference_sphere_radius
-        rows, status = self._columns.to_sphere(rays, spheres, zeros, radius, threads=1)
+        response, status = self._rays.respond(part, threads=1)
+        table = self._columns.of_path(response)
         lost = status > RayStatus.VIGNETTED
         if lost.any():
-            rows = np.where(lost, 0.0, rows)
-        rows = rows.reshape(len(rows), -1, count).transpose(1, 2, 0)
-        return WavefrontBlock(
-            part,
-            -rows[..., 0],
-            status.reshape(-1, count),
-            rows[..., 1:4],
-            rows[..., 4:],
-            self._moved[part],
-            self._piston[part],
-        )
+            table = np.where(lost, 0.0, table)
+        return WavefrontBlock(part, table, status, self._moved[part], self._piston[part])

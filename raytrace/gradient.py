@@ -20,7 +20,7 @@ from ..models.telescope import Telescope
 from .adjoint_kernels import COLUMNS, FORCE, HIT, INDEX, SAG
 from .gradient_kernels import sweep_back
 from .launch import launch
-from .packed import pack_surfaces, refractive_indices
+from .packed import pack_surfaces
 from .packet import LANES, lanes
 from .rays import Rays, RayStatus
 from .trace import PacketTrace, trace_packets
@@ -46,8 +46,6 @@ class Sweep:
         Vacuum wavelength [m].
     count : int
         Number of rays, ``n``.
-    indices : ndarray, shape [n_surface + 1]
-        Refractive index before the first surface and after each.
     packets : PacketTrace
         The rays after every surface.
     """
@@ -55,8 +53,12 @@ class Sweep:
     telescope: Telescope
     wavelength: float
     count: int
-    indices: np.ndarray
     packets: PacketTrace
+
+    @property
+    def indices(self) -> np.ndarray:
+        """Refractive index before the first surface and after each, shape [n_surface + 1]."""
+        return self.packets.indices
 
     def _last(self, values: wp.array) -> np.ndarray:
         last = values.numpy()[-1]
@@ -120,7 +122,7 @@ def sweep(telescope: Telescope, rays: Rays, *, threads: int | None = None) -> Sw
     """
     check_differentiable(telescope)
     packets = trace_packets(telescope, rays, len(telescope.surfaces), threads=threads)
-    return Sweep(telescope, rays.wavelength, len(rays), refractive_indices(telescope, rays.wavelength), packets)
+    return Sweep(telescope, rays.wavelength, len(rays), packets)
 
 
 @dataclass(frozen=True)

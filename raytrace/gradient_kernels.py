@@ -56,7 +56,7 @@ def back_loop(special: bool) -> wp.Function:
         position: wp.array3d(dtype=lanes),
         direction: wp.array3d(dtype=lanes),
         kept: wp.int32,
-        per_path: wp.float64,
+        per_path: lanes,
         ax: lanes,
         ay: lanes,
         az: lanes,
@@ -70,10 +70,10 @@ def back_loop(special: bool) -> wp.Function:
     ):
         """Carry the adjoint of output ``o`` back through packet ``p``, and return it at the start of the rays.
 
-        ``position`` and ``direction`` at ``kept`` are what the forward sweep left after every surface; a, b and
-        ``per_path`` the derivatives of the output with respect to the last of them and to the path, all in the
-        telescope frame. ``rows`` says in which row of ``response`` a column of a surface belongs, -1 where nobody asks;
-        force and torque are asked for together.
+        ``start``, ``position`` and ``direction`` at ``kept`` are what the forward sweep began with and left after every
+        surface; a, b and ``per_path`` the derivatives of the output with respect to the last of them and to the path,
+        all in the telescope frame. ``rows`` says in which row of ``response`` a column of a surface belongs, -1 where
+        nobody asks; force and torque are asked for together.
         """
         n_surfaces = surfaces.kinds.shape[0]
         last = n_surfaces - 1
@@ -103,12 +103,12 @@ def back_loop(special: bool) -> wp.Function:
             x = position[s, 0, kept]
             y = position[s, 1, kept]
             z = position[s, 2, kept]
-            du = start_direction[0, p]
-            dv = start_direction[1, p]
-            dw = start_direction[2, p]
-            px = start[0, p]
-            py = start[1, p]
-            pz = start[2, p]
+            du = start_direction[0, kept]
+            dv = start_direction[1, kept]
+            dw = start_direction[2, kept]
+            px = start[0, kept]
+            py = start[1, kept]
+            pz = start[2, kept]
             if s > 0:
                 du = direction[s - 1, 0, kept]
                 dv = direction[s - 1, 1, kept]
@@ -196,14 +196,14 @@ def back_loop(special: bool) -> wp.Function:
                     fz = lanes(ZERO)
                     cx = (-ONE / before) * fx
                     cy = (-ONE / before) * fy
-                    by_value = lanes(per_path)
+                    by_value = per_path
             # With respect to the hit, along the surface and along the ray; a screen's map adds to the path there.
             hx = ax - wp.cw_mul(sxx, cx) - wp.cw_mul(sxy, cy)
             hy = ay - wp.cw_mul(sxy, cx) - wp.cw_mul(syy, cy)
             if wp.static(special):
                 hx = hx + wp.cw_mul(by_value, sx)
                 hy = hy + wp.cw_mul(by_value, sy)
-            height = wp.cw_div(dot(hx, hy, az, u, v, w) + lanes(per_path * before), along)
+            height = wp.cw_div(dot(hx, hy, az, u, v, w) + before * per_path, along)
             # With respect to the ray in front, its position anywhere along it and its direction about the hit.
             ex = hx - wp.cw_mul(height, nx)
             ey = hy - wp.cw_mul(height, ny)
@@ -223,7 +223,7 @@ def back_loop(special: bool) -> wp.Function:
             if wp.static(special):
                 if interaction == PHASE:
                     by_mu = wp.cw_mul(cx, sx) + wp.cw_mul(cy, sy)
-            keep(rows, s, INDEX, o, p, per_path * t + (ONE / after) * by_mu, response)
+            keep(rows, s, INDEX, o, p, wp.cw_mul(per_path, t) + (ONE / after) * by_mu, response)
             if wp.static(special):
                 if interaction == PHASE:
                     by_mu = lanes(ZERO)
@@ -289,7 +289,7 @@ def sweep_back(special: bool, module: wp.Module) -> wp.Kernel:
             position,
             direction,
             p,
-            seed_path[o],
+            lanes(seed_path[o]),
             seed_position[o, 0, p],
             seed_position[o, 1, p],
             seed_position[o, 2, p],

@@ -28,6 +28,7 @@ FORWARD_OPTIONS = {"enable_backward": False, "max_unroll": 32, "cpu_compiler_fla
 
 _loaded: set[tuple[str, str]] = set()
 _start = threading.Lock()
+_loading = threading.Lock()
 _started: list[bool] = []
 
 
@@ -97,11 +98,19 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
     key = (kernel.module.name, device)
     if key in _loaded:
         return
-    block = 1 if device == "cpu" else 256
-    if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
-        print(f"compiling {kernel.module.name.rpartition('.')[2]} for this machine (once)", file=sys.stderr, flush=True)
-    wp.load_module(kernel.module, device=device, block_dim=block)
-    _loaded.add(key)
+    with _loading:
+        # Another thread may have loaded it while this one waited.
+        if key in _loaded:
+            return
+        block = 1 if device == "cpu" else 256
+        if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
+            print(
+                f"compiling {kernel.module.name.rpartition('.')[2]} for this machine (once)",
+                file=sys.stderr,
+                flush=True,
+            )
+        wp.load_module(kernel.module, device=device, block_dim=block)
+        _loaded.add(key)
 
 
 def launch(

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 _LOCK = threading.RLock()
+
+
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Return the libraries in memory. To look for them takes a millisecond; new ones come with new modules."""
+    return ThreadpoolController()
 
 
 @contextmanager
@@ -19,5 +27,5 @@ def one_blas_thread() -> Iterator[None]:
     the small matrices here they are no faster. The limit belongs to the process: one block runs at a time, or the end
     of one would lift the limit of another.
     """
-    with _LOCK, threadpool_limits(limits=1, user_api="blas"):
+    with _LOCK, _libraries(len(sys.modules)).limit(limits=1, user_api="blas"):
         yield

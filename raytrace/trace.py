@@ -58,6 +58,8 @@ class PacketTrace:
 
     Attributes
     ----------
+    indices : ndarray, shape [n_surface + 1]
+        Refractive index before the first surface and after each.
     start, start_direction : array of lanes, shape [3, n_packet]
         Where the rays start [m], and where they go.
     position, direction : array of lanes, shape [every, 3, n_packet]
@@ -68,6 +70,7 @@ class PacketTrace:
         A :class:`~pachon.raytrace.rays.RayStatus` each.
     """
 
+    indices: np.ndarray
     start: wp.array
     start_direction: wp.array
     position: wp.array
@@ -80,12 +83,13 @@ def trace_packets(telescope: Telescope, rays: Rays, every: int, *, threads: int 
     """Trace rays and leave them in packets, the last one filled up; ``every`` surfaces are kept, the last ones."""
     packed = pack_surfaces(telescope)
     count = packet_count(len(rays))
-    indices = wp.array(refractive_indices(telescope, rays.wavelength)[None], dtype=wp.float64, device="cpu")
+    indices = refractive_indices(telescope, rays.wavelength)
 
     def inputs(values: np.ndarray) -> wp.array:
         return wp.array(to_packets(values), dtype=lanes, device="cpu", copy=False)
 
     end = PacketTrace(
+        indices,
         inputs(rays.position.T),
         inputs(rays.direction.T),
         wp.empty((every, 3, count), dtype=lanes, device="cpu"),
@@ -98,7 +102,7 @@ def trace_packets(telescope: Telescope, rays: Rays, every: int, *, threads: int 
         count,
         [
             packed,
-            indices,
+            wp.array(indices[None], dtype=wp.float64, device="cpu"),
             end.start,
             end.start_direction,
             inputs(rays.path_length),
