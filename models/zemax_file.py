@@ -46,8 +46,15 @@ class Findings:
 
     lenient: bool = False
 
-    def report(self, where: str, message: str) -> None:
+    def report(self, where: str, message: str, instead: str = "") -> None:
         """Raise PrescriptionError, or warn.
+
+        Parameters
+        ----------
+        where, message : str
+            The place, and what is wrong there.
+        instead : str
+            What is done about it where it is only a warning.
 
         Raises
         ------
@@ -57,7 +64,7 @@ class Findings:
         text = f"{where}: {message}"
         if not self.lenient:
             raise PrescriptionError(text)
-        warnings.warn(text, PrescriptionWarning, stacklevel=2)
+        warnings.warn(f"{text}; {instead}" if instead else text, PrescriptionWarning, stacklevel=2)
 
 
 @dataclass

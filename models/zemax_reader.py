@@ -115,7 +115,7 @@ class LensReader:
             self._surface(number, block)
             block.report_rest(IGNORED_SURFACE, findings)
         if self.stop is None:
-            findings.report(str(self.file.path), "no surface is the stop (STOP); the first is taken")
+            findings.report(str(self.file.path), "no surface is the stop (STOP)", "the first is taken")
             self.paraxial.mark_stop(0.0, first=True)
         pupil = read_pupil(self.file, self.paraxial, self.unit, waves.primary, self.first_medium, findings)
         header.report_rest(IGNORED_HEADER, findings)
@@ -258,7 +258,7 @@ class LensReader:
                 return False, catalogue[name]
         if not model:
             self.findings.report(
-                line.where, f"{line.shown}: the glass is in no catalogue; taken as a model glass of its figures"
+                line.where, f"{line.shown}: the glass is in no catalogue", "taken as a model glass of its figures"
             )
         try:
             return False, replace(model_glass(nd, vd, deviation), name=name)

@@ -62,7 +62,7 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     kind = block.text("TYPE").split()[0].upper() if block.text("TYPE") else "STANDARD"
     kind = "GRID_SAG" if kind == "GRIDSAG" else kind
     if kind not in TYPES:
-        findings.report(block.where, f"TYPE {kind}: expected one of {', '.join(TYPES)}; taken as STANDARD")
+        findings.report(block.where, f"TYPE {kind}: expected one of {', '.join(TYPES)}", "taken as STANDARD")
         block.used |= {"PARM", "XDAT", "GDAT", "GARR"}
         kind = "STANDARD"
     curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)

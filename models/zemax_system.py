@@ -199,7 +199,7 @@ def _pupil_diameter(
             f"{header.where}: {keyword}: expected an entrance pupil of finite size, not {diameter:g} m"
         )
     if len(found) > 1:
-        findings.report(header.where, f"{' and '.join(found)}: two apertures; {keyword} is taken")
+        findings.report(header.where, f"{' and '.join(found)}: two apertures", f"{keyword} is taken")
     return diameter
 
 

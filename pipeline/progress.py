@@ -12,12 +12,15 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     SpinnerColumn,
+    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 
 class Stage:
@@ -55,9 +58,25 @@ class Stage:
 
     def step(self, name: str, done: int, total: int) -> None:
         """Write that one more part is done, and for how long the rest will take, where there are no bars to see."""
-        left = (time.perf_counter() - self._start) / done * (total - done)
-        rest = f", about {left:.0f} s left" if left < 100.0 else f", about {left / 60.0:.0f} min left"
+        seconds = time.perf_counter() - self._start
+        left = seconds / done * (total - done)
+        rest = (
+            f", {_rate(done / seconds)}, about "
+            + (f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min")
+            + " left"
+        )
         self.line(f"{name} ({done} of {total}{rest if done < total else ''})")
+
+
+class _Rate(ProgressColumn):
+    """How many items are done in a second, or in a minute where they take long."""
+
+    def render(self, task: Task) -> Text:
+        return Text("" if not task.speed else _rate(task.speed), style="progress.data.speed")
+
+
+def _rate(per_second: float) -> str:
+    return f"{per_second:.3g}/s" if per_second >= 0.1 else f"{60.0 * per_second:.3g}/min"
 
 
 class Reporter:
@@ -106,6 +125,7 @@ class Reporter:
             TextColumn("{task.description}"),
             BarColumn(bar_width=32),
             MofNCompleteColumn(),
+            _Rate(),
             TimeRemainingColumn(compact=True),
             TimeElapsedColumn(),
         )
