@@ -18,6 +18,7 @@ of the prescription (``M2.dz_um``, ``M1.Z5_nm``): see :mod:`pachon.studies.sweep
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -90,8 +91,14 @@ class SweepFile(_Section):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that decides the figures of the sweep, file contents included."""
-        return digest(self.model_dump(mode="json"))
+        """SHA-256 of all that decides the figures of the sweep, the contents of the files that it names included."""
+        named = [self.design.file] if self.design.file else []
+        if isinstance(self.base, dict):
+            air = self.base.get("atmosphere")
+            named += [self.base.get("telescope"), air.get("site") if isinstance(air, dict) else None]
+        files = [path for path in named if isinstance(path, str) and Path(path).is_file()]
+        contents = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files}
+        return digest({"sweep": self.model_dump(mode="json"), "files": contents})
 
 
 def load_sweep(path: Path) -> SweepFile:
@@ -105,10 +112,20 @@ def load_sweep(path: Path) -> SweepFile:
     content = _content(path)
     if isinstance(content.get("base"), str):
         content["base"] = _content(path.parent / content["base"])
-    design = content.get("design")
-    if isinstance(design, dict) and isinstance(design.get("file"), str):
-        content["design"] = {**design, "file": str((path.parent / design["file"]).resolve())}
+    folder = path.parent
+    content["design"] = _with_path(content.get("design", {}), "file", folder)
+    base = _with_path(content.get("base", {}), "telescope", folder)
+    if isinstance(base, dict) and "atmosphere" in base:
+        base = {**base, "atmosphere": _with_path(base["atmosphere"], "site", folder)}
+    content["base"] = base
     return read_sweep(content, str(path))
+
+
+def _with_path(section: Any, key: str, folder: Path) -> Any:
+    """Return a section in which a key that names a file, as seen from a folder, has its absolute path."""
+    if isinstance(section, dict) and isinstance(section.get(key), str) and (folder / section[key]).is_file():
+        return {**section, key: str((folder / section[key]).resolve())}
+    return section
 
 
 def read_sweep(content: dict[str, Any], source: str) -> SweepFile:

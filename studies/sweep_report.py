@@ -56,7 +56,8 @@ def write_report(store: SweepStore, folder: Path) -> Path:
 
 def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Picture]]:
     """Return the pictures that the design of a sweep allows, with the names of their files."""
-    drawn = {metric: curves(table, sweep, metric) for metric in table.metrics}
+    # Correlations go first: they are what a sweep is for.
+    drawn = {m: curves(table, sweep, m) for m in sorted(table.metrics, key=lambda m: (not m.startswith("xi"), m))}
     drawn = {metric: each for metric, each in drawn.items() if each}
     pictures: list[tuple[str, Picture]] = []
     if drawn:
@@ -85,7 +86,7 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
         picture = Picture(f"{metric}, one at a time", figures_sweep.curves_figure(drawn[metric]), shows)
         pictures.append((f"curves_{metric}", picture))
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
-    for metric in (m for m in drawn if m.startswith(("xi", "rms"))):
+    for metric in (m for m in drawn if m.startswith("xi")):
         found = [b for mark in marks if (b := budget(table, sweep, metric, mark)) is not None]
         if found:
             picture = Picture(f"Error budget of {metric}", figures_sweep.budget_figure(found), _budget_words(found))

@@ -114,3 +114,15 @@ def test_bad_sweep_files_get_one_line_that_names_file_and_key(tmp_path, text, me
         load_sweep(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_another_table_or_prescription_is_another_sweep(tmp_path):
+    (tmp_path / "sweep.yaml").write_text("base: {telescope: mine.yaml}\ndesign: {kind: table, file: points.ecsv}\n")
+    Table({"a": [1.0]}).write(tmp_path / "points.ecsv")
+    (tmp_path / "mine.yaml").write_text("name: mine\n")
+    first = load_sweep(tmp_path / "sweep.yaml").digest
+    assert load_sweep(tmp_path / "sweep.yaml").digest == first
+    (tmp_path / "mine.yaml").write_text("name: other\n")
+    second = load_sweep(tmp_path / "sweep.yaml").digest
+    Table({"a": [2.0]}).write(tmp_path / "points.ecsv", overwrite=True)
+    assert len({first, second, load_sweep(tmp_path / "sweep.yaml").digest}) == 3
