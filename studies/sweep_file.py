@@ -30,8 +30,6 @@ from ..pipeline.config import digest, first_problem
 
 #: Folder of the sweeps that come along.
 EXAMPLES = Path(__file__).parent / "examples"
-#: Kinds of designs, see :mod:`pachon.studies.sweep_design`.
-KINDS = ("one_at_a_time", "grid", "monte_carlo", "latin_hypercube", "sobol", "table")
 
 
 def _number(value: Any) -> Any:

@@ -274,3 +274,17 @@ def test_a_mesh_with_corners_that_are_not_finite_is_refused(tmp_path):
     mesh.export(tmp_path / "bad.stl")
     with pytest.raises(PrescriptionError, match=r"bad\.stl: obstruction 'bad': .* triangles: expected finite corners"):
         Obstruction.from_file(tmp_path / "bad.stl")
+
+
+def test_obstructions_are_added_to_those_that_are_there():
+    triangles = trimesh.creation.box((1.0, 1.0, 0.2)).triangles
+    one = Obstruction("one", triangles + np.array([-1.0, 0.0, 2.0]))
+    two = Obstruction("two", triangles + np.array([1.0, 0.0, 2.0]))
+    clear = telescope_of(detector(0.0))
+    blocked = clear.with_obstructions(one).with_obstructions(two)
+    x = np.array([-1.0, 0.0, 1.0])
+    rays = pachon.launch_rays(blocked, (0.0, 0.0), 5e-7, (x, np.zeros(3)))
+    assert not pachon.trace(clear, rays).vignetted.any()
+    assert pachon.trace(blocked, rays).vignetted.tolist() == [True, False, True]
+    with pytest.raises(PrescriptionError, match="one"):
+        blocked.with_obstructions(one)
