@@ -90,7 +90,7 @@ class SweepFile(_Section):
     @property
     def digest(self) -> str:
         """SHA-256 of all that decides the figures of the sweep, the contents of the files that it names included."""
-        named = [self.design.file] if self.design.file else []
+        named: list[Any] = [self.design.file]
         if isinstance(self.base, dict):
             air = self.base.get("atmosphere")
             named += [self.base.get("telescope"), air.get("site") if isinstance(air, dict) else None]
