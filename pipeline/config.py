@@ -19,27 +19,30 @@ from ..models.errors import ConfigError, PachonError, PrescriptionError
 from ..models.yaml_reader import as_number, read_yaml
 
 
-def _number(value: Any) -> Any:
+def plain_number(value: Any) -> Any:
+    """Return a number that YAML took for text as a number, and anything else as it is."""
     # YAML 1.1 reads 1e-9, without a point, as text; whoever wrote it means a number.
     number = as_number(value) if isinstance(value, str) else None
     return value if number is None else number
 
 
-Real = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False, gt=0)]
-NotNegative = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False, ge=0)]
+Real = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False, gt=0)]
+NotNegative = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False, ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
-Fraction = Annotated[float, BeforeValidator(_number), Field(strict=True, ge=0, le=1)]
+Fraction = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=1)]
 Switch = Annotated[bool, Field(strict=True)]
 BandName = Literal["u", "g", "r", "i", "z", "y"]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """Part of a file in which every key is known, and nothing changes once it is read."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class StarsConfig(_Section):
+class StarsConfig(Section):
     """How many stars stand on a CCD, and how bright they are."""
 
     truth: Count = Field(100, description="noise-free PSFs on each CCD, where no observed star is")
@@ -50,7 +53,7 @@ class StarsConfig(_Section):
     saturated: Fraction = Field(0.0, description="fraction of the observed stars, the brightest, with a saturated core")
 
 
-class MotionConfig(_Section):
+class MotionConfig(Section):
     """Motion of a raft or CCD as a rigid body."""
 
     dz_um: Real = Field(0.0, description="along +z, towards the sky [um]")
@@ -58,7 +61,7 @@ class MotionConfig(_Section):
     ry_urad: Real = Field(0.0, description="about y; positive lowers the side at larger x [urad]")
 
 
-class FocalPlaneConfig(_Section):
+class FocalPlaneConfig(Section):
     """Heights of the CCD surfaces (Jee & Tyson 2011, Table 1)."""
 
     budget: Literal["simulated", "specification", "flat"] = Field(
@@ -101,15 +104,15 @@ class FocalPlaneConfig(_Section):
         return tuple(n for n in names if getattr(self, "global_" if n == "global" else n))
 
 
-class ActiveOpticsConfig(_Section):
+class ActiveOpticsConfig(Section):
     """What the active optics leaves uncorrected: an aberration of each visit (0.2 um in Jee & Tyson 2011)."""
 
-    residual_um: Annotated[float, BeforeValidator(_number), Field(strict=True, ge=0, le=2)] = Field(
+    residual_um: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=2)] = Field(
         0.0, description="rms of the wavefront left over, over pupil and field [um]"
     )
 
 
-class AtmosphereConfig(_Section):
+class AtmosphereConfig(Section):
     """Turbulence and refraction above the telescope."""
 
     enabled: Switch = Field(True, description="false for the optics alone")
@@ -124,13 +127,13 @@ class AtmosphereConfig(_Section):
     screen_size: Annotated[int, Field(strict=True, ge=16)] = Field(8192, description="samples on a side of a screen")
     screen_length_m: Positive = Field(1300.0, description="side of a screen [m]")
     ground_lift_m: NotNegative = Field(0.0, description="height given to a layer on the ground [m]")
-    zenith_angle_deg: Annotated[float, BeforeValidator(_number), Field(strict=True, ge=0, le=80)] = Field(
+    zenith_angle_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=80)] = Field(
         0.0, description="angle of the telescope from the zenith [deg]"
     )
     parallactic_angle_deg: Real = Field(0.0, description="direction of the zenith from +x towards +y [deg]")
 
 
-class PsfConfig(_Section):
+class PsfConfig(Section):
     """How point-spread functions are made."""
 
     engine: Literal["fast", "wave", "long_exposure"] = Field(
@@ -145,7 +148,7 @@ class PsfConfig(_Section):
     jitter_arcsec: NotNegative = Field(0.0, description="rms of the telescope's pointing along each axis [arcsec]")
 
 
-class ReconstructionConfig(_Section):
+class ReconstructionConfig(Section):
     """How the PSF is measured and modelled."""
 
     flag_stars: Switch = Field(
@@ -168,7 +171,7 @@ class ReconstructionConfig(_Section):
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")
 
 
-class Configuration(_Section):
+class Configuration(Section):
     """All that decides what a run computes; nothing else does."""
 
     band: BandName | None = Field(None, description="filter: u, g, r, i, z or y")
@@ -281,10 +284,10 @@ def to_yaml(config: Configuration, heading: Sequence[str] = ()) -> str:
 
 
 def _is_section(config: Configuration, name: str) -> bool:
-    return isinstance(getattr(config, name), _Section)
+    return isinstance(getattr(config, name), Section)
 
 
-def _yaml_lines(section: _Section, names: list[str], indent: str) -> list[str]:
+def _yaml_lines(section: Section, names: list[str], indent: str) -> list[str]:
     lines = []
     for name in names:
         field = type(section).model_fields[name]

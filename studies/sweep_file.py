@@ -22,30 +22,20 @@ import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from ..models.errors import ConfigError, PrescriptionError
-from ..models.yaml_reader import as_number, read_yaml
-from ..pipeline.config import digest, first_problem
+from ..models.yaml_reader import read_yaml
+from ..pipeline.config import Real, Section, digest, first_problem, plain_number
 
 #: Folder of the sweeps that come along.
 EXAMPLES = Path(__file__).parent / "examples"
 
 
-def _number(value: Any) -> Any:
-    number = as_number(value) if isinstance(value, str) else None
-    return value if number is None else number
+Value = Annotated[float | str | bool | int, BeforeValidator(plain_number)]
 
 
-Real = Annotated[float, BeforeValidator(_number), Field(strict=True, allow_inf_nan=False)]
-Value = Annotated[float | str | bool | int, BeforeValidator(_number)]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SweptParameter(_Section):
+class SweptParameter(Section):
     """The values that one parameter takes: a list, a range, or a normal distribution."""
 
     nominal: Value | None = Field(None, description="value where the parameter is not varied")
@@ -58,7 +48,7 @@ class SweptParameter(_Section):
     marks: dict[str, Real] = Field(default_factory=dict, description="named values that the report points out")
 
 
-class Design(_Section):
+class Design(Section):
     """Which combinations of values are computed."""
 
     kind: Literal["one_at_a_time", "grid", "monte_carlo", "latin_hypercube", "sobol", "table"] = Field(
@@ -74,7 +64,7 @@ class Design(_Section):
     )
 
 
-class SweepFile(_Section):
+class SweepFile(Section):
     """All that decides what a sweep computes."""
 
     name: str = Field("sweep", description="what the report calls it")

@@ -14,7 +14,8 @@ turbulence and wind theirs, so a difference between two points is the doing of t
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
     """
     if not isinstance(sweep.base, dict):
         raise ConfigError(f"base = {sweep.base!r}: expected the content of the file; see load_sweep")
-    content = _copy(sweep.base)
+    content = deepcopy(sweep.base)
     content["seed"] = seed
     keys = known_keys()
     sections = {key.partition(".")[0] for key in keys if "." in key}
@@ -127,7 +128,6 @@ _kept: list[Experiment] = []
 
 def _with_screens(experiment: Experiment) -> Experiment:
     """Return the experiment with the screens of the one before, where they are the same: they take seconds to make."""
-    from dataclasses import replace
 
     def air(one: Experiment) -> Any:
         return one.config.seed, one.config.atmosphere, one.config.psf.engine
@@ -153,7 +153,3 @@ def _set(content: dict[str, Any], path: list[str], value: Any) -> None:
     for part in path[:-1]:
         content = content.setdefault(part, {})
     content[path[-1]] = value
-
-
-def _copy(content: Any) -> Any:
-    return {k: _copy(v) for k, v in content.items()} if isinstance(content, dict) else content
