@@ -23,8 +23,8 @@ import numpy as np
 from atmosphere_vs_galsim import ARCMIN, ARCSEC, SITE, ellipticity, ideal_telescope, pachon_stars, through_screens
 
 import pachon
-from pachon.models.random_streams import stream
-from pachon.wavefront.atmosphere import Atmosphere
+from pachon.core.random_streams import stream
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 EXPOSURES = (1.0, 5.0, 15.0, 60.0)
 LIFTS = (0.0, 200.0)

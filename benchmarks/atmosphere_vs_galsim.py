@@ -32,11 +32,11 @@ import numpy as np
 import scipy.fft
 
 import pachon
-from pachon.models.aberration_free import without_aberration
-from pachon.models.random_streams import stream
+from pachon.core.random_streams import stream
+from pachon.models.ideal_telescope import without_aberration
 from pachon.models.telescope import Telescope
-from pachon.pipeline.shapes import fwhm
-from pachon.wavefront.atmosphere import SLOPE_LAG, Atmosphere
+from pachon.pipeline.measure.shapes import fwhm
+from pachon.wavefront.atmosphere.atmosphere import SLOPE_LAG, Atmosphere
 
 ARCSEC = math.radians(1.0 / 3600.0)
 ARCMIN = 60.0 * ARCSEC

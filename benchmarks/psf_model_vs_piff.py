@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 import pachon
 from pachon.pipeline.ccd_product import read_product
-from pachon.pipeline.shapes import measure_shapes
+from pachon.pipeline.measure.shapes import measure_shapes
 
 ARCSEC = np.pi / 180.0 / 3600.0
 PIXEL = 10.0e-6  # side of a pixel [m]

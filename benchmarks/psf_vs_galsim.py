@@ -36,8 +36,8 @@ from atmosphere_vs_galsim import (
 )
 
 import pachon
-from pachon.wavefront.atmosphere import Atmosphere
-from pachon.wavefront.fast_psf import PUPIL_POINTS
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.psf.fast import PUPIL_POINTS
 
 PIXEL, STAMP, STARS = 0.2 * ARCSEC, 31, 64
 FINE = {"n_pupil": 1300}

@@ -16,7 +16,7 @@ import galsim
 import numpy as np
 
 import pachon
-from pachon.wavefront.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 WAVELENGTH = 620.0
 

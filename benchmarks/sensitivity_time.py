@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 import pachon
-from pachon.design.parameters import apply, with_figures
+from pachon.design.optimize.sensitivity import field_rings, sensitivity
+from pachon.design.parameters.parameters import apply, with_figures
 from pachon.design.pupil_sampling import pupil_sampling
-from pachon.design.sensitivity import field_rings, sensitivity
 from pachon.raytrace.rays import field_direction, parallel_rays
 from pachon.wavefront.zernike import annular_zernikes
 

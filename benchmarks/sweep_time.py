@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 
 import pachon
-from pachon.studies.sweep import numbered_points
-from pachon.studies.sweep_file import load_sweep
-from pachon.studies.sweep_point import PointMeasurement
-from pachon.studies.sweep_store import SweepStore, create_store
-from pachon.studies.sweep_workers import ProcessWorkers
+from pachon.studies.sweep.file import load_sweep
+from pachon.studies.sweep.point import PointMeasurement
+from pachon.studies.sweep.store import SweepStore, create_store
+from pachon.studies.sweep.sweep import numbered_points
+from pachon.studies.sweep.workers import ProcessWorkers
 
 POINTS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
-EXAMPLE = Path(__file__).parents[1] / "studies" / "examples" / "table1.yaml"
+EXAMPLE = Path(__file__).parents[1] / "studies" / "sweep" / "examples" / "table1.yaml"
 ROUNDS = 2
 
 

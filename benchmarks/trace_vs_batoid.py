@@ -19,7 +19,7 @@ import batoid
 import numpy as np
 
 import pachon
-from pachon.models.shape_grid import GridSag
+from pachon.models.shapes.grid import GridSag
 
 RAYS = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
 ROUNDS = 7

@@ -16,22 +16,20 @@ from typing import Annotated, Any
 
 import typer
 
-from ..models.errors import PachonError
-from . import (
-    command_baseline,
-    command_design,
-    command_design_images,
-    command_diagnostics,
-    command_field,
-    command_lens,
-    command_models,
-    command_reproduce,
-    command_run,
-    command_sensitivity,
-    command_study,
-    command_sweep,
-)
-from .command_options import InterruptedRunError
+from ..core.errors import PachonError
+from . import baseline as command_baseline
+from . import design as command_design
+from . import design_images as command_design_images
+from . import diagnostics as command_diagnostics
+from . import field as command_field
+from . import lens as command_lens
+from . import models as command_models
+from . import reproduce as command_reproduce
+from . import run as command_run
+from . import sensitivity as command_sensitivity
+from . import study as command_study
+from . import sweep as command_sweep
+from .options import InterruptedRunError
 
 #: The groups of commands, in the order of the help.
 _GROUPS = (

@@ -1,1 +1,1 @@
-"""Design studies: what a telescope does to light in figures, pictures, derivatives, and how to make it better."""
+"""Design studies: metrics, images, derivatives, optimisation and their plots."""

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..models.errors import DomainError
+from ..core.errors import DomainError
+from ..core.units import metres, radians
 from ..models.telescope import Telescope
-from ..models.units import metres, radians
-from ..raytrace.packed import refractive_indices
+from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, field_direction, launch_bundles
 from ..raytrace.trace import trace
-from ..wavefront.reference import distance_to_sphere
+from ..wavefront.reference_sphere import distance_to_sphere
 
 #: Rays traced at once where a figure reduces them: 15 doubles each, so some 60 MB.
 RAYS_AT_ONCE = 1 << 19

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.tri import Triangulation
 
-from ..wavefront.picture import new_figure
+from ..core.plotting import new_figure
 
 #: Fields that a legend or a row of panels can hold; a figure of more is drawn against the distance from the axis.
 FEW = 12

@@ -12,7 +12,7 @@ import numpy as np
 from ..models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
 from ..models.surface import Interaction, Surface
 from ..models.telescope import Telescope
-from ..raytrace.packed import refractive_indices
+from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, launch_rays
 from ..raytrace.trace import trace
 from .bundles import field_points, wavelength_points
@@ -113,7 +113,7 @@ class Layout:
 
     def plot(self) -> Figure:
         """Draw the section of the telescope with its rays and, where they are small beside it, its lenses."""
-        from .layout_picture import layout_figure
+        from .plots.layout import layout_figure
 
         return layout_figure(self)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..models.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 
 KINDS = ("gauss", "rings", "spiral", "square")

@@ -1,1 +1,1 @@
-"""What exists: prescriptions, glasses, cameras, sites and their files. NumPy only, no Warp."""
+"""What exists: telescopes, surfaces, media, cameras, sites and their files. NumPy only, no Warp."""

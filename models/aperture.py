@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import PrescriptionError
+from ..core.errors import PrescriptionError
 
 
 def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import DomainError
+from ..core.errors import DomainError
 from .surface import Interaction, Surface
 from .telescope import Telescope
 

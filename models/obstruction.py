@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .errors import PrescriptionError
+from ..core.errors import PrescriptionError
 
 if TYPE_CHECKING:
     import trimesh

@@ -41,7 +41,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from .errors import DomainError
+from ..core.errors import DomainError
 from .first_order import footprints
 from .surface import Annulus, Aperture, Circle, Conic, Interaction, Plane, Shape, Sphere, Surface
 from .telescope import VACUUM, Telescope

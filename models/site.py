@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import PrescriptionError, unknown_name
-from .yaml_reader import Section, read_yaml
+from ..core.errors import PrescriptionError, unknown_name
+from ..core.yaml_reader import Section, read_yaml
 
 #: How far the weights of a site may be from a sum of 1: published ones are rounded to three figures.
 WEIGHT_TOLERANCE = 5e-3

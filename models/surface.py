@@ -9,16 +9,16 @@ from typing import Any, cast
 
 import numpy as np
 
+from ..core.errors import PrescriptionError
 from .aperture import Annulus as Annulus
 from .aperture import Aperture
 from .aperture import Circle as Circle
-from .errors import PrescriptionError
-from .glass import Medium
-from .shape import Conic as Conic
-from .shape import EvenAsphere as EvenAsphere
-from .shape import Plane as Plane
-from .shape import Shape
-from .shape import Sphere as Sphere
+from .media.medium import Medium
+from .shapes.shape import Conic as Conic
+from .shapes.shape import EvenAsphere as EvenAsphere
+from .shapes.shape import Plane as Plane
+from .shapes.shape import Shape
+from .shapes.shape import Sphere as Sphere
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]

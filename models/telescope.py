@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from .errors import DomainError, PrescriptionError, unknown_name
-from .glass import ConstantIndex, Medium
+from ..core.errors import DomainError, PrescriptionError, unknown_name
+from ..core.units import metres, radians
+from .media.medium import ConstantIndex, Medium
 from .obstruction import Obstruction
-from .shape import Shape, Sum
+from .shapes.shape import Shape, Sum
 from .surface import Interaction, Matrix, Surface, Vector, move_frame
-from .units import metres, radians
 
 VACUUM = ConstantIndex(1.0)
 #: Surfaces that leave light in the medium that it came through.

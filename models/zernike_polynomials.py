@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .errors import DomainError
+from ..core.errors import DomainError
 
 #: Names of the first terms, as optical shops call them.
 NOLL_NAMES = {

@@ -39,7 +39,7 @@ class BaselineItem(pytest.Item):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """Return the table of what is out, or the line that says what cannot be read."""
-        from .models.errors import PachonError
+        from .core.errors import PachonError
 
         if isinstance(excinfo.value, (AssertionError, PachonError)):
             return str(excinfo.value)

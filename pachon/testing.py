@@ -37,7 +37,7 @@ def assert_matches_baseline(
     PachonError
         If one of the files cannot be read.
     """
-    from .studies.baseline import check_baseline
+    from .studies.baseline.baseline import check_baseline
 
     config = None if configuration is None else Path(configuration)
     check = check_baseline(Path(baseline), model, config, threads=threads)

@@ -1,1 +1,1 @@
-"""Products: star fields, shapes, PCA models, correlations, reports and the command line."""
+"""A run: stars, PSFs, shapes, PSF models, correlations, products."""

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from astropy.io import fits
 
-from ..models.errors import ProductError, unknown_name
-from .photometry import ARCSEC
-from .products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
-from .psf_model import PsfModel
+from ..core.errors import ProductError, unknown_name
+from ..core.files import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from .psf_model.model import PsfModel
+from .simulate.photometry import ARCSEC
 
 
 class _Unit(NamedTuple):
@@ -127,7 +127,7 @@ class ObservedStars(Stars):
     used : ndarray of bool
         Whether the model was fitted to the star.
     defects : ndarray of int
-        :class:`~pachon.pipeline.star_selection.StarFlag` bits that were found: such a star has no ellipticity here. 0
+        :class:`~.StarFlag` bits that were found: such a star has no ellipticity here. 0
         where none was looked for.
     left_out_e1, left_out_e2 : ndarray
         Ellipticity of the model at the star with the star left out of the fit; NaN where it was not used.

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal, get_args
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from ..models.errors import ConfigError, PachonError, PrescriptionError
-from ..models.yaml_reader import as_number, read_yaml
+from ..core.errors import ConfigError, PachonError, PrescriptionError
+from ..core.yaml_reader import as_number, read_yaml
 
 
 def plain_number(value: Any) -> Any:
@@ -86,7 +86,7 @@ class FocalPlaneConfig(Section):
 
     @property
     def sizes(self) -> dict[str, Any]:
-        """Sizes in place of the budget's, as :class:`~pachon.models.height_budget.HeightBudget` has them, in SI."""
+        """Sizes in place of the budget's, as :class:`~.HeightBudget` has them, in SI."""
         given = {
             "global_height": self.global_um,
             "raft_height": self.raft_um,

@@ -13,27 +13,27 @@ from typing import TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from ..design.changes import apply_changes
-from ..models.camera import Camera, load_camera
-from ..models.errors import ConfigError, PachonError
-from ..models.focal_plane import FocalPlane
-from ..models.height_budget import load_budget
-from ..models.prescription import ENDINGS, bundled_names, load_telescope
+from ..core.errors import ConfigError, PachonError
+from ..design.parameters.changes import apply_changes
+from ..models.camera.camera import Camera, load_camera
+from ..models.camera.focal_plane import FocalPlane
+from ..models.camera.height_budget import load_budget
+from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
 from ..models.site import Site, load_site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
 from ..wavefront.aberration import ResidualWavefront
-from ..wavefront.atmosphere import Atmosphere
-from ..wavefront.fast_psf import PUPIL_POINTS, PUPIL_POINTS_STILL
-from ..wavefront.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
-from ..wavefront.psf import SCREENS
+from ..wavefront.atmosphere.atmosphere import Atmosphere
+from ..wavefront.atmosphere.refraction import dispersion_shift
+from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
+from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
+from ..wavefront.psf.psf import SCREENS
 from ..wavefront.pupil_optics import chief_rays
-from ..wavefront.refraction import dispersion_shift
 from .config import BandName, Configuration, digest
-from .photometry import ARCSEC
-from .polynomial import term_count
-from .psf_fit import COMPONENTS
-from .screen_cover import check_screens
+from .psf_model.fit import COMPONENTS
+from .psf_model.polynomial import term_count
+from .simulate.photometry import ARCSEC
+from .simulate.screen_cover import check_screens
 
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
 DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")

@@ -15,18 +15,18 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from ..models.errors import DomainError, PachonError
-from ..raytrace.launch import thread_count
+from ..core.errors import DomainError, PachonError
+from ..core.files import write_bytes, write_ecsv, write_json
+from ..core.launch import thread_count
+from ..core.progress import Reporter
 from .ccd_product import product_path, read_product, write_product
-from .ccd_stage import CcdExposure, expose_ccd, model_ccd
 from .config import Configuration
 from .experiment import Experiment, prepare
+from .measure.summary import correlations, run_figures
 from .memory import check_memory
-from .products import write_bytes, write_ecsv, write_json
-from .progress import Reporter
-from .report import build_report, draw_pictures
+from .report.report import build_report, draw_pictures
 from .run_folder import SUMMARY_NAME, claim_folder, finished_ccds, stamp_of
-from .summary import correlations, run_figures
+from .simulate.ccd_exposure import CcdExposure, expose_ccd, model_ccd
 
 _MESH_CELLS = 16
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from importlib.metadata import version
 from pathlib import Path
 
-from ..models.errors import PachonError, ProductError
+from ..core.errors import PachonError, ProductError
+from ..core.files import Stamp, write_bytes
 from .ccd_product import product_path, read_product
 from .config import Configuration, differences, load_configuration, to_yaml
 from .experiment import Experiment
-from .products import Stamp, write_bytes
 
 CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 

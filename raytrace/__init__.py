@@ -1,1 +1,1 @@
-"""Where rays go: sources of rays, trace kernels, launching, detector surfaces, meshes."""
+"""Where rays go: launching, tracing, landing on CCDs and meshes."""

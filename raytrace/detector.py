@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..models.focal_plane import FocalPlane
+from ..models.camera.focal_plane import FocalPlane
 from ..models.surface import Surface
 
 #: Newton steps to a CCD surface. Heights are tens of micrometres and slopes below 1e-3, so each step gains three

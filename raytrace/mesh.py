@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from ..core.launch import launch, start_warp
 from ..models.surface import Surface
-from .launch import launch, start_warp
-from .mesh_kernels import first_facet
+from .kernels.mesh import first_facet
 
 #: Rays are started this far in front of the nominal surface [m] and followed for twice as far: heights of a focal
 #: plane are micrometres, and single precision resolves 0.1 nm over this distance.

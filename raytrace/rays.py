@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..models.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError
+from ..core.units import metres, radians
 from ..models.telescope import Telescope
-from ..models.units import metres, radians
-from . import surface_kernels
+from .kernels import surface as surface_kernels
 
 
 class RayStatus(IntEnum):

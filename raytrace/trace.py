@@ -8,15 +8,15 @@ from typing import Literal, overload
 import numpy as np
 import warp as wp
 
-from ..models.errors import ConfigError
-from ..models.focal_plane import FocalPlane
+from ..core.errors import ConfigError
+from ..core.launch import launch
+from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .detector import land_on_ccds
-from .launch import launch
-from .packed import pack_surfaces, refractive_indices
-from .packet import lane_flags, lanes, packet_count, to_packets
+from .kernels.packet import lane_flags, lanes, packet_count, to_packets
+from .kernels.trace import trace_rays
+from .pack.surfaces import pack_surfaces, refractive_indices
 from .rays import Rays, RayStatus
-from .trace_kernels import trace_rays
 
 
 @dataclass(frozen=True)

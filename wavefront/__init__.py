@@ -1,1 +1,1 @@
-"""Phase: optical path differences, Zernikes, phase screens, the atmosphere, PSF engines."""
+"""Phase: optical path differences, Zernikes, reference spheres."""

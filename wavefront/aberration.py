@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..models.errors import DomainError
-from ..models.random_streams import stream
+from ..core.errors import DomainError
+from ..core.random_streams import stream
+from ..core.units import metres
 from ..models.telescope import Telescope
-from ..models.units import metres
 from ..models.zernike_polynomials import annular_zernike_gradients, annular_zernikes, noll_to_nm
 
 #: Accuracy that Jee & Tyson (2011) quote for the LSST's active optics [m].

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..models.errors import ConfigError, DomainError
-from ..models.focal_plane import FocalPlane
+from ..core.errors import ConfigError, DomainError
+from ..core.units import metres, radians
+from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..models.units import metres, radians
-from ..raytrace.packed import refractive_indices
+from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, field_direction, launch_rays
 from ..raytrace.trace import trace
-from .reference import distance_to_sphere, reference_spheres
+from .reference_sphere import distance_to_sphere, reference_spheres
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -99,7 +99,7 @@ class OpdMap:
         -------
         matplotlib.figure.Figure
         """
-        from .opd_picture import opd_figure
+        from .opd_plot import opd_figure
 
         return opd_figure(self, zernikes, name)
 

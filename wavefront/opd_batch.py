@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..models.errors import DomainError
-from ..models.focal_plane import FocalPlane
+from ..core.errors import DomainError
+from ..core.launch import launch
+from ..core.units import radians
+from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..models.units import radians
-from ..raytrace.launch import launch
-from ..raytrace.packed import pack_surfaces, refractive_indices
-from ..raytrace.packet import LANES, lane_flags, lanes, packet_count, to_packets
+from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, to_packets
+from ..raytrace.kernels.trace import PackedSurfaces
+from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
 from ..raytrace.rays import check_wavelength, field_direction, object_points
-from ..raytrace.trace_kernels import PackedSurfaces
 from .opd import pupil_points, sphere_radius_of
 from .opd_batch_kernels import trace_opds
-from .reference import reference_spheres
+from .reference_sphere import reference_spheres
 
 #: Rays in one batch: enough that starting a batch does not count, and 0.2 s between two reports of progress.
 RAYS_AT_ONCE = 1 << 22

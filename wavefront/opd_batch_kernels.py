@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..raytrace.launch import FORWARD_OPTIONS, kernel_pair
-from ..raytrace.packet import LANES, lane_flags, lanes, lanes_sqrt
-from ..raytrace.pupil_kernels import launched
-from ..raytrace.surface_kernels import OK, ONE, ZERO
-from ..raytrace.trace_kernels import LOOPS, PackedSurfaces
+from ..core.launch import FORWARD_OPTIONS, kernel_pair
+from ..raytrace.kernels.packet import LANES, lane_flags, lanes, lanes_sqrt
+from ..raytrace.kernels.pupil import launched
+from ..raytrace.kernels.surface import OK, ONE, ZERO
+from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
 

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..models.errors import DomainError
-from ..models.focal_plane import FocalPlane
+from ..core.errors import DomainError
+from ..core.launch import launch
+from ..core.units import metres, radians
+from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..models.units import metres, radians
-from ..raytrace.launch import launch
-from ..raytrace.packed import pack_surfaces, refractive_indices
-from ..raytrace.packet import lane_flags, lanes, packet_count, to_packets
-from ..raytrace.pupil_kernels import trace_pupils as trace_pupils_kernel
+from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, to_packets
+from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
+from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
 from ..raytrace.rays import RayStatus, field_direction, parallel_rays
 from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
-from .reference import distance_to_sphere
+from .reference_sphere import distance_to_sphere
 
 #: Step of the central differences for the Jacobian [rad]: 20 arcsec, so that both rounding (1e-15 m / 1e-4) and the
 #: third-order distortion over it stay below 1e-8 of the focal length.

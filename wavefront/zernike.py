@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..models.errors import DomainError
+from ..core.errors import DomainError
 from ..models.zernike_polynomials import annular_zernikes
 from .opd import OpdMap
 

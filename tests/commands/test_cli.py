@@ -13,8 +13,8 @@ import pytest
 
 from pachon.commands import cli
 from pachon.commands.cli import main
-from pachon.models import prescription
-from pachon.models.prescription import bundled_names
+from pachon.models.io import prescription
+from pachon.models.io.prescription import bundled_names
 from pachon.models.site import DATA
 from pachon.pipeline import memory
 from pachon.pipeline import run as run_module

@@ -7,7 +7,7 @@ from pathlib import Path
 import matplotlib
 import pytest
 
-from pachon.models.prescription import DATA
+from pachon.models.io.prescription import DATA
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}

@@ -8,14 +8,14 @@ import pytest
 import trimesh
 
 import pachon
+from pachon.core.plotting import png_bytes
 from pachon.design.layout import layout, outer_radius, surface_section
 from pachon.design.layout_model import surface_mesh, tubes
 from pachon.models.aperture import Complement, Intersection, Polygon, Rectangle, Union, Vane
-from pachon.models.glass import ConstantIndex
+from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction
 from pachon.models.surface import Annulus, Circle, Conic, Interaction, Plane, Surface
 from pachon.models.telescope import VACUUM
-from pachon.wavefront.picture import png_bytes
 
 
 def runs(points):

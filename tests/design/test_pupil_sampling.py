@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from pachon.core.errors import ConfigError, DomainError
 from pachon.design.pupil_sampling import (
     PupilSampling,
     gauss_annulus,
@@ -10,7 +11,6 @@ from pachon.design.pupil_sampling import (
     spiral_annulus,
     square_annulus,
 )
-from pachon.models.errors import ConfigError, DomainError
 
 
 def mean_power(a, b, radius, obscuration):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pachon.core.errors import PrescriptionError
 from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
-from pachon.models.errors import PrescriptionError
-from pachon.models.prescription import load_telescope, save_telescope
+from pachon.models.io.prescription import load_telescope, save_telescope
 
 X, Y = np.random.default_rng(3).uniform(-2.0, 2.0, (2, 20000))
 # A star of five points, which is neither convex nor symmetric about the axes it is measured along.

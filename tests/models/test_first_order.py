@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from conic_trace import fan_coefficients, trace
 
-from pachon.models.errors import DomainError
+from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order, footprints, seidel_sums
-from pachon.models.glass import ConstantIndex
-from pachon.models.prescription import load_telescope
+from pachon.models.io.prescription import load_telescope
+from pachon.models.media.medium import ConstantIndex
 from pachon.models.surface import Conic, EvenAsphere, Interaction, Plane, Surface
 from pachon.models.telescope import VACUUM, Telescope
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from conic_trace import fan_coefficients, land
 
-from pachon.models.errors import DomainError
+from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order, seidel_sums
+from pachon.models.io.prescription import load_telescope
 from pachon.models.paul_baker import COPLANAR, paul_baker
-from pachon.models.prescription import load_telescope
 from pachon.models.surface import Circle, Conic, Sphere
 
 DESIGN = paul_baker()

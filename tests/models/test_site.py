@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pachon.models.errors import PrescriptionError, UnknownNameError
+from pachon.core.errors import PrescriptionError, UnknownNameError
 from pachon.models.site import DATA, load_site, site_names
 
 TEXT = (DATA / "cerro_pachon.yaml").read_text()

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pachon.models.errors import PrescriptionError
-from pachon.models.glass import ConstantIndex
+from pachon.core.errors import PrescriptionError
+from pachon.models.media.medium import ConstantIndex
 from pachon.models.surface import Annulus, Circle, Conic, EvenAsphere, Interaction, Plane, Sphere, Surface
 
 X, Y = np.random.default_rng(1).uniform(-1.5, 1.5, (2, 200))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from astropy import units as u
 
-from pachon.models.errors import DomainError, PrescriptionError, UnknownNameError
-from pachon.models.prescription import load_telescope
+from pachon.core.errors import DomainError, PrescriptionError, UnknownNameError
+from pachon.models.io.prescription import load_telescope
 from pachon.models.surface import Interaction
 from pachon.models.telescope import rotation_matrix
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pachon.studies import baseline
-from pachon.studies.baseline_file import write_baseline
+from pachon.studies.baseline.baseline import baseline
+from pachon.studies.baseline.file import write_baseline
 
-FOLDER = Path(baseline.__file__).parent / "baselines"
+FOLDER = Path(baseline.__file__).parent / "bundled"
 BATOID = {
     "opd": "batoid within 0.001 nm",
     "landing": "batoid within 1e-9 mm",

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.pipeline.shapes import fwhm, measure_shapes
-from pachon.studies.baseline import bundled_baselines
-from pachon.studies.baseline_file import read_baseline
+from pachon.pipeline.measure.shapes import fwhm, measure_shapes
+from pachon.studies.baseline.baseline import bundled_baselines
+from pachon.studies.baseline.file import read_baseline
 from pachon.wavefront.pupil_optics import fields_at
 
 batoid = pytest.importorskip("batoid")

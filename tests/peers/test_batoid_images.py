@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.design.diffraction import fft_psf, huygens_psf
-from pachon.design.encircled_energy import encircled_energy
-from pachon.design.ghost_paths import ghost_pairs, ghost_path
+from pachon.design.images.diffraction import fft_psf, huygens_psf
+from pachon.design.images.encircled_energy import encircled_energy
+from pachon.design.metrics.ghost_paths import ghost_pairs, ghost_path
 from pachon.design.pupil_sampling import PupilSampling
 
 batoid = pytest.importorskip("batoid")

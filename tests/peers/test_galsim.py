@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pachon.pipeline.shapes import fwhm
-from pachon.wavefront.atmosphere import Atmosphere
+from pachon.pipeline.measure.shapes import fwhm
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 galsim = pytest.importorskip("galsim")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.prescription import bundled_names
+from pachon.models.io.prescription import bundled_names
 from pachon.raytrace.rays import RayStatus
 
 batoid = pytest.importorskip("batoid")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pachon.models.errors import ConfigError, PachonError
-from pachon.models.prescription import load_telescope, save_telescope
+from pachon.core.errors import ConfigError, PachonError
+from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.site import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
 from pachon.pipeline.experiment import DEFAULT_CCDS, prepare, resolve

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from pachon.commands.cli import main
-from pachon.models.errors import ConfigError
+from pachon.core.errors import ConfigError
+from pachon.core.memory import available_bytes, readable
 from pachon.pipeline import memory as run_memory
 from pachon.pipeline import run as run_module
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import prepare, resolve
 from pachon.pipeline.memory import check_memory, needed_bytes
-from pachon.wavefront.memory import available_bytes, readable
 
 GB = 1_000_000_000
 MEMINFO = "MemTotal:       24000000 kB\nMemFree:         100 kB\nMemAvailable:   20000000 kB\n"

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 
 from pachon.commands.cli import main
-from pachon.models.errors import ConfigError, DomainError, PachonError, ProductError
-from pachon.pipeline import ccd_stage, run_folder
+from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
+from pachon.core.progress import Reporter
 from pachon.pipeline import run as run_module
+from pachon.pipeline import run_folder
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import load_configuration, with_options
-from pachon.pipeline.correlation import shear_correlation
 from pachon.pipeline.experiment import prepare, resolve
-from pachon.pipeline.photometry import electrons
-from pachon.pipeline.progress import Reporter
+from pachon.pipeline.measure.correlation import shear_correlation
+from pachon.pipeline.measure.summary import separation_bins
 from pachon.pipeline.run import run
-from pachon.pipeline.summary import separation_bins
+from pachon.pipeline.simulate import ccd_exposure as ccd_stage
+from pachon.pipeline.simulate.photometry import electrons
 
 CCDS = ("R22_S11", "R24_S12")
 CHANGES_EVERY_TIME = "timings.json"

@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 import pachon
+from pachon.core.errors import PrescriptionError, UnknownNameError
 from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
-from pachon.models.errors import PrescriptionError, UnknownNameError
-from pachon.models.glass import ConstantIndex
+from pachon.models.io.prescription import load_telescope, save_telescope
+from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction
-from pachon.models.prescription import load_telescope, save_telescope
 from pachon.models.surface import Conic, Interaction, Plane, Sphere, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.raytrace.rays import RayStatus

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.camera import lsst_camera
-from pachon.models.errors import DomainError
-from pachon.models.glass import ConstantIndex
+from pachon.core.errors import DomainError
+from pachon.models.camera.camera import lsst_camera
+from pachon.models.media.medium import ConstantIndex
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.pupil_optics import fields_at
 

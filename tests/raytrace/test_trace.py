@@ -9,11 +9,11 @@ import pytest
 from astropy import units as u
 
 import pachon
-from pachon.models.errors import ConfigError, DomainError
-from pachon.models.glass import ConstantIndex
+from pachon.core.errors import ConfigError, DomainError
+from pachon.models.media.medium import ConstantIndex
 from pachon.models.surface import Circle, Conic, Interaction, Plane, Sphere, Surface
 from pachon.models.telescope import Telescope
-from pachon.raytrace.packet import LANES
+from pachon.raytrace.kernels.packet import LANES
 from pachon.raytrace.rays import Rays, RayStatus, field_direction
 
 ZEMAX = Path(__file__).parents[1] / "data" / "zemax"

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.core.errors import DomainError
 from pachon.models.aperture import Circle, Complement, Rectangle
-from pachon.models.errors import DomainError
-from pachon.models.prescription import load_telescope, save_telescope
-from pachon.models.shape import Conic, Sum
-from pachon.models.shape_freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
-from pachon.models.shape_grid import GridSag
+from pachon.models.io.prescription import load_telescope, save_telescope
+from pachon.models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from pachon.models.shapes.grid import GridSag
+from pachon.models.shapes.shape import Conic, Sum
 
 DATA = Path(__file__).parents[1] / "data" / "zmx"
 FILES = sorted(DATA.glob("*.zmx"))

@@ -6,19 +6,28 @@ from astropy.table import Table
 from scipy.special import j0
 
 from pachon.commands.cli import main
-from pachon.models.errors import ConfigError, UnknownNameError
+from pachon.core.errors import ConfigError, UnknownNameError
 from pachon.pipeline.ccd_product import KINDS
-from pachon.pipeline.ccd_stage import expose_ccd, model_ccd
 from pachon.pipeline.config import load_configuration, with_options
-from pachon.pipeline.correlation import shear_correlation
 from pachon.pipeline.experiment import prepare, resolve
-from pachon.pipeline.photometry import ARCSEC
-from pachon.pipeline.shapes import measure_shapes
-from pachon.pipeline.stamps import center_stamps
-from pachon.pipeline.summary import correlations
-from pachon.studies import attribution
-from pachon.studies.attribution import CAUSES, FULL, NOISE, OPTICS, RANGES, attribute, causes_of, write_attribution
-from pachon.wavefront.turbulence import structure_function
+from pachon.pipeline.measure.correlation import shear_correlation
+from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.pipeline.measure.summary import correlations
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd, model_ccd
+from pachon.pipeline.simulate.photometry import ARCSEC
+from pachon.pipeline.simulate.stamps import center_stamps
+from pachon.studies.attribution.attribution import (
+    CAUSES,
+    FULL,
+    NOISE,
+    OPTICS,
+    RANGES,
+    attribute,
+    attribution,
+    causes_of,
+    write_attribution,
+)
+from pachon.wavefront.atmosphere.turbulence import structure_function
 
 
 @pytest.fixture(scope="module")

@@ -15,13 +15,13 @@ import yaml
 
 import pachon
 from pachon.commands.cli import main
-from pachon.models.errors import ConfigError
-from pachon.models.focal_plane import FocalPlane
-from pachon.models.prescription import DATA, load_telescope, save_telescope
-from pachon.models.shape import EvenAsphere
-from pachon.studies.baseline import bundled_baselines, check_baseline, make_baseline
-from pachon.studies.baseline_figures import CAMERA, OPTICS
-from pachon.studies.baseline_file import baseline_text, read_baseline, rounded, write_baseline
+from pachon.core.errors import ConfigError
+from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.io.prescription import DATA, load_telescope, save_telescope
+from pachon.models.shapes.shape import EvenAsphere
+from pachon.studies.baseline.baseline import bundled_baselines, check_baseline, make_baseline
+from pachon.studies.baseline.file import baseline_text, read_baseline, rounded, write_baseline
+from pachon.studies.baseline.metrics import CAMERA, OPTICS
 from pachon.testing import assert_matches_baseline
 
 ROOT = Path(__file__).parents[2]
@@ -205,7 +205,7 @@ def test_a_changed_sign_of_heights_is_caught(project, monkeypatch):
 
 def test_a_changed_sign_where_light_meets_the_heights_is_caught(project, monkeypatch):
     """The heights as such stay as they are; what light sees of them does not."""
-    from pachon.studies import baseline_figures
+    from pachon.studies.baseline import metrics as baseline_figures
 
     seen = baseline_figures.trace_pupils
 

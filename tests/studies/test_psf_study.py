@@ -6,18 +6,18 @@ import pytest
 from astropy.table import Table
 
 from pachon.commands.cli import main
-from pachon.models.errors import ConfigError, DomainError
-from pachon.pipeline.ccd_observation import Observation
-from pachon.pipeline.ccd_stage import CcdExposure, Exposed
+from pachon.core.errors import ConfigError, DomainError
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import prepare
-from pachon.pipeline.photometry import ARCSEC
-from pachon.pipeline.polynomial import mapped
-from pachon.pipeline.shapes import measure_shapes
-from pachon.pipeline.star_field import make_star_field
-from pachon.studies import psf_study
-from pachon.studies.psf_study import Study, StudyCcd, fit, noise_law, observe, study
-from pachon.studies.study_plan import NOISE_FREE, Case, Plan, make_plan
+from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.pipeline.psf_model.polynomial import mapped
+from pachon.pipeline.simulate.ccd_exposure import CcdExposure, Exposed
+from pachon.pipeline.simulate.ccd_observation import Observation
+from pachon.pipeline.simulate.photometry import ARCSEC
+from pachon.pipeline.simulate.star_field import make_star_field
+from pachon.studies.psf_choice import study as psf_study
+from pachon.studies.psf_choice.plan import NOISE_FREE, Case, Plan, make_plan
+from pachon.studies.psf_choice.study import Study, StudyCcd, fit, noise_law, observe, study
 
 SCALE = 0.2 * ARCSEC
 
@@ -262,9 +262,9 @@ def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
     for name in ("study_choices.png", "study_stars.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     # One CCD has no correlations and no errors over CCDs, but all the rest. The written configuration is the study's.
-    monkeypatch.setattr("pachon.studies.study_product.choices_figure", lambda *_: b"")
+    monkeypatch.setattr("pachon.studies.psf_choice.product.choices_figure", lambda *_: b"")
     assert load_configuration(out / "config.yaml").stars.observed == 12
-    monkeypatch.setattr("pachon.studies.study_product.stars_figure", lambda *_: b"")
+    monkeypatch.setattr("pachon.studies.psf_choice.product.stars_figure", lambda *_: b"")
     alone = [*command, "--ccds", "R22_S11", "--stars", "12", "--orders", "1", "--out", str(tmp_path / "alone")]
     assert main([*alone, "--quiet", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["base"]["figures"]

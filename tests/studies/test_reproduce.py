@@ -14,18 +14,18 @@ from scipy.special import j1
 
 import pachon
 from pachon.commands.cli import main
-from pachon.design.encircled_energy import energy_curve
-from pachon.models.aberration_free import without_aberration
-from pachon.models.prescription import load_telescope
+from pachon.design.images.encircled_energy import energy_curve
+from pachon.models.ideal_telescope import without_aberration
+from pachon.models.io.prescription import load_telescope
 from pachon.models.site import load_site
 from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
-from pachon.studies import reproduce as module
-from pachon.studies.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
-from pachon.studies.reproduce_atmosphere import beginning
-from pachon.studies.reproduce_parts import PAPER, SMALL, Bench, Scale
-from pachon.wavefront.atmosphere import Atmosphere
-from pachon.wavefront.refraction import air_refractivity
+from pachon.studies.reproduce.atmosphere import beginning
+from pachon.studies.reproduce.parts import PAPER, SMALL, Bench, Scale
+from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
+from pachon.studies.reproduce import reproduce as module
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.refraction import air_refractivity
 
 ARCSEC = math.radians(1 / 3600)
 # Far too small for figures that mean anything; every step is real.

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pachon.wavefront import fast_psf, wave_psf
-from pachon.wavefront.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.psf import fast as fast_psf
+from pachon.wavefront.psf import wave as wave_psf
 from pachon.wavefront.pupil_optics import PupilOptics
 
 FOCAL_LENGTH = 10.31

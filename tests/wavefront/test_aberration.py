@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from astropy import units as u
 
-from pachon.models.errors import DomainError
+from pachon.core.errors import DomainError
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.wavefront.aberration import LINEAR_SHARE, PAPER_RMS, ResidualWavefront
-from pachon.wavefront.psf import make_psfs
+from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.pupil_optics import trace_pupils
 
 WAVELENGTH = np.array([620e-9])

@@ -7,7 +7,7 @@ import pytest
 from astropy import units as u
 
 import pachon
-from pachon.models.errors import ConfigError, DomainError
+from pachon.core.errors import ConfigError, DomainError
 from pachon.wavefront.pupil_optics import fields_at
 
 ZEMAX = Path(__file__).parents[1] / "data" / "zemax"

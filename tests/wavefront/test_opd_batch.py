@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.errors import ConfigError, DomainError
-from pachon.models.shape_freeform import ZernikeSag
+from pachon.core.errors import ConfigError, DomainError
+from pachon.models.shapes.freeform import ZernikeSag
 from pachon.wavefront import opd_batch
 
 # Rounding of 30 m of path, in two orders of the last sums.

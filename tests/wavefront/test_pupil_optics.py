@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.errors import DomainError
+from pachon.core.errors import DomainError
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.pupil_optics import fields_at, trace_pupils
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.errors import DomainError
+from pachon.core.errors import DomainError
 from pachon.models.zernike_polynomials import annular_zernike_gradients, annular_zernikes, noll_to_nm
 from pachon.wavefront.zernike import fit_zernikes
 

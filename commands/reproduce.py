@@ -1,0 +1,60 @@
+"""The command ``pachon reproduce``; :mod:`~pachon.commands.cli` registers it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from .options import Json, Quiet, Threads, interruptible, wide_console
+
+
+def reproduce_command(
+    figures: Annotated[
+        list[str] | None, typer.Argument(metavar="fig1 ... fig14 | table1 | all", help="Figures; all by default.")
+    ] = None,
+    scale: Annotated[str, typer.Option(help="small (a minute or two) or paper (189 CCDs, about an hour).")] = "small",
+    out: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("pachon_figures"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Make figures of Jee & Tyson (2011) again, those that need no galaxies: what the paper says, what comes out here.
+
+    Each gives pictures (PNG), the numbers behind them (ECSV or FITS) and a verdict; `all` writes summary.json too.
+    Figures 9 and 11 to 14 show one run of the pipeline, in the sub-folder run: it is kept, and used again.
+
+    **Examples**
+
+    - `pachon reproduce`: all of them, small
+
+    - `pachon reproduce fig3 table1 --out figures`
+
+    - `pachon reproduce all --scale paper --out paper_figures`
+    """
+    from ..core.files import json_text
+    from ..studies.reproduce.reproduce import reproduce_at
+
+    with interruptible(quiet, f"what was finished is in {out}, and is used by the next call") as reporter:
+        summary = reproduce_at(figures or ("all",), scale, out, seed=seed, threads=threads, reporter=reporter)
+    if as_json:
+        print(json_text(summary))
+    elif not quiet:
+        _show_reproduced(summary, out)
+
+
+def _show_reproduced(summary: dict[str, Any], folder: Path) -> None:
+    table = Table(header_style="bold", padding=(0, 1), show_lines=True)
+    table.add_column("figure", no_wrap=True)
+    for name in ("paper", "here", "verdict"):
+        table.add_column(name, ratio=1)
+    for name, figure in summary["figures"].items():
+        table.add_row(name, figure["paper"], figure["here"], f"{figure['verdict']}: {figure['why']}")
+    wide_console().print(table, markup=False, highlight=False)
+    print(f"figures: {folder.resolve()}")
+
+
+COMMANDS = {"reproduce": reproduce_command}

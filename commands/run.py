@@ -1,0 +1,110 @@
+"""The command ``pachon run``; :mod:`~pachon.commands.cli` registers it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from .options import (
+    Ccds,
+    Config,
+    Json,
+    ObservedStars,
+    Quiet,
+    Raft,
+    Threads,
+    TruthStars,
+    interruptible,
+    one_name_list,
+    resolved_configuration,
+    wide_console,
+)
+
+
+def run_command(
+    config: Config = None,
+    ccds: Ccds = None,
+    raft: Raft = None,
+    all_ccds: Annotated[bool, typer.Option("--all", help="All CCDs of the camera.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("pachon_run"),
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the CCDs that are finished, compute the others.")
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="End at the first CCD that cannot be modelled, in place of leaving it out.")
+    ] = False,
+    truth_stars: TruthStars = None,
+    observed_stars: ObservedStars = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Follow starlight from the sky to a PSF model: optics, CCD heights, atmosphere, noisy stars, PCA, correlations.
+
+    Without a configuration: r band of the LSST, nine CCDs from the centre of the field to its edge.
+
+    Everything goes into one folder: report.html, summary.json, a FITS product for each CCD, config.yaml with every
+    default written out (running it again gives the same bytes), and the focal plane as a table and as a mesh.
+
+    **Examples**
+
+    - `pachon run`: the default, a few minutes on two cores
+
+    - `pachon run --raft R22 --out central_raft --seed 7`
+
+    - `pachon run --ccds R22_S11,R24_S12 --truth-stars 400`
+
+    - `pachon run pachon_run/config.yaml --out again`: the same bytes
+
+    - `pachon run --all --out full --resume`: go on where a run was stopped
+    """
+    from ..core.files import json_text
+    from ..pipeline.run import left_out_line, run
+
+    names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
+    resolved = resolved_configuration(
+        config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
+    )
+    with interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter:
+        result = run(resolved, out, resume=resume, strict=strict, threads=threads, reporter=reporter)
+    if quiet:  # the reporter has said nothing
+        for name, reason in result.not_modelled.items():
+            print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)
+    if as_json:
+        print(json_text(result.summary))
+    elif not quiet:
+        _show_run(result, sum(reporter.seconds.values()))
+
+
+def _show_run(result: Any, seconds: float) -> None:
+    from ..pipeline.report.tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
+
+    console = wide_console()
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for what, value in headline(result.summary):
+        table.add_row(what, value)
+    rows = per_ccd(result.summary)
+    if len(rows) <= 21:
+        each = Table(box=None, header_style="bold", padding=(0, 1, 0, 0))
+        for name, unit in PER_CCD_COLUMNS:
+            each.add_column(
+                f"{name} [{unit}]".replace("[", "\\[") if unit else name, justify="right" if unit else "left"
+            )
+        for row in rows:
+            each.add_row(*row)
+        console.print(each)
+        console.print(PER_CCD_CAPTION, style="dim", width=100)
+        console.print()
+    console.print(table)
+    console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
+    if result.not_modelled:
+        console.print(f"left out, not to be modelled: {', '.join(result.not_modelled)}", style="bold")
+    print(f"report: {result.report.resolve()}")
+
+
+COMMANDS = {"run": run_command}

@@ -1,0 +1,135 @@
+"""The command ``pachon study``; :mod:`~pachon.commands.cli` registers it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from ..core.errors import ConfigError
+from .options import (
+    Config,
+    Json,
+    Quiet,
+    Threads,
+    TruthStars,
+    interruptible,
+    name_list,
+    one_name_list,
+    resolved_configuration,
+    show_table,
+    wide_console,
+)
+
+if TYPE_CHECKING:
+    from ..studies.psf_choice.study import Study
+
+_Number = TypeVar("_Number", int, float)
+_COLUMNS = {
+    "rms_e_at_stars": "at stars: rms e",
+    "rms_e_away": "no star: rms e",
+    "rms_size_away": "rms size",
+    "mean_e_away": "mean e of a CCD",
+    "xi_plus_away_long": "ξ+ beyond 10'",
+}
+_CAPTION = (
+    "Residuals of the base, of what is recommended, and of the best order of each number of stars. Rms of one "
+    "component of e: observed - model at the stars, which flatters; truth - model where no star is. There, too: rms of "
+    "the relative size, rms over CCDs of their mean of e, and mean ξ+ from 10' to 3 deg."
+)
+
+
+def study_command(
+    config: Config = None,
+    ccds: Annotated[
+        str | None, typer.Option(help="CCDs, separated by commas; by default nine across the field.")
+    ] = None,
+    stars: Annotated[str, typer.Option(help="Stars of a CCD.")] = "10,20,40,80,160",
+    orders: Annotated[str, typer.Option(help="Orders of the polynomials.")] = "1,2,3,4,5,6",
+    components: Annotated[str, typer.Option(help="Components of the basis.")] = "5,10,20,40",
+    snr: Annotated[str, typer.Option(help="S/N of the faintest star.")] = "30,100,300",
+    draws: Annotated[int, typer.Option(min=1, help="Draws of the noise.")] = 4,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("pachon_study"),
+    truth_stars: TruthStars = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Find how to model the PSF: how many stars, which order, how many components, basis, interpolation, S/N.
+
+    Stars are simulated once, observed through several draws of noise and modelled in some 350 ways about that of the
+    configuration; each is held against the truth where no star is. Some minutes. Table (ECSV), pictures and all
+    figures (study.json) go into one folder.
+
+    **Examples**
+
+    - `pachon study`: forty stars of S/N 30 and more on nine CCDs across the field
+
+    - `pachon study my_config.yaml --ccds R22_S11,R24_S11 -o small_study --stars 20,40 --orders 1,2,3 --draws 2`
+    """
+    from ..core.files import json_text, make_folder
+    from ..studies.psf_choice.plan import make_plan
+    from ..studies.psf_choice.product import study_summary, write_study
+    from ..studies.psf_choice.study import STUDY_CCDS, study, study_configuration
+
+    names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
+    resolved = resolved_configuration(config, ccds=names, stars__truth=truth_stars)
+    plan = make_plan(
+        resolved,
+        stars=_numbers(stars, "--stars", int),
+        orders=_numbers(orders, "--orders", int),
+        components=_numbers(components, "--components", int),
+        snrs=_numbers(snr, "--snr", float),
+        draws=draws,
+    )
+    study_configuration(resolved, plan)  # refuses what cannot be, before anything is written
+    make_folder(out)
+    with interruptible(quiet) as reporter:
+        result = study(resolved, plan, threads=threads, reporter=reporter)
+    write_study(result, out, resolved)
+    if as_json:
+        print(json_text(study_summary(result)))
+        return
+    if not quiet:
+        _show(result)
+    print(f"study: {out.resolve()}")
+
+
+def _show(result: Study) -> None:
+    plan, chosen, console = result.plan, result.recommended(), wide_console()
+    cases = [plan.base, *([chosen] if chosen is not None else [])]
+    for stars in plan.stars:
+        cases += [best for how in ("equal", "softened") if (best := result.best_order(stars, how))]
+    rows = []
+    for case in dict.fromkeys(cases):
+        if (found := result.figures.get(case)) is not None:
+            rows.append((f"{case.stars} stars, {case}", *(f"{found[key]:.1e}" for key in _COLUMNS)))
+    show_table(("model", *_COLUMNS.values()), rows, _CAPTION)
+    if result.problems:
+        console.print(f"{len(result.problems)} ways could not be fitted, such as {_example(result)}", style="dim")
+    if chosen is None:
+        console.print(f"no way to model {plan.base.stars} stars could be fitted")
+        return
+    error = result.figures[chosen]["error_rms_e_away"]
+    console.print(
+        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e where no "
+        f"star is {result.figures[chosen]['rms_e_away']:.2e} ± {error:.0e}",
+        highlight=False,
+    )
+
+
+def _example(result: Study) -> str:
+    case, why = next(iter(result.problems.items()))
+    return f"{case.stars} stars, {case}: {why}"
+
+
+def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]:
+    try:
+        return tuple(kind(part) for part in name_list(text, option))
+    except ValueError:
+        expected = "whole numbers" if kind is int else "numbers"
+        raise ConfigError(f"{option} = {text!r}: expected {expected} separated by commas, such as 20,40") from None
+
+
+COMMANDS = {"study": study_command}

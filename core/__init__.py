@@ -1,0 +1,1 @@
+"""What every layer needs: errors, units, random streams, YAML, files, memory, threads, Warp, progress, plotting."""

@@ -1,0 +1,90 @@
+"""How much memory there is, so that what will not fit is refused before the system ends the process without a word."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from .errors import DomainError
+
+# Where control groups are mounted, and what their files are called: version 2, then version 1.
+_UNIFIED = ("memory.max", "memory.current", "inactive_file")
+_LEGACY = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+
+
+def available_bytes(root: Path = Path("/")) -> int | None:
+    """Return how many bytes this process may still take without swapping.
+
+    On Linux it is the least of what the machine has available and what every control group that the process is in
+    leaves (containers and batch systems set their limits there); cached files, which the kernel drops when it must,
+    count as free.
+
+    Parameters
+    ----------
+    root : Path
+        Where ``proc`` and ``sys`` are.
+
+    Returns
+    -------
+    int or None
+        None where the system does not say.
+    """
+    return min((*_machine(root), *_groups(root)), default=None)
+
+
+def require_bytes(needed: int, what: str) -> None:
+    """Refuse what needs more memory than there is.
+
+    Raises
+    ------
+    DomainError
+        If it is known that so much is not available: one line that starts with what needs it.
+    """
+    free = available_bytes()
+    if free is not None and needed > free:
+        raise DomainError(f"{what}: needs about {readable(needed)} of memory, {readable(free)} are free")
+
+
+def readable(count: float) -> str:
+    """Return a number of bytes in MB or GB, for people."""
+    size, unit = (count / 1e9, "GB") if count >= 0.95e9 else (count / 1e6, "MB")
+    return f"{size:.0f} {unit}" if size >= 9.95 else f"{size:.1f} {unit}"
+
+
+def _machine(root: Path) -> Iterator[int]:
+    for line in _lines(root / "proc/meminfo"):
+        words = line.split()
+        if len(words) > 1 and words[0] == "MemAvailable:" and words[1].isdigit():
+            yield 1024 * int(words[1])
+
+
+def _groups(root: Path) -> Iterator[int]:
+    for line in _lines(root / "proc/self/cgroup"):
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if number == "0" and not controllers:
+            base, names = root / "sys/fs/cgroup", _UNIFIED
+        elif "memory" in controllers.split(","):
+            base, names = root / "sys/fs/cgroup/memory", _LEGACY
+        else:
+            continue
+        # Limits of all groups above count too. Inside a container the path may be that of the host: then there is
+        # nothing but the base.
+        inner = Path(path.strip().lstrip("/"))
+        for folder in (inner, *inner.parents):
+            yield from _left(base / folder, *names)
+
+
+def _left(folder: Path, limit_name: str, used_name: str, cached_key: str) -> Iterator[int]:
+    """Return what one group leaves, if it has a limit."""
+    limit, used = (next(iter(_lines(folder / name)), "").strip() for name in (limit_name, used_name))
+    if limit.isdigit() and used.isdigit():
+        cached = [int(w[1]) for w in (line.split() for line in _lines(folder / "memory.stat")) if w[0] == cached_key]
+        yield max(0, int(limit) - int(used) + sum(cached))
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []

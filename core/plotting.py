@@ -1,0 +1,88 @@
+"""What all pictures share: drawing without global state, one style, the palette, the bytes of a PNG."""
+
+from __future__ import annotations
+
+import io
+import logging
+from typing import Any, Literal
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from .errors import ConfigError
+
+#: The palette, in the order in which curves of one picture take it; all differ in lightness too.
+GREY, BLUE, RED, ORANGE, PURPLE = "#3a3a3a", "#1f6fbf", "#c8322b", "#e08a00", "#7a4fb5"
+_STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.labelsize": 9.0,
+    "axes.linewidth": 0.7,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "image.origin": "lower",
+    "image.interpolation": "nearest",
+    "text.usetex": False,
+    "svg.hashsalt": "pachon",
+}
+_DPI = 150
+#: What each format would say of itself, left out: equal pictures are equal bytes.
+_NAMELESS: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    "svg": {"Date": None, "Creator": None},
+}
+# Matplotlib announces the building of its font cache, which no astronomer asked about.
+logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
+
+
+def styled() -> Any:
+    """Return the context in which figures are drawn: our style on top of matplotlib's own, not the user's."""
+    return matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE, "backend": "agg"})
+
+
+def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
+    """Return an empty figure of a size in inches that belongs to no window and no global state."""
+    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def picture_bytes(figure: Figure, kind: str) -> bytes:
+    """Return a figure as the bytes of a file, without the date and the version of what drew it.
+
+    Parameters
+    ----------
+    figure : Figure
+        The figure.
+    kind : {"png", "pdf", "svg"}
+        Format of the file.
+
+    Raises
+    ------
+    ConfigError
+        If the format is another.
+    """
+    if kind not in _NAMELESS:
+        raise ConfigError(f"picture format {kind!r}: expected one of {', '.join(_NAMELESS)}")
+    buffer = io.BytesIO()
+    # Ticks are made, and take their style, when a figure is drawn.
+    with styled():
+        figure.savefig(buffer, format=kind, dpi=_DPI, metadata=_NAMELESS[kind])
+    return buffer.getvalue()
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """Return a figure as PNG, without the date and the version of what drew it."""
+    return picture_bytes(figure, "png")
+
+
+def figure_of(axes: Axes) -> Figure:
+    """Return the figure that axes belong to."""
+    figure = axes.get_figure(root=True)
+    assert isinstance(figure, Figure)
+    return figure

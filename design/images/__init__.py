@@ -1,0 +1,1 @@
+"""Diffraction images and what is measured on them."""

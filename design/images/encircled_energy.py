@@ -1,0 +1,289 @@
+"""Encircled energy: how much of a star's light falls within a circle, of rays alone or with diffraction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.ndimage import zoom
+
+from ...core.errors import ConfigError, DomainError
+from ...core.units import metres
+from ...models.telescope import Telescope
+from ..metrics.spots import SpotDiagram, spots
+from ..pupil_sampling import PupilSampling
+from .diffraction import DiffractionPsf, fft_psf
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: A pixel is cut into so many parts along each axis to find what of it is within a circle.
+_PARTS = 4
+#: Diffraction images are interpolated to so many times as many pixels, which their band limit allows.
+_FINER = 3
+#: Radii of a curve where none are given.
+_RADII = 301
+#: Pixels on a side of the images that curves with diffraction are taken from.
+_PIXELS = 256
+KINDS = ("diffraction", "geometric")
+
+
+@dataclass(frozen=True)
+class EncircledEnergy:
+    """Encircled energy of several field points, all wavelengths together.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    kind : {"diffraction", "geometric"}
+        With diffraction, or of rays alone.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    radius : ndarray, shape [n_radius]
+        Radii about the centroid of the rays, or the chief ray, from zero [m].
+    fraction : ndarray, shape [n_field, n_radius]
+        Part of the light of the image within each.
+    plate_scale : ndarray, shape [n_field]
+        Angle on the sky over length on the detector [rad/m].
+    """
+
+    telescope: str
+    kind: str
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    radius: np.ndarray
+    fraction: np.ndarray
+    plate_scale: np.ndarray
+
+    def radius_holding(self, share: float) -> np.ndarray:
+        """Return the radius that holds a share of the light [m], shape [n_field]; NaN where the curve ends before."""
+        if not 0 < share < 1:
+            raise DomainError(f"share = {share!r}: expected a number between 0 and 1")
+        found = np.array([_crossing(row, self.radius, share) for row in self.fraction])
+        return np.where(self.fraction[:, -1] >= share, found, np.nan)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; lists run over the fields."""
+        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        shares = {f"ee{round(100 * share)}_radius": self.radius_holding(share) for share in (0.5, 0.8, 0.9)}
+        return {
+            "telescope": self.telescope,
+            "kind": self.kind,
+            "wavelength_nm": self.wavelengths * 1e9,
+            "field_deg": np.rad2deg(self.fields),
+            **{f"{name}_um": value * 1e6 for name, value in shares.items()},
+            **{f"{name}_arcsec": value * arcsec for name, value in shares.items()},
+            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+            "radius_um": self.radius * 1e6,
+            "fraction": self.fraction,
+        }
+
+    def plot(self) -> Figure:
+        """Draw the curves, and the radii of 50 and 80 % against the field."""
+        from ..plots.encircled_energy import encircled_energy_figure
+
+        return encircled_energy_figure(self)
+
+
+def encircled_energy(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelengths: Any = None,
+    *,
+    kind: str = "diffraction",
+    radii: Any = None,
+    wavelength_weights: Any = None,
+    reference: str = "centroid",
+    sampling: str | PupilSampling = "spiral",
+    pixels: int = _PIXELS,
+    pupil_points: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+    advance: Callable[[], None] | None = None,
+) -> EncircledEnergy:
+    """Return the encircled energy of a star over the field.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; five from the axis to the edge by default.
+    wavelengths : array_like or Quantity, shape [n_wave], optional
+        Vacuum wavelengths [m]; the telescope's own by default.
+    kind : {"diffraction", "geometric"}
+        From diffraction images (:func:`~pachon.design.images.diffraction.fft_psf`), or of the rays alone.
+    radii : array_like or Quantity, shape [n_radius], optional
+        Radii [m], ascending; by default from zero to the edge of the images, or beyond the farthest ray.
+    wavelength_weights : array_like, shape [n_wave], optional
+        Relative amounts of light; equal by default.
+    reference : {"centroid", "chief"}
+        Centre of the circles: the centroid of the rays, or the chief ray of the middle wavelength.
+    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+        Points of the pupil, for "geometric": on a spiral no two rays are alike, so that the curves are smooth.
+    pixels, pupil_points : int, optional
+        As for :func:`~pachon.design.images.diffraction.fft_psf`, for "diffraction".
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads for tracing; all processors by default.
+    advance : callable, optional
+        Called after each field and wavelength, for "diffraction".
+
+    Raises
+    ------
+    ConfigError
+        If kind, reference, sampling or projection is unknown.
+    DomainError
+        If something is out of range, or no light passes.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"kind = {kind!r}: expected one of {', '.join(KINDS)}")
+    given = None if radii is None else np.atleast_1d(metres(radii, "radii"))
+    if given is not None and not (
+        given.ndim == 1 and np.isfinite(given).all() and (given >= 0).all() and (np.diff(given) > 0).all()
+    ):
+        raise DomainError(f"radii of shape {given.shape}: expected ascending lengths from 0, shape [n]")
+    if kind == "geometric":
+        return _geometric(
+            spots(
+                telescope,
+                fields,
+                wavelengths,
+                wavelength_weights=wavelength_weights,
+                sampling=sampling,
+                reference=reference,
+                projection=projection,
+                threads=threads,
+            ),
+            given,
+        )
+    psf = fft_psf(
+        telescope,
+        fields,
+        wavelengths,
+        wavelength_weights=wavelength_weights,
+        pixels=pixels,
+        pupil_points=pupil_points,
+        reference=reference,
+        projection=projection,
+        threads=threads,
+        advance=advance,
+    )
+    return energy_of_psf(psf, given)
+
+
+def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:
+    """Return the encircled energy about the middles of diffraction images.
+
+    Parameters
+    ----------
+    psf : DiffractionPsf
+        The images.
+    radii : ndarray, shape [n_radius], optional
+        Radii [m]; out to the edge of the images by default.
+
+    Raises
+    ------
+    DomainError
+        If a radius lies beyond the images.
+    """
+    edge = float(psf.axis[-1])
+    radius = np.linspace(0.0, edge, _RADII) if radii is None else radii
+    if radius[-1] > edge * (1 + 1e-9):
+        raise DomainError(f"radii to {radius[-1] * 1e6:.6g} um: expected at most {edge * 1e6:.6g} um, the images' edge")
+    # The place of the middle pixel's centre among the finer ones.
+    middle = (psf.image.shape[-1] // 2 + 0.5) * _FINER - 0.5
+    rows = []
+    for image in psf.image:
+        # Pixels are samples at points: squares of even light would blur the image.
+        finer = zoom(image, _FINER, order=5, mode="nearest", grid_mode=True) / _FINER**2
+        at, within = energy_curve(finer, center=(middle, middle), parts=1)
+        rows.append(np.interp(radius, at * psf.pixel / _FINER, within))
+    return EncircledEnergy(
+        psf.telescope, "diffraction", psf.fields, psf.wavelengths, radius, np.stack(rows), psf.plate_scale
+    )
+
+
+def energy_curve(
+    image: np.ndarray, center: tuple[float, float] | None = None, *, parts: int = _PARTS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the light within circles on an image, light being even within a pixel.
+
+    Parameters
+    ----------
+    image : ndarray, shape [ny, nx]
+        Light in each pixel.
+    center : (x, y), optional
+        Centre of the circles [pixels from the centre of the first one]; the centroid of the image by default.
+    parts : int
+        Parts that a pixel is cut into along each axis.
+
+    Returns
+    -------
+    radius : ndarray, shape [n]
+        Radii from zero, ascending [pixels].
+    light : ndarray, shape [n]
+        Light within each, in the unit of the image.
+
+    Raises
+    ------
+    DomainError
+        If the image is not finite, or the centroid is asked for and there is no light.
+    """
+    light = np.asarray(image, dtype=np.float64)
+    if light.ndim != 2 or not np.isfinite(light).all():
+        raise DomainError(f"image of shape {light.shape}: expected a finite one, shape [ny, nx]")
+    x, y = np.arange(light.shape[1], dtype=np.float64), np.arange(light.shape[0], dtype=np.float64)
+    if center is None:
+        total = light.sum()
+        if not total > 0:
+            raise DomainError(f"image of sum {total:.6g}: expected light, to have a centroid")
+        center = float(light.sum(axis=0) @ x / total), float(light.sum(axis=1) @ y / total)
+    inside = (np.arange(parts) + 0.5) / parts - 0.5
+    across, along = (np.add.outer(v - c, inside).ravel() for v, c in zip((x, y), center, strict=True))
+    squared = np.add.outer(along**2, across**2).ravel()
+    order = np.argsort(squared, kind="stable")
+    each = np.repeat(np.repeat(light / parts**2, parts, axis=0), parts, axis=1).ravel()[order]
+    # A part stands in the middle of its own light.
+    within = np.cumsum(each) - 0.5 * each
+    return np.concatenate([[0.0], np.sqrt(squared[order])]), np.concatenate([[0.0], within])
+
+
+def _geometric(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnergy:
+    distance = np.where(diagram.weight > 0, np.linalg.norm(diagram.displacement, axis=-1), np.inf)
+    farthest = float(distance[np.isfinite(distance)].max(initial=0.0))
+    if not farthest > 0:
+        raise DomainError(f"{diagram.telescope}: no spot of any size; expected rays that reach the detector")
+    radius = np.linspace(0.0, 1.02 * farthest, _RADII) if radii is None else radii
+    rows = []
+    for at, weight in zip(distance, diagram.weight, strict=True):
+        lit = weight > 0
+        order = np.argsort(at[lit], kind="stable")
+        each = weight[lit][order]
+        # A ray stands in the middle of the light that it carries.
+        within = (np.cumsum(each) - 0.5 * each) / each.sum() if len(each) else np.zeros(0)
+        rows.append(np.interp(radius, at[lit][order], within, left=0.0, right=1.0) if len(each) else np.nan * radius)
+    return EncircledEnergy(
+        diagram.telescope,
+        "geometric",
+        diagram.fields,
+        diagram.wavelengths,
+        radius,
+        np.stack(rows),
+        diagram.plate_scale,
+    )
+
+
+def _crossing(fraction: np.ndarray, radius: np.ndarray, share: float) -> float:
+    """Return where a curve that does not fall reaches a share, straight between two points."""
+    k = int(np.argmax(fraction >= share))
+    if k == 0:
+        return float(radius[0])
+    low, high = fraction[k - 1], fraction[k]
+    return float(radius[k - 1] + (share - low) / (high - low) * (radius[k] - radius[k - 1]))

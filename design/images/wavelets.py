@@ -1,0 +1,382 @@
+r"""Wavelets: the plane waves, one for each ray, whose sum is the light on the detector.
+
+Near the image a ray stands for a plane wave. At the place X of the detector, counted from a reference point C, all of
+them add up to the field
+
+.. math:: U(X) = \frac{1}{\lambda} \sum_k a_k \, e^{-i k w_k} \, e^{i k X \cdot c_k},
+
+with the optical path difference :math:`w_k` at C (path of the chief ray minus path of the ray, so that a wave that
+leads has a positive one), and the cosines :math:`c_k` of the ray along the detector, less the chief ray's and times the
+refractive index there. The pattern is exact as long as rays meet the detector within some millimetres of C. A ray that
+carries the part :math:`e_k` of the light and fills the area :math:`\omega_k` of cosines has the amplitude
+:math:`a_k = \sqrt{e_k \omega_k}`; the integral of :math:`|U|^2` over the detector is then the light that the pupil lets
+through (Parseval).
+
+Rays may go through any points of the entrance pupil (Huygens), or be aimed so that their cosines lie on a square
+lattice (Fourier). The distances of the lattice say how the cosines are sampled exactly: no distortion of the pupil,
+no anamorphism and no skew of the exit pupil has to be put right afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...models.telescope import Telescope
+from ..bundles import Bundles, trace_bundles
+from ..metrics.principal_rays import PrincipalRays
+from ..metrics.spots import SpotDiagram
+from ..pupil_sampling import PupilSampling, ring_annulus
+
+#: Degree of the polynomials that the search for aimed rays starts from; they give the Jacobian too.
+_DEGREE = 7
+#: Rings of rays that those polynomials are fitted to.
+_RINGS = 14
+#: Rays that are stopped are believed as long as they are no farther off a linear map than so many times what light is.
+_ASTRAY = 2.0
+#: How far cosines may be off the lattice, in units of its spacing; phases at the edge of the image are off by pi times
+#: that at most.
+_AIM = 1e-4
+_MOST_TRACES = 8
+#: Cells that a rim crosses are cut into so many parts along each axis to find how much of them is lit.
+_PARTS = 6
+#: Share of the light that images are made to hold, and how far beyond it they go.
+_HELD, _BEYOND = 0.99, 1.1
+#: Range of direction cosines below which there is no focus.
+_PARALLEL = 1e-7
+#: Step of the derivative of the cosines by the place in the pupil, over the pupil's radius.
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Wavelets:
+    """Plane waves that make the image of one field point at one wavelength.
+
+    Attributes
+    ----------
+    cosine : ndarray, shape [..., 2]
+        Direction cosines along the detector, less the chief ray's, times the refractive index.
+    opd : ndarray, shape [...]
+        Path of the chief ray minus path of the ray [m], at the reference point.
+    amplitude : ndarray, shape [...]
+        Amplitudes `a`; zero where no light passes.
+    light : float
+        Part of the entrance pupil that is lit.
+    wavelength : float
+        Vacuum wavelength [m].
+    """
+
+    cosine: np.ndarray
+    opd: np.ndarray
+    amplitude: np.ndarray
+    light: float
+    wavelength: float
+
+    @property
+    def field(self) -> np.ndarray:
+        """Complex amplitude of each wavelet at the reference point, 1/wavelength included [1/m]."""
+        return self.amplitude / self.wavelength * np.exp(-2j * np.pi / self.wavelength * self.opd)
+
+    @property
+    def perfect_peak(self) -> float:
+        """Irradiance at the peak if all wavelets were in phase, part of the light that enters per area [1/m^2]."""
+        return float((self.amplitude.sum() / self.wavelength) ** 2)
+
+
+@dataclass(frozen=True)
+class WaveletLattice:
+    """Wavelets whose cosines lie on a square lattice.
+
+    Attributes
+    ----------
+    wavelets : Wavelets
+        The wavelets, shape [n, n]: the second axis of the lattice first.
+    steps : ndarray, shape [n]
+        Cosines along either axis of the lattice.
+    spacing : float
+        Distance of lattice points.
+    """
+
+    wavelets: Wavelets
+    steps: np.ndarray
+    spacing: float
+
+
+def traced_wavelets(
+    telescope: Telescope,
+    field: np.ndarray,
+    wavelength: float,
+    center: np.ndarray,
+    sampling: PupilSampling,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Wavelets:
+    """Return the wavelets of rays through given points of the entrance pupil.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    field : ndarray, shape [2]
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    center : ndarray, shape [2]
+        Reference point, x and y of the detector [m].
+    sampling : PupilSampling
+        Points of the pupil and their weights.
+    projection : str
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+    """
+    step = _STEP * 0.5 * telescope.pupil_diameter
+    points = sampling.points
+    beside = (points, points + np.array([step, 0.0]), points + np.array([0.0, step]))
+    bundle = trace_bundles(telescope, field[None], wavelength, np.concatenate(beside), projection, threads)
+    opd, cosine = _at_reference(telescope, bundle, center)
+    here, along_x, along_y = cosine.reshape(3, -1, 2)
+    jacobian = np.abs(_cross(along_x - here, along_y - here)) / step**2
+    lit = bundle.lit[0, : len(points)] & np.isfinite(jacobian)
+    annulus = 0.25 * np.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
+    amplitude = np.where(lit, sampling.weights * np.sqrt(annulus * jacobian), 0.0)
+    return Wavelets(
+        cosine=np.where(lit[:, None], here, 0.0),
+        opd=np.where(lit, opd[: len(points)], 0.0),
+        amplitude=amplitude,
+        light=float(sampling.weights[lit].sum()),
+        wavelength=wavelength,
+    )
+
+
+def lattice_wavelets(
+    telescope: Telescope,
+    field: np.ndarray,
+    wavelength: float,
+    center: np.ndarray,
+    spacing: float,
+    *,
+    angle: float = 0.0,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> WaveletLattice:
+    """Return the wavelets of rays that are aimed at a square lattice of direction cosines on the detector.
+
+    What a rim leaves of a cell of the lattice is found from more rays there, and the amplitude of the cell goes down
+    with it.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    field : ndarray, shape [2]
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    center : ndarray, shape [2]
+        Reference point, x and y of the detector [m].
+    spacing : float
+        Distance of the lattice points: the pattern repeats itself after wavelength / spacing.
+    angle : float
+        Angle from the x axis of the detector to the first axis of the lattice [rad].
+    projection : str
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Raises
+    ------
+    DomainError
+        If no light passes, or no ray has some of the directions: the map of the pupil to the image is not one to one.
+    """
+    radius = 0.5 * telescope.pupil_diameter
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+    def rays(points: np.ndarray) -> tuple[Bundles, np.ndarray, np.ndarray]:
+        bundle = trace_bundles(telescope, field[None], wavelength, points, projection, threads)
+        opd, cosine = _at_reference(telescope, bundle, center)
+        return bundle, opd, cosine @ turn
+
+    guess = _InverseMap(telescope, rays)
+    n = 2 * int(np.ceil(guess.reach / spacing)) + 3
+    steps = (np.arange(n) - n // 2) * spacing
+    targets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    start = guess.pupil(steps).reshape(-1, 2)
+    # A cell reaches half a spacing to all sides; beyond that the polynomials need not hold.
+    margin = spacing * guess.metres_per_cosine
+    near = np.flatnonzero(np.hypot(*start.T) <= radius + margin)
+    targets, points = targets[near], start[near]
+    jacobian = guess.jacobian(steps).reshape(-1, 2, 2)[near]
+    for _ in range(_MOST_TRACES):
+        bundle, opd, cosine = rays(points)
+        lit = bundle.lit[0] & _in_annulus(telescope, points)
+        off = targets - cosine
+        known = np.isfinite(off).all(axis=1)
+        if not (lit & known).any():
+            raise DomainError(f"field = {_degrees(field)} deg: no light passes; expected a lit pupil")
+        if np.abs(off[lit & known]).max() <= _AIM * spacing:
+            break
+        points = points + np.einsum("nij,nj->ni", jacobian, np.where(known[:, None], off, 0.0))
+    else:
+        raise DomainError(
+            f"field = {_degrees(field)} deg: rays could not be aimed at all directions; expected a pupil that the "
+            "telescope maps one to one on its image (huygens_psf does without)"
+        )
+    cover = _coverage(telescope, rays, points, jacobian, lit, near, n, spacing)
+    cell = np.abs(np.linalg.det(jacobian)) * spacing**2
+    annulus = np.pi * radius**2 * (1.0 - telescope.pupil_obscuration**2)
+    energy = np.where(np.isfinite(opd), cell / annulus, 0.0)
+    amplitude, path = np.zeros((2, n * n))
+    amplitude[near] = cover * np.sqrt(energy) * spacing
+    path[near] = np.where(np.isfinite(opd), opd, 0.0)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1) @ turn.T
+    # Cells on the rim are known to a few per cent each, and so may add up to a little more than the whole.
+    light = min(float((cover * energy).sum()), 1.0)
+    wavelets = Wavelets(grid, path.reshape(n, n), amplitude.reshape(n, n), light, wavelength)
+    return WaveletLattice(wavelets, steps, spacing)
+
+
+def range_of_cosines(telescope: Telescope, principal: PrincipalRays) -> float:
+    """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio.
+
+    Raises
+    ------
+    DomainError
+        If light arrives parallel: there is no image.
+    """
+    found = float((1.0 / principal.f_number).max())
+    if not _PARALLEL < found < np.inf:
+        raise DomainError(
+            f"{telescope.name}: focal ratio {1.0 / max(found, 1e-300):.3g}; expected one that makes an image"
+        )
+    return found
+
+
+def spot_reach(diagram: SpotDiagram) -> float:
+    """Return the radius about the middles of spots that holds nearly all their light, of the largest [m]."""
+    reach = 0.0
+    for distance, weight in zip(np.linalg.norm(diagram.displacement, axis=-1), diagram.weight, strict=True):
+        lit = weight > 0
+        if lit.any():
+            order = np.argsort(distance[lit], kind="stable")
+            held = np.cumsum(weight[lit][order])
+            # A few stray rays may land anywhere; a lattice that had to hold them would have no end.
+            reach = max(reach, float(distance[lit][order][np.searchsorted(held, _HELD * held[-1])]))
+    return _BEYOND * reach
+
+
+#: Traces rays through points of the pupil: to bundles, path differences and cosines along the lattice.
+_Trace = Callable[[np.ndarray], tuple[Bundles, np.ndarray, np.ndarray]]
+
+
+class _InverseMap:
+    """Polynomials that give the point of the entrance pupil whose ray has given cosines."""
+
+    def __init__(self, telescope: Telescope, rays: _Trace) -> None:
+        radius = 0.5 * telescope.pupil_diameter
+        # The outermost ring stands a little beyond the rim, so that nothing has to be extrapolated.
+        points = ring_annulus(1.05 * radius, 0.9 * telescope.pupil_obscuration, _RINGS).points
+        bundle, _, cosine = rays(points)
+        lit = bundle.lit[0] & np.isfinite(cosine[:, 0])
+        if lit.sum() < 3:
+            raise DomainError(f"{telescope.name}: {int(lit.sum())} of {len(lit)} rays arrive; expected a lit pupil")
+        # Rays that are stopped may go astray, and would spoil the polynomials where light passes.
+        linear = np.column_stack([np.ones(len(cosine)), cosine])
+        slope = np.linalg.lstsq(linear[lit], points[lit], rcond=None)[0]
+        off = np.linalg.norm(linear @ slope - points, axis=-1)
+        known = off <= max(_ASTRAY * float(off[lit].max()), 0.01 * radius)
+        terms = (_DEGREE + 1) * (_DEGREE + 2) // 2
+        if known.sum() < 2 * terms:
+            raise DomainError(
+                f"{telescope.name}: {int(known.sum())} of {len(known)} rays arrive; expected most of them"
+            )
+        points, cosine = points[known], cosine[known]
+        self.reach = float(np.abs(cosine).max())
+        first, second = (self._powers(cosine[:, axis]) for axis in (0, 1))
+        i, j = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
+        self._coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
+        self._coefficients[i, j] = np.linalg.lstsq(first[:, i] * second[:, j], points, rcond=None)[0]
+        #: Change of the point in the pupil with the cosines, about [m].
+        self.metres_per_cosine = float(np.linalg.norm(slope[1:], 2))
+
+    def pupil(self, steps: np.ndarray) -> np.ndarray:
+        """Return points of the entrance pupil [m] for a lattice of cosines, shape [n, n, 2], the second axis first."""
+        return self._on_lattice(self._powers(steps), self._powers(steps))
+
+    def jacobian(self, steps: np.ndarray) -> np.ndarray:
+        """Return the derivatives of those points by the cosines [m], shape [n, n, 2, 2]."""
+        plain, derived = self._powers(steps), self._powers(steps, derivative=True)
+        return np.stack([self._on_lattice(derived, plain), self._on_lattice(plain, derived)], axis=-1)
+
+    def _on_lattice(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return np.stack([second @ self._coefficients[..., k].T @ first.T for k in (0, 1)], axis=-1)
+
+    def _powers(self, cosine: np.ndarray, *, derivative: bool = False) -> np.ndarray:
+        """Return powers of cosines over their reach, from the zeroth, or their derivatives by the cosines."""
+        powers = np.vander(cosine / self.reach, _DEGREE + 1, increasing=True)
+        if not derivative:
+            return powers
+        return np.arange(_DEGREE + 1) / self.reach * np.pad(powers, ((0, 0), (1, 0)))[:, :-1]
+
+
+def _coverage(
+    telescope: Telescope,
+    rays: _Trace,
+    points: np.ndarray,
+    jacobian: np.ndarray,
+    lit: np.ndarray,
+    near: np.ndarray,
+    n: int,
+    spacing: float,
+) -> np.ndarray:
+    """Return how much of each cell is lit: cells whose neighbours differ are looked at with more rays."""
+    whole = np.zeros(n * n, dtype=np.int8)
+    whole[near] = lit
+    square = np.pad(whole.reshape(n, n), 1)
+    shifts = [square[1 + i : n + 1 + i, 1 + j : n + 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    mixed = (np.minimum.reduce(shifts) != np.maximum.reduce(shifts)).ravel()[near]
+    cover = lit.astype(np.float64)
+    if not mixed.any():
+        return cover
+    parts = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) * spacing
+    inside = np.stack(np.meshgrid(parts, parts), axis=-1).reshape(-1, 2)
+    finer = points[mixed][:, None] + np.einsum("nij,pj->npi", jacobian[mixed], inside)
+    bundle, _, _ = rays(finer.reshape(-1, 2))
+    passed = bundle.lit[0] & _in_annulus(telescope, finer.reshape(-1, 2))
+    cover[mixed] = passed.reshape(-1, _PARTS**2).mean(axis=1)
+    return cover
+
+
+def _at_reference(telescope: Telescope, bundle: Bundles, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return path differences [m] at a point of the detector, shape [n], and cosines along it there, shape [n, 2]."""
+    shape = telescope.surfaces[-1].shape
+    point = np.array([*center, float(shape.sag(*center))])
+    slopes = np.array([float(v) for v in shape.gradient(*center)])
+    n = bundle.index
+
+    def path(length: np.ndarray, position: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        return length + n * np.einsum("...i,...i", point - position, direction)
+
+    def along(direction: np.ndarray) -> np.ndarray:
+        return n * (direction[..., :2] + slopes * direction[..., 2:])
+
+    chief = path(bundle.chief_path, bundle.chief_position, bundle.chief_direction)
+    opd = chief[0] - path(bundle.path[0], bundle.position[0], bundle.direction[0])
+    return opd, along(bundle.direction[0]) - along(bundle.chief_direction[0])
+
+
+def _in_annulus(telescope: Telescope, points: np.ndarray) -> np.ndarray:
+    radius = 0.5 * telescope.pupil_diameter
+    distance = np.hypot(points[:, 0], points[:, 1])
+    return (distance <= radius) & (distance >= telescope.pupil_obscuration * radius)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _degrees(field: np.ndarray) -> str:
+    return "({:.6g}, {:.6g})".format(*np.rad2deg(field))

@@ -1,0 +1,1 @@
+"""Metrics of a design from rays and wavefronts."""

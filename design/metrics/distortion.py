@@ -1,0 +1,225 @@
+"""Distortion: where stars land, against a picture of the sky that is only scaled.
+
+The picture is the gnomonic one: positions on the detector go as the slopes of the light, ``r = f tan(theta)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+from ...models.telescope import Telescope
+from ...raytrace.rays import field_direction
+from ..bundles import RAYS_AT_ONCE, field_points, trace_bundles, wavelength_points
+from ..pupil_sampling import PupilSampling, pupil_sampling
+from .spots import REFERENCES, spots
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Points across the field of view where none are given.
+_ACROSS = 21
+#: Step of the slopes that the scale on the axis is taken from.
+_NEAR_AXIS = 1e-4
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Landing points against a scaled picture of the sky.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    reference : {"chief", "centroid"}
+        What stands for a star: where its chief ray lands, or the centroid of its light.
+    position : ndarray, shape [n_field, 2]
+        Landing points [m], x and y of the detector.
+    predicted : ndarray, shape [n_field, 2]
+        The scaled picture that fits them best: turned, shifted and if need be mirrored, but not distorted [m].
+    center : ndarray, shape [2]
+        Where that picture has the axis [m].
+    focal_length : float
+        Its scale, length on the detector over slope of the light [m/rad].
+    axis_focal_length : float
+        Scale at the axis itself [m/rad].
+    """
+
+    telescope: str
+    fields: np.ndarray
+    wavelength: float
+    reference: str
+    position: np.ndarray
+    predicted: np.ndarray
+    center: np.ndarray
+    focal_length: float
+    axis_focal_length: float
+
+    @property
+    def shift(self) -> np.ndarray:
+        """Landing point minus scaled picture [m], shape [n_field, 2]."""
+        return self.position - self.predicted
+
+    @property
+    def percent(self) -> np.ndarray:
+        """Distortion against the best-fitting scale [percent of the distance from the axis]; NaN on the axis."""
+        return self._percent(1.0)
+
+    @property
+    def percent_of_axis_scale(self) -> np.ndarray:
+        """Distortion against the scale at the axis, as lens designers quote it [percent]; NaN on the axis."""
+        return self._percent(self.axis_focal_length / self.focal_length)
+
+    def _percent(self, scale: float) -> np.ndarray:
+        ray, length = self.predicted - self.center, np.linalg.norm(self.predicted - self.center, axis=-1)
+        away = length > 1e-9 * length.max(initial=1e-30)
+        radial = ((self.position - self.center) * ray).sum(axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(away, 100.0 * (radial / (scale * length**2) - 1.0), np.nan)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; lists run over the fields."""
+        shift = np.linalg.norm(self.shift, axis=-1)
+        return {
+            "telescope": self.telescope,
+            "wavelength_nm": self.wavelength * 1e9,
+            "reference": self.reference,
+            "focal_length_m": self.focal_length,
+            "axis_focal_length_m": self.axis_focal_length,
+            "largest_percent": float(np.nanmax(np.abs(self.percent), initial=0.0)),
+            "largest_percent_of_axis_scale": float(np.nanmax(np.abs(self.percent_of_axis_scale), initial=0.0)),
+            "largest_shift_um": float(shift.max()) * 1e6,
+            "rms_shift_um": float(np.sqrt((shift**2).mean())) * 1e6,
+            "field_deg": np.rad2deg(self.fields),
+            "position_mm": self.position * 1e3,
+            "predicted_mm": self.predicted * 1e3,
+            "percent": self.percent,
+            "percent_of_axis_scale": self.percent_of_axis_scale,
+        }
+
+    def plot(self) -> Figure:
+        """Draw the distorted picture, exaggerated, and the distortion in percent against the distance from the axis."""
+        from ..plots.distortion import distortion_figure
+
+        return distortion_figure(self)
+
+
+def distortion(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelength: Any = None,
+    *,
+    reference: str = "chief",
+    sampling: str | PupilSampling = "gauss",
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Distortion:
+    """Compare landing points with a scaled picture of the sky.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad], at least three that do not lie on a line; a square lattice in the field of view by default.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    reference : {"chief", "centroid"}
+        What stands for a star.
+    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+        Points of the pupil, where centroids are asked for.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Raises
+    ------
+    ConfigError
+        If reference, sampling or projection is unknown.
+    DomainError
+        If fields or wavelength are out of range, too few, or a star does not reach the detector.
+    """
+    if reference not in REFERENCES:
+        raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
+    points = field_lattice(telescope, _ACROSS) if fields is None else field_points(telescope, fields)
+    (w,) = wavelength_points(telescope, wavelength)
+    light = field_direction(points[:, 0], points[:, 1], projection)
+    slopes = light[:, :2] / -light[:, 2:]
+    if len(points) < 3 or np.linalg.matrix_rank(slopes - slopes.mean(axis=0), tol=1e-9) < 2:
+        raise DomainError(f"fields of shape {points.shape}: expected at least three points that are not on a line")
+    position = _landing(
+        telescope, points, float(w), reference, pupil_sampling(telescope, sampling), projection, threads
+    )
+    if not np.isfinite(position).all():
+        lost = np.rad2deg(points[~np.isfinite(position).all(axis=1)][0])
+        raise DomainError(f"field = ({lost[0]:.6g}, {lost[1]:.6g}) deg: no light reaches the detector")
+    scale, turn, offset = _similarity(slopes, position)
+    near = _NEAR_AXIS * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    ends = trace_bundles(telescope, near, float(w), np.zeros((1, 2)), "gnomonic", threads).chief_landing()
+    jacobian = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * _NEAR_AXIS)
+    return Distortion(
+        telescope=telescope.name,
+        fields=points,
+        wavelength=float(w),
+        reference=reference,
+        position=position,
+        predicted=scale * slopes @ turn.T + offset,
+        center=offset,
+        focal_length=scale,
+        axis_focal_length=float(np.sqrt(np.abs(np.linalg.det(jacobian)))),
+    )
+
+
+def field_lattice(telescope: Telescope, across: int) -> np.ndarray:
+    """Return the points of a square lattice that lie in the field of view [rad], shape [n, 2], the axis among them.
+
+    Raises
+    ------
+    DomainError
+        If `across` is not an odd whole number of at least 3.
+    """
+    if int(across) != across or across < 3 or across % 2 == 0:
+        raise DomainError(f"across = {across!r}: expected an odd whole number of at least 3")
+    u = np.linspace(-1.0, 1.0, int(across)) * telescope.field_radius
+    x, y = np.meshgrid(u, u)
+    # Rounding must not drop the four points on the rim.
+    inside = np.hypot(x, y) <= telescope.field_radius * (1 + 1e-9)
+    return np.stack([x[inside], y[inside]], axis=-1)
+
+
+def _landing(
+    telescope: Telescope,
+    fields: np.ndarray,
+    wavelength: float,
+    reference: str,
+    pupil: PupilSampling,
+    projection: str,
+    threads: int | None,
+) -> np.ndarray:
+    if reference == "centroid":
+        step = max(1, RAYS_AT_ONCE // len(pupil))
+        parts = (fields[first : first + step] for first in range(0, len(fields), step))
+        options: dict[str, Any] = dict(sampling=pupil, projection=projection, threads=threads)
+        return np.concatenate([spots(telescope, part, wavelength, **options).reference for part in parts])
+    return trace_bundles(telescope, fields, wavelength, np.zeros((1, 2)), projection, threads).chief_landing()
+
+
+def _similarity(slopes: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return the scale, the rotation or reflection [2, 2] and the offset that carry slopes to positions best.
+
+    Least squares after Schoenemann (1966, Psychometrika 31, 1).
+    """
+    mean_slope, mean_position = slopes.mean(axis=0), position.mean(axis=0)
+    a, b = slopes - mean_slope, position - mean_position
+    left, strengths, right = np.linalg.svd(b.T @ a)
+    turn = left @ right
+    scale = float(strengths.sum() / (a**2).sum())
+    return scale, turn, mean_position - scale * turn @ mean_slope

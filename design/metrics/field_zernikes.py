@@ -1,0 +1,290 @@
+"""Annular Zernikes of the wavefront over the field of view, and double Zernikes.
+
+A double Zernike expansion is one in the pupil times one in the field, ``W(p, f) = sum a_kj Z_k(f) Z_j(p)``: annular
+Zernikes of the pupil (obscuration stated) and Zernikes of the full disc of the field, both in Noll's order and of mean
+square one. So ``a_kj`` is in metres, and the squares of all add up to the mean square wavefront over pupil and field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+from ...core.units import radians
+from ...models.telescope import Telescope
+from ...models.zernike_polynomials import annular_zernikes
+from ...wavefront.pupil_optics import trace_pupils
+from ..bundles import RAYS_AT_ONCE, field_points, wavelength_points
+from ..pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PUPILS = ("full", "lit")
+
+
+@dataclass(frozen=True)
+class FieldZernikes:
+    """Annular Zernike coefficients of the wavefront at several field points.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    coefficients : ndarray, shape [n_field, jmax]
+        Noll order from j = 1 [m]; orthonormal terms in entrance-pupil coordinates, so each is its own rms.
+    residual_rms : ndarray, shape [n_field]
+        Root mean square of what the terms leave, over the points that were fitted [m].
+    obscuration : float
+        Inner over outer radius of the annulus.
+    pupil : {"full", "lit"}
+        What was fitted: the whole annulus, vignetted or not, or only where light passes.
+    """
+
+    telescope: str
+    fields: np.ndarray
+    wavelength: float
+    coefficients: np.ndarray
+    residual_rms: np.ndarray
+    obscuration: float
+    pupil: str
+
+    @property
+    def rms(self) -> np.ndarray:
+        """Root mean square wavefront of the terms but piston and tilt [m], shape [n_field]."""
+        return np.sqrt((self.coefficients[:, 3:] ** 2).sum(axis=1))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; rows are fields, columns Noll indices from 1."""
+        return {
+            "telescope": self.telescope,
+            "wavelength_nm": self.wavelength * 1e9,
+            "obscuration": self.obscuration,
+            "pupil": self.pupil,
+            "field_deg": np.rad2deg(self.fields),
+            "rms_without_tilt_nm": self.rms * 1e9,
+            "residual_rms_nm": self.residual_rms * 1e9,
+            "zernike_nm": self.coefficients * 1e9,
+        }
+
+    def plot(self) -> Figure:
+        """Draw the terms as bars for each field; for many fields their rms over the field, and maps of the largest."""
+        from ..plots.field_zernikes import field_zernikes_figure
+
+        return field_zernikes_figure(self)
+
+
+@dataclass(frozen=True)
+class DoubleZernikes:
+    """Double Zernike coefficients: Zernikes of the field times annular Zernikes of the pupil.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape [kmax, jmax]
+        Coefficients [m]; rows are Noll indices of the field from k = 1, columns those of the pupil from j = 1.
+    field_radius : float
+        Radius of the field's disc [rad].
+    at_nodes : FieldZernikes
+        The pupil's coefficients at the nodes of the field quadrature, which the fit is made from.
+    residual_rms : ndarray, shape [jmax]
+        Root mean square over the field of what the field's terms leave of each pupil coefficient [m].
+    """
+
+    coefficients: np.ndarray
+    field_radius: float
+    at_nodes: FieldZernikes
+    residual_rms: np.ndarray
+
+    def at(self, fields: Any) -> np.ndarray:
+        """Return the pupil's coefficients that the expansion gives at field angles [rad], shape [n_field, jmax] [m]."""
+        x, y = np.atleast_2d(np.asarray(fields, dtype=np.float64)).T / self.field_radius
+        return annular_zernikes(len(self.coefficients), x, y).T @ self.coefficients
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; rows are field terms, columns pupil terms, both from 1."""
+        nodes = self.at_nodes
+        return {
+            "telescope": nodes.telescope,
+            "wavelength_nm": nodes.wavelength * 1e9,
+            "obscuration": nodes.obscuration,
+            "pupil": nodes.pupil,
+            "field_radius_deg": float(np.rad2deg(self.field_radius)),
+            "rms_without_tilt_nm": float(np.sqrt((self.coefficients[:, 3:] ** 2).sum())) * 1e9,
+            "residual_rms_nm": self.residual_rms * 1e9,
+            "double_zernike_nm": self.coefficients * 1e9,
+        }
+
+    def plot(self) -> Figure:
+        """Draw the table of coefficients as a picture, and the sizes of the pupil's terms."""
+        from ..plots.field_zernikes import double_zernikes_figure
+
+        return double_zernikes_figure(self)
+
+
+def wavefront_zernikes(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelength: Any = None,
+    *,
+    jmax: int = 28,
+    pupil: str = "full",
+    sampling: str | PupilSampling = "gauss",
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> FieldZernikes:
+    """Fit annular Zernikes to the wavefronts of several field points.
+
+    The wavefront is that of :func:`~pachon.wavefront.opd.wavefront_opd`, against the chief ray.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; five from the axis to the edge by default.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    jmax : int
+        Highest Noll index.
+    pupil : {"full", "lit"}
+        "full": project on the whole annulus, clear apertures ignored. The terms stay orthogonal, so a coefficient does
+        not depend on `jmax`, and it varies smoothly over the field. "lit": fit where light passes, as a measured
+        wavefront is.
+    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+        Points of the pupil, whose weights the fit takes.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Raises
+    ------
+    ConfigError
+        If pupil, sampling or projection is unknown.
+    DomainError
+        If fields or wavelength are out of range, there are fewer points than terms, or rays of the full annulus do not
+        reach the detector.
+    """
+    if pupil not in PUPILS:
+        raise ConfigError(f"pupil = {pupil!r}: expected one of {', '.join(PUPILS)}")
+    points = field_points(telescope, fields)
+    (w,) = wavelength_points(telescope, wavelength)
+    sample = pupil_sampling(telescope, sampling)
+    if int(jmax) != jmax or not 1 <= jmax <= len(sample):
+        raise DomainError(f"jmax = {jmax!r}: expected a whole number from 1 to the {len(sample)} points of the pupil")
+    unit = sample.points / (0.5 * telescope.pupil_diameter)
+    terms = annular_zernikes(int(jmax), unit[:, 0], unit[:, 1], telescope.pupil_obscuration).T
+    coefficients, residual = np.empty((len(points), int(jmax))), np.empty(len(points))
+    step = max(1, RAYS_AT_ONCE // len(sample))
+    for first in range(0, len(points), step):
+        part = slice(first, first + step)
+        optics = trace_pupils(telescope, points[part], w, sample.points, projection=projection, threads=threads)
+        value = -optics.path[:, 0]
+        used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
+        coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, points[part], pupil)
+    return FieldZernikes(
+        telescope=telescope.name,
+        fields=points,
+        wavelength=float(w),
+        coefficients=coefficients,
+        residual_rms=residual,
+        obscuration=telescope.pupil_obscuration,
+        pupil=pupil,
+    )
+
+
+def double_zernikes(
+    telescope: Telescope,
+    wavelength: Any = None,
+    *,
+    jmax: int = 28,
+    kmax: int = 22,
+    rings: int = 8,
+    field_radius: Any = None,
+    pupil: str = "full",
+    sampling: str | PupilSampling = "gauss",
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> DoubleZernikes:
+    """Expand the wavefront in Zernikes of pupil and field, by Gauss quadrature over the field of view.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    jmax, kmax : int
+        Highest Noll index in the pupil and in the field.
+    rings : int
+        Rings of the field quadrature, each of ``4 rings`` points: what varies over the field up to degree ``2 rings``
+        comes out exactly.
+    field_radius : float or Quantity, optional
+        Radius of the field's disc [rad]; that of the field of view by default.
+    pupil, sampling, projection, threads
+        As for :func:`wavefront_zernikes`.
+
+    Raises
+    ------
+    ConfigError
+        If pupil, sampling or projection is unknown.
+    DomainError
+        If the wavelength or the disc is out of range, or there are too few points for the terms.
+    """
+    radius = telescope.field_radius if field_radius is None else float(radians(field_radius, "field_radius"))
+    if not (np.isfinite(radius) and radius > 0):
+        raise DomainError(f"field_radius = {field_radius!r}: expected a positive angle")
+    nodes = gauss_annulus(radius, 0.0, rings, 4 * rings)
+    if int(kmax) != kmax or not 1 <= kmax <= len(nodes):
+        raise DomainError(f"kmax = {kmax!r}: expected a whole number from 1 to the {len(nodes)} points of the field")
+    at_nodes = wavefront_zernikes(
+        telescope,
+        nodes.points,
+        wavelength,
+        jmax=jmax,
+        pupil=pupil,
+        sampling=sampling,
+        projection=projection,
+        threads=threads,
+    )
+    terms = annular_zernikes(int(kmax), *(nodes.points.T / radius)).T
+    root = np.sqrt(nodes.weights)[:, None]
+    coefficients, *_ = np.linalg.lstsq(terms * root, at_nodes.coefficients * root, rcond=None)
+    rest = at_nodes.coefficients - terms @ coefficients
+    return DoubleZernikes(coefficients, radius, at_nodes, np.sqrt(nodes.weights @ rest**2))
+
+
+def _fit(
+    terms: np.ndarray, value: np.ndarray, used: np.ndarray, weights: np.ndarray, fields: np.ndarray, pupil: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit terms [n_pupil, jmax] to wavefronts [n_field, n_pupil] by weighted least squares over the points used."""
+    root = np.sqrt(weights)
+    jmax = terms.shape[1]
+    short = used.sum(axis=1) < (len(weights) if pupil == "full" else jmax)
+    if short.any():
+        field = np.rad2deg(fields[short][0])
+        what = f"field = ({field[0]:.6g}, {field[1]:.6g}) deg"
+        if pupil == "full":
+            raise DomainError(f"{what}: rays of the annulus miss the detector; pupil='lit' leaves them out")
+        raise DomainError(f"{what}: {int(used[short][0].sum())} pupil points are lit; expected at least {jmax}")
+    coefficients = np.empty((len(value), jmax))
+    everything = used.all(axis=1)
+    if everything.any():
+        # One factorisation serves all fields whose points are the same.
+        orthogonal, triangle = np.linalg.qr(terms * root[:, None])
+        size = np.abs(np.diag(triangle))
+        if size.min() < 1e-9 * size.max():
+            raise DomainError(f"jmax = {jmax}: the {len(weights)} points of the pupil do not tell so many terms apart")
+        coefficients[everything] = np.linalg.solve(triangle, (value[everything] * root @ orthogonal).T).T
+    for i in np.flatnonzero(~everything):
+        lit = used[i]
+        coefficients[i], *_ = np.linalg.lstsq(terms[lit] * root[lit, None], value[i, lit] * root[lit], rcond=None)
+    rest = np.where(used, value - coefficients @ terms.T, 0.0)
+    return coefficients, np.sqrt((rest**2 @ weights) / (used @ weights))

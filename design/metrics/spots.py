@@ -1,0 +1,224 @@
+"""Spot diagrams: where the rays of a star land on the detector, and the sizes that follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+from ...models.telescope import Telescope
+from ..bundles import field_points, trace_bundles, wavelength_points
+from ..pupil_sampling import PupilSampling, pupil_sampling
+from .principal_rays import principal_rays
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+REFERENCES = ("centroid", "chief")
+
+
+@dataclass(frozen=True)
+class SpotDiagram:
+    """Spots of several field points, all wavelengths together.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    displacement : ndarray, shape [n_field, n_wave, n_pupil, 2]
+        Landing points relative to `reference` [m], x and y of the detector; NaN where a ray does not arrive.
+    weight : ndarray, shape [n_field, n_wave, n_pupil]
+        What each ray contributes to the light of its field, area of the pupil times weight of the wavelength; zero
+        where it is vignetted. The sum over a field is the part of the pupil that is lit.
+    reference : ndarray, shape [n_field, 2]
+        Detector coordinates [m] that the displacements start from: the centroid of the light, or where the chief ray of
+        the middle wavelength lands.
+    plate_scale : ndarray, shape [n_field]
+        Angle on the sky over length on the detector at each field [rad/m].
+    airy_radius : ndarray, shape [n_field]
+        Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m].
+    """
+
+    telescope: str
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    displacement: np.ndarray
+    weight: np.ndarray
+    reference: np.ndarray
+    plate_scale: np.ndarray
+    airy_radius: np.ndarray
+
+    @property
+    def lit_fraction(self) -> np.ndarray:
+        """Part of the entrance pupil that is lit, shape [n_field]."""
+        return self.weight.sum(axis=(1, 2))
+
+    @property
+    def centroid(self) -> np.ndarray:
+        """Centroid of the light relative to `reference` [m], shape [n_field, 2]."""
+        return self._mean(self.displacement)
+
+    @property
+    def rms_radius(self) -> np.ndarray:
+        """Root mean square distance from the centroid [m], shape [n_field]; NaN where no light arrives."""
+        return np.sqrt(self.rms_xy[:, 0] ** 2 + self.rms_xy[:, 1] ** 2)
+
+    @property
+    def rms_xy(self) -> np.ndarray:
+        """Root mean square distance from the centroid along x and y [m], shape [n_field, 2]."""
+        return np.sqrt(self._mean(self._centered() ** 2))
+
+    @property
+    def geometric_radius(self) -> np.ndarray:
+        """Largest distance of a lit ray from the centroid [m], shape [n_field]."""
+        radius = np.where(self.weight > 0, np.linalg.norm(self._centered(), axis=-1), -np.inf)
+        largest = radius.max(axis=(1, 2))
+        return np.where(largest >= 0, largest, np.nan)
+
+    def radius_holding(self, share: float = 0.8) -> np.ndarray:
+        """Return the radius about the centroid that holds a share of the rays [m], shape [n_field].
+
+        Geometric: diffraction is left out. The rays in the order of their radii are taken to stand in the middle of the
+        light that they carry, those of one radius together, and the radius is interpolated between two of them.
+        """
+        if not 0 < share < 1:
+            raise DomainError(f"share = {share!r}: expected a number between 0 and 1")
+        radii = np.linalg.norm(self._centered(), axis=-1).reshape(len(self.fields), -1)
+        weights = self.weight.reshape(len(self.fields), -1)
+        found = np.full(len(self.fields), np.nan)
+        for i, (radius, weight) in enumerate(zip(radii, weights, strict=True)):
+            order = np.argsort(radius[weight > 0], kind="stable")
+            if len(order):
+                found[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], share)
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; lists run over the fields."""
+        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        sizes = {
+            "rms_radius": self.rms_radius,
+            "radius_80_percent": self.radius_holding(0.8),
+            "geometric_radius": self.geometric_radius,
+            "airy_radius": self.airy_radius,
+        }
+        return {
+            "telescope": self.telescope,
+            "wavelength_nm": self.wavelengths * 1e9,
+            "rays_per_field": int(np.prod(self.weight.shape[1:])),
+            "field_deg": np.rad2deg(self.fields),
+            "reference_mm": self.reference * 1e3,
+            "centroid_um": self.centroid * 1e6,
+            "rms_xy_um": self.rms_xy * 1e6,
+            **{f"{name}_um": value * 1e6 for name, value in sizes.items()},
+            **{f"{name}_arcsec": value * arcsec for name, value in sizes.items()},
+            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+            "lit_fraction": self.lit_fraction,
+        }
+
+    def plot(self) -> Figure:
+        """Draw a panel for each field, all on one scale, with the Airy disc and a scale bar."""
+        from ..plots.spots import spots_figure
+
+        return spots_figure(self)
+
+    def _mean(self, values: np.ndarray) -> np.ndarray:
+        """Return the weighted mean of values [n_field, n_wave, n_pupil, 2] over the rays of each field."""
+        known = np.where(self.weight[..., None] > 0, values, 0.0)
+        with np.errstate(invalid="ignore"):
+            return np.einsum("fwp,fwpi->fi", self.weight, known) / self.lit_fraction[:, None]
+
+    def _centered(self) -> np.ndarray:
+        return self.displacement - self.centroid[:, None, None]
+
+
+def spots(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelengths: Any = None,
+    *,
+    wavelength_weights: Any = None,
+    sampling: str | PupilSampling = "gauss",
+    reference: str = "centroid",
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> SpotDiagram:
+    """Trace spot diagrams.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; five from the axis to the edge by default.
+    wavelengths : array_like or Quantity, shape [n_wave], optional
+        Vacuum wavelengths [m]; the telescope's own by default.
+    wavelength_weights : array_like, shape [n_wave], optional
+        Relative amounts of light; equal by default.
+    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+        Points of the pupil.
+    reference : {"centroid", "chief"}
+        What the displacements start from: the centroid, or the chief ray of the middle wavelength.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Raises
+    ------
+    ConfigError
+        If sampling, reference or projection is unknown.
+    DomainError
+        If fields or wavelengths lie outside what the telescope covers, or the weights do not match.
+    """
+    if reference not in REFERENCES:
+        raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
+    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+    shares = checked_weights(wavelength_weights, len(waves))
+    pupil = pupil_sampling(telescope, sampling)
+    middle = len(waves) // 2
+    bundles = [trace_bundles(telescope, points, float(w), pupil.points, projection, threads) for w in waves]
+    principal = principal_rays(telescope, points, waves[middle], projection=projection, threads=threads)
+    chief = bundles[middle].chief_landing()
+    lit = np.stack([b.lit for b in bundles], axis=1)
+    diagram = SpotDiagram(
+        telescope=telescope.name,
+        fields=points,
+        wavelengths=waves,
+        displacement=np.stack([b.landing() for b in bundles], axis=1) - chief[:, None, None],
+        weight=np.where(lit, shares[:, None] * pupil.weights, 0.0),
+        reference=chief,
+        plate_scale=principal.mean_plate_scale,
+        airy_radius=1.22 * waves[middle] * principal.mean_f_number,
+    )
+    if reference == "chief":
+        return diagram
+    centroid = diagram.centroid
+    return replace(diagram, displacement=diagram.displacement - centroid[:, None, None], reference=chief + centroid)
+
+
+def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """Return where ascending values pass a share of their weights; equal ones, but for rounding, count as one."""
+    starts = np.flatnonzero(np.diff(values, prepend=-np.inf) > 1e-9 * values[-1])
+    held = np.add.reduceat(weights, starts)
+    middle = (np.cumsum(held) - 0.5 * held) / held.sum()
+    return float(np.interp(share, middle, values[starts]))
+
+
+def checked_weights(weights: Any, count: int) -> np.ndarray:
+    """Return relative weights of so many wavelengths, of sum 1; equal where none are given.
+
+    Raises
+    ------
+    DomainError
+        If there are more or fewer, or one is negative, or all are zero.
+    """
+    values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
+        raise DomainError(f"wavelength_weights = {weights!r}: expected {count} numbers, none negative, not all zero")
+    return values / values.sum()

@@ -1,0 +1,221 @@
+"""Spots and wavefronts against the height of the detector, and where focus is best.
+
+Behind the last surface rays are straight, so one trace gives the figures at every height: landing points move in
+proportion to it, and the mean square radius is a parabola in it, whose minimum is known without a search. The wavefront
+is measured anew at each height, on a sphere about where the chief ray meets the detector there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...core.units import metres
+from ...models.telescope import Telescope
+from ..bundles import Bundles, field_points, trace_bundles, wavelength_points
+from ..pupil_sampling import PupilSampling, pupil_sampling
+from .principal_rays import principal_rays
+from .spots import checked_weights
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Heights where none are given.
+_HEIGHTS = 61
+
+
+@dataclass(frozen=True)
+class ThroughFocus:
+    """Image quality against the height of the detector.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    defocus : ndarray, shape [n_height]
+        Heights of the detector above its place [m], along its own z axis.
+    rms_radius : ndarray, shape [n_field, n_height]
+        Root mean square radius of the spots about their centroids, all wavelengths together [m].
+    rms_wavefront : ndarray, shape [n_field, n_height]
+        Root mean square of the wavefront without piston and tilt, in quadrature over the wavelengths [m].
+    strehl : ndarray, shape [n_field, n_height]
+        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, tilt taken off; mean over the
+        wavelengths. The Strehl ratio where that is the brightest point, so for small aberrations.
+    best_spot : ndarray, shape [n_field]
+        Height of the smallest rms radius of each field [m].
+    best_wavefront : ndarray, shape [n_field]
+        Height of the smallest rms wavefront of each field [m]; NaN where it lies outside the heights.
+    best_common : float
+        The height at which the mean square radius of all fields is smallest [m].
+    smallest_radius : ndarray, shape [n_field]
+        Root mean square radius at `best_spot` [m].
+    """
+
+    telescope: str
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    defocus: np.ndarray
+    rms_radius: np.ndarray
+    rms_wavefront: np.ndarray
+    strehl: np.ndarray
+    best_spot: np.ndarray
+    best_wavefront: np.ndarray
+    best_common: float
+    smallest_radius: np.ndarray
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; rows are fields, columns heights of the detector."""
+        return {
+            "telescope": self.telescope,
+            "wavelength_nm": self.wavelengths * 1e9,
+            "field_deg": np.rad2deg(self.fields),
+            "best_focus_spot_um": self.best_spot * 1e6,
+            "best_focus_wavefront_um": self.best_wavefront * 1e6,
+            "best_focus_common_um": self.best_common * 1e6,
+            "smallest_rms_radius_um": self.smallest_radius * 1e6,
+            "defocus_um": self.defocus * 1e6,
+            "rms_radius_um": self.rms_radius * 1e6,
+            "rms_wavefront_nm": self.rms_wavefront * 1e9,
+            "strehl": self.strehl,
+        }
+
+    def plot(self) -> Figure:
+        """Draw rms radius, rms wavefront and Strehl ratio against the height of the detector."""
+        from ..plots.through_focus import through_focus_figure
+
+        return through_focus_figure(self)
+
+
+def through_focus(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelengths: Any = None,
+    defocus: Any = None,
+    *,
+    wavelength_weights: Any = None,
+    sampling: str | PupilSampling = "gauss",
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> ThroughFocus:
+    """Measure spots and wavefronts against the height of the detector.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; five from the axis to the edge by default.
+    wavelengths : array_like or Quantity, shape [n_wave], optional
+        Vacuum wavelengths [m]; the telescope's own by default.
+    defocus : array_like or Quantity, shape [n_height], optional
+        Heights of the detector above its place [m], ascending; by default about the common best focus, as far as the
+        spots grow to about three times their size.
+    wavelength_weights : array_like, shape [n_wave], optional
+        Relative amounts of light; equal by default.
+    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+        Points of the pupil.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Raises
+    ------
+    DomainError
+        If fields, wavelengths or heights are out of range, or a field gets no light.
+    """
+    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+    shares = checked_weights(wavelength_weights, len(waves))
+    pupil = pupil_sampling(telescope, sampling)
+    bundles = [trace_bundles(telescope, points, float(w), pupil.points, projection, threads) for w in waves]
+    square = _mean_squares(bundles, shares, pupil.weights, points)
+    best = -square[:, 1] / (2.0 * square[:, 2])
+    total = square.sum(axis=0)
+    common = float(-total[1] / (2.0 * total[2]))
+    smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
+    if defocus is None:
+        principal = principal_rays(telescope, points, waves[len(waves) // 2], projection=projection, threads=threads)
+        blur = max(float(smallest.max()), float((waves.mean() * principal.mean_f_number).max()))
+        reach = float(np.abs(best - common).max()) + 3.0 * blur / float(np.sqrt(square[:, 2].min()))
+        heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
+    else:
+        heights = np.atleast_1d(metres(defocus, "defocus"))
+        if heights.ndim != 1 or not (np.isfinite(heights).all() and (np.diff(heights) > 0).all() and len(heights)):
+            raise DomainError(f"defocus = {defocus!r}: expected ascending heights of the detector in metres")
+    wavefront, strehl = _wavefronts(telescope, bundles, shares, pupil, heights)
+    return ThroughFocus(
+        telescope=telescope.name,
+        fields=points,
+        wavelengths=waves,
+        defocus=heights,
+        rms_radius=np.sqrt(np.maximum(np.polynomial.polynomial.polyval(heights, square.T), 0.0)),
+        rms_wavefront=wavefront,
+        strehl=strehl,
+        best_spot=best,
+        best_wavefront=np.array([_lowest(heights, row**2) for row in wavefront]),
+        best_common=common,
+        smallest_radius=smallest,
+    )
+
+
+def _mean_squares(bundles: list[Bundles], shares: np.ndarray, weights: np.ndarray, fields: np.ndarray) -> np.ndarray:
+    """Return the mean square radius of each field as a parabola in the height, coefficients [n_field, 3]."""
+    lit = np.stack([b.lit for b in bundles], axis=1)
+    weight = np.where(lit, shares[:, None] * weights, 0.0)
+    light = weight.sum(axis=(1, 2))
+    if not (light > 0).all():
+        dark = np.rad2deg(fields[~(light > 0)][0])
+        raise DomainError(f"field = ({dark[0]:.6g}, {dark[1]:.6g}) deg: no light reaches the detector")
+    weight /= light[:, None, None]
+    start = np.stack([b.landing() for b in bundles], axis=1)
+    slope = np.stack([b.direction[..., :2] / b.direction[..., 2:] for b in bundles], axis=1)
+
+    def centered(values: np.ndarray) -> np.ndarray:
+        values = np.where(lit[..., None], values, 0.0)
+        return values - np.einsum("fwp,fwpi->fi", weight, values)[:, None, None]
+
+    start, slope = centered(start), centered(slope)
+
+    def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.einsum("fwp,fwpi,fwpi->f", weight, a, b)
+
+    return np.stack([mean(start, start), 2.0 * mean(start, slope), mean(slope, slope)], axis=-1)
+
+
+def _wavefronts(
+    telescope: Telescope, bundles: list[Bundles], shares: np.ndarray, pupil: PupilSampling, heights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rms wavefront [m] and Strehl ratio, shape [n_field, n_height] each."""
+    plane = np.stack([np.ones(len(pupil)), *(pupil.points.T / (0.5 * telescope.pupil_diameter))], axis=-1)
+    square, strehl = np.zeros((2, len(bundles[0].chief_path), len(heights)))
+    for bundle, share in zip(bundles, shares, strict=True):
+        for i, lit in enumerate(bundle.lit):
+            if not lit.any():
+                continue
+            weight = pupil.weights[lit] / pupil.weights[lit].sum()
+            # Weighted least squares by one factorisation serves all heights.
+            basis = np.linalg.qr(plane[lit] * np.sqrt(weight)[:, None])[0]
+            for k, height in enumerate(heights):
+                value = bundle.one(i).opd(telescope.reference_sphere_radius, float(height))[0, lit]
+                scaled = value * np.sqrt(weight)
+                rest = scaled - basis @ (basis.T @ scaled)
+                square[i, k] += share * (rest**2).sum()
+                phase = 2.0 * np.pi / bundle.wavelength * rest / np.sqrt(weight)
+                strehl[i, k] += share * np.abs((weight * np.exp(1j * phase)).sum()) ** 2
+    return np.sqrt(square), strehl
+
+
+def _lowest(x: np.ndarray, y: np.ndarray) -> float:
+    """Return where a sampled curve is lowest, by the parabola through the lowest sample and its neighbours."""
+    i = int(np.argmin(y))
+    if not 0 < i < len(x) - 1:
+        return float("nan")
+    curve = np.polynomial.Polynomial.fit(x[i - 1 : i + 2], y[i - 1 : i + 2], 2)
+    return float(curve.deriv().roots()[0].real)

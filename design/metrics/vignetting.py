@@ -1,0 +1,145 @@
+"""Vignetting: how much of the entrance pupil lights the detector, against field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...models.telescope import Telescope
+from ..bundles import bundle_blocks, field_points, wavelength_points
+from ..pupil_sampling import spiral_annulus
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Rings and spokes of field points where none are given.
+_RINGS, _SPOKES = 14, 24
+
+
+@dataclass(frozen=True)
+class Vignetting:
+    """Part of the entrance pupil that lights the detector.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    fraction : ndarray, shape [n_field]
+        Part of the area of the entrance pupil, the annulus of its diameter and obscuration, through which light reaches
+        the detector. The light of a field also goes with the cosine of its angle, which is not in here.
+    error : ndarray, shape [n_field]
+        Estimate of the standard error of `fraction`, which the finite number of rays leaves.
+    axis_fraction : float
+        The same on the axis.
+    """
+
+    telescope: str
+    fields: np.ndarray
+    wavelength: float
+    fraction: np.ndarray
+    error: np.ndarray
+    axis_fraction: float
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Light relative to the axis, shape [n_field]."""
+        return self.fraction / self.axis_fraction
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; lists run over the fields."""
+        return {
+            "telescope": self.telescope,
+            "wavelength_nm": self.wavelength * 1e9,
+            "axis_fraction": self.axis_fraction,
+            "smallest_relative": float(self.relative.min()),
+            "largest_error": float(self.error.max()),
+            "field_deg": np.rad2deg(self.fields),
+            "radius_deg": np.rad2deg(np.linalg.norm(self.fields, axis=-1)),
+            "fraction": self.fraction,
+            "error": self.error,
+            "relative": self.relative,
+        }
+
+    def plot(self) -> Figure:
+        """Draw the light relative to the axis against the distance from it and, where fields suffice, as a map."""
+        from ..plots.vignetting import vignetting_figure
+
+        return vignetting_figure(self)
+
+
+def vignetting(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelength: Any = None,
+    *,
+    rays: int = 16384,
+    projection: str = "zemax",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Vignetting:
+    """Trace the part of the entrance pupil that is lit, field by field.
+
+    Points of equal weight fill the annulus of the pupil. Every fourth of them is a sampling of its own, and half the
+    standard deviation of the four estimates is the error that is given.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; rings and spokes over the field of view by default.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    rays : int
+        Rays of each field.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+    progress : callable, optional
+        Told, now and then, how many fields more are done; the axis counts as one.
+
+    Raises
+    ------
+    DomainError
+        If fields, wavelength or the number of rays are out of range, or no light reaches the detector on the axis.
+    """
+    if int(rays) != rays or rays < 16:
+        raise DomainError(f"rays = {rays!r}: expected a whole number of at least 16")
+    points = field_disc(telescope) if fields is None else field_points(telescope, fields)
+    (w,) = wavelength_points(telescope, wavelength)
+    # A multiple of four, so that the four parts are as large as each other.
+    pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, 4 * (int(rays) // 4)).points
+    everywhere = np.concatenate([np.zeros((1, 2)), points])
+    quarters = np.empty((len(everywhere), 4))
+    for some, bundles in bundle_blocks(telescope, everywhere, float(w), pupil, projection, threads):
+        quarters[some] = bundles.lit.reshape(len(bundles.lit), -1, 4).mean(axis=1)
+        if progress is not None:
+            progress(some.stop - some.start)
+    fraction = quarters.mean(axis=1)
+    if not fraction[0] > 0:
+        raise DomainError(f"telescope {telescope.name}: expected one with light on the axis; all of it is vignetted")
+    return Vignetting(
+        telescope=telescope.name,
+        fields=points,
+        wavelength=float(w),
+        fraction=fraction[1:],
+        error=0.5 * quarters[1:].std(axis=1, ddof=1),
+        axis_fraction=float(fraction[0]),
+    )
+
+
+def field_disc(telescope: Telescope, rings: int = _RINGS, spokes: int = _SPOKES) -> np.ndarray:
+    """Return the axis and rings of equal spacing out to the edge of the field of view [rad], shape [n, 2]."""
+    radius = telescope.field_radius * np.arange(1, rings + 1)[:, None] / rings
+    angle = 2.0 * np.pi * np.arange(spokes) / spokes
+    disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(-1, 2)
+    return np.concatenate([np.zeros((1, 2)), disc])

@@ -1,0 +1,1 @@
+"""Derivatives of wavefronts and spots, merit functions, optimisation."""

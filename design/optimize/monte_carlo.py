@@ -1,0 +1,229 @@
+"""What telescopes within their tolerances are worth: many draws, each traced, or all through the exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError, PachonError
+from ...models.telescope import Telescope
+from ..parameters.degrees_of_freedom import DegreesOfFreedom
+from ..parameters.tolerances import Tolerance, draw
+from .jacobian import ParameterColumns
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit
+from .optimize import NO_EFFECT, beams
+from .sensitivity import field_rings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MERITS: dict[str, Callable[[Telescope, Beams], Merit]] = {"wavefront": WavefrontMerit, "spots": SpotMerit}
+_SHARES = (50, 80, 90, 95)
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """The merit of telescopes drawn within tolerances.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    merit_name : str
+        "wavefront" (rms without piston and tilt) or "spots" (rms radius), over all fields and wavelengths.
+    method : str
+        "linear" or "traced".
+    tolerances : tuple of Tolerance
+        The tolerances.
+    compensators : tuple of str
+        Degrees of freedom that are set anew for each draw.
+    units, compensator_units : tuple of str
+        Units of the deviations and of the compensators.
+    deviations : ndarray, shape [n, n_tolerance]
+        What was drawn.
+    moves : ndarray, shape [n, n_compensator]
+        Where the compensators were set.
+    merit : ndarray, shape [n]
+        Merit of each draw [m]; NaN where a traced telescope lost rays.
+    nominal : float
+        Merit of the telescope as it is, compensated [m].
+    contribution : ndarray, shape [n_tolerance]
+        Root mean square that each tolerance alone adds, compensated, in quadrature, to first order [m].
+    """
+
+    telescope: str
+    merit_name: str
+    method: str
+    tolerances: tuple[Tolerance, ...]
+    compensators: tuple[str, ...]
+    units: tuple[str, ...]
+    compensator_units: tuple[str, ...]
+    deviations: np.ndarray
+    moves: np.ndarray
+    merit: np.ndarray
+    nominal: float
+    contribution: np.ndarray
+
+    def at_most(self, share: float) -> float:
+        """Return the merit [m] that a share (0 to 1) of the telescopes keeps below; lost ones count as the worst."""
+        return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), share, method="higher"))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names."""
+        return {
+            "telescope": self.telescope,
+            "merit": self.merit_name,
+            "method": self.method,
+            "draws": len(self.merit),
+            "lost": int(np.isnan(self.merit).sum()),
+            "nominal_m": self.nominal,
+            **{f"at_most_{share}_percent_m": self.at_most(share / 100.0) for share in _SHARES},
+            "tolerances": [t.name for t in self.tolerances],
+            "units": list(self.units),
+            "contribution_m": self.contribution,
+            "compensators": list(self.compensators),
+            "compensator_units": list(self.compensator_units),
+            "compensator_rms": np.sqrt((self.moves**2).mean(axis=0)),
+        }
+
+    def plot(self) -> Figure:
+        """Draw how the merit is distributed, and what each tolerance contributes."""
+        from ..plots.monte_carlo import monte_carlo_figure
+
+        return monte_carlo_figure(self)
+
+
+def monte_carlo(
+    telescope: Telescope,
+    tolerances: Iterable[Tolerance],
+    merit: str = "wavefront",
+    n: int = 100,
+    seed: int = 0,
+    *,
+    degrees_of_freedom: DegreesOfFreedom | None = None,
+    compensators: Iterable[str] = (),
+    method: str = "linear",
+    fields: Any = None,
+    wavelengths: Any = None,
+    sampling: Any = "gauss",
+    count: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> MonteCarlo:
+    """Draw telescopes within tolerances and return their merits.
+
+    The linear method takes the residuals of the merit as linear in the deviations, with their exact derivatives: a
+    thousand draws cost little more than one, and the merit itself, the root of a sum of squares, is not linearised.
+    The traced method traces each telescope. Compensators are set by linear least squares in both.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    tolerances : iterable of Tolerance
+        Of degrees of freedom by name, or of parameters by address where no degrees of freedom are given.
+    merit : {"wavefront", "spots"}
+        What telescopes are judged by.
+    n : int
+        Number of draws.
+    seed : int
+        Seed of the draws.
+    degrees_of_freedom : DegreesOfFreedom, optional
+        What the names belong to.
+    compensators : iterable of str
+        Names of degrees of freedom that make the best of each draw, such as the camera's focus.
+    method : {"linear", "traced"}
+        How the merit is found.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; by default 31 over the field of view, see :func:`~.field_rings`.
+    wavelengths, sampling, count, projection, threads :
+        As for :func:`~pachon.design.optimize.optimize.optimize`.
+    progress : callable, optional
+        Called with the number of draws done, of the traced method.
+
+    Raises
+    ------
+    ConfigError
+        If a merit or method does not exist, or something is both tolerance and compensator.
+    UnknownNameError, DomainError
+        If a name does not exist, a number is out of range, or no light arrives.
+    """
+    chosen, free = tuple(tolerances), tuple(compensators)
+    if merit not in MERITS:
+        raise ConfigError(f"merit = {merit!r}: expected one of {', '.join(MERITS)}")
+    if method not in ("linear", "traced"):
+        raise ConfigError(f"method = {method!r}: expected 'linear' or 'traced'")
+    deviations = draw(chosen, seed, n)
+    names = [t.name for t in chosen] + list(free)
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{name!r} occurs more than once: expected either a tolerance or a compensator")
+    dof = degrees_of_freedom or DegreesOfFreedom.of_parameters(telescope, names)
+    dof = dof.select(names)
+
+    fields = field_rings(telescope) if fields is None else fields
+    rays = beams(telescope, fields, wavelengths, None, None, sampling, count, projection, threads)
+    judge: Merit = MERITS[merit](telescope, rays)
+    prepared, parameters, matrix = dof.combination(telescope)
+    columns = ParameterColumns.at(prepared, parameters)
+    residuals, slopes = judge.derivatives(columns)
+    slopes = slopes @ matrix
+    by_draw, by_free = slopes[:, : len(chosen)], slopes[:, len(chosen) :]
+    # What of an effect may be rounding: that much of the terms that cancel.
+    least = NO_EFFECT * (judge.size_of_terms(columns) @ np.abs(matrix))[len(chosen) :] if free else np.zeros(0)
+    setting = _settings(by_free, free, least)
+    # After the best setting of the compensators, what is left of the residuals and of their slopes.
+    fixed = residuals - by_free @ (setting @ residuals)
+    left = by_draw - by_free @ (setting @ by_draw)
+    moves = -(deviations @ (setting @ by_draw).T + setting @ residuals)
+    contribution = np.linalg.norm(left, axis=0) * np.array([t.spread for t in chosen])
+    if method == "linear":
+        # |r + J v|^2 through the small matrices J^T J and J^T r.
+        square = fixed @ fixed + 2.0 * deviations @ (left.T @ fixed)
+        square = square + np.einsum("ni,ij,nj->n", deviations, left.T @ left, deviations)
+        found = np.sqrt(np.maximum(square, 0.0))
+        nominal = float(np.linalg.norm(fixed))
+    else:
+        found = np.empty(len(deviations))
+        for i, values in enumerate(np.concatenate([deviations, moves], axis=1)):
+            found[i] = _merit(judge, dof.apply(telescope, values))
+            if progress is not None:
+                progress(i + 1)
+        still = np.concatenate([np.zeros(len(chosen)), -(setting @ residuals)])
+        nominal = _merit(judge, dof.apply(telescope, still))
+    units = dof.units
+    return MonteCarlo(
+        telescope=telescope.name,
+        merit_name=merit,
+        method=method,
+        tolerances=chosen,
+        compensators=free,
+        units=units[: len(chosen)],
+        compensator_units=units[len(chosen) :],
+        deviations=deviations,
+        moves=moves,
+        merit=found,
+        nominal=nominal,
+        contribution=contribution,
+    )
+
+
+def _merit(judge: Merit, telescope: Telescope) -> float:
+    """Return the merit of a telescope [m]; NaN where its light gets lost."""
+    try:
+        return float(np.linalg.norm(judge.residuals(telescope)))
+    except PachonError:
+        return np.nan
+
+
+def _settings(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> np.ndarray:
+    """Return the matrix that takes residuals to the opposite of the best setting of compensators, [n_free, n]."""
+    size = np.linalg.norm(slopes, axis=0)
+    for name, value, rounding in zip(names, size, least, strict=True):
+        if not value > rounding:
+            raise DomainError(f"compensator {name!r} has no effect on the merit: expected one that has")
+    return np.linalg.pinv(slopes / size, rcond=1e-9) / size[:, None] if names else np.zeros((0, len(slopes)))

@@ -1,0 +1,389 @@
+"""Optimise a telescope: least squares over chosen variables, with exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from ...core.errors import ConfigError, DomainError, PachonError
+from ...core.single_thread import one_blas_thread
+from ...models.telescope import Telescope
+from ...raytrace.rays import RayStatus
+from ..bundles import field_points, wavelength_points
+from ..parameters.parameters import Parameter, apply, parse_parameters
+from ..pupil_sampling import pupil_sampling
+from .jacobian import ParameterColumns
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit
+from .targets import FocalLength, Target
+from .wavefront_derivatives import WavefrontBlock
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Points along the radius of the pupil by default.
+_RINGS = 6
+#: A variable whose effect is below this fraction of what single surfaces do to single rays has none: it is rounding.
+NO_EFFECT = 1e-11
+#: Effect of the longest first step, in units of the merit at the start.
+_FIRST_STEP = 100.0
+#: Variables whose effects, each scaled to 1, add up to less than this in some combination are collinear.
+_COLLINEAR = 1e-6
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """What an optimisation found.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        The new telescope.
+    variables : tuple of Parameter
+        What was free.
+    changes : ndarray, shape [n_variable]
+        Change of each, in its own unit.
+    start_values, values : ndarray, shape [n_variable]
+        What the telescope had and has; motions are counted from the start.
+    merit_name : str
+        "spots" or "wavefront".
+    history : ndarray, shape [n_step + 1]
+        Rms of merit and targets [m] before the first step and after each.
+    effect : ndarray, shape [n_variable]
+        Rms change of the merit's residuals per unit of each variable [m], at the solution.
+    covariance : ndarray, shape [n_variable, n_variable]
+        Covariance of the variables, from the residuals that are left taken as noise; that of combinations without
+        effect is left out.
+    collinear : tuple of str
+        Combinations of variables that the merit cannot tell apart, such as "M1.radius - 0.998 M1.curvature".
+    message : str
+        Why the solver stopped.
+    """
+
+    telescope: Telescope
+    variables: tuple[Parameter, ...]
+    changes: np.ndarray
+    start_values: np.ndarray
+    values: np.ndarray
+    merit_name: str
+    history: np.ndarray
+    effect: np.ndarray
+    covariance: np.ndarray
+    collinear: tuple[str, ...]
+    message: str
+
+    @property
+    def uncertainty(self) -> np.ndarray:
+        """Standard deviation of each variable, in its own unit, shape [n_variable]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names."""
+        return {
+            "telescope": self.telescope.name,
+            "merit": self.merit_name,
+            "rms_start_m": self.history[0],
+            "rms_end_m": self.history[-1],
+            "steps": len(self.history) - 1,
+            "variables": [p.address for p in self.variables],
+            "units": [p.unit or "1" for p in self.variables],
+            "start_values": self.start_values,
+            "values": self.values,
+            "changes": self.changes,
+            "uncertainty": self.uncertainty,
+            "effect_m_per_unit": self.effect,
+            "collinear": list(self.collinear),
+            "message": self.message,
+        }
+
+    def plot(self) -> Figure:
+        """Draw the merit step by step, and how much each variable's change did."""
+        from ..plots.sensitivity import optimum_figure
+
+        return optimum_figure(self)
+
+
+@one_blas_thread()
+def optimize(
+    telescope: Telescope,
+    variables: Iterable[str | Parameter],
+    merit: str | Merit = "spots",
+    fields: Any = None,
+    wavelengths: Any = None,
+    *,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    targets: Sequence[FocalLength | Target] = (),
+    field_weights: Any = None,
+    wavelength_weights: Any = None,
+    reference: str = "centroid",
+    goal: Any = None,
+    sampling: Any = "gauss",
+    count: int | None = None,
+    projection: str = "zemax",
+    tolerance: float = 1e-10,
+    max_steps: int = 200,
+    threads: int | None = None,
+) -> Optimum:
+    """Make spots or wavefronts small over chosen variables.
+
+    A trust-region least-squares solver takes the exact derivatives of every ray. Variables are scaled by what they do,
+    so that a conic constant and a coefficient of r^8 are on one footing. Compensators (focus, tilt of the camera)
+    are variables like all others.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        Where to start.
+    variables : iterable of str or Parameter
+        What is free, see :mod:`~pachon.design.parameters.parameters`.
+    merit : {"spots", "wavefront"} or Merit
+        What to make small: rms spot radius, or rms wavefront without piston and tilt.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; five from the axis to the edge by default.
+    wavelengths : array_like or Quantity, optional
+        Vacuum wavelengths [m]; the telescope's own by default.
+    bounds : mapping of str to (low, high), optional
+        Limits of variables, in what :meth:`Parameter.value` counts: of a radius or conic the value itself, of a motion
+        the change.
+    targets : sequence of FocalLength and Target
+        Numbers to be held.
+    field_weights, wavelength_weights : array_like, optional
+        Weights in the mean square; equal by default.
+    reference : {"centroid", "chief"}
+        What spots are measured from.
+    goal : array_like, shape [n_field, n_wave, n_pupil], optional
+        Wavefronts to be reached [m], in place of none (:func:`wavefronts` gives those of a telescope).
+    sampling, count :
+        Points of the pupil, see :func:`~pachon.design.pupil_sampling.pupil_sampling`.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    tolerance : float
+        Relative change of the sum of squares, or of the variables, at which the solver stops.
+    max_steps : int
+        Most evaluations of the merit.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Returns
+    -------
+    Optimum
+
+    Raises
+    ------
+    DomainError
+        If a variable has no effect at all, a bound excludes the start, or no ray reaches the image.
+    ConfigError, UnknownNameError
+        If a merit or variable does not exist.
+    """
+    chosen = parse_parameters(variables, telescope)
+    rays = beams(
+        telescope, fields, wavelengths, field_weights, wavelength_weights, sampling, count, projection, threads
+    )
+    wanted = merit if not isinstance(merit, str) else _merit(merit, telescope, rays, reference, goal)
+    problem = _Problem(telescope, chosen, wanted, tuple(targets))
+    low, high = _bounds(telescope, chosen, bounds or {})
+    start, slopes = problem.linear(np.zeros(len(chosen)))
+    effect = _checked_effect(chosen, slopes, wanted.size_of_terms(ParameterColumns.at(telescope, chosen)))
+    scale = 1.0 / effect
+    history = [float(np.linalg.norm(start))]
+
+    def jacobian(scaled: np.ndarray) -> np.ndarray:
+        # The solver asks for derivatives at the start and wherever it has arrived.
+        values, change = problem.linear(scaled * scale)
+        if scaled.any():
+            history.append(float(np.linalg.norm(values)))
+        return change * scale
+
+    done = least_squares(
+        lambda scaled: problem.residuals(scaled * scale),
+        np.zeros(len(chosen)),
+        jac=jacobian,
+        bounds=(low / scale, high / scale),
+        method="trf",
+        # The first steps may do this much: variables that work against each other need more than they bring.
+        x_scale=float(max(_FIRST_STEP * history[0], np.finfo(float).tiny)),
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=1e-15,
+        max_nfev=max_steps,
+    )
+    changes = done.x * scale
+    values, slopes = problem.linear(changes)
+    end = float(np.linalg.norm(values))
+    if end != history[-1]:
+        history.append(end)
+    covariance, collinear = _covariance(values, slopes, chosen)
+    begun = np.array([p.value(telescope) for p in chosen])
+    return Optimum(
+        telescope=apply(telescope, dict(zip(chosen, changes, strict=True))),
+        variables=chosen,
+        changes=changes,
+        start_values=begun,
+        values=begun + changes,
+        merit_name=merit if isinstance(merit, str) else type(merit).__name__,
+        history=np.array(history),
+        effect=np.linalg.norm(slopes, axis=0),
+        covariance=covariance,
+        collinear=collinear,
+        message=str(done.message),
+    )
+
+
+def beams(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelengths: Any = None,
+    field_weights: Any = None,
+    wavelength_weights: Any = None,
+    sampling: Any = "gauss",
+    count: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Beams:
+    """Return the rays of a merit; parameters are those of :func:`optimize`."""
+    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+    pupil = pupil_sampling(telescope, sampling, _RINGS if count is None and sampling == "gauss" else count)
+    by_field = _weights(field_weights, len(points), "field")
+    by_wavelength = _weights(wavelength_weights, len(waves), "wavelength")
+    return Beams(points, waves, pupil, by_field, by_wavelength, projection, threads)
+
+
+def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
+    """Return the wavefronts of a telescope [m], shape [n_field, n_wave, n_pupil], NaN where not lit.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    rays : Beams
+        Which, from :func:`beams` with the arguments that :func:`optimize` is given.
+    """
+    columns = ParameterColumns.at(telescope, ())
+
+    def lit(block: WavefrontBlock) -> np.ndarray:
+        return np.where(block.status == RayStatus.OK, block.value, np.nan)
+
+    return np.stack([np.concatenate(rays.wavefronts(columns, float(w)).map(lit)) for w in rays.wavelengths], axis=1)
+
+
+class _Problem:
+    """Merit and targets as functions of the changes of all variables."""
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        variables: tuple[Parameter, ...],
+        merit: Merit,
+        targets: tuple[FocalLength | Target, ...],
+    ) -> None:
+        self.telescope, self.variables, self.merit, self.targets = telescope, variables, merit, targets
+        self.size = 0
+
+    def _at(self, changes: np.ndarray) -> Telescope:
+        return apply(self.telescope, dict(zip(self.variables, changes, strict=True)))
+
+    def residuals(self, changes: np.ndarray) -> np.ndarray:
+        """Return all residuals [m]; NaN, which makes the solver step back, where there is no such telescope."""
+        try:
+            telescope = self._at(changes)
+            return np.concatenate([self.merit.residuals(telescope), *(t.residuals(telescope) for t in self.targets)])
+        except PachonError:
+            if not self.size:
+                raise
+            return np.full(self.size, np.nan)
+
+    def linear(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return all residuals [m] and their derivatives, shape [n, n_variable]."""
+        columns = ParameterColumns.at(self.telescope, self.variables, changes)
+        values, slopes = self.merit.derivatives(columns)
+        found, rates = [values], [slopes]
+        for target in self.targets:
+            if isinstance(target, Target):
+                found.append(target.residuals(columns.telescope))
+                rates.append(self._differences(target, changes, np.linalg.norm(slopes, axis=0)))
+            else:
+                value, rate = target.derivatives(columns)
+                found.append(value)
+                rates.append(rate)
+        whole = np.concatenate(found)
+        self.size = len(whole)
+        return whole, np.concatenate(rates)
+
+    def _differences(self, target: Target, changes: np.ndarray, effect: np.ndarray) -> np.ndarray:
+        rates = np.zeros((1, len(changes)))
+        for i, size in enumerate(effect):
+            step = np.zeros(len(changes))
+            step[i] = target.step / size if size > 0 else target.step
+            there, here = (target.residuals(self._at(changes + sign * step)) for sign in (1.0, -1.0))
+            rates[:, i] = (there - here) / (2.0 * step[i])
+        return rates
+
+
+def _merit(name: str, telescope: Telescope, rays: Beams, reference: str, goal: Any) -> Merit:
+    if reference not in ("centroid", "chief"):
+        raise ConfigError(f"reference = {reference!r}: expected 'centroid' or 'chief'")
+    if name == "wavefront":
+        return WavefrontMerit(telescope, rays, goal)
+    if name != "spots":
+        raise ConfigError(f"merit = {name!r}: expected 'spots' or 'wavefront'")
+    if goal is not None:
+        raise ConfigError("goal is given: expected merit = 'wavefront' with it")
+    return SpotMerit(telescope, rays, reference)
+
+
+def _weights(given: Any, count: int, name: str) -> np.ndarray:
+    weights = np.ones(count) if given is None else np.asarray(given, dtype=np.float64)
+    if weights.shape != (count,) or not np.isfinite(weights).all() or (weights < 0).any() or not weights.any():
+        raise DomainError(f"{name}_weights: expected {count} numbers, none negative and not all zero")
+    return weights / weights.sum()
+
+
+def _bounds(
+    telescope: Telescope, variables: tuple[Parameter, ...], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the limits of the changes."""
+    limits = np.array([[-np.inf, np.inf]] * len(variables))
+    addresses = [p.address for p in variables]
+    for address, pair in bounds.items():
+        if address not in addresses:
+            raise ConfigError(f"bounds of {address!r}: expected one of the variables, {', '.join(addresses)}")
+        i = addresses.index(address)
+        now = variables[i].value(telescope)
+        low, high = (float(v) for v in pair)
+        if not low < high or not low <= now <= high:
+            raise DomainError(f"bounds of {address} = ({low:g}, {high:g}): expected rising ones about its {now:.6g}")
+        limits[i] = low - now, high - now
+    return limits[:, 0], limits[:, 1]
+
+
+def _checked_effect(variables: tuple[Parameter, ...], slopes: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return the rms effect of each variable per unit [m]; one that has none is refused."""
+    effect = np.linalg.norm(slopes, axis=0)
+    for parameter, value, size in zip(variables, effect, terms, strict=True):
+        if not value > NO_EFFECT * size:
+            raise DomainError(f"variable {parameter.address} has no effect on the merit: leave it out")
+    return effect
+
+
+def _covariance(
+    values: np.ndarray, slopes: np.ndarray, variables: tuple[Parameter, ...]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the covariance of the variables, and the combinations that nothing tells apart."""
+    norm = np.linalg.norm(slopes, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
+    _, sizes, modes = np.linalg.svd(slopes / norm, full_matrices=False)
+    blind = sizes < _COLLINEAR * sizes[0]
+    inverse = np.where(blind, 0.0, 1.0 / np.where(blind, 1.0, sizes))
+    spread = (modes.T * inverse) / norm[:, None]
+    noise = float(values @ values) / max(1, len(values) - len(variables))
+    combinations = []
+    for mode in modes[blind]:
+        # In natural units, the largest part 1.
+        parts = mode / norm
+        main = np.flatnonzero(np.abs(mode) > 0.05)
+        parts = parts / parts[main[np.argmax(np.abs(mode[main]))]]
+        combinations.append(" ".join(f"{parts[i]:+.4g} {variables[i].address}" for i in main))
+    return noise * spread @ spread.T, tuple(combinations)

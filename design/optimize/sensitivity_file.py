@@ -1,0 +1,87 @@
+"""The file that a sensitivity matrix is kept in: FITS, or a table that people read."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from ...core.errors import ConfigError
+from ...core.files import table_hdu, write_ecsv, write_fits
+from .sensitivity import Sensitivity
+
+
+def write_sensitivity(path: Path, result: Sensitivity) -> None:
+    """Write a sensitivity matrix; the end of the name says how.
+
+    ``.fits``: images MATRIX [field, zernike, parameter] and ZERNIKES [field, zernike], tables FIELDS and PARAMETERS.
+    ``.ecsv``: a row for each field point and Zernike term, a column for each parameter.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    result : Sensitivity
+        The matrix.
+
+    Raises
+    ------
+    ConfigError
+        If the name ends otherwise.
+    ProductError
+        If the file cannot be written.
+    """
+    x, y = np.rad2deg(result.fields.T)
+    if path.suffix == ".ecsv":
+        n_field, n_zernike, _ = result.matrix.shape
+        places = [np.repeat(v, n_zernike) for v in (x, y)]
+        columns = {
+            "field_x": (places[0], "deg", "field angle"),
+            "field_y": (places[1], "deg", "field angle"),
+            "noll": (np.tile(np.arange(1, n_zernike + 1), n_field), "", "Noll index of the annular Zernike term"),
+            "zernike": (result.zernikes.ravel(), "m", "the term of the telescope as it is"),
+        }
+        for i, parameter in enumerate(result.parameters):
+            columns[parameter.address] = (
+                result.matrix[:, :, i].ravel(),
+                _metres_per(parameter.unit),
+                "derivative of the term",
+            )
+        meta = {
+            "creator": f"pachon {version('pachon')}",
+            "telescope": result.telescope,
+            "wavelength_m": result.wavelength,
+            "obscuration": result.obscuration,
+        }
+        write_ecsv(path, columns, meta)
+        return
+    if path.suffix != ".fits":
+        raise ConfigError(f"--out {path}: expected a name that ends in .fits or .ecsv")
+    fields = {"X": (x, "deg", "field angle"), "Y": (y, "deg", "field angle")}
+    width = max(len(p.address) for p in result.parameters)
+    listed = fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name="ADDRESS", array=[p.address for p in result.parameters], format=f"{width}A"),
+            fits.Column(name="UNIT", array=[p.unit for p in result.parameters], format="8A"),
+        ],
+        name="PARAMETERS",
+    )
+    matrix = fits.ImageHDU(result.matrix, name="MATRIX")
+    matrix.header["COMMENT"] = "derivatives of annular Zernike terms [m per unit]: parameter fastest, then Noll, field"
+    zernikes = fits.ImageHDU(result.zernikes, name="ZERNIKES")
+    zernikes.header["BUNIT"] = "m"
+    cards = [
+        ("CREATOR", f"pachon {version('pachon')}", "program and version"),
+        ("TELESCOP", result.telescope, "model"),
+        ("WAVELEN", result.wavelength, "[m] vacuum wavelength"),
+        ("OBSCURAT", result.obscuration, "inner over outer radius of the annulus"),
+    ]
+    write_fits(path, [matrix, zernikes, table_hdu("FIELDS", fields), listed], None, cards)
+
+
+def _metres_per(unit: str) -> str:
+    """Return the unit of metres per a unit of a parameter, as astropy writes it: m, rad, 1/m, m^-5 or none."""
+    known = {"": "m", "m": "", "rad": "m / rad", "1/m": "m2"}
+    return known[unit] if unit in known else f"m{1 - int(unit.removeprefix('m^'))}"

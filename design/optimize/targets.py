@@ -1,0 +1,81 @@
+"""Targets: numbers that an optimisation pulls towards a value, beside its merit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...models.telescope import Telescope
+from ...raytrace.adjoint.gradient import landing_seeds, sweep
+from ...raytrace.rays import field_direction, parallel_rays
+from .jacobian import ParameterColumns
+
+#: Angle [rad] between the two chief rays that tell the focal length: distortion enters as its square.
+_SMALL_FIELD = 1e-4
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """Focal length: distance on the detector of two chief rays by the axis over the tangent of their angle.
+
+    It is the scale of the detector where that is, which differs from the paraxial focal length where it is not in the
+    paraxial focus.
+
+    Parameters
+    ----------
+    value : float
+        The focal length that is wanted [m].
+    weight : float
+        A focal length that is off by 1 mm counts as `weight` times 1 mm of rms spot or wavefront.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    """
+
+    value: float
+    weight: float = 1.0
+    wavelength: float | None = None
+
+    def residuals(self, telescope: Telescope) -> np.ndarray:
+        """Return the residual [m], shape [1]."""
+        return self.derivatives(ParameterColumns.at(telescope, ()))[0]
+
+    def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residual [m] and its derivatives, shape [1, n_parameter]."""
+        telescope = columns.telescope
+        angles = np.array([-0.5, 0.5]) * _SMALL_FIELD
+        light = field_direction(angles, np.zeros(2))
+        w = telescope.default_wavelength if self.wavelength is None else self.wavelength
+        swept = sweep(telescope, parallel_rays(telescope, light, w, np.zeros((1, 2))))
+        change = np.diff(columns.derivatives(swept, landing_seeds(swept)), axis=1)[:, 0]
+        apart = np.diff(swept.landing[:2], axis=1)[:, 0]
+        length = float(np.hypot(*apart))
+        rate = self.weight / (2.0 * np.tan(0.5 * _SMALL_FIELD))
+        return np.array([rate * length - self.weight * self.value]), (rate / length * apart @ change)[None]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Any number that a telescope has, with derivatives from central differences.
+
+    Parameters
+    ----------
+    function : callable
+        Takes a telescope, returns a number [m, or whatever `weight` turns into m].
+    value : float
+        What it should be.
+    weight : float
+        Factor that makes it comparable with the rms spot or wavefront [m].
+    step : float
+        Change of the wavefront or spots [m] that a variable's step for the differences is to make.
+    """
+
+    function: Callable[[Telescope], float]
+    value: float
+    weight: float = 1.0
+    step: float = 1e-5
+
+    def residuals(self, telescope: Telescope) -> np.ndarray:
+        """Return the residual, shape [1]."""
+        return np.array([self.weight * (float(self.function(telescope)) - self.value)])

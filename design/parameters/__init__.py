@@ -1,0 +1,1 @@
+"""Parameters of a telescope: single ones, degrees of freedom, tolerances, temperature."""

@@ -1,0 +1,60 @@
+"""Changes of a telescope as files and command lines give them: with the unit in the name, ``M2.dz_um: 10``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ...core.errors import ConfigError
+from ...models.telescope import Telescope
+from .parameters import Parameter, apply
+
+_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
+_ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "arcsec": 4.84813681109536e-06, "deg": 0.017453292519943295}
+
+
+def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telescope:
+    """Return a telescope with changes applied.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope; it stays as it is.
+    changes : mapping of str to float
+        Change of each parameter: its address (:mod:`.parameters`), an underscore and the unit of the
+        value. A length takes m, mm, um or nm, an angle rad, mrad, urad, arcsec or deg; all else has no ending, and is
+        in SI: ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.conic``, ``L1_entrance.n``.
+
+    Raises
+    ------
+    ConfigError
+        If the unit is missing, or is none of what the parameter is.
+    PachonError
+        As :func:`~pachon.design.parameters.parameters.apply`.
+    """
+    values: dict[Parameter, float] = {}
+    for name, value in changes.items():
+        parameter, factor = parse_change(telescope, name)
+        if parameter in values:
+            raise ConfigError(f"changes.{name}: {parameter.address} is changed twice; expected each once")
+        values[parameter] = float(value) * factor
+    return apply(telescope, values) if values else telescope
+
+
+def parse_change(telescope: Telescope, name: str) -> tuple[Parameter, float]:
+    """Return the parameter that a name with a unit means, and its SI value for a value of one."""
+    address, _, ending = name.rpartition("_")
+    if address and ending in (*_LENGTHS, *_ANGLES) and "." in address:
+        parameter = Parameter.parse(address, telescope)
+        units = _units(parameter)
+        if ending not in units:
+            raise ConfigError(f"changes.{name}: {address} is in {parameter.unit or 'no unit'}, not in {ending}")
+        return parameter, units[ending]
+    parameter = Parameter.parse(name, telescope)
+    units = _units(parameter)
+    if units:
+        raise ConfigError(f"changes.{name}: expected its unit at the end, such as {name}_{list(units)[2]}")
+    return parameter, 1.0
+
+
+def _units(parameter: Parameter) -> dict[str, float]:
+    return {"m": _LENGTHS, "rad": _ANGLES}.get(parameter.unit, {})

@@ -1,0 +1,338 @@
+"""Parameters: what of a telescope may change, addressed by a text such as "M2.dx", "M1.conic" or "L1_entrance.n".
+
+========================== ======================================== ======
+address                    what it is                               unit
+========================== ======================================== ======
+``M2.dx`` ``dy`` ``dz``    shift along the axes of the telescope    m
+``M2.rx`` ``ry`` ``rz``    tilt about the body's own axes           rad
+``M1.radius`` ``conic``    a figure that the shape has              its own
+``M1.a6`` ``M1.Z5``        a power or Zernike term, added if absent m^-5, m
+``silica.n``               index of a medium, wherever it is
+``L1_entrance.n``          index of the medium behind one surface
+========================== ======================================== ======
+
+Shift and tilt are those of :meth:`Telescope.perturbed`, of a surface or a group. *A value is always a change*: zero
+leaves the telescope as it is. Where several bodies move, groups go before what they contain.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError, unknown_name
+from ...models.media.changed_index import with_index_change
+from ...models.shapes.shape import Shape
+from ...models.surface import Interaction
+from ...models.telescope import Telescope, rotation_matrix
+from .surface_deformation import figure_unit, with_figure
+
+MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One thing that may change.
+
+    Attributes
+    ----------
+    address : str
+        Its text.
+    target : str
+        Name of the surface, group or medium.
+    name : str
+        What of it: a motion, a figure, or "n".
+    kind : {"motion", "figure", "index"}
+        Which of these it is.
+    unit : str
+        Unit of its values; empty for a pure number.
+    """
+
+    address: str
+    target: str
+    name: str
+    kind: Literal["motion", "figure", "index"]
+    unit: str
+
+    @classmethod
+    def parse(cls, text: str, telescope: Telescope) -> Parameter:
+        """Return the parameter that an address names.
+
+        Parameters
+        ----------
+        text : str
+            The address.
+        telescope : Telescope
+            The telescope that it is to be found in.
+
+        Raises
+        ------
+        UnknownNameError
+                If there is no such surface, group, medium or figure.
+        ConfigError
+            If it is no address at all.
+        DomainError
+            If a figure cannot be had: a Zernike term on a surface without rims.
+        """
+        media = _media(telescope)
+        bodies = (*telescope.surface_names, *telescope.groups, *media)
+        # Names may hold dots themselves.
+        targets = [b for b in bodies if text.startswith(f"{b}.")]
+        if not targets:
+            target, dot, name = text.partition(".")
+            if not (target and dot and name):
+                raise ConfigError(f"parameter {text!r}: expected <surface or group>.<what>, such as M2.dz or M1.conic")
+            raise unknown_name("surface, group or medium", target, bodies)
+        target = max(targets, key=len)
+        name = text[len(target) + 1 :]
+        if target in media and target not in telescope.surface_names and target not in telescope.groups:
+            if name != "n":
+                raise unknown_name(f"parameter of medium {target}", name, ("n",))
+            return cls(text, target, name, "index", "")
+        if name in MOTIONS:
+            return cls(text, target, name, "motion", "m" if name[0] == "d" else "rad")
+        if target in telescope.groups:
+            raise unknown_name(f"motion of group {target}", name, MOTIONS)
+        surface = telescope.surface(target)
+        if name == "n":
+            if surface.interaction != Interaction.REFRACT:
+                raise DomainError(f"parameter {text!r}: expected a refracting surface, which a medium begins behind")
+            return cls(text, target, name, "index", "")
+        return cls(text, target, name, "figure", figure_unit(with_figure(surface, name), name))
+
+    def value(self, telescope: Telescope) -> float:
+        """Return what the telescope has now: a figure's value, the index at the default wavelength; 0 of a motion."""
+        if self.kind == "motion":
+            return 0.0
+        if self.kind == "index":
+            first = telescope.surfaces[index_surfaces(telescope, self.target)[0]]
+            return float(first.medium_after.index(telescope.default_wavelength))
+        surface = telescope.surface(self.target)
+        return float(surface.shape.parameters.get(self.name, 0.0))
+
+
+def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> tuple[Parameter, ...]:
+    """Return the parameters of a list of addresses; ``M1.Z4-22`` stands for Z4, Z5 ... Z22, ``M2.*`` for six motions.
+
+    Raises
+    ------
+    ConfigError
+        If the list is empty or names a parameter twice, or a text is no address.
+    UnknownNameError
+        If there is no such surface, group or figure.
+    """
+    found: list[Parameter] = []
+    for text in texts:
+        if isinstance(text, Parameter):
+            found.append(text)
+            continue
+        span = re.fullmatch(r"(.*\.Z)(\d+)-(\d+)", text)
+        if span:
+            first, last = int(span[2]), int(span[3])
+            if not 1 <= first <= last:
+                raise ConfigError(f"parameter {text!r}: expected Noll indices that rise, from 1, such as Z4-22")
+            highest = Parameter.parse(f"{span[1]}{last}", telescope)
+            found += [replace(highest, address=f"{span[1]}{j}", name=f"Z{j}") for j in range(first, last + 1)]
+        elif text.endswith(".*"):
+            found += [Parameter.parse(f"{text[:-1]}{motion}", telescope) for motion in MOTIONS]
+        else:
+            found.append(Parameter.parse(text, telescope))
+    addresses = [p.address for p in found]
+    if not found:
+        raise ConfigError("parameters = []: expected at least one, such as M2.dz")
+    if len(set(addresses)) < len(addresses):
+        address = next(a for a in addresses if addresses.count(a) > 1)
+        raise ConfigError(f"parameter {address!r} occurs more than once: expected each once")
+    return tuple(found)
+
+
+def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
+    """Return five motions (all but the turn about the axis) of every body: outermost groups, and mirrors in none.
+
+    The first mirror is left out: the others are aligned to it.
+    """
+    groups = {name: set(members) for name, members in telescope.groups.items()}
+    outer = [g for g, members in groups.items() if not any(members < others for others in groups.values())]
+    inside = set().union(*groups.values()) if groups else set()
+    mirrors = [s.name for s in telescope.surfaces if s.interaction == Interaction.MIRROR]
+    bodies = [m for m in mirrors[1:] if m not in inside] + outer
+    return parse_parameters([f"{b}.{m}" for b in bodies or telescope.surface_names[:1] for m in MOTIONS[:5]], telescope)
+
+
+def with_figures(telescope: Telescope, parameters: Iterable[Parameter]) -> Telescope:
+    """Return the telescope with every figure that parameters name, zero where it was not there: the same optics."""
+    for target, shape in figured_shapes(telescope, parameters).items():
+        if shape is not telescope.surface(target).shape:
+            telescope = telescope.with_shape(target, shape)
+    return telescope
+
+
+def figured_shapes(telescope: Telescope, parameters: Iterable[Parameter]) -> dict[str, Shape]:
+    """Return the shapes of the surfaces whose figures parameters name, with all of these figures, by surface."""
+    shapes: dict[str, Shape] = {}
+    names: dict[str, list[str]] = {}
+    for parameter in parameters:
+        if parameter.kind == "figure":
+            names.setdefault(parameter.target, []).append(parameter.name)
+    for target, figures in names.items():
+        surface = telescope.surface(target)
+        known = set(surface.shape.parameters)
+        # The highest Zernike term, or power, makes room for those below it.
+        for name in sorted(figures, key=lambda name: (len(name), name), reverse=True):
+            if name not in known:
+                surface = replace(surface, shape=with_figure(surface, name))
+                known = set(surface.shape.parameters)
+        shapes[target] = surface.shape
+    return shapes
+
+
+def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter, float]) -> Telescope:
+    """Return the telescope with changes applied.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope; it stays as it is.
+    values : mapping of str or Parameter to float
+        Change of each parameter, in its unit.
+
+    Raises
+    ------
+    DomainError
+        If a value is not a finite number, or what it leads to cannot be.
+    UnknownNameError, ConfigError
+        As :meth:`Parameter.parse`.
+    """
+    parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
+    changes = _finite(parameters, values.values())
+    telescope = with_figures(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
+    for parameter, change in zip(parameters, changes, strict=True):
+        if not change:
+            continue
+        if parameter.kind == "figure":
+            shape = telescope.surface(parameter.target).shape
+            value = shape.parameters[parameter.name] + change
+            telescope = telescope.with_shape(parameter.target, shape.with_parameter(parameter.name, value))
+        elif parameter.kind == "index":
+            telescope = _with_index(telescope, parameter.target, change)
+    for body, motion in _body_motions(telescope, parameters, changes):
+        if motion.any():
+            telescope = telescope.perturbed(body, shift=motion[:3], tilt=motion[3:])
+    return telescope
+
+
+def _finite(parameters: list[Parameter], values: Iterable[float]) -> list[float]:
+    changes = [float(v) for v in values]
+    for parameter, change in zip(parameters, changes, strict=True):
+        if not np.isfinite(change):
+            raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
+    return changes
+
+
+def _media(telescope: Telescope) -> set[str]:
+    """Return the names of the media behind refracting surfaces."""
+    refracting = (s for s in telescope.surfaces if s.interaction == Interaction.REFRACT)
+    return {s.medium_after.name for s in refracting if s.medium_after.name}
+
+
+def index_surfaces(telescope: Telescope, target: str) -> list[int]:
+    """Return the indices of the surfaces behind which light is in the medium that an index parameter is about.
+
+    Behind one refracting surface, and those after it up to the next that refracts; or, of a medium, all such.
+    """
+    found: list[int] = []
+    inside = False
+    for i, surface in enumerate(telescope.surfaces):
+        if surface.interaction == Interaction.REFRACT:
+            wanted = surface.name if target in telescope.surface_names else surface.medium_after.name
+            inside = wanted == target
+        if inside:
+            found.append(i)
+    return found
+
+
+def _with_index(telescope: Telescope, target: str, change: float) -> Telescope:
+    surfaces = list(telescope.surfaces)
+    for i in index_surfaces(telescope, target):
+        surfaces[i] = replace(surfaces[i], medium_after=with_index_change(surfaces[i].medium_after, change))
+    return replace(telescope, surfaces=tuple(surfaces))
+
+
+def _body_motions(
+    telescope: Telescope, parameters: Iterable[Parameter], values: Iterable[float]
+) -> list[tuple[str, np.ndarray]]:
+    """Return each body that may move with its shift [m] and tilt [rad], in the order in which they are applied."""
+    motions: dict[str, np.ndarray] = {}
+    for parameter, value in zip(parameters, values, strict=True):
+        if parameter.kind == "motion":
+            motions.setdefault(parameter.target, np.zeros(6))[MOTIONS.index(parameter.name)] = value
+    # A stable sort: bodies of one size stay in the order in which they were named.
+    return sorted(motions.items(), key=lambda item: -len(_members(telescope, item[0])))
+
+
+def _members(telescope: Telescope, body: str) -> tuple[str, ...]:
+    return telescope.groups.get(body, (body,))
+
+
+def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.ndarray) -> np.ndarray:
+    """Return how each surface moves with each parameter, at given values of all.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope that the values are changes of.
+    parameters : tuple of Parameter
+        All that change.
+    values : ndarray, shape [n_parameter]
+        Their changes.
+
+    Returns
+    -------
+    ndarray, shape [n_parameter, n_surface, 6]
+        Velocity of the point of the surface's frame at the telescope's origin, and angular velocity: a point ``x`` of
+        surface ``s`` moves by ``v + w x x`` per unit of the parameter. Zero for figures and indices.
+    """
+    result = np.zeros((len(parameters), len(telescope.surfaces), 6))
+    names = telescope.surface_names
+    for body, motion in _body_motions(telescope, parameters, values):
+        shift, tilt = motion[:3], motion[3:]
+        members = _members(telescope, body)
+        places = [names.index(m) for m in members]
+        surface = telescope.surface(members[0])
+        pivot, axes = (np.array(v) for v in telescope.group_frames.get(body, (surface.vertex, surface.rotation)))
+        turn = axes @ rotation_matrix(tilt) @ axes.T
+        # Vector product with a vector from the left: a turn about where the pivot has gone to.
+        x, y, z = pivot + shift
+        about = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        # Those that moved before: a body whose frame went along turns about where it went, with it.
+        for row, parameter in enumerate(parameters):
+            if parameter.kind == "motion" and result[row, places].any():
+                larger = telescope.groups.get(parameter.target, ())
+                along = body not in telescope.groups or set(members) <= set(larger)
+                for place in places:
+                    v, w = result[row, place, :3], result[row, place, 3:]
+                    if along:
+                        result[row, place, :3] = v - np.cross(w, shift)
+                    else:
+                        w = turn @ w
+                        result[row, place, :3] = turn @ v + np.cross(w, turn @ pivot - pivot - shift)
+                        result[row, place, 3:] = w
+        for row, parameter in enumerate(parameters):
+            if parameter.kind != "motion" or parameter.target != body:
+                continue
+            axis = MOTIONS.index(parameter.name)
+            if axis < 3:
+                result[row, places, axis] = 1.0
+                continue
+            # R = Rx Ry Rz: the axis of each factor is turned by those before it.
+            earlier = np.where(np.arange(3) < axis - 3, tilt, 0.0)
+            w = axes @ rotation_matrix(earlier)[:, axis - 3]
+            result[row, places, :3] = about @ w
+            result[row, places, 3:] = w
+        if motion.any():
+            telescope = telescope.perturbed(body, shift=shift, tilt=tilt)
+    return result

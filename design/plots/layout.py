@@ -1,0 +1,219 @@
+"""The picture of a layout: the section of a telescope with its rays, and its lenses in a panel of their own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
+from ...models.surface import Interaction
+from ..drawing import field_label
+from ..layout import Layout
+
+_RAYS = (BLUE, GREY, RED, ORANGE, PURPLE, "#2a9d6f")
+_GLASS, _GLASS_RIM, _MIRROR, _DETECTOR, _BAFFLE = "#bfe3f2", "#3f7d99", "#1a1a1a", "#0b6b3a", "#6b4a2b"
+#: Lenses and detector get a panel of their own where they are less than this part of the whole.
+_SMALL = 0.4
+
+
+class _Drawing:
+    """Coordinates of a drawing: (y, z) upright, or (-z, y) where the telescope is long."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        width, height = layout.size[1:]
+        self.lying = bool(height > 1.6 * width)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        y, z = points[..., 1], points[..., 2]
+        return np.stack([-z, y] if self.lying else [y, z], axis=-1)
+
+    def box(self, names: list[str]) -> np.ndarray:
+        """Return the lowest and the highest corner of some surfaces, shape [2, 2]."""
+        points = np.concatenate([self(self.layout.profiles[name]) for name in names])
+        return np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)])
+
+
+def layout_figure(layout: Layout) -> Figure:
+    """Draw a telescope in section, with rays of its fields in colours, names and axes in metres or millimetres."""
+    drawing = _Drawing(layout)
+    surfaces = layout.telescope.surfaces
+    names = [s.name for s in surfaces if np.isfinite(layout.profiles[s.name]).all(axis=1).any()]
+    whole = drawing.box(names)
+    within = {lens.front for lens in layout.lenses} | {lens.back for lens in layout.lenses}
+    within |= {s.name for s in surfaces if s.interaction == Interaction.DETECTOR}
+    small = drawing.box([n for n in names if n in within]) if within & set(names) else whole
+    zoom = bool(layout.lenses) and bool(np.ptp(small, axis=0).max() < _SMALL * np.ptp(whole, axis=0).max())
+    with styled():
+        if zoom:
+            figure = new_figure(12.4, 5.4 if drawing.lying else 6.4)
+            left, right = figure.subplots(1, 2)
+            _draw(right, drawing, small, within & set(names), beams=False)
+            outside = [n for n in names if n not in within]
+            _draw(left, drawing, whole, set(outside), beams=True)
+        else:
+            ratio = np.ptp(whole, axis=0)
+            wide = float(np.clip(5.2 * ratio[0] / max(ratio[1], 1e-12), 6.4, 12.0))
+            figure = new_figure(wide + 1.2, float(np.clip(wide * ratio[1] / ratio[0], 3.0, 7.5)) + 1.6)
+            left = figure.subplots()
+            _draw(left, drawing, whole, set(names), beams=True)
+        handles, labels = left.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 8))
+        figure.suptitle(
+            f"{layout.telescope.name}: section x = 0, rays of {layout.wavelength * 1e9:.4g} nm; "
+            f"light comes from {'the left' if drawing.lying else 'above'}",
+            fontsize=11,
+        )
+        return figure
+
+
+def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, beams: bool) -> None:
+    layout = drawing.layout
+    size = np.ptp(box, axis=0)
+    unit, scale = ("m", 1.0) if size.max() >= 1.5 else ("mm", 1e3)
+    margin = 0.06 * size.max()
+    low, high = (box[0] - margin) * scale, (box[1] + margin) * scale
+    for i, (field, fan) in enumerate(zip(layout.fields, layout.fans, strict=True)):
+        color = _RAYS[i % len(_RAYS)]
+        axes.add_collection(
+            LineCollection(list(drawing(fan) * scale), colors=color, linewidths=0.6, alpha=0.8, zorder=1)
+        )
+        axes.plot([], [], color=color, linewidth=1.2, label=_signed_label(field))
+    for lens in layout.lenses:
+        front, back = (drawing(layout.profiles[name]) * scale for name in (lens.front, lens.back))
+        outline = np.concatenate([front[np.isfinite(front).all(axis=1)], back[np.isfinite(back).all(axis=1)][::-1]])
+        if len(outline) > 2:
+            axes.add_patch(
+                Polygon(
+                    outline, closed=True, facecolor=_GLASS, edgecolor=_GLASS_RIM, linewidth=0.9, alpha=0.75, zorder=2
+                )
+            )
+    in_glass = {lens.front for lens in layout.lenses} | {lens.back for lens in layout.lenses}
+    for surface in layout.telescope.surfaces:
+        if surface.interaction == Interaction.REFRACT and surface.name in in_glass:
+            continue
+        if surface.interaction == Interaction.PASS and not beams:
+            # Baffles stand in the light on its way to the mirrors, beside the lenses at most in the drawing.
+            continue
+        color, width = {
+            Interaction.MIRROR: (_MIRROR, 2.2),
+            Interaction.DETECTOR: (_DETECTOR, 2.6),
+            Interaction.PASS: (_BAFFLE, 1.8),
+        }.get(surface.interaction, (_GLASS_RIM, 1.0))
+        points = drawing(layout.profiles[surface.name]) * scale
+        axes.plot(*points.T, color=color, linewidth=width, solid_capstyle="butt", zorder=3)
+    for obstruction in layout.telescope.obstructions:
+        segments = drawing(_cut(obstruction.triangles.astype(np.float64))) * scale
+        axes.add_collection(LineCollection(list(segments), colors=_BAFFLE, linewidths=1.0, zorder=3))
+    if beams:
+        start = np.concatenate([drawing(fan[:, 0]) for fan in layout.fans] or [box]) * scale
+        if len(start):
+            low, high = np.minimum(low, start.min(axis=0)), np.maximum(high, start.max(axis=0))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    along = f"along the axis, away from the sky [{unit}]"
+    axes.set_xlabel(f"−z, {along}" if drawing.lying else f"y [{unit}]")
+    axes.set_ylabel(f"y [{unit}]" if drawing.lying else f"z, towards the sky [{unit}]")
+    axes.grid(True, color="0.94", linewidth=0.6)
+    axes.set_axisbelow(True)
+    _write_names(axes, _labels(drawing, named, scale, (low, high)), drawing.lying)
+
+
+def _labels(
+    drawing: _Drawing, named: set[str], scale: float, limits: tuple[np.ndarray, np.ndarray]
+) -> list[tuple[str, np.ndarray]]:
+    """Return names, each with the rim of what it belongs to; those of the surfaces of a lens are one."""
+    layout = drawing.layout
+    parts: dict[str, list[str]] = {}
+    covered: set[str] = set()
+    for lens in layout.lenses:
+        if {lens.front, lens.back} <= named:
+            # Cemented lenses share a surface, and then each name stands alone.
+            shared = {lens.front, lens.back} & covered
+            parts[lens.name if not shared else lens.back] = [n for n in (lens.front, lens.back) if n not in shared]
+            covered |= {lens.front, lens.back}
+    for surface in layout.telescope.surfaces:
+        if surface.name in named - covered:
+            parts[surface.name] = [surface.name]
+    # Without a word in common the names of both surfaces are written.
+    found = []
+    for name, members in parts.items():
+        points = np.concatenate([drawing(layout.profiles[m]) for m in members]) * scale
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            continue
+        side = 1 if drawing.lying else 0
+        rim = points[points[:, side] >= points[:, side].max() - 1e-6 * scale]
+        place = rim.mean(axis=0)
+        if (place >= limits[0]).all() and (place <= limits[1]).all():
+            found.append((name, place))
+    return found
+
+
+def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) -> None:
+    """Write names in a column at the right, or a row above where it lies, far enough apart, with lines to surfaces."""
+    if not labels:
+        return
+    side = 0 if lying else 1
+    low, high = axes.get_xlim() if lying else axes.get_ylim()
+    step = (high - low) / (30.0 if not lying else 34.0)
+    labels = sorted(labels, key=lambda item: float(item[1][side]))
+    places = _apart(np.array([item[1][side] for item in labels]), step, low + step, high - step)
+    edge = axes.get_ylim()[1] if lying else axes.get_xlim()[1]
+    for (name, rim), place in zip(labels, places, strict=True):
+        end: Any = (place, edge) if lying else (edge, place)
+        axes.annotate(
+            name,
+            xy=(rim[0], rim[1]),
+            xytext=end,
+            rotation=60 if lying else 0,
+            ha="left",
+            va="bottom" if lying else "center",
+            fontsize=7.5,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": "0.55", "linewidth": 0.5, "shrinkA": 1.0, "shrinkB": 0.0},
+            zorder=4,
+        )
+
+
+def _apart(wanted: np.ndarray, step: float, low: float, high: float) -> np.ndarray:
+    """Return ascending places near those wanted, at least a step apart and within bounds where there is room."""
+    step = min(step, (high - low) / max(len(wanted) - 1, 1))
+    places = np.clip(wanted, low, high)
+    # Groups that are too close are spread about their middle, and joined with what they then touch.
+    groups = [[float(p), 1] for p in places]
+    merged = True
+    while merged:
+        merged = False
+        for i in range(len(groups) - 1):
+            (a, n), (b, m) = groups[i], groups[i + 1]
+            if b - a < 0.5 * step * (n + m) - 1e-12:
+                groups[i : i + 2] = [[(a * n + b * m) / (n + m), n + m]]
+                merged = True
+                break
+    found = np.concatenate([c + step * (np.arange(n) - 0.5 * (n - 1)) for c, n in groups])
+    return found + max(low - found[0], 0.0) - max(found[-1] - high, 0.0)
+
+
+def _cut(triangles: np.ndarray) -> np.ndarray:
+    """Return the segments in which triangles [n, 3, 3] cross the plane x = 0, shape [k, 2, 3]."""
+    start, end = triangles, np.roll(triangles, -1, axis=1)
+    before, after = start[..., 0], end[..., 0]
+    crosses = (before < 0) != (after < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.where(crosses, before / (before - after), np.nan)
+    points = start + part[..., None] * (end - start)
+    both = crosses.sum(axis=1) == 2
+    return points[both][crosses[both]].reshape(-1, 2, 3)
+
+
+def _signed_label(field: np.ndarray) -> str:
+    """Return a field as text; on the y axis with its sign, as both sides are drawn."""
+    x, y = np.rad2deg(field)
+    if abs(x) < 1e-9:
+        return "on the axis" if abs(y) < 1e-9 else f"field {y:+.4g}°"
+    return f"field {field_label(field)}"

@@ -1,0 +1,1 @@
+"""The camera: CCDs, their heights, and the focal plane that they make."""

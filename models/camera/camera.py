@@ -1,0 +1,173 @@
+"""Cameras: where each CCD of a mosaic lies, by name.
+
+Positions are in the frame of the detector: x, y along the telescope's, origin on the optical axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...core.errors import unknown_name
+from ...core.units import metres
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A mosaic of equal square CCDs.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera.
+    ccd_names : tuple of str
+        Names of the CCDs.
+    raft_names : tuple of str
+        Names of the rafts that carry them.
+    raft_index : ndarray of int, shape (n,)
+        Raft of each CCD.
+    centers : ndarray, shape (n, 2)
+        Centres of the CCDs (x, y) [m].
+    pixels : int
+        Pixels along a side of a CCD.
+    pixel_size : float
+        Side of a pixel [m].
+    """
+
+    name: str
+    ccd_names: tuple[str, ...]
+    raft_names: tuple[str, ...]
+    raft_index: np.ndarray
+    centers: np.ndarray
+    pixels: int
+    pixel_size: float
+
+    def __post_init__(self) -> None:
+        for array in (self.raft_index, self.centers):
+            array.flags.writeable = False
+
+    def __len__(self) -> int:
+        return len(self.ccd_names)
+
+    @property
+    def ccd_size(self) -> float:
+        """Side of a CCD [m]."""
+        return self.pixels * self.pixel_size
+
+    @property
+    def half_size(self) -> float:
+        """Half the side of a CCD [m]."""
+        return 0.5 * self.ccd_size
+
+    @cached_property
+    def raft_of(self) -> tuple[str, ...]:
+        """Name of the raft of each CCD."""
+        return tuple(self.raft_names[i] for i in self.raft_index)
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.ccd_names)}
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.centers)
+
+    def ccd_index(self, name: str) -> int:
+        """Return the index of a CCD.
+
+        Raises
+        ------
+        UnknownNameError
+            If the camera has no CCD of that name.
+        """
+        try:
+            return self._index[name]
+        except (KeyError, TypeError):
+            raise unknown_name(f"CCD of {self.name}", name, self.ccd_names) from None
+
+    def ccds_of_raft(self, raft: str) -> tuple[str, ...]:
+        """Return the names of the CCDs on a raft.
+
+        Raises
+        ------
+        UnknownNameError
+            If the camera has no raft of that name.
+        """
+        if raft not in self.raft_names:
+            raise unknown_name(f"raft of {self.name}", raft, self.raft_names)
+        return tuple(n for n, r in zip(self.ccd_names, self.raft_of, strict=True) if r == raft)
+
+    def ccd_at(self, x: Any, y: Any, *, margin: float = 0.0) -> np.ndarray:
+        """Return which CCD a point lies on.
+
+        Parameters
+        ----------
+        x, y : float, array or Quantity
+            Position on the focal plane [m].
+        margin : float
+            Width added around every CCD [m], less than half a gap.
+
+        Returns
+        -------
+        ndarray of int
+            Index of the CCD, rims included; -1 in a gap or outside.
+        """
+        px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
+        index = np.full(px.shape, -1, dtype=np.int64)
+        finite = np.isfinite(px) & np.isfinite(py)
+        if np.any(finite):
+            # Equal squares that do not overlap: the nearest centre in the maximum norm is the only candidate.
+            distance, nearest = self._tree.query(np.stack([px[finite], py[finite]], axis=-1), p=np.inf)
+            index[finite] = np.where(distance <= self.half_size + margin, nearest, -1)
+        return index
+
+
+@lru_cache(maxsize=1)
+def lsst_camera() -> Camera:
+    """Return the LSST camera: 189 CCDs of 4096 x 4096 pixels of 10 um in 21 rafts of 3 x 3.
+
+    Rafts stand on a 5 x 5 grid of 127.0 mm less its corners, CCDs on a grid of 42.25 mm. ``R<row><column>_S<row>
+    <column>``: rows along +y, columns along +x, R22_S11 at the centre. Order: rafts row by row, then CCDs row by row.
+    """
+    raft_pitch, ccd_pitch = 127.0e-3, 42.25e-3
+    # A corner has both its row and its column at the rim; every other place has at least one that is not.
+    grid = [(row, column) for row in range(5) for column in range(5) if {row, column} - {0, 4}]
+    rafts = [(f"R{row}{column}", row, column) for row, column in grid]
+    names, raft_index, centers = [], [], []
+    for index, (raft, row, column) in enumerate(rafts):
+        for s_row in range(3):
+            for s_column in range(3):
+                names.append(f"{raft}_S{s_row}{s_column}")
+                raft_index.append(index)
+                x = (column - 2) * raft_pitch + (s_column - 1) * ccd_pitch
+                y = (row - 2) * raft_pitch + (s_row - 1) * ccd_pitch
+                centers.append((x, y))
+    return Camera(
+        name="lsst",
+        ccd_names=tuple(names),
+        raft_names=tuple(r[0] for r in rafts),
+        raft_index=np.array(raft_index),
+        centers=np.array(centers),
+        pixels=4096,
+        pixel_size=10e-6,
+    )
+
+
+CAMERAS = {"lsst": lsst_camera}
+
+
+def load_camera(name: str) -> Camera:
+    """Return a camera by name.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no camera of that name.
+    """
+    if name not in CAMERAS:
+        raise unknown_name("camera", name, CAMERAS)
+    return CAMERAS[name]()

@@ -1,0 +1,359 @@
+"""The focal plane: the height of every CCD's surface, drawn from a budget, measured, or flat.
+
+Heights are positive along +z of the telescope frame, which is the direction that light travels when it meets the LSST
+detector. Camera teams often use the opposite sign: turn it round before a table or mesh enters here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import trimesh
+from astropy.table import Table
+
+from ...core.errors import DomainError, unknown_name
+from ...core.units import metres, radians
+from .camera import Camera, load_camera
+from .ccd_surfaces import CcdSurfaces
+from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
+from .height_fit import fit_heights
+
+# Rims of tiles read back from a file land this far [m] outside by rounding (a float32 STL keeps 0.34 m to 15 nm).
+_MESH_MARGIN = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class FocalPlane:
+    """Height of the CCD surfaces over the nominal focal plane.
+
+    Made by `from_budget`, `flat`, `from_heights` or `from_mesh`.
+
+    Parameters
+    ----------
+    camera : Camera
+        Where the CCDs lie.
+    surfaces : CcdSurfaces
+        Height function of each CCD.
+    measured : ndarray of bool, shape (n_ccd,)
+        Which CCDs carry measured heights; all False for a drawn or flat focal plane.
+    terms : tuple of str
+        Terms of the height budget that are on.
+    budget : HeightBudget, optional
+        What the heights were drawn from.
+    seed : int, optional
+        Seed that they were drawn with.
+    """
+
+    camera: Camera
+    surfaces: CcdSurfaces
+    measured: np.ndarray
+    terms: tuple[str, ...] = ()
+    budget: HeightBudget | None = None
+    seed: int | None = None
+
+    @classmethod
+    def from_budget(
+        cls,
+        camera: str | Camera = "lsst",
+        *,
+        seed: int,
+        terms: Iterable[str] | None = None,
+        budget: str | HeightBudget = "simulated",
+    ) -> FocalPlane:
+        """Draw heights from the budget of Jee & Tyson 2011, Table 1.
+
+        Parameters
+        ----------
+        camera : str or Camera
+            Camera, or its name.
+        seed : int
+            Seed, not negative. Every term has its own random streams.
+        terms : iterable of str, optional
+            Terms to include, of "global", "raft", "ccd", "tilt", "potato_chip"; all by default.
+        budget : str or HeightBudget
+            "simulated" (the paper's simulation), "specification", or sizes of your own.
+
+        Raises
+        ------
+        UnknownNameError
+            If the camera, a term or the budget does not exist.
+        DomainError
+            If the seed is not a whole number of zero or more.
+        """
+        camera = load_camera(camera) if isinstance(camera, str) else camera
+        budget = load_budget(budget) if isinstance(budget, str) else budget
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise DomainError(f"seed = {seed!r}: expected a whole number of zero or more")
+        wanted = TERMS if terms is None else (terms,) if isinstance(terms, str) else tuple(terms)
+        for term in wanted:
+            if term not in TERMS:
+                raise unknown_name("height term", term, TERMS)
+        wanted = tuple(term for term in TERMS if term in wanted)
+        surfaces = draw_heights(camera, budget, int(seed), wanted)
+        return cls(camera, surfaces, np.zeros(len(camera), dtype=bool), wanted, budget, int(seed))
+
+    @classmethod
+    def flat(cls, camera: str | Camera = "lsst") -> FocalPlane:
+        """Return a focal plane whose every CCD lies at height zero."""
+        camera = load_camera(camera) if isinstance(camera, str) else camera
+        n = len(camera)
+        surfaces = CcdSurfaces(camera.half_size, np.zeros((n, 10)), np.zeros((n, 2, 4)))
+        return cls(camera, surfaces, np.zeros(n, dtype=bool))
+
+    @classmethod
+    def from_heights(cls, table: Any, camera: str | Camera = "lsst") -> FocalPlane:
+        """Fit measured heights.
+
+        Parameters
+        ----------
+        table : Table, structured array or mapping
+            Columns x, y, z of scattered points, z positive along +z of the telescope frame. Units of the columns
+            are honoured; columns without a unit are metres. Points off every CCD are left aside.
+        camera : str or Camera
+            Camera, or its name.
+
+        Returns
+        -------
+        FocalPlane
+            With `measured` telling which CCDs had points; the others lie at height zero.
+
+        Raises
+        ------
+        DomainError
+            If a column is missing or not finite, no point lies on a CCD, or a CCD has points but fewer than three
+            or all on one line.
+        """
+        camera = load_camera(camera) if isinstance(camera, str) else camera
+        x, y, z = (_column(table, name) for name in "xyz")
+        if not x.shape == y.shape == z.shape or x.ndim != 1:
+            raise DomainError(f"heights: columns of shape {x.shape}, {y.shape}, {z.shape}: expected one length")
+        surfaces, measured = fit_heights(camera, x, y, z)
+        return cls(camera, surfaces, measured)
+
+    @classmethod
+    def from_mesh(cls, mesh: trimesh.Trimesh, camera: str | Camera = "lsst") -> FocalPlane:
+        """Fit the vertices of a surface mesh as `from_heights` does: metres, z positive along +z of the telescope."""
+        camera = load_camera(camera) if isinstance(camera, str) else camera
+        x, y, z = np.asarray(mesh.vertices, dtype=np.float64).T
+        surfaces, measured = fit_heights(camera, x, y, z, margin=_MESH_MARGIN)
+        return cls(camera, surfaces, measured)
+
+    def with_terms(self, terms: Iterable[str]) -> FocalPlane:
+        """Return the focal plane of the same seed and budget with only these terms.
+
+        Raises
+        ------
+        UnknownNameError
+            If a term does not exist.
+        DomainError
+            If the heights were not drawn from a budget.
+        """
+        if self.budget is None or self.seed is None:
+            raise DomainError(f"terms = {terms!r}: expected a focal plane drawn from a height budget")
+        return FocalPlane.from_budget(self.camera, seed=self.seed, terms=terms, budget=self.budget)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the CCDs."""
+        return self.camera.ccd_names
+
+    @property
+    def polynomial(self) -> np.ndarray:
+        """Coefficients [m] of 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3, shape (n_ccd, 10)."""
+        return self.surfaces.polynomial
+
+    @property
+    def waves(self) -> np.ndarray:
+        """Amplitude [m], kx, ky [rad/m] and phase [rad] of two waves a CCD, shape (n_ccd, 2, 4)."""
+        return self.surfaces.waves
+
+    @property
+    def grid(self) -> np.ndarray | None:
+        """Coefficients [m] of uniform cubic B-splines, index order CCD, y, x, shape (n_ccd, m, m), or None."""
+        return self.surfaces.grid
+
+    def ccd_at(self, x: Any, y: Any) -> np.ndarray:
+        """Return the index of the CCD at (x, y) [m]; -1 in a gap or outside."""
+        return self.camera.ccd_at(x, y)
+
+    def ccd_index(self, name: str) -> int:
+        """Return the index of the CCD of that name."""
+        return self.camera.ccd_index(name)
+
+    def with_moved(self, name: str, *, dz: Any = 0.0, rx: Any = 0.0, ry: Any = 0.0) -> FocalPlane:
+        """Return the focal plane with one CCD, or all CCDs of a raft, moved as a rigid body.
+
+        Angles are small: the surface is sheared by their tangents, which for 1e-3 rad is right to 1e-6 of its height.
+
+        Parameters
+        ----------
+        name : str
+            Name of a CCD or a raft.
+        dz : float or Quantity
+            Displacement along +z of the telescope frame [m].
+        rx, ry : float or Quantity
+            Rotation about the axes through the centre of the CCD or raft [rad], right-handed: a positive rx lifts the
+            side at larger y, a positive ry lowers that at larger x.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such CCD or raft.
+        DomainError
+            If a figure is not one finite number.
+        """
+        camera = self.camera
+        members = np.array([camera.ccd_index(n) for n in ((name,) if "_" in name else camera.ccds_of_raft(name))])
+        lift, turn_x, turn_y = metres(dz, "dz"), radians(rx, "rx"), radians(ry, "ry")
+        for label, value in (("dz", lift), ("rx", turn_x), ("ry", turn_y)):
+            if value.ndim or not np.isfinite(value):
+                raise DomainError(f"{name} {label} = {value.tolist()}: expected one finite number")
+        x, y = (camera.centers[members] - camera.centers[members].mean(axis=0)).T
+        polynomial = self.surfaces.polynomial.copy()
+        polynomial[members, 0] += lift + y * np.tan(turn_x) - x * np.tan(turn_y)
+        polynomial[members, 1] -= camera.half_size * np.tan(turn_y)
+        polynomial[members, 2] += camera.half_size * np.tan(turn_x)
+        return replace(self, surfaces=replace(self.surfaces, polynomial=polynomial))
+
+    def height(self, x: Any, y: Any) -> np.ndarray:
+        """Return the height of the CCD surface.
+
+        Parameters
+        ----------
+        x, y : float, array or Quantity
+            Position on the focal plane [m].
+
+        Returns
+        -------
+        ndarray
+            Height [m], positive along +z of the telescope frame; NaN in a gap or outside.
+        """
+        ccd, dx, dy, lit = self._local(x, y)
+        height = np.full(lit.shape, np.nan)
+        height[lit] = self.surfaces.height(ccd[lit], dx[lit], dy[lit])
+        return height
+
+    def gradient(self, x: Any, y: Any) -> np.ndarray:
+        """Return the slopes (dh/dx, dh/dy) of the CCD surface.
+
+        Parameters
+        ----------
+        x, y : float, array or Quantity
+            Position on the focal plane [m].
+
+        Returns
+        -------
+        ndarray, shape (..., 2)
+            Slopes [rad]; NaN in a gap or outside.
+        """
+        ccd, dx, dy, lit = self._local(x, y)
+        slopes = np.full((*lit.shape, 2), np.nan)
+        slopes[lit] = self.surfaces.gradient(ccd[lit], dx[lit], dy[lit])
+        return slopes
+
+    def _local(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
+        ccd = self.camera.ccd_at(px, py)
+        centre = self.camera.centers[ccd]
+        return ccd, px - centre[..., 0], py - centre[..., 1], ccd >= 0
+
+    def to_mesh(self, cells_per_ccd: int = 32) -> trimesh.Trimesh:
+        """Return the CCD surfaces as triangles, one tile for each CCD.
+
+        Parameters
+        ----------
+        cells_per_ccd : int
+            Cells along the side of a CCD; each is two triangles.
+
+        Returns
+        -------
+        Trimesh
+            Vertices [m], z the height; normals along +z. Tiles follow the order of `names` with
+            ``2 * cells_per_ccd**2`` faces each. Between vertices it departs from the surface by at most
+            `facet_error`.
+        """
+        cells = _cells(cells_per_ccd)
+        ccd, dx, dy = self._nodes(cells)
+        x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
+        vertices = np.stack([x, y, self.surfaces.height(ccd, dx, dy)], axis=-1)
+        index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+        a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+        tile = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2).reshape(-1, 3)
+        faces = tile + (np.arange(len(self.camera)) * index.size)[:, None, None]
+        return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
+
+    def facet_error(self, cells_per_ccd: int = 32) -> np.ndarray:
+        """Return how far the mesh can depart from the surface.
+
+        On a right triangle with two sides of one cell, linear interpolation is off by at most the largest second
+        derivative in any direction times the square of the cell over 4 (the circumscribed circle's radius squared
+        over 2).
+
+        Parameters
+        ----------
+        cells_per_ccd : int
+            Cells along the side of a CCD.
+
+        Returns
+        -------
+        ndarray, shape (n_ccd,)
+            Upper bound of ``|mesh height - height|`` [m] on each CCD.
+        """
+        cell = self.camera.ccd_size / _cells(cells_per_ccd)
+        return 0.25 * self.surfaces.curvature_bound() * cell**2
+
+    def to_table(self, cells_per_ccd: int = 32) -> Table:
+        """Return heights on a grid of each CCD, as a table that `from_heights` reads.
+
+        Parameters
+        ----------
+        cells_per_ccd : int
+            Cells along the side of a CCD; there are ``(cells_per_ccd + 1)**2`` points on it, strictly inside.
+
+        Returns
+        -------
+        Table
+            Columns ccd (name), x, y, z [m].
+        """
+        # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
+        ccd, dx, dy = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
+        x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
+        names = np.array(self.names)[ccd]
+        columns = [names, x, y, self.surfaces.height(ccd, dx, dy)]
+        return Table(columns, names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
+
+    def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        axis = np.linspace(-1.0, 1.0, cells + 1) * (self.camera.half_size * scale)
+        n = len(self.camera)
+        ccd, dy, dx = np.broadcast_arrays(np.arange(n)[:, None, None], axis[None, :, None], axis[None, None, :])
+        return ccd.ravel(), dx.ravel(), dy.ravel()
+
+
+def _cells(cells_per_ccd: int) -> int:
+    if isinstance(cells_per_ccd, bool) or not isinstance(cells_per_ccd, (int, np.integer)) or cells_per_ccd < 1:
+        raise DomainError(f"cells_per_ccd = {cells_per_ccd!r}: expected a whole number of one or more")
+    return int(cells_per_ccd)
+
+
+def _column(table: Any, name: str) -> np.ndarray:
+    if isinstance(table, Mapping):
+        columns: Iterable[str] = table.keys()
+    elif isinstance(table, Table):
+        columns = table.colnames
+    else:
+        columns = getattr(getattr(table, "dtype", None), "names", None) or ()
+    if name not in columns:
+        raise DomainError(f"heights: column {name!r} is missing: expected columns x, y, z")
+    column = table[name]
+    if isinstance(table, Table) and getattr(column, "unit", None) is not None:
+        column = column.quantity if hasattr(column, "quantity") else column
+    if np.ma.isMaskedArray(column) and np.ma.is_masked(column):
+        raise DomainError(f"heights: column {name!r} has masked rows: expected finite numbers")
+    values = metres(column, f"heights column {name!r}")
+    if not np.all(np.isfinite(values)):
+        row = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise DomainError(f"heights: column {name!r}, row {row} = {values.flat[row]}: expected finite numbers")
+    return values

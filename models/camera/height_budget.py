@@ -1,0 +1,203 @@
+"""The focal-plane height budget of Jee & Tyson (2011), Table 1, and random heights drawn from it.
+
+Every term has its own random streams, one for each raft or CCD, so leaving a term out leaves the others as they were
+to the last bit. Heights are positive along +z of the telescope frame.
+
+- ``global``: one random quadratic over the whole focal plane (tip, tilt, defocus-like and two astigmatism-like terms
+  with normal weights), scaled to exactly the peak to valley over the CCDs, centred on zero.
+- ``raft``: a piston for each raft, uniform within half the peak to valley on either side of zero.
+- ``ccd``: the same for each CCD.
+- ``tilt``: each CCD tilted about x and about y, each angle uniform within half the peak to valley on either side.
+- ``potato_chip``: two crossed cosine waves of equal amplitude on each CCD, of random orientation and phase, each with
+  1 to 2 cycles along a CCD's side, scaled to exactly the peak to valley over the CCD, with zero mean.
+
+The paper gives the peak-to-valley figures and the 1 to 2 cycles; the distributions are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.errors import DomainError, unknown_name
+from ...core.random_streams import stream
+from .camera import Camera
+from .ccd_surfaces import CcdSurfaces
+
+# Points a side at which the potato chip's peak and valley are sought: 64 a cycle or more, so found to 0.1 %.
+_POTATO_POINTS = 129
+
+
+@dataclass(frozen=True)
+class HeightBudget:
+    """Peak-to-valley size of each term of the focal-plane height.
+
+    Parameters
+    ----------
+    global_height : float
+        Surface of the whole focal plane [m].
+    raft_height : float
+        Height of rafts [m].
+    ccd_height : float
+        Height of CCDs on their raft [m].
+    ccd_tilt : float
+        Tilt of CCDs about either axis [rad].
+    potato_chip : float
+        Ripple within a CCD [m].
+    potato_chip_cycles : tuple of float, shape (2,)
+        Fewest and most cycles of the ripple along the side of a CCD.
+    """
+
+    global_height: float
+    raft_height: float
+    ccd_height: float
+    ccd_tilt: float
+    potato_chip: float
+    potato_chip_cycles: tuple[float, float] = (1.0, 2.0)
+
+    def __post_init__(self) -> None:
+        for key in ("global_height", "raft_height", "ccd_height", "ccd_tilt", "potato_chip"):
+            value = getattr(self, key)
+            if not (np.isfinite(value) and value >= 0):
+                raise DomainError(f"{key} = {value!r}: expected a peak to valley of zero or more")
+        low, high = self.potato_chip_cycles
+        if not 0 < low <= high < np.inf:
+            raise DomainError(f"potato_chip_cycles = {self.potato_chip_cycles!r}: expected 0 < fewest <= most")
+
+
+SPECIFICATION = HeightBudget(10e-6, 4.8e-6, 4e-6, 2.5e-4, 4e-6)
+SIMULATED = HeightBudget(10e-6, 6.5e-6, 10e-6, 2.5e-4, 5e-6)
+BUDGETS = {"specification": SPECIFICATION, "simulated": SIMULATED}
+
+
+def load_budget(name: str) -> HeightBudget:
+    """Return a column of Table 1 by name: "specification" or "simulated".
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no budget of that name.
+    """
+    if name not in BUDGETS:
+        raise unknown_name("height budget", name, BUDGETS)
+    return BUDGETS[name]
+
+
+def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[str, ...]) -> CcdSurfaces:
+    """Draw the heights of every CCD.
+
+    Parameters
+    ----------
+    camera : Camera
+        Where the CCDs lie.
+    budget : HeightBudget
+        Size of each term.
+    seed : int
+        Seed of the focal plane.
+    terms : tuple of str
+        Terms to include, of `TERMS`.
+
+    Returns
+    -------
+    CcdSurfaces
+        Height functions.
+    """
+    polynomial = np.zeros((len(camera), 10))
+    waves = np.zeros((len(camera), 2, 4))
+    for term, draw in _DRAWS.items():
+        if term in terms:
+            # Added in the order of the table whatever the order asked for: sums must not depend on it.
+            polynomial += draw(camera, budget, seed)
+    if "potato_chip" in terms:
+        offset, waves = _potato_chip(camera, budget, seed)
+        polynomial[:, 0] += offset
+    return CcdSurfaces(camera.half_size, polynomial, waves)
+
+
+def _global(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
+    scale = np.hypot(*camera.centers.T).max()
+    x, y = camera.centers.T / scale
+    a = camera.half_size / scale
+    px, py, power, astigmatism, oblique = stream(seed, "focal plane", "global").standard_normal(5)
+    xx, yy, xy = power + astigmatism, power - astigmatism, oblique
+    # px X + py Y + xx X^2 + yy Y^2 + xy X Y with X = x + a u, Y = y + a v, in powers of u and v.
+    polynomial = np.zeros((len(camera), 10))
+    polynomial[:, 0] = px * x + py * y + xx * x**2 + yy * y**2 + xy * x * y
+    polynomial[:, 1] = a * (px + 2 * xx * x + xy * y)
+    polynomial[:, 2] = a * (py + 2 * yy * y + xy * x)
+    polynomial[:, 3], polynomial[:, 4], polynomial[:, 5] = a**2 * xx, a**2 * xy, a**2 * yy
+    low, high = _quadratic_range(polynomial)
+    polynomial[:, 0] -= 0.5 * (low + high)
+    return polynomial * (budget.global_height / (high - low))
+
+
+def _quadratic_range(polynomial: np.ndarray) -> tuple[float, float]:
+    """Return the least and greatest value of quadratics over the tiles -1 <= u, v <= 1."""
+    c0, cu, cv, uu, uv, vv = polynomial[:, :6].T
+    ends = np.array([-1.0, 1.0])
+    points = [(np.full_like(c0, u), np.full_like(c0, v)) for u in ends for v in ends]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points += [(-(cu + uv * v) / (2 * uu), np.full_like(c0, v)) for v in ends]
+        points += [(np.full_like(c0, u), -(cv + uv * u) / (2 * vv)) for u in ends]
+        determinant = 4 * uu * vv - uv**2
+        points.append(((uv * cv - 2 * vv * cu) / determinant, (uv * cu - 2 * uu * cv) / determinant))
+    values = []
+    for u, v in points:
+        inside = (np.abs(u) <= 1) & (np.abs(v) <= 1)
+        values.append((c0 + cu * u + cv * v + uu * u**2 + uv * u * v + vv * v**2)[inside])
+    extremes = np.concatenate(values)
+    return float(extremes.min()), float(extremes.max())
+
+
+def _raft(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
+    half = 0.5 * budget.raft_height
+    pistons = np.array([stream(seed, "focal plane", "raft", name).uniform(-half, half) for name in camera.raft_names])
+    polynomial = np.zeros((len(camera), 10))
+    polynomial[:, 0] = pistons[camera.raft_index]
+    return polynomial
+
+
+def _ccd(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
+    half = 0.5 * budget.ccd_height
+    polynomial = np.zeros((len(camera), 10))
+    polynomial[:, 0] = [stream(seed, "focal plane", "ccd", name).uniform(-half, half) for name in camera.ccd_names]
+    return polynomial
+
+
+def _tilt(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
+    half = 0.5 * budget.ccd_tilt
+    angles = [stream(seed, "focal plane", "tilt", name).uniform(-half, half, 2) for name in camera.ccd_names]
+    polynomial = np.zeros((len(camera), 10))
+    polynomial[:, 1:3] = camera.half_size * np.tan(angles)
+    return polynomial
+
+
+def _potato_chip(camera: Camera, budget: HeightBudget, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    offset = np.zeros(len(camera))
+    waves = np.zeros((len(camera), 2, 4))
+    a = camera.half_size
+    axis = np.linspace(-a, a, _POTATO_POINTS)
+    for i, name in enumerate(camera.ccd_names):
+        rng = stream(seed, "focal plane", "potato_chip", name)
+        angle = rng.uniform(0.0, np.pi) + np.array([0.0, 0.5 * np.pi])
+        k = 2 * np.pi * rng.uniform(*budget.potato_chip_cycles, 2) / camera.ccd_size
+        phase = rng.uniform(0.0, 2 * np.pi, 2)
+        kx, ky = k * np.cos(angle), k * np.sin(angle)
+        along_y, along_x = np.exp(1j * (np.outer(ky, axis) + phase[:, None])), np.exp(1j * np.outer(kx, axis))
+        ripple = np.real(along_y[:, :, None] * along_x[:, None, :]).sum(axis=0)
+        amplitude = budget.potato_chip / (ripple.max() - ripple.min())
+        waves[i] = np.stack([np.full(2, amplitude), kx, ky, phase], axis=-1)
+        # Mean of a cosine over the square: each axis contributes sin(k a) / (k a).
+        offset[i] = -amplitude * np.sum(np.cos(phase) * np.sinc(kx * a / np.pi) * np.sinc(ky * a / np.pi))
+    return offset, waves
+
+
+_DRAWS: dict[str, Callable[[Camera, HeightBudget, int], np.ndarray]] = {
+    "global": _global,
+    "raft": _raft,
+    "ccd": _ccd,
+    "tilt": _tilt,
+}
+TERMS = (*_DRAWS, "potato_chip")

@@ -1,0 +1,115 @@
+"""Fit CCD height functions to measured points (x, y, z)."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import splu
+
+from ...core.errors import DomainError
+from .camera import Camera
+from .ccd_surfaces import POWERS, CcdSurfaces, spline_weights
+
+# Fewest points for a polynomial of each degree; about twice its number of coefficients from the quadratic on.
+_DEGREES = ((20, 3, 10), (9, 2, 6), (3, 1, 3))
+# From here on a B-spline is added, of at most one coefficient for every three points and side of 20.
+_SPLINE_POINTS, _POINTS_PER_COEFFICIENT, _LARGEST_GRID = 48, 3, 20
+# Weight of the spline's second differences against the data. Ripples of two cycles a CCD lose less than 1e-4 of
+# their height to it, while patches without points are bridged smoothly.
+_SMOOTHING = 1e-4
+
+
+def fit_heights(
+    camera: Camera, x: np.ndarray, y: np.ndarray, z: np.ndarray, *, margin: float = 0.0
+) -> tuple[CcdSurfaces, np.ndarray]:
+    """Fit each CCD's height function to the points that lie on it.
+
+    A polynomial by least squares takes the large shape: a plane from 3 points, a quadratic from 9, a cubic from 20.
+    Where there are at least 48 points, a uniform cubic B-spline takes what is left.
+
+    Parameters
+    ----------
+    camera : Camera
+        Where the CCDs lie.
+    x, y, z : ndarray, shape (n,)
+        Measured points [m]; z positive along +z of the telescope frame.
+    margin : float
+        Points this far outside a CCD still count as on it [m].
+
+    Returns
+    -------
+    surfaces : CcdSurfaces
+        Height functions; flat at zero where there are no points.
+    measured : ndarray of bool, shape (n_ccd,)
+        Which CCDs have points.
+
+    Raises
+    ------
+    DomainError
+        If no point lies on a CCD, or a CCD has points but too few or all on one line.
+    """
+    ccd = camera.ccd_at(x, y, margin=margin)
+    order = np.argsort(ccd, kind="stable")
+    order = order[ccd[order] >= 0]
+    if not order.size:
+        raise DomainError(f"heights: none of {len(x)} points lies on a CCD: expected x, y in m on the focal plane")
+    bounds = np.searchsorted(ccd[order], np.arange(len(camera) + 1))
+    counts = np.diff(bounds)
+    rich = counts[counts >= _SPLINE_POINTS]
+    m = 0
+    if rich.size:
+        # One grid for all CCDs (kernels read one array), so that the poorest of them supports it.
+        m = int(np.clip(np.sqrt(rich.min() / _POINTS_PER_COEFFICIENT), 4, _LARGEST_GRID))
+    polynomial = np.zeros((len(camera), 10))
+    grid = np.zeros((len(camera), m, m)) if m else None
+    bending = _bending(m) if m else None
+    for i, (first, last) in enumerate(pairwise(bounds)):
+        if first == last:
+            continue
+        chosen = order[first:last]
+        u, v = ((np.stack([x[chosen], y[chosen]]).T - camera.centers[i]) / camera.half_size).T
+        polynomial[i], rest = _fit_polynomial(u, v, z[chosen], camera.ccd_names[i])
+        if grid is not None and bending is not None and last - first >= _SPLINE_POINTS:
+            grid[i] = _fit_spline(u, v, rest, bending)
+    return CcdSurfaces(camera.half_size, polynomial, np.zeros((len(camera), 2, 4)), grid), counts > 0
+
+
+def _fit_polynomial(u: np.ndarray, v: np.ndarray, z: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    for points, _, size in _DEGREES:
+        if len(z) < points:
+            continue
+        design = np.stack([u**p * v**q for p, q in POWERS[:size]])
+        # Sums by einsum and not by BLAS, whose threads would change the last bits.
+        normal = np.einsum("in,jn->ij", design, design)
+        spread = np.linalg.eigvalsh(normal)
+        # Points in a few rows cannot carry the higher terms: go down a degree.
+        if spread[0] > 1e-10 * spread[-1]:
+            solution = np.linalg.solve(normal, np.einsum("in,n->i", design, z))
+            return np.concatenate([solution, np.zeros(10 - size)]), z - np.einsum("in,i->n", design, solution)
+    raise DomainError(f"heights on {name}: {len(z)} points: expected at least 3 that are not on one line")
+
+
+def _bending(m: int) -> csc_array:
+    """Return the quadratic form of second differences along both sides, plus a tiny ridge, shape (m^2, m^2)."""
+    second = np.diff(np.eye(m), 2, axis=0)
+    stiffness = second.T @ second
+    # The ridge settles the plane that neither bending nor, in an empty corner, the data hold.
+    stiffness = _SMOOTHING * (np.kron(np.eye(m), stiffness) + np.kron(stiffness, np.eye(m)))
+    return csc_array(stiffness + 1e-9 * np.eye(m * m))
+
+
+def _fit_spline(u: np.ndarray, v: np.ndarray, z: np.ndarray, bending: csc_array) -> np.ndarray:
+    m = math.isqrt(bending.shape[0])
+    i, wu = spline_weights(u, m)
+    j, wv = spline_weights(v, m)
+    four = np.arange(4)
+    columns = (j + four[:, None])[:, None] * m + (i + four[:, None])[None, :]
+    weights = wv[:, None] * wu[None, :]
+    rows = np.broadcast_to(np.arange(len(z)), weights.shape)
+    design = csr_array((weights.ravel(), (rows.ravel(), columns.ravel())), shape=(len(z), m * m))
+    normal = csc_array(design.T @ design)
+    normal = normal + bending * (normal.trace() / m**2)
+    return splu(normal).solve(design.T @ z).reshape(m, m)

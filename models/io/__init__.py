@@ -1,0 +1,1 @@
+"""Files of telescopes, one folder for each format."""

@@ -1,0 +1,1 @@
+"""CODE V lens files (.seq)."""

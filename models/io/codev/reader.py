@@ -1,0 +1,252 @@
+"""Read a CODE V lens file (.seq): its commands are put into the terms of a Zemax file, and read as one.
+
+What is read: RDM, DIM, TITLE, EPD, FNO, NAO, WL, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, the surfaces SO S SI
+(radius or curvature, thickness, glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE
+YDE ZDE ADE BDE CDE with DAR and BEN, CIR (OBS) and REX REY with ADX ADY. ADE and BDE turn to the left, CDE to the
+right (CODE V reference manual, "Decentered surfaces"), Zemax's tilts all to the right. A glass is a name
+(N-BK7_SCHOTT), REFL, or a number (517642).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ....core.errors import PachonError, PrescriptionError
+from ...telescope import Telescope
+from ..glass_catalogue import GlassCatalogue
+from ..zemax.file import Block, Findings, ZemaxFile
+from ..zemax.reader import LensReader, chosen_catalogues
+from ..zemax.text import Record, read_text
+
+UNITS = {"M": "MM", "C": "CM", "I": "IN"}
+FIELDS = {
+    "XAN": ("XFLN", 0), "YAN": ("YFLN", 0), "XOB": ("XFLN", 1), "YOB": ("YFLN", 1),
+    "XIM": ("XFLN", 2), "YIM": ("YFLN", 2), "XRI": ("XFLN", 3), "YRI": ("YFLN", 3),
+}  # fmt: skip
+APERTURES = {"EPD": "ENPD", "FNO": "FNUM", "NAO": "OBNA"}
+POWERS = "ABCDEFG"
+#: Commands that say nothing about rays: names, variables and couplings, weights, vignetting factors of the beams,
+#: solves, whose solution stands in the file, and drawing.
+_IGNORED = """
+LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC WTW WTF VUX VLX VUY VLY PIM CUM
+UMY SPH CON ASP RDM WTX WTY VIE DRA COM CUX THM GLC TEM PRE CRA
+"""
+IGNORED = frozenset(_IGNORED.split())
+INFINITE = 1e10
+
+
+def read_codev(
+    path: str | os.PathLike[str],
+    *,
+    lenient: bool = False,
+    glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
+) -> Telescope:
+    """Read a CODE V lens file; arguments, result and errors are those of `zemax_reader.read_zemax`."""
+    target = Path(path)
+    findings = Findings(lenient)
+    catalogues = chosen_catalogues(target, glass_catalogues)
+    try:
+        return LensReader(_Translation(target, findings).file(), findings, catalogues).telescope()
+    except PachonError as error:
+        text = str(error)
+        raise error if text.startswith(str(target)) else PrescriptionError(f"{target}: {text}") from None
+
+
+def _commands(path: Path) -> Iterator[Record]:
+    """Yield the commands of a file: parted by line ends and semicolons, carried on by &, comments from ! to the end."""
+    carried, first = "", 1
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        first = first if carried else number
+        text = carried + line.split("!")[0].rstrip()
+        if text.endswith("&"):
+            carried = text[:-1] + " "
+            continue
+        carried = ""
+        for part in re.split(r";(?=(?:[^']*'[^']*')*[^']*$)", text):
+            words = part.split()
+            if words:
+                after = part.strip()[len(words[0]) :].strip()
+                yield Record(str(path), first, "", words[0].upper(), tuple(words[1:]), after)
+
+
+class _Translation:
+    """Goes through the commands and collects the lines that the same lens has in a Zemax file."""
+
+    def __init__(self, path: Path, findings: Findings) -> None:
+        self.path, self.findings = path, findings
+        self.header = Block(str(path))
+        self.surfaces: list[Block] = []
+        self.figures: list[dict[str, float]] = []
+        self.radii = True
+        self.field_type = 0.0
+        self.waves: list[float] = []
+
+    def file(self) -> ZemaxFile:
+        """Return the parts of the Zemax file."""
+        current = -1
+        for command in _commands(self.path):
+            if command.keyword in ("SO", "SI") or re.fullmatch(r"S\d*", command.keyword):
+                self.surfaces.append(Block(f"{self.path}, surface {len(self.surfaces)}"))
+                self.figures.append({})
+                current = len(self.surfaces) - 1
+                self._start(self._placed(command, current))
+            elif self.surfaces:
+                chosen = current
+                if command.words and re.fullmatch(r"[Ss](\d+|[OoIi])", command.words[0]):
+                    chosen = self._number(command)
+                    command = replace(command, words=command.words[1:])
+                self._surface(self._placed(command, chosen), chosen)
+            else:
+                self._system(command)
+        if len(self.surfaces) < 3:
+            raise PrescriptionError(f"{self.path}: {len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
+        count = len(self.waves)
+        line = Record(str(self.path), 1, "", "FTYP", (repr(self.field_type), "0", "0", str(count)), "")
+        self.header.lines.append(line)
+        return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)))
+
+    def _placed(self, command: Record, number: int) -> Record:
+        return replace(command, place=f"surface {number}")
+
+    def _number(self, command: Record) -> int:
+        word = command.words[0][1:].upper()
+        number = {"O": 0, "I": len(self.surfaces) - 1}.get(word)
+        number = int(word) if number is None else number
+        if number >= len(self.surfaces):
+            raise command.error(f"a surface from 0 to {len(self.surfaces) - 1}")
+        return number
+
+    def _system(self, command: Record) -> None:
+        key, words = command.keyword, command.words
+
+        def add(keyword: str, *values: object) -> None:
+            self.header.lines.append(replace(command, keyword=keyword, words=tuple(map(str, values))))
+
+        if key == "RDM":
+            self.radii = not (words and words[0].upper() == "N")
+        elif key == "DIM":
+            unit = (words or ("M",))[0].upper()
+            if unit not in UNITS:
+                raise command.error(f"one of {', '.join(UNITS)}")
+            self.header.lines.append(replace(command, keyword="UNIT", words=(UNITS[unit],), text=UNITS[unit]))
+        elif key == "TITLE" or key == "TIT":
+            self.header.lines.append(replace(command, keyword="NAME", text=command.text.strip("'\" ")))
+        elif key in APERTURES:
+            add(APERTURES[key], command.number(0))
+        elif key == "WL":
+            self.waves = [command.number(i) / 1e3 for i in range(len(words))]
+            for i, wave in enumerate(self.waves, start=1):
+                add("WAVM", i, repr(wave))
+        elif key == "REF":
+            add("PWAV", command.integer(0))
+        elif key in FIELDS:
+            keyword, self.field_type = FIELDS[key]
+            add(keyword, *(repr(command.number(i)) for i in range(len(words))))
+        elif key not in IGNORED:
+            self.findings.report(command.where, f"{command.shown}: this command is not understood")
+
+    def _start(self, command: Record) -> None:
+        """Take what stands on the line that begins a surface: radius or curvature, thickness, glass."""
+        figures = self.figures[-1]
+        figures["bend"] = self._curvature(command, 0, radius=self.radii) if command.words else 0.0
+        figures["THI"] = command.number(1, 0.0)
+        if len(command.words) > 2:
+            self._glass(command, command.words[2], len(self.surfaces) - 1)
+
+    def _curvature(self, command: Record, position: int, *, radius: bool) -> float:
+        value = command.number(position)
+        return (1.0 / value if value else 0.0) if radius else value
+
+    def _glass(self, command: Record, name: str, number: int) -> None:
+        found = re.fullmatch(r"(\d{3})\.?(\d{3})|(\d{6})\.(\d{6})", name)
+        if name.upper() in ("REFL", "MIRROR"):
+            words: tuple[str, ...] = ("MIRROR",)
+        elif name.upper() == "AIR":
+            return
+        elif found:
+            # A number: the digits of nd - 1, then the Abbe number times ten, each with three digits or six.
+            index, abbe = (found[1], found[2]) if found[1] else (found[3], found[4])
+            words = (name, "1", "0", repr(1 + float(f"0.{index}")), repr(float(abbe) / 10 ** (len(abbe) - 2)))
+        else:
+            words = (name.split("_")[0],)
+        self.surfaces[number].lines.append(replace(command, keyword="GLAS", words=words))
+
+    def _surface(self, command: Record, number: int) -> None:
+        key, words = command.keyword, command.words
+        block, figures = self.surfaces[number], self.figures[number]
+        if key in ("RDY", "CUY"):
+            figures["bend"] = self._curvature(command, 0, radius=key == "RDY")
+        elif key == "GLA":
+            self._glass(command, (words or ("AIR",))[0], number)
+        elif key in ("STO", "SLB"):
+            keyword = {"STO": "STOP", "SLB": "COMM"}[key]
+            block.lines.append(replace(command, keyword=keyword, text=command.text.strip("'\" ")))
+        elif key in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ADX", "ADY", *POWERS):
+            figures[key] = command.number(0)
+        elif key in ("DAR", "BEN"):
+            figures[key] = 1.0
+        elif key == "CIR":
+            obscures = bool(words) and words[0].upper() == "OBS"
+            radius = command.number(1 if obscures else 0)
+            block.lines.append(replace(command, keyword="OBSC" if obscures else "CLAP", words=("0", repr(radius))))
+        elif key not in IGNORED:
+            self.findings.report(command.where, f"{command.shown}: this command is not understood")
+
+    def _blocks(self) -> list[Block]:
+        """Return the surfaces, with coordinate breaks between them where they are tilted or decentred."""
+        blocks: list[Block] = []
+        carried = self.figures[-1].get("THI", 0.0)
+        for number, (block, figures) in enumerate(zip(self.surfaces, self.figures, strict=True)):
+            last = number == len(self.surfaces) - 1
+            thickness = 0.0 if last else figures.get("THI", 0.0)
+            # The thickness of the image is a defocus: it counts from where the surface before it leads.
+            thickness += carried if number == len(self.surfaces) - 2 else 0.0
+            kind = "EVENASPH" if any(figures.get(p) for p in POWERS) else "STANDARD"
+            lines: list[tuple[Any, ...]] = [
+                ("TYPE", kind),
+                ("CURV", figures.get("bend", 0.0)),
+                ("CONI", figures.get("K", 0.0)),
+            ]
+            lines += [("PARM", i, figures.get(p, 0.0)) for i, p in enumerate(POWERS, start=2) if figures.get(p)]
+            if "REX" in figures or "REY" in figures:
+                lines.append(("SQAP", figures.get("REX", 0.0), figures.get("REY", 0.0)))
+            if figures.get("ADX") or figures.get("ADY"):
+                lines.append(("OBDC", figures.get("ADX", 0.0), figures.get("ADY", 0.0)))
+            distance = "INFINITY" if number == 0 and abs(thickness) >= INFINITE else thickness
+            tilts = (-figures.get("ADE", 0.0), -figures.get("BDE", 0.0), figures.get("CDE", 0.0))
+            shift = (figures.get("XDE", 0.0), figures.get("YDE", 0.0))
+            depth = figures.get("ZDE", 0.0)
+            moved = any(tilts) or any(shift) or depth
+            after: list[Block] = []
+            if moved and figures.get("DAR"):
+                back = [*(-v for v in (*shift, *tilts)), 1]
+                after = [self._break(number, back, 0.0), self._break(number, [0.0] * 6, thickness - depth)]
+                distance = 0.0
+            elif moved and figures.get("BEN"):
+                if tilts[2]:
+                    raise PrescriptionError(f"{block.where}: BEN with CDE {figures['CDE']:g}: not understood")
+                after, distance = [self._break(number, [0, 0, *tilts, 0], thickness)], 0.0
+            if moved:
+                blocks += [self._break(number, [0.0] * 6, depth), self._break(number, [*shift, *tilts, 0], 0.0)]
+            if not last and not block.all("COMM"):
+                block.lines.append(self._record(number, "COMM", f"S{number}"))
+            block.lines += [self._record(number, *line) for line in (*lines, ("DISZ", distance))]
+            blocks += [block, *after]
+        return blocks
+
+    def _break(self, number: int, parameters: Iterable[float], thickness: float) -> Block:
+        lines: list[tuple[Any, ...]] = [
+            ("TYPE", "COORDBRK"),
+            ("DISZ", thickness),
+            *(("PARM", i, v) for i, v in enumerate(parameters, start=1)),
+        ]
+        return Block(self.surfaces[number].where, [self._record(number, *line) for line in lines])
+
+    def _record(self, number: int, keyword: str, *values: object) -> Record:
+        words = tuple(repr(v) if isinstance(v, float) else str(v) for v in values)
+        return Record(str(self.path), 1, f"surface {number}", keyword, words, " ".join(words))

@@ -1,0 +1,95 @@
+"""Grids of sag in FITS files: measured figures and bending modes.
+
+The first image of two dimensions is taken, its rows along y. Its header says where the nodes are, as for any map:
+``x = CRVAL1 + (i - CRPIX1) CDELT1`` for column i = 1, 2, ... in CUNIT1, the same with 2 for the rows, and BUNIT, the
+unit of the sag. Units are metres where a card is missing.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+
+from ...core.errors import PrescriptionError
+from ..shapes.grid import GridSag
+
+
+def read_grid(path: str | os.PathLike[str]) -> GridSag:
+    """Return the sag that a FITS image holds.
+
+    Parameters
+    ----------
+    path : str or path
+        File to read.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read, has no image of two dimensions, a unit that is no length, or is no valid grid.
+    """
+    path = Path(path)
+    try:
+        with fits.open(path, memmap=False) as hdus:
+            images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
+        raise PrescriptionError(f"{path}: cannot be read as FITS ({reason[:120]})") from None
+    if not images:
+        raise PrescriptionError(f"{path}: expected a FITS image of two dimensions")
+    header, data = images[0]
+    try:
+        x, y = _axis(header, 1, data.shape[1], path), _axis(header, 2, data.shape[0], path)
+        return GridSag(x, y, np.asarray(data, dtype=np.float64) * _unit(header, "BUNIT", path))
+    except PrescriptionError as error:
+        text = str(error)
+        raise error if text.startswith(str(path)) else PrescriptionError(f"{path}: {text}") from None
+
+
+def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
+    """Write a grid of sag as a FITS image that :func:`read_grid` reads; the file is replaced as a whole.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be written.
+    """
+    header = fits.Header()
+    for number, (first, step) in enumerate(zip((grid.x[0], grid.y[0]), grid.step, strict=True), start=1):
+        header[f"CRPIX{number}"] = 1.0
+        header[f"CRVAL{number}"] = float(first)
+        header[f"CDELT{number}"] = step
+        header[f"CUNIT{number}"] = "m"
+    header["BUNIT"] = ("m", "sag")
+    target = Path(path)
+    scratch = target.with_name(target.name + ".part")
+    try:
+        fits.PrimaryHDU(np.asarray(grid.values), header).writeto(scratch, overwrite=True, checksum=True)
+        scratch.replace(target)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        raise PrescriptionError(f"{target}: cannot be written ({error.strerror or error})") from None
+
+
+def _axis(header: Any, number: int, size: int, path: Path) -> np.ndarray:
+    keys = [f"CRPIX{number}", f"CRVAL{number}", f"CDELT{number}"]
+    for key in keys:
+        if key not in header:
+            raise PrescriptionError(f"{path}: {key} is missing: expected the header to say where the nodes are")
+        if isinstance(header[key], bool) or not isinstance(header[key], (int, float)) or not np.isfinite(header[key]):
+            raise PrescriptionError(f"{path}: {key} = {header[key]!r}: expected a number")
+    reference, value, step = (float(header[key]) for key in keys)
+    return (value + (np.arange(1, size + 1) - reference) * step) * _unit(header, f"CUNIT{number}", path)
+
+
+def _unit(header: Any, key: str, path: Path) -> float:
+    """Return the length in metres of the unit that a card names."""
+    text = header.get(key, "m")
+    try:
+        return float(u.Unit(text).to(u.m))
+    except (ValueError, TypeError, u.UnitConversionError):
+        raise PrescriptionError(f"{path}: {key} = {text!r}: expected a unit of length") from None

@@ -1,0 +1,155 @@
+"""Telescope prescriptions: our YAML format, one surface a line, read strictly and written back exactly.
+
+A file has a header and a table of surfaces in the order that light meets them::
+
+    name: my_telescope
+    source: where the figures come from
+    version: "1"
+    units: {length: m, angle: deg, wavelength: um}
+    stop: {z: 0.44}
+    pupil: {diameter: 8.36, obscuration: 0.612}
+    launch_distance: 15.0
+    reference_sphere_radius: 5.0
+    field: {radius: 1.75, limit: 2.5}
+    wavelengths: {range: [0.3, 1.2], default: 0.624, band: [0.545, 0.703]}
+    media:
+      silica: {B: [0.696, 0.408, 0.897], C: [0.00468, 0.0135, 97.9], range: [0.21, 3.71]}
+    groups:
+      L1: [L1_entrance, L1_exit]
+    surfaces:
+      - {name: M1, type: mirror, shape: conic, z: 0.0, radius: 19.8, conic: -1.2, annulus: [2.6, 4.2]}
+
+Telescope frame: origin at the primary's vertex, +z towards the sky; a positive radius has its centre on the +z side.
+`coefficients` of an even asphere belong to r^4, r^6, r^8...; a mirror or detector stays in the medium before it.
+`C` of a Sellmeier glass is in um^2 whatever the unit of wavelength.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+from ...core.errors import PrescriptionError, unknown_name
+from ...core.yaml_reader import read_yaml
+from ..telescope import Telescope
+from .codev.reader import read_codev
+from .glass_catalogue import GlassCatalogue
+from .yaml.reader import read_telescope
+from .yaml.writer import telescope_to_yaml
+from .zemax.reader import read_zemax
+from .zemax.writer import catalogue_path, telescope_to_zemax
+
+DATA = Path(__file__).parents[1] / "data"
+BUNDLED = (
+    *(f"lsst_v3.3_{band}" for band in "ugrizy"),
+    "lsst_v3.3_r_obstructed",
+    "lsst_v3.3_g_vacuum_zemax_check",
+    *(f"rubin_v3.14_{band}" for band in "ugrizy"),
+    "comcam_r",
+    "auxtel",
+    "decam",
+    "hsc",
+    "paul_baker",
+)
+
+
+#: Endings of files that a telescope is read from.
+ENDINGS = (".yaml", ".yml", ".zmx", ".seq")
+
+
+def bundled_names() -> tuple[str, ...]:
+    """Return the names of the prescriptions that come with the package."""
+    return BUNDLED
+
+
+def load_telescope(
+    name_or_path: str | os.PathLike[str],
+    *,
+    lenient: bool = False,
+    glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
+) -> Telescope:
+    """Load a bundled prescription by name, or any prescription by the path of its file.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, or of a ``.zmx`` (Zemax) or ``.seq``
+        (CODE V) file.
+    lenient : bool
+        Of a Zemax or CODE V file: warn about what is not understood instead of raising.
+    glass_catalogues : iterable of GlassCatalogue or path
+        AGF catalogues that a Zemax or CODE V file's glasses are looked up in, before the bundled one.
+
+    Returns
+    -------
+    Telescope
+        The prescription.
+
+    Raises
+    ------
+    UnknownNameError
+        If it is neither a bundled name nor a path.
+    PrescriptionError
+        If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
+    """
+    text = os.fspath(name_or_path)
+    if text in BUNDLED:
+        return _bundled(text)
+    path = Path(text)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return read_telescope(read_yaml(path))
+    if path.suffix.lower() == ".seq":
+        return read_codev(path, lenient=lenient, glass_catalogues=glass_catalogues)
+    if path.suffix.lower() == ".zmx":
+        return read_zemax(path, lenient=lenient, glass_catalogues=glass_catalogues)
+    if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
+        raise PrescriptionError(f"{path}: expected a prescription file that ends in .yaml, .zmx or .seq")
+    raise unknown_name("telescope", text, BUNDLED)
+
+
+@cache
+def _bundled(name: str) -> Telescope:
+    # A telescope never changes, so that one serves all who ask; a sweep asks for it at every point.
+    return read_telescope(read_yaml(DATA / f"{name}.yaml"))
+
+
+def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
+    """Write a prescription file: YAML, or where the name ends in ``.zmx`` a Zemax lens file.
+
+    Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
+    it.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        What to write.
+    path : str or path
+        File to write; it is replaced as a whole, or left as it was.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be written, or cannot hold the telescope.
+    """
+    target = Path(path)
+    if target.suffix.lower() == ".zmx":
+        lens, glasses = telescope_to_zemax(telescope)
+        if glasses:
+            _write_text(catalogue_path(target), glasses)
+        _write_text(target, lens)
+    else:
+        _write_text(target, telescope_to_yaml(telescope))
+
+
+def _write_text(target: Path, text: str) -> None:
+    scratch = target.with_name(target.name + ".part")
+    try:
+        scratch.write_text(text, encoding="utf-8")
+        scratch.replace(target)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            scratch.unlink()
+        raise PrescriptionError(f"{target}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,1 @@
+"""Zemax lens files (.zmx)."""

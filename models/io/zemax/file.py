@@ -1,0 +1,180 @@
+"""The parts of a Zemax lens file (.zmx), before anything is made of them: header, surfaces, and what is ignored.
+
+A file is a list of lines "KEYWORD words". A header is followed by one block a surface, which begins with SURF and
+whose lines are indented, and by merit function, tolerances and configurations, which describe work on the lens and
+not the lens.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ....core.errors import PrescriptionError, PrescriptionWarning
+from .text import Record, read_text, records
+
+#: Keywords of the header that say nothing about rays: notes, names of other files, analysis and display settings,
+#: weights. Vignetting factors (VDXN...) and ray aiming (RAIM) choose which rays Zemax launches, not where they go.
+_HEADER = """
+VERS MODE NAME AUTH NOTE IWDP PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN FWGT FCOM VDXN VDYN VCXN
+VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDSX VDSY WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EERA OPDX PUPD EFFL DMFS CONF
+PMAG TOTR TRAC MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE
+"""
+#: Keywords of a surface that say nothing about rays: comments, coatings, scatter, drawing and tolerancing settings,
+#: automatic semi-diameters, and solves, variables and pick-ups, whose solution stands in the file.
+_SURFACE = """
+COMM SSID SLAB HIDE MIRR POPS COAT FIMP SCAT STRE MEMA DIAM EDGE TCED TCEC TCMM EXPN LBLK CHZN BORE PICK CCOM VCUR
+VDSZ VPAR VCON VGLA VXDT VDIA PZUP PCUP PPAR PXDT PCOP PDIA PGLA PKUP CPKP MAZH MARG CHAZ CHAA POSI COMP CURF GLCZ
+RSCE TRAC FNOT BRKS SPAC ROWC SCOL
+"""
+#: Keywords that only stand after the surfaces, for files without indentation.
+TRAILER = ("BLNK", "TOL", "MNUM", "MOFF")
+IGNORED_HEADER = frozenset(_HEADER.split())
+IGNORED_SURFACE = frozenset(_SURFACE.split())
+
+
+@dataclass
+class Findings:
+    """What to do about something that is not understood: an error, or with `lenient` a warning.
+
+    Parameters
+    ----------
+    lenient : bool
+        Whether to warn and go on.
+    """
+
+    lenient: bool = False
+
+    def report(self, where: str, message: str, instead: str = "") -> None:
+        """Raise PrescriptionError, or warn.
+
+        Parameters
+        ----------
+        where, message : str
+            The place, and what is wrong there.
+        instead : str
+            What is done about it where it is only a warning.
+
+        Raises
+        ------
+        PrescriptionError
+            Unless lenient.
+        """
+        text = f"{where}: {message}"
+        if not self.lenient:
+            raise PrescriptionError(text)
+        warnings.warn(f"{text}; {instead}" if instead else text, PrescriptionWarning, stacklevel=2)
+
+
+@dataclass
+class Block:
+    """Lines that belong together, by keyword: the header, or a surface.
+
+    Parameters
+    ----------
+    where : str
+        File and surface, for messages.
+    lines : list of Record
+        Lines in the order of the file.
+    used : set of str
+        Keywords that have been read.
+    """
+
+    where: str
+    lines: list[Record] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
+
+    def all(self, keyword: str) -> list[Record]:
+        """Return every line with a keyword."""
+        self.used.add(keyword)
+        return [line for line in self.lines if line.keyword == keyword]
+
+    def last(self, keyword: str) -> Record | None:
+        """Return the last line with a keyword, or None."""
+        found = self.all(keyword)
+        return found[-1] if found else None
+
+    def number(self, keyword: str, default: float, position: int = 0, *, infinite: bool = False) -> float:
+        """Return a number of the last line with a keyword, or a default where there is no such line."""
+        line = self.last(keyword)
+        return default if line is None else line.number(position, infinite=infinite)
+
+    def text(self, keyword: str) -> str:
+        """Return what follows a keyword on its last line; empty where there is no such line."""
+        line = self.last(keyword)
+        return "" if line is None else line.text.strip('" ')
+
+    def table(self, keyword: str) -> dict[int, float]:
+        """Return the numbers of lines "KEYWORD position number", by position."""
+        return {line.integer(0): line.number(1) for line in self.all(keyword)}
+
+    def report_rest(self, ignored: frozenset[str], findings: Findings) -> None:
+        """Report every keyword that was neither read nor is among those to ignore."""
+        for line in self.lines:
+            if line.keyword not in self.used and line.keyword not in ignored:
+                findings.report(line.where, f"{line.shown}: this keyword is not understood")
+
+
+@dataclass
+class ZemaxFile:
+    """A lens file, taken apart.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    header : Block
+        Lines before the first surface.
+    surfaces : list of Block
+        Surfaces from the object to the image.
+    trailer : Block
+        Lines after the last surface.
+    """
+
+    path: Path
+    header: Block
+    surfaces: list[Block]
+    trailer: Block
+
+
+def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
+    """Return the parts of a lens file.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read, is not a sequential lens, or has fewer than three surfaces.
+    """
+    text = read_text(path)
+    source = str(path)
+    indented = {i for i, line in enumerate(text.splitlines(), start=1) if line[:1].isspace()}
+    header = trailer = Block(source)
+    current = header
+    surfaces: list[Block] = []
+    for record in records(text, source):
+        if record.keyword == "SURF":
+            if record.integer(0) != len(surfaces):
+                raise record.error(f"surface {len(surfaces)} here")
+            current = Block(f"{source}, surface {len(surfaces)}")
+            surfaces.append(current)
+        elif surfaces and (record.keyword in TRAILER or (indented and record.line not in indented)):
+            # What stands at the margin after the surfaces no longer belongs to one.
+            current = trailer = Block(source) if trailer is header else trailer
+            current.lines.append(replace(record, place=""))
+        else:
+            current.lines.append(record)
+    mode = header.text("MODE")
+    if mode and mode.upper() != "SEQ":
+        raise PrescriptionError(f"{source}: MODE {mode}: expected SEQ, a sequential lens")
+    if len(surfaces) < 3:
+        raise PrescriptionError(
+            f"{source}: {len(surfaces)} surfaces (SURF): expected an object, an image and one between"
+        )
+    file = ZemaxFile(path, header, surfaces, trailer)
+    if trailer is header:
+        file.trailer = Block(source)
+    configurations = file.trailer.number("MNUM", 1.0)
+    if configurations > 1:
+        findings.report(source, f"MNUM {configurations:.0f}: one configuration is read, the one the file was saved in")
+    return file

@@ -1,0 +1,291 @@
+"""Read a sequential Zemax lens file (.zmx) as a telescope.
+
+Frame: Zemax sends light along +z, a telescope along -z. The telescope's axes are those of the object space of the
+file turned by half a turn about y, ``(x, y, z) = (-X, Y, Z0 - Z)``; `Z0` is where the first surface with power lies,
+so that its vertex is at z = 0. A field of the file at angles (tx, ty) is the field (-tx, ty) here. Coordinate breaks
+become positions and rotations of the surfaces behind them, and nothing else remains of them.
+
+What is not understood is an error that names file, surface and keyword, or with `lenient` a warning; keywords that
+cannot change what rays do are listed in `zemax_file`. The page docs/zemax.md has the tables.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ....core.errors import PachonError, PrescriptionError
+from ...media.dispersion import model_glass
+from ...media.medium import Medium
+from ...shapes.shape import Plane
+from ...surface import Interaction, Surface
+from ...telescope import VACUUM, Telescope, rotation_matrix
+from ..glass_catalogue import GlassCatalogue
+from ..yaml.media import medium_wavelengths
+from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile, read_zemax_file
+from .frame import TURN, turned_aperture, turned_axes, turned_shape
+from .shape_reader import read_aperture, read_shape
+from .system import UNITS, FirstSurfaces, read_pupil, read_wavelengths
+
+#: Comment of the plane that the writer puts in front to carry the entrance pupil.
+PUPIL_COMMENT = "pachon entrance pupil"
+
+
+def read_zemax(
+    path: str | os.PathLike[str],
+    *,
+    lenient: bool = False,
+    glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
+) -> Telescope:
+    """Read a Zemax lens file.
+
+    Parameters
+    ----------
+    path : str or path
+        The .zmx file, in UTF-16, UTF-8 or ISO 8859-1.
+    lenient : bool
+        Warn about what is not understood and go on without it, instead of raising.
+    glass_catalogues : iterable of GlassCatalogue or path
+        Catalogues to look glasses up in, first of all; then comes one beside the file that has its name and ends in
+        .agf, then the bundled one.
+
+    Returns
+    -------
+    Telescope
+        The lens; lengths in metres, indices as in the file: relative to air, whose index is 1.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read or, unless lenient, something in it is not understood.
+    """
+    target = Path(path)
+    findings = Findings(lenient)
+    file = read_zemax_file(target, findings)
+    catalogues = chosen_catalogues(target, glass_catalogues)
+    try:
+        return LensReader(file, findings, catalogues).telescope()
+    except PachonError as error:
+        text = str(error)
+        raise error if text.startswith(str(target)) else PrescriptionError(f"{target}: {text}") from None
+
+
+def chosen_catalogues(path: Path, given: Iterable[GlassCatalogue | str | os.PathLike[str]]) -> list[GlassCatalogue]:
+    """Return the catalogues to look glasses up in: those given, one beside the file with its name, the bundled one."""
+    catalogues = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in given]
+    beside = path.with_suffix(".agf")
+    catalogues += [GlassCatalogue.read(beside)] if beside.is_file() else []
+    return [*catalogues, GlassCatalogue.bundled()]
+
+
+class LensReader:
+    """Walks through the surfaces of a file with the frame and the medium that the light is in."""
+
+    def __init__(self, file: ZemaxFile, findings: Findings, catalogues: list[GlassCatalogue]) -> None:
+        self.file = file
+        self.findings = findings
+        self.catalogues = catalogues
+        words = file.header.text("UNIT").split() or ["MM"]
+        if words[0].upper() not in UNITS:
+            raise PrescriptionError(f"{file.path}: UNIT {words[0]}: expected one of {', '.join(UNITS)}")
+        self.unit = UNITS[words[0].upper()]
+        self.origin, self.axes = np.zeros(3), np.eye(3)
+        self.medium = self.first_medium = self._glass(file.surfaces[0], VACUUM)[1]
+        self.surfaces: list[Surface] = []
+        self.paraxial = FirstSurfaces()
+        self.stop: Block | None = None
+
+    def telescope(self) -> Telescope:
+        """Return the telescope that the file describes."""
+        header, findings = self.file.header, self.findings
+        waves = read_wavelengths(header)
+        self._check_environment()
+        pupil_plane = False
+        for number, block in enumerate(self.file.surfaces[1:], start=1):
+            comment = block.text("COMM")
+            if block.all("STOP"):
+                self.stop = block
+                self.paraxial.mark_stop(block.number("DIAM", 0.0) * self.unit)
+                pupil_plane = number == 1 and comment == PUPIL_COMMENT
+            self._surface(number, block)
+            block.report_rest(IGNORED_SURFACE, findings)
+        if self.stop is None:
+            findings.report(str(self.file.path), "no surface is the stop (STOP)", "the first is taken")
+            self.paraxial.mark_stop(0.0, first=True)
+        pupil = read_pupil(self.file, self.paraxial, self.unit, waves.primary, self.first_medium, findings)
+        header.report_rest(IGNORED_HEADER, findings)
+        self.file.surfaces[0].used |= {"TYPE", "CURV", "DISZ", "CONI"}
+        self.file.surfaces[0].report_rest(IGNORED_SURFACE, findings)
+        if pupil_plane:
+            del self.surfaces[0]
+        z0 = _first_power(self.surfaces)
+        surfaces = tuple(self._turned(s, z0) for s in self.surfaces)
+        low, high = self._wavelength_range(waves.values)
+        reach = max(max(abs(v) for s in surfaces for v in s.vertex), abs(pupil.z + z0), pupil.diameter)
+        limit = min(max(2 * pupil.field_radius, math.radians(5.0)), math.radians(85.0))
+        return Telescope(
+            name=self.file.path.stem,
+            source=f"Zemax file {self.file.path.name}",
+            version=(header.text("VERS").split() or ["1"])[0],
+            description=header.text("NAME"),
+            surfaces=surfaces,
+            # Heights count against the light.
+            stop_z=float(z0 - pupil.z) + 0.0,
+            pupil_diameter=pupil.diameter,
+            pupil_obscuration=0.0,
+            launch_distance=3.0 * reach / math.cos(limit),
+            reference_sphere_radius=pupil.reference_radius,
+            field_radius=pupil.field_radius,
+            field_limit=limit,
+            wavelength_range=(low, high),
+            default_wavelength=waves.primary,
+            band=waves.band(low, high),
+            medium_before=self.first_medium,
+            object_distance=float(z0 - pupil.object_z),
+        )
+
+    def _check_environment(self) -> None:
+        line = self.file.header.last("ENVD")
+        if line is not None and line.number(2, 0.0) != 0 and (line.number(0), line.number(1, 1.0)) != (20.0, 1.0):
+            self.findings.report(line.where, f"{line.shown}: indices are not adjusted to temperature and pressure")
+
+    def _surface(self, number: int, block: Block) -> None:
+        last = number == len(self.file.surfaces) - 1
+        kind = block.text("TYPE").split()[:1]
+        thickness = block.number("DISZ", 0.0, infinite=True) * self.unit
+        if not math.isfinite(thickness):
+            if not last:
+                raise PrescriptionError(f"{block.where}: DISZ INFINITY: expected a finite thickness")
+            thickness = 0.0
+        if kind and kind[0].upper() == "COORDBRK":
+            if last:
+                raise PrescriptionError(f"{block.where}: TYPE COORDBRK: expected the image as the last surface")
+            self._break(block)
+        else:
+            self._tilt(block)
+            self._acting(number, block, last)
+        self.paraxial.advance(thickness)
+        self.origin = self.origin + self.axes[:, 2] * thickness
+
+    def _break(self, block: Block) -> None:
+        values = block.table("PARM")
+        for i in sorted(set(values) - {1, 2, 3, 4, 5, 6}):
+            if values[i] != 0:
+                self.findings.report(block.where, f"PARM {i} {values[i]:g}: not understood for TYPE COORDBRK")
+        block.used |= {"CURV", "CONI", "GLAS", "XDAT"}
+        dx, dy, *tilt = (values.get(i, 0.0) for i in range(1, 6))
+        self._move(dx, dy, tilt, backwards=values.get(6, 0.0) != 0)
+
+    def _tilt(self, block: Block) -> None:
+        """Apply the tilt and decentre that a surface carries itself, before it."""
+        for line in block.all("SCBD"):
+            figures = [line.number(i, 0.0) for i in range(len(line.words))]
+            if not any(figures[3:]):
+                continue
+            if figures[:3] != [1.0, 0.0, 0.0] or len(figures) < 8:
+                self.findings.report(line.where, f"{line.shown}: only a tilt before the surface (SCBD 1 0 0) is read")
+                continue
+            self._move(figures[3], figures[4], figures[5:8], backwards=False)
+
+    def _move(self, dx: float, dy: float, tilt: list[float], *, backwards: bool) -> None:
+        """Decentre, then tilt about x, the new y, the new z [deg]; backwards: tilts first, and z before y and x."""
+        angles = np.radians(tilt)
+        shift = np.array([dx, dy, 0.0]) * self.unit
+        if backwards:
+            for axis in (2, 1, 0):
+                self.axes = self.axes @ rotation_matrix(np.where(np.arange(3) == axis, angles, 0.0))
+            self.origin = self.origin + self.axes @ shift
+        else:
+            self.origin = self.origin + self.axes @ shift
+            self.axes = self.axes @ rotation_matrix(angles)
+
+    def _acting(self, number: int, block: Block, last: bool) -> None:
+        try:
+            shape = read_shape(block, self.unit, self.findings)
+            aperture = read_aperture(block, self.unit, self.findings)
+        except PrescriptionError as error:
+            text = str(error)
+            raise (
+                error if text.startswith(str(self.file.path)) else PrescriptionError(f"{block.where}: {text}")
+            ) from None
+        except (OverflowError, ZeroDivisionError):
+            raise PrescriptionError(f"{block.where}: the figures of its shape are too large or too small") from None
+        mirror, after = self._glass(block, VACUUM)
+        if mirror:
+            interaction, after = Interaction.MIRROR, self.medium
+        elif last:
+            interaction, after = Interaction.DETECTOR, self.medium
+        else:
+            interaction = Interaction.PASS if after == self.medium else Interaction.REFRACT
+        self.paraxial.add(shape.curvature, self.medium, after, mirror=mirror)
+        self.medium = after
+        x, y, z = (float(v) for v in self.origin)
+        self.surfaces.append(
+            Surface(
+                name=self._name(number, block.text("COMM"), last),
+                interaction=interaction,
+                shape=turned_shape(shape),
+                vertex=(x, y, z),
+                medium_after=after,
+                aperture=None if aperture is None else turned_aperture(aperture),
+                rotation=turned_axes(self.axes),
+            )
+        )
+
+    def _name(self, number: int, comment: str, last: bool) -> str:
+        taken = {s.name for s in self.surfaces}
+        name = " ".join(comment.split()) or ("Image" if last else f"S{number}")
+        return name if name not in taken else f"{name} (S{number})"
+
+    def _glass(self, block: Block, none: Medium) -> tuple[bool, Medium]:
+        """Return whether a surface is a mirror, and the medium behind it where it is not."""
+        line = block.last("GLAS")
+        if line is None or not line.words:
+            return False, none
+        name = line.words[0].upper()
+        if name == "MIRROR":
+            return True, none
+        nd, vd, deviation = line.number(3, 0.0), line.number(4, 0.0), line.number(5, 0.0)
+        # The second word: 1 is a model glass, whose figures follow; its name is only a name.
+        model = line.number(1, 0.0) == 1 and nd > 1
+        for catalogue in self.catalogues:
+            if name in catalogue and not model:
+                return False, catalogue[name]
+        if not model:
+            self.findings.report(
+                line.where, f"{line.shown}: the glass is in no catalogue", "taken as a model glass of its figures"
+            )
+        try:
+            return False, replace(model_glass(nd, vd, deviation), name=name)
+        except PrescriptionError as error:
+            raise PrescriptionError(f"{line.where}: {line.shown}: {error}") from None
+
+    def _turned(self, surface: Surface, z0: float) -> Surface:
+        x, y, z = TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
+        return replace(surface, vertex=(float(x), float(y), float(z)))
+
+    def _wavelength_range(self, waves: tuple[float, ...]) -> tuple[float, float]:
+        low, high = min(0.1e-6, *waves), max(20e-6, *waves)
+        for medium in (self.first_medium, *(s.medium_after for s in self.surfaces)):
+            covered = medium_wavelengths(medium)
+            if not covered:
+                continue
+            if not covered[0] <= min(waves) <= max(waves) <= covered[-1]:
+                raise PrescriptionError(
+                    f"{self.file.path}: WAVM {min(waves) * 1e6:g} to {max(waves) * 1e6:g} um: expected "
+                    f"{covered[0] * 1e6:g} to {covered[-1] * 1e6:g} um, which glass {medium.name} covers"
+                )
+            low, high = max(low, covered[0]), min(high, covered[-1])
+        return low, high
+
+
+def _first_power(surfaces: list[Surface]) -> float:
+    """Return where along the axis the first curved mirror or lens surface is, or else the first flat one."""
+    acting = [s for s in surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)]
+    curved = [s for s in acting if not isinstance(s.shape, Plane)]
+    return (curved or acting or surfaces)[0].vertex[2]

@@ -1,0 +1,238 @@
+"""Shapes and apertures of Zemax surfaces, in their own local frame (+z along the light) and in metres.
+
+The sag of each type, from the OpticStudio user guide ("Surface types"), with ``c`` CURV, ``k`` CONI, ``r^2 = x^2 +
+y^2``:
+
+========= ===================================================================================================
+STANDARD  conic of revolution
+EVENASPH  conic + PARM 1 r^2 + PARM 2 r^4 + ... + PARM 8 r^16
+ODDASPHE  conic + PARM 1 r + PARM 2 r^2 + ... + PARM 8 r^8
+BICONICX  conics of different curvature along y (CURV, CONI) and x (radius PARM 1, conic PARM 2)
+TOROIDAL  conic in the y, z plane, turned about an axis at PARM 1; Zernike terms in XDAT
+SZERNSAG  as EVENASPH + sum of XDAT (2 + j) Z_j(x / R, y / R), Noll, R = XDAT 2, XDAT 1 terms
+XPOLYNOM  conic + sum of XDAT (2 + i) times x, y, x^2, xy, y^2, x^3... of x / R, y / R, R = XDAT 2, XDAT 1 terms
+XASPHERE  conic + sum of XDAT (2 + i) (r / R)^(2 i), R = XDAT 2, XDAT 1 terms
+TILTSURF  the plane x PARM 1 + y PARM 2
+GRID_SAG  as EVENASPH + a grid of nodes (GDAT nx ny dx dy; GARR i sag ...), interpolated by bicubics
+========= ===================================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle, Union, Vane
+from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...shapes.grid import GridSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from .file import Block, Findings
+
+TYPES = (
+    *("STANDARD", "EVENASPH", "ODDASPHE", "BICONICX", "TOROIDAL"),
+    *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG"),
+)
+MOST_TERMS = 1000
+MOST_NODES = 4_000_000
+
+
+def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
+    """Return the shape of a surface.
+
+    Parameters
+    ----------
+    block : Block
+        Lines of the surface.
+    unit : float
+        Lens unit [m].
+    findings : Findings
+        What to do about something that is not understood.
+
+    Returns
+    -------
+    Shape
+        In metres, sag along the light as Zemax has it.
+
+    Raises
+    ------
+    PrescriptionError
+        If a line is malformed or, unless lenient, not understood.
+    """
+    kind = block.text("TYPE").split()[0].upper() if block.text("TYPE") else "STANDARD"
+    kind = "GRID_SAG" if kind == "GRIDSAG" else kind
+    if kind not in TYPES:
+        findings.report(block.where, f"TYPE {kind}: expected one of {', '.join(TYPES)}", "taken as STANDARD")
+        block.used |= {"PARM", "XDAT", "GDAT", "GARR"}
+        kind = "STANDARD"
+    curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)
+    parameters = {i: v for i, v in block.table("PARM").items() if v != 0}
+    if kind == "STANDARD":
+        parts: list[Shape] = [_conic(curvature, conic)]
+    elif kind in ("EVENASPH", "SZERNSAG", "GRID_SAG"):
+        powers = [parameters.pop(i, 0.0) * unit ** (1 - 2 * i) for i in range(1, 9)]
+        parts = _even_asphere(curvature, conic, powers)
+    elif kind == "ODDASPHE":
+        odd = tuple(_trimmed([parameters.pop(i, 0.0) * unit ** (1 - i) for i in range(1, 9)]))
+        parts = [OddAsphere(_radius(curvature), conic, odd) if odd else _conic(curvature, conic)]
+    elif kind == "BICONICX":
+        radius_x = parameters.pop(1, math.inf) * unit
+        parts = [Biconic(radius_x, _radius(curvature), parameters.pop(2, 0.0), conic)]
+    elif kind == "TOROIDAL":
+        radius_x = parameters.pop(1, math.inf) * unit
+        flat = curvature == 0 and math.isinf(radius_x)
+        parts = [Plane() if flat else Toroid(radius_x, _radius(curvature), conic)]
+    elif kind == "TILTSURF":
+        parts = [XYPolynomial(((1, 0, parameters.pop(1, 0.0)), (0, 1, parameters.pop(2, 0.0))))]
+    elif kind == "XASPHERE":
+        radius, terms = _extra_data(block, unit)
+        parts = _even_asphere(curvature, conic, [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)] or [0.0])
+    else:
+        parts = [_conic(curvature, conic)]
+    for i, value in sorted(parameters.items()):
+        findings.report(block.where, f"PARM {i} {value:g}: not understood for TYPE {kind}")
+    if kind in ("SZERNSAG", "TOROIDAL", "XPOLYNOM"):
+        parts += _expansion(block, kind, unit)
+    elif kind == "GRID_SAG":
+        parts.append(_grid(block, unit))
+    elif kind != "XASPHERE":
+        for i, value in block.table("XDAT").items():
+            if value != 0:
+                findings.report(block.where, f"XDAT {i} {value:g}: not understood for TYPE {kind}")
+    acting = [part for part in parts if not isinstance(part, Plane)]
+    if len(acting) > 1:
+        return Sum(tuple(acting))
+    return acting[0] if acting else Plane()
+
+
+def _radius(curvature: float) -> float:
+    return 1.0 / curvature if curvature else math.inf
+
+
+def _conic(curvature: float, conic: float) -> Shape:
+    if curvature == 0:
+        return Plane()
+    return Conic(1.0 / curvature, conic) if conic else Sphere(1.0 / curvature)
+
+
+def _trimmed(values: list[float]) -> list[float]:
+    while values and values[-1] == 0:
+        values = values[:-1]
+    return values
+
+
+def _even_asphere(curvature: float, conic: float, powers: list[float]) -> list[Shape]:
+    """Return an asphere, `powers` those of r^2, r^4...; a term in r^2 becomes a part of its own."""
+    higher = tuple(_trimmed(powers[1:]))
+    if not higher:
+        base = _conic(curvature, conic)
+    elif curvature == 0:
+        base = XYPolynomial(_flat_terms(higher))
+    else:
+        base = EvenAsphere(1.0 / curvature, conic, higher)
+    return [base, XYPolynomial(((2, 0, powers[0]), (0, 2, powers[0])))] if powers[0] else [base]
+
+
+def _flat_terms(coefficients: tuple[float, ...]) -> tuple[tuple[int, int, float], ...]:
+    """Return a sum of even powers of r, from r^4, as a polynomial of x and y: (x^2 + y^2)^n by the binomial theorem."""
+    return tuple(
+        (2 * i, 2 * (n - i), a * math.comb(n, i))
+        for n, a in enumerate(coefficients, start=2)
+        if a
+        for i in range(n + 1)
+    )
+
+
+def polynomial_powers(count: int) -> list[tuple[int, int]]:
+    """Return the powers (i, j) of x and y of the terms of an extended polynomial: x, y, x^2, xy, y^2, x^3..."""
+    powers = [(n - j, j) for n in range(1, 60) for j in range(n + 1)]
+    return powers[:count]
+
+
+def _extra_data(block: Block, unit: float) -> tuple[float, list[float]]:
+    """Return the normalisation radius [m] and the coefficients [m] in the extra data of a surface."""
+    data = block.table("XDAT")
+    count = round(data.get(1, 0.0))
+    if count <= 0:
+        return 1.0, []
+    line = block.all("XDAT")[0]
+    radius = data.get(2, 0.0) * unit
+    if radius <= 0:
+        raise line.error("a positive normalisation radius as XDAT 2")
+    if count > MOST_TERMS:
+        raise line.error(f"at most {MOST_TERMS} terms")
+    return radius, [data.get(2 + i, 0.0) * unit for i in range(1, count + 1)]
+
+
+def _expansion(block: Block, kind: str, unit: float) -> list[Shape]:
+    """Return the polynomial that the extra data of a surface describe."""
+    radius, terms = _extra_data(block, unit)
+    if not any(terms):
+        return []
+    if kind == "XPOLYNOM":
+        powers = polynomial_powers(len(terms))
+        return [
+            XYPolynomial(tuple((i, j, a / radius ** (i + j)) for (i, j), a in zip(powers, terms, strict=False) if a))
+        ]
+    return [ZernikeSag(tuple(terms), radius)]
+
+
+def _grid(block: Block, unit: float) -> GridSag:
+    size = block.last("GDAT")
+    if size is None:
+        raise block.lines[0].error("a line GDAT with the size of the grid in this surface")
+    nx, ny, dx, dy = size.integer(0), size.integer(1), size.number(2) * unit, size.number(3) * unit
+    if not (nx > 3 and ny > 3 and nx * ny <= MOST_NODES and dx > 0 and dy > 0):
+        raise size.error("at least 4 x 4 nodes and positive steps")
+    values = np.full(nx * ny, np.nan)
+    for line in block.all("GARR"):
+        place = line.integer(0) - 1
+        if not 0 <= place < nx * ny:
+            raise line.error(f"a node from 1 to {nx * ny}")
+        values[place] = line.number(1) * unit
+    if np.any(np.isnan(values)):
+        raise size.error(f"{nx * ny} lines GARR; that of node {int(np.argmax(np.isnan(values))) + 1} is missing")
+    # The first node is at the smallest x and the largest y, and x runs first.
+    x, y = (dx * (np.arange(nx) - (nx - 1) / 2), dy * (np.arange(ny) - (ny - 1) / 2))
+    return GridSag(x, y, values.reshape(ny, nx)[::-1])
+
+
+def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | None:
+    """Return the clear region of a surface [m], or None where it has none.
+
+    Semi-diameters (DIAM) clip no rays; a floating aperture (FLAP) does where its semi-diameter is fixed.
+    """
+    shift = block.last("OBDC")
+    x, y = (shift.number(0) * unit, shift.number(1) * unit) if shift else (0.0, 0.0)
+    found: list[Aperture] = []
+    for keyword in ("CLAP", "FLAP", "OBSC", "SQAP", "SQOB", "SPID"):
+        line = block.last(keyword)
+        if line is None:
+            continue
+        first, second = line.number(0, 0.0), line.number(1, 0.0)
+        if keyword == "FLAP" and block.number("DIAM", 0.0, 1) != 1:
+            continue
+        if keyword == "SPID":
+            if not (first > 0 and 0 < second <= 1000 and second == int(second)):
+                raise line.error("a width and a number of arms")
+            turns = [2 * math.pi * arm / int(second) for arm in range(int(second))]
+            found.append(Complement(Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))))
+        elif keyword in ("SQAP", "SQOB"):
+            if not (first > 0 and second > 0):
+                raise line.error("two positive half widths")
+            rectangle = Rectangle(2 * first * unit, 2 * second * unit, x, y)
+            found.append(rectangle if keyword == "SQAP" else Complement(rectangle))
+        elif keyword == "OBSC" and second == 0:
+            continue
+        elif not 0 <= first < second:
+            raise line.error("a smallest and a largest radius")
+        else:
+            ring = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
+            found.append(Complement(ring) if keyword == "OBSC" else ring)
+    for keyword in ("ELAP", "ELOB", "UDAD", "USAP", "USOB", "UDAP"):
+        for line in block.all(keyword):
+            findings.report(line.where, f"{line.shown}: elliptical and user-defined apertures are not read")
+            break
+    if len(found) > 1:
+        raise block.lines[0].error("one aperture in this surface")
+    return found[0] if found else None

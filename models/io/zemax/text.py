@@ -1,0 +1,128 @@
+"""Text files of Zemax: their encodings, and their lines as keyword and words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from ....core.errors import PrescriptionError
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or ISO 8859-1.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read, or is no text.
+    """
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise PrescriptionError(f"{path}: no such file") from None
+    except OSError as error:
+        raise PrescriptionError(f"{path}: cannot be read ({error.strerror})") from None
+    wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        text = raw.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        if wide:
+            raise PrescriptionError(f"{path}: not a UTF-16 text file, although it begins like one") from None
+        # Every byte is a character of ISO 8859-1.
+        text = raw.decode("iso-8859-1")
+    if "\0" in text:
+        raise PrescriptionError(f"{path}: not a text file")
+    return text
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One line of a file: a keyword and what follows it.
+
+    Parameters
+    ----------
+    source : str
+        File, for messages.
+    line : int
+        Line number, from 1.
+    place : str
+        Part of the file, such as ``"surface 3"``; empty in a header.
+    keyword : str
+        First word of the line.
+    words : tuple of str
+        Further words.
+    text : str
+        The same as it stands in the file.
+    """
+
+    source: str
+    line: int
+    place: str
+    keyword: str
+    words: tuple[str, ...]
+    text: str
+
+    def error(self, expected: str) -> PrescriptionError:
+        """Return the error for this line."""
+        return PrescriptionError(f"{self.where}: {self.shown}: expected {expected}")
+
+    @property
+    def where(self) -> str:
+        """File, line and part of it."""
+        return f"{self.source}, line {self.line}" + (f", {self.place}" if self.place else "")
+
+    @property
+    def shown(self) -> str:
+        """Keyword and words, cut short."""
+        text = " ".join((self.keyword, *self.words))
+        return text if len(text) <= 60 else text[:57] + "..."
+
+    def number(self, position: int, default: float | None = None, *, infinite: bool = False) -> float:
+        """Return a word as a number.
+
+        Parameters
+        ----------
+        position : int
+            Which of the words.
+        default : float, optional
+            What to return where there are not as many words; without one that is an error.
+        infinite : bool
+            Whether "INFINITY" is a number here.
+        """
+        if position >= len(self.words):
+            if default is None:
+                raise self.error(f"a number as word {position + 1} after {self.keyword}")
+            return default
+        word = self.words[position]
+        if infinite and word.upper() in ("INFINITY", "INF", "1E10", "1.0E+10"):
+            return math.inf
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or "_" in word:
+            raise self.error(f"a number in place of {word!r}")
+        return value
+
+    def integer(self, position: int, default: int | None = None) -> int:
+        """Return a word as a whole number."""
+        value = self.number(position, default)
+        if value != int(value) or abs(value) > 1e9:
+            raise self.error(f"a whole number in place of {self.words[position]!r}")
+        return int(value)
+
+
+def records(text: str, source: str) -> list[Record]:
+    """Return the lines of a file that are not empty; those from a line "SURF n" on belong to surface n."""
+    found = []
+    place = ""
+    for line, content in enumerate(text.splitlines(), start=1):
+        words = content.split()
+        if words:
+            keyword, *rest = words
+            if keyword.upper() == "SURF" and rest:
+                place = f"surface {rest[0]}"
+            after = content.strip()[len(keyword) :].strip()
+            found.append(Record(source, line, place, keyword.upper(), tuple(rest), after))
+    return found

@@ -1,0 +1,226 @@
+"""Write a telescope as a sequential Zemax lens file (.zmx), with a glass catalogue (.agf) beside it where it needs one.
+
+The axes are turned as the reader turns them (see `zemax_frame`). A plane of its own in front carries the stop, so
+that the entrance pupil is where the telescope has it; the reader knows this plane by its comment. Surfaces off the
+axis or tilted stand between two coordinate breaks, of which the second undoes the first.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....core.errors import PrescriptionError
+from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle, Union, Vane
+from ...media.dispersion import Dispersion
+from ...media.medium import ConstantIndex, Medium, Sellmeier
+from ...surface import Interaction, Surface
+from ...telescope import VACUUM, Telescope
+from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from .frame import TURN, turned_aperture, turned_shape
+from .reader import PUPIL_COMMENT
+from .shape_writer import shape_lines
+
+MM = 1e-3
+#: AGF coefficients of a glass of constant index: Schott's formula with its first term alone.
+CONSTANT_FORMULA = 1
+
+
+def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
+    """Return the text of a lens file, and that of the glass catalogue that it needs; empty where it needs none.
+
+    Raises
+    ------
+    PrescriptionError
+        If the telescope has something that a Zemax file cannot hold here: the line names surface and part.
+    """
+    t = telescope
+    if t.surfaces[-1].interaction != Interaction.DETECTOR:
+        raise PrescriptionError(f"{t.name}: a Zemax file needs a detector as its last surface")
+    if t.obstructions:
+        raise PrescriptionError(f"{t.name}: obstruction {t.obstructions[0].name}: a Zemax file cannot hold meshes")
+    glasses = _glass_names(t)
+    angles = math.degrees(t.field_radius)
+    low, high = t.band or (t.default_wavelength, t.default_wavelength)
+    waves = list(dict.fromkeys([t.default_wavelength, low, high]))
+    lines = [
+        "VERS 190513 30 123457 L123457",
+        "MODE SEQ",
+        f"NAME {' '.join((t.description or t.name).split())}",
+        "UNIT MM X W X CM MR CPMM",
+        f"ENPD {_number(t.pupil_diameter / MM)}",
+        "ENVD 20 1 0",
+        f"FTYP 0 0 3 {len(waves)} 0 0 0",
+        "XFLN 0 0 0",
+        f"YFLN 0 {_number(angles / math.sqrt(2))} {_number(angles)}",
+        *(f"WAVM {i} {_micrometres(w)} 1" for i, w in enumerate(waves, start=1)),
+        "PWAV 1",
+    ]
+    blocks = [["TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]]
+    distance = (t.object_distance - t.stop_z) / MM
+    blocks[0].append(f"DISZ {_number(distance)}" if math.isfinite(distance) else "DISZ INFINITY")
+    # The plane of the stop, in front of all; z counts along the light, from the origin.
+    blocks.append(
+        [f"COMM {PUPIL_COMMENT}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
+    )
+    place = -t.stop_z
+    before = t.medium_before
+    for surface in t.surfaces:
+        x, y, z = (float(v) for v in TURN @ np.array(surface.vertex))
+        blocks[-1].append(f"DISZ {_number((z - place) / MM)}")
+        place = z
+        axes = TURN @ surface.matrix @ TURN
+        own = _surface_lines(surface, before, glasses)
+        if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
+            blocks.append(own)
+        else:
+            figures = [x / MM, y / MM, *np.degrees(_tilts(axes))]
+            medium = _glass_line(before, glasses)
+            blocks.append([*_break_lines(figures, 0), *medium, "DISZ 0"])
+            blocks.append([*own, "DISZ 0"])
+            if surface is not t.surfaces[-1]:
+                blocks.append([*_break_lines([-v for v in figures], 1), *_glass_line(surface.medium_after, glasses)])
+        before = surface.medium_after
+    if not blocks[-1][-1].startswith("DISZ"):
+        blocks[-1].append("DISZ 0")
+    for number, block in enumerate(blocks):
+        lines += [f"SURF {number}", *(f"  {line}" for line in block)]
+    return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
+
+
+def _number(value: float) -> str:
+    return repr(float(value) + 0.0)
+
+
+def _micrometres(wavelength: float) -> str:
+    # The decimal point is moved in the figure as written, so that it comes back as it was.
+    return repr(float(Decimal(repr(float(wavelength))).scaleb(6)))
+
+
+def _tilts(axes: np.ndarray) -> tuple[float, float, float]:
+    """Return the angles [rad] about x, the new y and the new z that make a rotation matrix."""
+    about_y = math.asin(max(-1.0, min(1.0, axes[0, 2])))
+    if abs(axes[0, 2]) > 1 - 1e-14:
+        # About y by a right angle, x and z turn about the same line: one of them does.
+        return math.atan2(axes[2, 1], axes[1, 1]), about_y, 0.0
+    return math.atan2(-axes[1, 2], axes[2, 2]), about_y, math.atan2(-axes[0, 1], axes[0, 0])
+
+
+def _break_lines(figures: list[float], order: int) -> list[str]:
+    return [
+        "TYPE COORDBRK",
+        "CURV 0.0",
+        *(f"PARM {i} {_number(v)}" for i, v in enumerate(figures, start=1)),
+        f"PARM 6 {order}",
+    ]
+
+
+def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str]) -> list[str]:
+    lines = [f"COMM {' '.join(surface.name.split())}"]
+    try:
+        if surface.interaction == Interaction.PHASE:
+            raise PrescriptionError("phase screens cannot be written")
+        lines += shape_lines(turned_shape(surface.shape), MM)
+        if surface.interaction == Interaction.MIRROR:
+            lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
+        elif surface.interaction != Interaction.DETECTOR:
+            lines += _glass_line(surface.medium_after, glasses)
+        if surface.aperture is not None:
+            lines += _aperture_lines(turned_aperture(surface.aperture))
+    except PrescriptionError as error:
+        raise PrescriptionError(f"surface {surface.name}: {error}") from None
+    return lines
+
+
+def _glass_line(medium: Medium, glasses: dict[Medium, str]) -> list[str]:
+    return [] if medium == VACUUM else [f"GLAS {glasses[medium]} 0 0 1.5 40 0 0 0 0 0 0"]
+
+
+def _aperture_lines(aperture: Aperture) -> list[str]:
+    clear = not isinstance(aperture, Complement)
+    region = aperture.part if isinstance(aperture, Complement) else aperture
+    if isinstance(region, Circle | Annulus):
+        inner, outer = (0.0, region.radius) if isinstance(region, Circle) else (region.inner, region.outer)
+        lines = [f"{'CLAP' if clear else 'OBSC'} {_number(inner / MM)} {_number(outer / MM)} 0"]
+    elif isinstance(region, Rectangle) and region.angle == 0:
+        half = f"{_number(region.width / 2 / MM)} {_number(region.height / 2 / MM)}"
+        lines = [f"{'SQAP' if clear else 'SQOB'} {half} 0"]
+    elif isinstance(region, Union) and not clear and _is_spider(region):
+        first = region.parts[0]
+        assert isinstance(first, Vane)
+        lines = [f"SPID {_number(first.width / MM)} {len(region.parts)} 0"]
+        region = Circle(1.0, first.x, first.y)
+    else:
+        raise PrescriptionError(f"aperture {type(region).__name__}: expected a disc, ring, rectangle or even spider")
+    if region.x or region.y:
+        lines.append(f"OBDC {_number(region.x / MM)} {_number(region.y / MM)}")
+    return lines
+
+
+def _is_spider(union: Union) -> bool:
+    """Return whether a union is one of equal vanes from one point, at equal angles, one of them along x."""
+    vanes = [part for part in union.parts if isinstance(part, Vane) and not part.both_ways]
+    if len(vanes) != len(union.parts) or len({(v.width, v.x, v.y) for v in vanes}) != 1:
+        return False
+    turns = np.sort(np.mod(np.array([v.angle for v in vanes]) + 1e-9, 2 * math.pi))
+    return bool(np.allclose(turns, 2 * math.pi * np.arange(len(vanes)) / len(vanes), atol=1e-8))
+
+
+def _glass_names(t: Telescope) -> dict[Medium, str]:
+    """Return a name for every glass: its own where the bundled catalogue has the same under it, else a new one."""
+    bundled = GlassCatalogue.bundled()
+    media = dict.fromkeys([t.medium_before, *(s.medium_after for s in t.surfaces)])
+    names: dict[Medium, str] = {}
+    for medium in (m for m in media if m != VACUUM):
+        name = re.sub(r"[^A-Z0-9_-]", "_", medium.name.upper())
+        if name in bundled and bundled[name] == medium:
+            names[medium] = name
+            continue
+        own = bool(re.match("[A-Z]", name)) and name not in (*names.values(), "MIRROR") and name not in bundled
+        number = len(names) + 1
+        while not own and (f"GLASS_{number}" in names.values()):
+            number += 1
+        names[medium] = name if own else f"GLASS_{number}"
+    return names
+
+
+def _catalogue_lines(glasses: dict[Medium, str]) -> Iterator[str]:
+    bundled = GlassCatalogue.bundled()
+    own = {medium: name for medium, name in glasses.items() if not (name in bundled and bundled[name] == medium)}
+    if own:
+        yield "CC Glasses of the lens file of the same name, written by pachon\n"
+    for medium, name in own.items():
+        formula, coefficients, limits = _formula(medium, name)
+        nd = float(medium.index(5.875618e-7)) if limits[0] <= 5.875618e-7 <= limits[1] else 0.0
+        yield f"NM {name} {formula} 0 {nd:.6f} 0 0 0\n"
+        yield f"CD {' '.join(_number(c) for c in coefficients)}\n"
+        yield f"LD {_micrometres(limits[0])} {_micrometres(limits[1])}\n"
+
+
+def _formula(medium: Medium, name: str) -> tuple[int, list[float], tuple[float, float]]:
+    if isinstance(medium, ConstantIndex):
+        return CONSTANT_FORMULA, [medium.n**2], (1e-8, 1e-3)
+    if isinstance(medium, Sellmeier):
+        pairs: list[Any] = [v for pair in zip(medium.B, medium.C, strict=True) for v in pair]
+        number = next((k for k, terms in SELLMEIER_TERMS.items() if len(medium.B) <= terms), None)
+        if number is not None:
+            return number, pairs, medium.wavelength_range
+    if isinstance(medium, Dispersion):
+        kind = "schott" if medium.formula == "sumita" else medium.formula
+        numbers = {formula: number for number, formula in NUMBERED.items()}
+        if kind in numbers:
+            return numbers[kind], list(medium.coefficients), medium.wavelength_range
+    raise PrescriptionError(
+        f"glass {name}: {type(medium).__name__} is none of the dispersion formulas of a Zemax glass catalogue"
+    )
+
+
+def catalogue_path(path: Path) -> Path:
+    """Return where the glass catalogue of a lens file stands."""
+    return path.with_suffix(".agf")

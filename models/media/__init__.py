@@ -1,0 +1,1 @@
+"""Refractive media: constant, Sellmeier and other dispersion formulas, tables, air."""

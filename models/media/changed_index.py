@@ -1,0 +1,44 @@
+"""A medium whose refractive index is off by a constant: a melt that is not what its catalogue says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import PrescriptionError
+from .medium import Medium
+
+
+@dataclass(frozen=True)
+class ChangedIndex:
+    """Medium whose index is that of another plus a constant, at every wavelength.
+
+    Parameters
+    ----------
+    medium : Medium
+        The other medium.
+    change : float
+        What is added to its index.
+    name : str
+        Name for messages and files; not part of what the medium is.
+    """
+
+    medium: Medium
+    change: float
+    name: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.change):
+            raise PrescriptionError(f"change = {self.change!r}: expected a finite change of the refractive index")
+
+    def index(self, wavelength: Any) -> np.ndarray:
+        """Return the refractive index at vacuum wavelengths [m], in their shape."""
+        return self.medium.index(wavelength) + self.change
+
+
+def with_index_change(medium: Medium, change: float) -> Medium:
+    """Return a medium with its index changed by a constant; changes of changes are summed up."""
+    base, before = (medium.medium, medium.change) if isinstance(medium, ChangedIndex) else (medium, 0.0)
+    return ChangedIndex(base, before + change, medium.name) if before + change else base

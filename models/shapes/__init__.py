@@ -1,0 +1,1 @@
+"""Shapes of surfaces: conics, aspheres, freeforms, grids and meshes."""

@@ -1,0 +1,391 @@
+"""Shapes without symmetry of revolution, and odd powers of the radius, in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import PrescriptionError
+from .polar_polynomial import PolarPolynomial, from_monomials, from_zernikes
+from .shape import (
+    Conic,
+    Plane,
+    Rotational,
+    Shape,
+    Triple,
+    check_coefficients,
+    check_conic,
+    check_radius,
+    conic_derivative,
+    coordinates,
+    root,
+)
+
+
+@dataclass(frozen=True)
+class OddAsphere(Shape):
+    """Conic plus all powers of the radius: coefficients of r^1, r^2, r^3... in SI (1, m^-1, m^-2, ...).
+
+    An infinite radius leaves the powers alone.
+    A term in r^1 makes a cone: at its very tip the slope is taken as zero.
+    """
+
+    radius: float
+    conic: float
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_radius(self.radius, flat=True)
+        check_conic(self.conic)
+        check_coefficients(self.coefficients)
+
+    @property
+    def base(self) -> Rotational:
+        """The conic that the powers are added to; a plane where the radius is infinite."""
+        return Conic(self.radius, self.conic) if np.isfinite(self.radius) else Plane()
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return 1.0 / self.radius + 2 * (*self.coefficients, 0.0, 0.0)[1]
+
+    @property
+    def fourth_order(self) -> float:  # noqa: D102
+        a4 = (*self.coefficients, 0.0, 0.0, 0.0, 0.0)[3]
+        return (1 + self.conic) / self.radius**3 / 8 + a4 - self.curvature**3 / 8
+
+    def _powers(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return r and the powers' sum, its derivative by r over r, and its second derivative by r."""
+        r = np.hypot(x, y)
+        value, slope, bend = (np.zeros_like(r) for _ in range(3))
+        for a in (*reversed(self.coefficients), 0.0):
+            bend = bend * r + 2 * slope
+            slope = slope * r + value
+            value = value * r + a
+        return r, value, np.divide(slope, r, out=np.where(r == 0, bend, 0.0), where=r > 0), bend
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        x, y = coordinates(x, y)
+        return self.base.sag(x, y) + self._powers(x, y)[1]
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+        x, y = coordinates(x, y)
+        slope = self._powers(x, y)[2]
+        sx, sy = self.base.gradient(x, y)
+        return sx + slope * x, sy + slope * y
+
+    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
+        x, y = coordinates(x, y)
+        r, _, over, bend = self._powers(x, y)
+        xx, xy, yy = self.base.hessian(x, y)
+        twist = np.divide(bend - over, r * r, out=np.zeros_like(r), where=r > 0)
+        return xx + over + twist * x * x, xy + twist * x * y, yy + over + twist * y * y
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        found = {"radius": self.radius, "curvature": 1.0 / self.radius, "conic": self.conic}
+        return found | {f"a{power}": a for power, a in enumerate(self.coefficients, start=1)}
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        if name.startswith("a"):
+            one = (0.0,) * (int(name[1:]) - 1) + (1.0,)
+            _, value, slope, _ = replace(self, coefficients=one)._powers(x, y)
+            return value, slope * x, slope * y
+        f, slope = conic_derivative(1.0 / self.radius, self.conic, name, x * x + y * y)
+        return f, 2 * x * slope, 2 * y * slope
+
+    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
+        self._check_parameter(name)
+        if name.startswith("a"):
+            place = int(name[1:]) - 1
+            return replace(
+                self, coefficients=(*self.coefficients[:place], float(value), *self.coefficients[place + 1 :])
+            )
+        return replace(self, **_conic_change(name, value))
+
+
+def _conic_change(name: str, value: float) -> dict[str, Any]:
+    """Return the field and its value that a figure stands for: a curvature is kept as a radius."""
+    if name.startswith("curvature"):
+        return {name.replace("curvature", "radius"): 1.0 / value if value else np.inf}
+    return {name: float(value)}
+
+
+@dataclass(frozen=True)
+class _TwoRadii(Shape):
+    """What shapes of different radius [m] along x and y share."""
+
+    radius_x: float
+    radius_y: float
+
+    def __post_init__(self) -> None:
+        check_radius(self.radius_x, "radius_x", flat=True)
+        check_radius(self.radius_y, "radius_y", flat=True)
+        for name in ("conic_x", "conic_y"):
+            check_conic(getattr(self, name, 0.0), name)
+
+    @property
+    def curvature(self) -> float:
+        return 0.5 * (1.0 / self.radius_x + 1.0 / self.radius_y)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return fields | {"curvature_x": 1.0 / self.radius_x, "curvature_y": 1.0 / self.radius_y}
+
+    def with_parameter(self, name: str, value: float) -> Shape:
+        self._check_parameter(name)
+        return replace(self, **_conic_change(name, value))
+
+
+@dataclass(frozen=True)
+class Biconic(_TwoRadii):
+    """Conics of different radius [m] along x and y; an infinite radius is flat in that direction.
+
+    With cx, cy the curvatures and kx, ky the conic constants::
+
+        z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2))
+    """
+
+    conic_x: float = 0.0
+    conic_y: float = 0.0
+
+    @property
+    def fourth_order(self) -> float:  # noqa: D102
+        # z = u/2 + u v/8 + ..., u = cx x^2 + cy y^2, v = (1 + kx) cx^2 x^2 + (1 + ky) cy^2 y^2; means of x^4 and y^4
+        # over azimuth are 3/8 r^4, of x^2 y^2 1/8 r^4.
+        cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
+        px, py = (1 + self.conic_x) * cx**2, (1 + self.conic_y) * cy**2
+        return (3 * cx * px + 3 * cy * py + cx * py + cy * px) / 64 - self.curvature**3 / 8
+
+    def _pieces(self, x: np.ndarray, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Return u and v of the formula and their derivatives by x, y and the figures, named by letters."""
+        cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
+        kx, ky = 1 + self.conic_x, 1 + self.conic_y
+        one = np.ones_like(x)
+        u = {"": cx * x * x + cy * y * y, "x": 2 * cx * x, "y": 2 * cy * y, "xx": 2 * cx * one, "yy": 2 * cy * one}
+        v = {
+            "": kx * cx**2 * x * x + ky * cy**2 * y * y,
+            "x": 2 * kx * cx**2 * x,
+            "y": 2 * ky * cy**2 * y,
+            "xx": 2 * kx * cx**2 * one,
+            "yy": 2 * ky * cy**2 * one,
+        }
+        # a, b: the curvatures; k, l: the conic constants.
+        u |= {"a": x * x, "ax": 2 * x, "b": y * y, "by": 2 * y}
+        v |= {"a": 2 * kx * cx * x * x, "ax": 4 * kx * cx * x, "b": 2 * ky * cy * y * y, "by": 4 * ky * cy * y}
+        v |= {"k": cx**2 * x * x, "kx": 2 * cx**2 * x, "l": cy**2 * y * y, "ly": 2 * cy**2 * y}
+        return u, v
+
+    def _derivatives(self, x: np.ndarray, y: np.ndarray, *names: str) -> list[np.ndarray]:
+        """Return first (one letter) and second derivatives (two) of the sag ``u / (1 + w)``, ``w = sqrt(1 - v)``."""
+        u, v = self._pieces(x, y)
+        w = root(1.0 - v[""])
+        zero = np.zeros_like(x)
+
+        def slope(of: str) -> np.ndarray:
+            return -0.5 * v.get(of, zero) / w
+
+        found = []
+        for name in names:
+            if not name:
+                found.append(u[""] / (1 + w))
+            elif len(name) == 1:
+                found.append(u.get(name, zero) / (1 + w) - u[""] * slope(name) / (1 + w) ** 2)
+            else:
+                p, q = name[0], name[1]
+                w_p, w_q = slope(p), slope(q)
+                w_pq = -0.5 * v.get(name, zero) / w - w_p * w_q / w
+                found.append(
+                    u.get(name, zero) / (1 + w)
+                    - (u.get(p, zero) * w_q + u.get(q, zero) * w_p + u[""] * w_pq) / (1 + w) ** 2
+                    + 2 * u[""] * w_p * w_q / (1 + w) ** 3
+                )
+        return found
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        return self._derivatives(*coordinates(x, y), "")[0]
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+        sx, sy = self._derivatives(*coordinates(x, y), "x", "y")
+        return sx, sy
+
+    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
+        xx, xy, yy = self._derivatives(*coordinates(x, y), "xx", "xy", "yy")
+        return xx, xy, yy
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        letter = {"curvature_x": "a", "curvature_y": "b", "conic_x": "k", "conic_y": "l"}[name]
+        f, fx, fy = self._derivatives(x, y, letter, letter + "x", letter + "y")
+        return f, fx, fy
+
+
+@dataclass(frozen=True)
+class Toroid(_TwoRadii):
+    """A conic of the y, z plane turned about an axis parallel to y, `radius_x` [m] from the vertex.
+
+    With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, ``cx = 1 / radius_x``::
+
+        z = g + q x^2 / (1 + sqrt(1 - q^2 x^2)),    q = cx / (1 - cx g)
+
+    An infinite radius is flat in that direction, so a cylinder is a toroid.
+    """
+
+    conic_y: float = 0.0
+
+    @property
+    def fourth_order(self) -> float:  # noqa: D102
+        # z = cx x^2/2 + cy y^2/2 + cx^3 x^4/8 + (1 + ky) cy^3 y^4/8 + cx^2 cy x^2 y^2/4 + ...; means as for a biconic.
+        cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
+        return (3 * cx**3 + 3 * (1 + self.conic_y) * cy**3 + 2 * cx**2 * cy) / 64 - self.curvature**3 / 8
+
+    def _pieces(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the sag, and what its derivatives are made of: q, w, g', g'', h_q and h_qq; h is the sag less g."""
+        cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
+        b = root(1.0 - (1.0 + self.conic_y) * cy**2 * y * y)
+        g, g1, g2 = cy * y * y / (1 + b), cy * y / b, cy / b**3
+        q = cx / (1.0 - cx * g)
+        w = root(1.0 - q * q * x * x)
+        h = q * x * x / (1 + w)
+        h_q = 0.5 * (x * x + h * h) / w
+        return g + h, q, w, g1, g2, h_q, h_q * q * x * x / w**2 + h * h_q / w
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        return self._pieces(*coordinates(x, y))[0]
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+        x, y = coordinates(x, y)
+        _, q, w, g1, _, h_q, _ = self._pieces(x, y)
+        # dq/dg = q^2, so what moves g moves the whole by 1 + h_q q^2.
+        return q * x / w, g1 * (1 + h_q * q**2)
+
+    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
+        x, y = coordinates(x, y)
+        _, q, w, g1, g2, h_q, h_qq = self._pieces(x, y)
+        yy = g2 * (1 + h_q * q**2) + g1**2 * (h_qq * q**4 + 2 * h_q * q**3)
+        return q / w**3, x / w**3 * q**2 * g1, yy
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        _, q, w, g1, _, h_q, h_qq = self._pieces(x, y)
+        if name == "curvature_x":
+            # dq/dcx = 1 / (1 - cx g)^2
+            cx = 1.0 / self.radius_x
+            g = Toroid(np.inf, self.radius_y, self.conic_y).sag(x, y)
+            q_c = 1.0 / (1.0 - cx * g) ** 2
+            return h_q * q_c, x / w**3 * q_c, g1 * (h_qq * q**2 + 2 * h_q * q) * q_c
+        change, slope = conic_derivative(1.0 / self.radius_y, self.conic_y, name.removesuffix("_y"), y * y)
+        change_y = 2 * y * slope
+        along_y = change_y * (1 + h_q * q**2) + change * g1 * (h_qq * q**4 + 2 * h_q * q**3)
+        return change * (1 + h_q * q**2), x / w**3 * q**2 * change, along_y
+
+
+class _Polynomial(Shape):
+    """What shapes that are a polynomial of x and y share."""
+
+    @property
+    def polynomial(self) -> PolarPolynomial:
+        """The polynomial."""
+        raise NotImplementedError
+
+    @property
+    def curvature(self) -> float:
+        terms = self.polynomial.terms
+        return 2.0 * float(terms[0, 1].real) if terms.shape[1] > 1 else 0.0
+
+    @property
+    def fourth_order(self) -> float:
+        terms = self.polynomial.terms
+        return (float(terms[0, 2].real) if terms.shape[1] > 2 else 0.0) - self.curvature**3 / 8
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:
+        return self.polynomial.value(*coordinates(x, y))
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+        return self.polynomial.gradient(*coordinates(x, y))
+
+    def hessian(self, x: Any, y: Any) -> Triple:
+        return self.polynomial.hessian(*coordinates(x, y))
+
+
+@dataclass(frozen=True)
+class XYPolynomial(_Polynomial):
+    """Sum of ``a x^i y^j`` over terms (i, j, a), a in m^(1 - i - j)."""
+
+    terms: tuple[tuple[int, int, float], ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", tuple((int(i), int(j), float(a)) for i, j, a in self.terms))
+        powers = [(i, j) for i, j, _ in self.terms]
+        for i, j, a in self.terms:
+            if i < 0 or j < 0 or not np.isfinite(a):
+                raise PrescriptionError(f"xy term ({i}, {j}, {a!r}): expected powers from 0 and a finite coefficient")
+            if powers.count((i, j)) > 1:
+                raise PrescriptionError(f"xy term ({i}, {j}) occurs more than once: expected each power once")
+
+    @cached_property
+    def polynomial(self) -> PolarPolynomial:
+        """The polynomial."""
+        return from_monomials(self.terms)
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        return {f"x{i}y{j}": a for i, j, a in self.terms}
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        i, j = (int(v) for v in name[1:].split("y"))
+        zero = np.zeros_like(x)
+        fx = i * x ** (i - 1) * y**j if i else zero
+        fy = j * x**i * y ** (j - 1) if j else zero
+        return x**i * y**j, fx, fy
+
+    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
+        self._check_parameter(name)
+        return XYPolynomial(tuple((i, j, value if name == f"x{i}y{j}" else a) for i, j, a in self.terms))
+
+
+@dataclass(frozen=True)
+class ZernikeSag(_Polynomial):
+    """Sum of Zernike polynomials, orthonormal over the annulus between two radii, Noll order.
+
+    Parameters
+    ----------
+    coefficients : tuple of float
+        Of the terms j = 1, 2, ... [m]; each is its own rms over the annulus.
+    outer_radius, inner_radius : float
+        Rims of the annulus [m].
+    """
+
+    coefficients: tuple[float, ...]
+    outer_radius: float
+    inner_radius: float = field(default=0.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "coefficients", tuple(float(a) for a in self.coefficients))
+        check_coefficients(self.coefficients)
+        if not self.coefficients:
+            raise PrescriptionError("zernikes = []: expected at least one coefficient")
+        if not 0 <= self.inner_radius < self.outer_radius < np.inf:
+            raise PrescriptionError(
+                f"zernike radii = [{self.inner_radius!r}, {self.outer_radius!r}] m: expected 0 <= inner < outer"
+            )
+
+    @cached_property
+    def polynomial(self) -> PolarPolynomial:
+        """The polynomial."""
+        return from_zernikes(self.coefficients, self.outer_radius, self.inner_radius)
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        return {f"Z{j}": a for j, a in enumerate(self.coefficients, start=1)}
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        one = (0.0,) * (int(name[1:]) - 1) + (1.0,)
+        polynomial = from_zernikes(one, self.outer_radius, self.inner_radius)
+        return polynomial.value(x, y), *polynomial.gradient(x, y)
+
+    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
+        self._check_parameter(name)
+        j = int(name[1:])
+        return replace(self, coefficients=(*self.coefficients[: j - 1], float(value), *self.coefficients[j:]))

@@ -1,0 +1,179 @@
+"""A sag given on a grid of nodes, such as a measured figure or a bending mode, and interpolated by bicubics."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import PrescriptionError
+from .shape import Shape, Triple, coordinates
+
+#: A bicubic needs the slopes at the four corners of its cell, and so a node beyond each of them.
+LEAST_NODES = 4
+#: How far from equal the steps of a grid may be, relative to the step: rounding of figures written with six digits.
+EQUAL_STEPS = 1e-5
+
+
+class GridSag(Shape):
+    """Bicubic interpolation of a sag on a regular grid.
+
+    Within a cell the sag is the cubic in x and in y that has, at its corners, the values of the nodes and their slopes;
+    slopes are central differences (one-sided at the rim of the grid). So the sag and its slopes are continuous, and
+    linear in the nodes. Beyond the grid the sag is NaN: a ray there misses the surface.
+
+    Parameters
+    ----------
+    x, y : array_like, shape [nx] and [ny]
+        Nodes along x and y [m], at equal steps, ascending.
+    values : array_like, shape [ny, nx]
+        Sag at the nodes [m].
+
+    Raises
+    ------
+    PrescriptionError
+        If there are fewer than four nodes along an axis, the steps are not equal, or a number is not finite.
+    """
+
+    def __init__(self, x: Any, y: Any, values: Any) -> None:
+        self.x, self.y = (np.array(v, dtype=np.float64) for v in (x, y))
+        self.values = np.array(values, dtype=np.float64)
+        for name, axis in (("x", self.x), ("y", self.y)):
+            if axis.ndim != 1 or len(axis) < LEAST_NODES:
+                raise PrescriptionError(
+                    f"grid {name} has {axis.size} nodes: expected at least {LEAST_NODES} along each axis"
+                )
+            step = np.diff(axis)
+            if not np.all(step > 0) or np.ptp(step) > EQUAL_STEPS * step.mean():
+                raise PrescriptionError(f"grid {name} = {_shown(axis)}: expected ascending nodes at equal steps")
+        if self.values.shape != (len(self.y), len(self.x)):
+            raise PrescriptionError(
+                f"grid values of shape {list(self.values.shape)}: expected [{len(self.y)}, {len(self.x)}], one per node"
+            )
+        if not np.all(np.isfinite(self.values)):
+            row, column = np.argwhere(~np.isfinite(self.values))[0]
+            raise PrescriptionError(
+                f"grid values[{row}, {column}] = {self.values[row, column]}: expected finite numbers at all nodes"
+            )
+        for array in (self.x, self.y, self.values):
+            array.flags.writeable = False
+
+    @cached_property
+    def _identity(self) -> tuple[bytes, bytes, bytes]:
+        return self.x.tobytes(), self.y.tobytes(), self.values.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, GridSag) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        return hash(self._identity)
+
+    def __repr__(self) -> str:
+        return f"GridSag(x={_shown(self.x)}, y={_shown(self.y)}, values of shape {list(self.values.shape)})"
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Steps along x and y [m]."""
+        nx, ny = len(self.x), len(self.y)
+        return float(self.x[-1] - self.x[0]) / (nx - 1), float(self.y[-1] - self.y[0]) / (ny - 1)
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """Value, slopes and mixed derivative times the steps along x, y and both, at each node [m], [ny, nx, 4]."""
+        along_x = _differences(self.values)
+        along_y = _differences(self.values.T).T
+        return np.stack([self.values, along_x, along_y, _differences(along_y)], axis=-1)
+
+    def _evaluate(self, x: Any, y: Any, *derivatives: tuple[int, int]) -> list[np.ndarray]:
+        """Return derivatives of the sag, each given by how often along x and how often along y."""
+        x, y = coordinates(x, y)
+        hx, hy = self.step
+        px, py = (x - self.x[0]) / hx, (y - self.y[0]) / hy
+        outside = ~((px >= 0) & (px <= len(self.x) - 1) & (py >= 0) & (py <= len(self.y) - 1))
+        i = np.clip(np.where(outside, 0, px).astype(int), 0, len(self.x) - 2)
+        j = np.clip(np.where(outside, 0, py).astype(int), 0, len(self.y) - 2)
+        corners = np.stack([np.stack([self.nodes[j + b, i + a] for a in (0, 1)], -2) for b in (0, 1)], -3)
+        found = []
+        for nx, ny in derivatives:
+            wx, wy = hermite(px - i, nx), hermite(py - j, ny)
+            value = (
+                np.einsum("...ba,...a,...b", corners[..., 0], wx[0], wy[0])
+                + np.einsum("...ba,...a,...b", corners[..., 1], wx[1], wy[0])
+                + np.einsum("...ba,...a,...b", corners[..., 2], wx[0], wy[1])
+                + np.einsum("...ba,...a,...b", corners[..., 3], wx[1], wy[1])
+            )
+            found.append(np.where(outside, np.nan, value / (hx**nx * hy**ny)))
+        return found
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        return self._evaluate(x, y, (0, 0))[0]
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+        sx, sy = self._evaluate(x, y, (1, 0), (0, 1))
+        return sx, sy
+
+    def hessian(self, x: Any, y: Any) -> Triple:
+        """Return the second derivatives along xx, xy, yy [1/m]; they jump where two cells meet."""
+        xx, xy, yy = self._evaluate(x, y, (2, 0), (1, 1), (0, 2))
+        return xx, xy, yy
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        if not (self.x[0] <= 0 <= self.x[-1] and self.y[0] <= 0 <= self.y[-1]):
+            return 0.0
+        xx, _, yy = self.hessian(0.0, 0.0)
+        return 0.5 * float(xx + yy)
+
+    @property
+    def fourth_order(self) -> float:
+        """Taken as zero: bicubics have no fourth derivative to speak of."""
+        return 0.0
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The nodes, ``node[row,column]`` [m]."""
+        return {f"node[{j},{i}]": float(v) for (j, i), v in np.ndenumerate(self.values)}
+
+    def _place(self, name: str) -> tuple[int, int]:
+        j, _, i = name.removeprefix("node[").removesuffix("]").partition(",")
+        return int(j), int(i)
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        one = np.zeros_like(self.values)
+        one[self._place(name)] = 1.0
+        f, fx, fy = GridSag(self.x, self.y, one)._evaluate(x, y, (0, 0), (1, 0), (0, 1))
+        return f, fx, fy
+
+    def with_parameter(self, name: str, value: float) -> GridSag:  # noqa: D102
+        self._check_parameter(name)
+        values = self.values.copy()
+        values[self._place(name)] = value
+        return GridSag(self.x, self.y, values)
+
+
+def hermite(t: np.ndarray, derivative: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of the values and of the slopes at the two ends of a cell, each [..., 2], at 0 <= t <= 1."""
+    if derivative == 0:
+        up, start, end = t * t * (3 - 2 * t), t * (1 - t) ** 2, t * t * (t - 1)
+        down = 1 - up
+    elif derivative == 1:
+        up, start, end = 6 * t * (1 - t), (1 - t) * (1 - 3 * t), t * (3 * t - 2)
+        down = -up
+    else:
+        up, start, end = 6 - 12 * t, 6 * t - 4, 6 * t - 2
+        down = -up
+    return np.stack([down, up], axis=-1), np.stack([start, end], axis=-1)
+
+
+def _differences(values: np.ndarray) -> np.ndarray:
+    """Return central differences along the last axis, one-sided at its ends, in units per step."""
+    out = np.empty_like(values)
+    out[:, 1:-1] = 0.5 * (values[:, 2:] - values[:, :-2])
+    out[:, 0] = values[:, 1] - values[:, 0]
+    out[:, -1] = values[:, -1] - values[:, -2]
+    return out
+
+
+def _shown(axis: np.ndarray) -> str:
+    return f"[{axis[0]:.6g}, {axis[1]:.6g}, ... {axis[-1]:.6g}]"

@@ -1,0 +1,372 @@
+"""Shapes of surfaces: their sag, its slopes and curvatures, and how it answers to each figure.
+
+The sag z(x, y) [m] is the height over the vertex plane in the frame of the surface. Most shapes are a conic of
+revolution and something added; with ``s = x^2 + y^2``, curvature ``c = 1/R`` and conic constant ``k``::
+
+    z = c s / (1 + sqrt(1 - (1 + k) c^2 s)) + a_4 s^2 + a_6 s^3 + ...
+
+A positive radius has its centre of curvature on the +z side of the vertex. Where a shape does not reach, its sag is
+NaN.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import PrescriptionError, unknown_name
+
+Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def check_radius(radius: float, name: str = "radius", *, flat: bool = False) -> None:
+    """Refuse a radius of curvature [m] of zero or, unless `flat` allows it, of infinity."""
+    if np.isnan(radius) or radius == 0 or (np.isinf(radius) and not flat):
+        raise PrescriptionError(f"{name} = {radius!r}: expected a finite radius of curvature in m, not zero")
+
+
+def check_conic(conic: float, name: str = "conic") -> None:
+    """Refuse a conic constant that is not finite."""
+    if not np.isfinite(conic):
+        raise PrescriptionError(f"{name} = {conic!r}: expected a finite conic constant")
+
+
+def check_coefficients(coefficients: tuple[float, ...]) -> None:
+    """Refuse coefficients that are not finite."""
+    if not np.all(np.isfinite(coefficients)):
+        raise PrescriptionError(f"coefficients = {coefficients!r}: expected finite numbers")
+
+
+def coordinates(x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y [m] as float64 arrays of one shape."""
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    return x, y
+
+
+def root(inside: np.ndarray) -> np.ndarray:
+    """Return the square root, NaN without a warning where the argument is negative."""
+    return np.sqrt(np.where(inside >= 0, inside, np.nan))
+
+
+class Shape(ABC):
+    """What every shape answers to."""
+
+    @abstractmethod
+    def sag(self, x: Any, y: Any) -> np.ndarray:
+        """Return the height of the surface over its vertex plane.
+
+        Parameters
+        ----------
+        x, y : float or array
+            Position in the surface's own frame [m].
+
+        Returns
+        -------
+        ndarray
+            Sag [m]; NaN where the shape does not reach.
+        """
+
+    @abstractmethod
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the slopes dz/dx and dz/dy at points x, y [m] of the surface's own frame."""
+
+    @abstractmethod
+    def hessian(self, x: Any, y: Any) -> Triple:
+        """Return the second derivatives of the sag along xx, xy and yy [1/m]."""
+
+    @property
+    @abstractmethod
+    def curvature(self) -> float:
+        """Paraxial curvature at the vertex [1/m], the mean over azimuth."""
+
+    @property
+    @abstractmethod
+    def fourth_order(self) -> float:
+        """What the coefficient of r^4 of the sag has beyond that of the sphere of the same curvature [m^-3].
+
+        The mean over azimuth: for a conic ``k c^3 / 8``, for an even asphere a_4 more.
+        """
+
+    @property
+    @abstractmethod
+    def parameters(self) -> dict[str, float]:
+        """Figures that the sag can be differentiated by, in SI; radius and curvature are two names of one."""
+
+    @abstractmethod
+    def with_parameter(self, name: str, value: float) -> Shape:
+        """Return the shape with another value of a figure; this one stays as it is."""
+
+    def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:
+        """Return how the sag answers to a figure.
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure, one of `parameters`.
+        x, y : float or array
+            Position in the surface's own frame [m].
+
+        Returns
+        -------
+        f, fx, fy : ndarray
+            Derivative of the sag with respect to the figure, and the slopes of that derivative along x and y.
+
+        Raises
+        ------
+        UnknownNameError
+            If the shape has no such figure.
+        """
+        self._check_parameter(name)
+        x, y = coordinates(x, y)
+        if name.startswith("radius"):
+            # Everything is worked out by curvature c = 1/R: d/dR = -c^2 d/dc.
+            name = name.replace("radius", "curvature")
+            factor = -(self.parameters[name] ** 2)
+            f, fx, fy = self._derivative(name, x, y)
+            return factor * f, factor * fx, factor * fy
+        return self._derivative(name, x, y)
+
+    @abstractmethod
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        """Return what `sag_derivative` does, for a name that exists and is no radius."""
+
+    def _check_parameter(self, name: str) -> None:
+        if name not in self.parameters:
+            raise unknown_name(f"figure of {type(self).__name__}", name, self.parameters)
+
+
+class Rotational(Shape):
+    """A conic of revolution plus even powers of the radius from the fourth."""
+
+    #: Conic constant.
+    conic: float
+    #: Coefficients of r^4, r^6... [m^-3, m^-5, ...].
+    coefficients: tuple[float, ...]
+
+    @property
+    def fourth_order(self) -> float:  # noqa: D102
+        return self.conic * self.curvature**3 / 8 + (*self.coefficients, 0.0)[0]
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        x, y = coordinates(x, y)
+        return self._radial(x * x + y * y)[0]
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+        x, y = coordinates(x, y)
+        _, slope, _ = self._radial(x * x + y * y)
+        return 2 * x * slope, 2 * y * slope
+
+    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
+        x, y = coordinates(x, y)
+        _, slope, bend = self._radial(x * x + y * y)
+        return 2 * slope + 4 * x * x * bend, 4 * x * y * bend, 2 * slope + 4 * y * y * bend
+
+    def _radial(self, s: np.ndarray) -> Triple:
+        """Return the sag and its first and second derivative by ``s = x^2 + y^2``."""
+        c, k = self.curvature, self.conic
+        w = root(1.0 - (1.0 + k) * c**2 * s)
+        # Where the rim of a sphere is vertical the slope is infinite; the sag there is still finite.
+        with np.errstate(divide="ignore"):
+            z, slope, bend = c * s / (1.0 + w), 0.5 * c / w, 0.25 * (1.0 + k) * c**3 / w**3
+        if self.coefficients:
+            value, first, second = (np.zeros_like(s) for _ in range(3))
+            for a in (*reversed(self.coefficients), 0.0, 0.0):
+                second = second * s + 2 * first
+                first = first * s + value
+                value = value * s + a
+            z, slope, bend = z + value, slope + first, bend + second
+        return z, slope, bend
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        c = self.curvature
+        found = {"radius": 1.0 / c if c else np.inf, "curvature": c, "conic": self.conic}
+        return found | {f"a{power}": a for power, a in zip(range(4, 1000, 2), self.coefficients, strict=False)}
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        s = x * x + y * y
+        if name.startswith("a"):
+            power = int(name[1:]) // 2
+            f, slope = s**power, power * s ** (power - 1)
+        else:
+            f, slope = conic_derivative(self.curvature, self.conic, name, s)
+        return f, 2 * x * slope, 2 * y * slope
+
+    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
+        self._check_parameter(name)
+        if name.startswith("a"):
+            place = int(name[1:]) // 2 - 2
+            terms = (*self.coefficients[:place], float(value), *self.coefficients[place + 1 :])
+            return EvenAsphere(self.parameters["radius"], self.conic, terms)
+        conic = float(value) if name == "conic" else self.conic
+        if name == "curvature" and value == 0 and not any(self.coefficients):
+            return Plane()
+        radius = self.parameters["radius"]
+        if name in ("radius", "curvature"):
+            radius = value if name == "radius" else (1.0 / value if value else np.inf)
+        if isinstance(self, EvenAsphere):
+            return EvenAsphere(float(radius), conic, self.coefficients)
+        return Conic(float(radius), conic) if conic != 0 else Sphere(float(radius))
+
+
+def conic_derivative(c: float, k: float, name: str, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivative of a conic's sag by "curvature" or "conic" at ``s = r^2``, and its derivative by s.
+
+    From ``G = c (s + (1 + k) z^2) - 2 z = 0``: dz/dc = (s + (1 + k) z^2) / (2 w) and dz/dk = c z^2 / (2 w), with
+    w = 1 - (1 + k) c z, the root of the closed form.
+    """
+    w = root(1.0 - (1.0 + k) * c**2 * s)
+    z, z_s, w_s = c * s / (1.0 + w), 0.5 * c / w, -0.5 * (1.0 + k) * c**2 / w
+    if name == "curvature":
+        top, top_s = s + (1.0 + k) * z * z, 1.0 + 2.0 * (1.0 + k) * z * z_s
+    else:
+        top, top_s = c * z * z, 2.0 * c * z * z_s
+    return 0.5 * top / w, 0.5 * (top_s - top * w_s / w) / w
+
+
+@dataclass(frozen=True)
+class Plane(Rotational):
+    """Flat surface, ``z = 0``."""
+
+    conic = 0.0
+    coefficients = ()
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return 0.0
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        return {"curvature": 0.0}
+
+    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
+        self._check_parameter(name)
+        return Sphere(1.0 / value) if value else self
+
+
+@dataclass(frozen=True)
+class Sphere(Rotational):
+    """Sphere of radius of curvature `radius` [m]."""
+
+    conic = 0.0
+    coefficients = ()
+    radius: float
+
+    def __post_init__(self) -> None:
+        check_radius(self.radius)
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return 1.0 / self.radius
+
+
+@dataclass(frozen=True)
+class Conic(Rotational):
+    """Conic of revolution: vertex radius [m] and conic constant (0 sphere, -1 paraboloid)."""
+
+    coefficients = ()
+    radius: float
+    conic: float
+
+    def __post_init__(self) -> None:
+        check_radius(self.radius)
+        check_conic(self.conic)
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return 1.0 / self.radius
+
+
+@dataclass(frozen=True)
+class EvenAsphere(Rotational):
+    """Conic plus even powers of the radius; coefficients of r^4, r^6, r^8... in SI (m^-3, m^-5, ...).
+
+    An infinite radius leaves the powers alone, as on a Schmidt plate.
+    """
+
+    radius: float
+    conic: float
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_radius(self.radius, flat=True)
+        check_conic(self.conic)
+        check_coefficients(self.coefficients)
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return 1.0 / self.radius
+
+
+@dataclass(frozen=True)
+class Sum(Shape):
+    """Sum of the sags of several shapes.
+
+    Figures keep their names; where two parts have the same, that of a later one is written ``part2.Z4``, parts counted
+    from 1.
+    """
+
+    parts: tuple[Shape, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self.parts))
+        if not self.parts:
+            raise PrescriptionError("sum = []: expected at least one shape")
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return sum(part.curvature for part in self.parts)
+
+    @property
+    def fourth_order(self) -> float:  # noqa: D102
+        # The coefficients of r^4 add, those of the spheres (c^3 / 8) do not add to that of the sum's sphere.
+        return sum(p.fourth_order + p.curvature**3 / 8 for p in self.parts) - self.curvature**3 / 8
+
+    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        return np.sum([part.sag(x, y) for part in self.parts], axis=0)
+
+    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+        along_x, along_y = np.sum([part.gradient(x, y) for part in self.parts], axis=0)
+        return along_x, along_y
+
+    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
+        xx, xy, yy = np.sum([part.hessian(x, y) for part in self.parts], axis=0)
+        return xx, xy, yy
+
+    @property
+    def parameters(self) -> dict[str, float]:  # noqa: D102
+        values = [part.parameters for part in self.parts]
+        return {name: values[i][inner] for name, (i, inner) in self._places.items()}
+
+    @cached_property
+    def _places(self) -> dict[str, tuple[int, str]]:
+        """Return, for each name, the part and the name within it."""
+        places: dict[str, tuple[int, str]] = {}
+        for i, part in enumerate(self.parts):
+            for name in part.parameters:
+                places[f"part{i + 1}.{name}" if name in places else name] = (i, name)
+        return places
+
+    def place(self, name: str) -> tuple[Shape, str]:
+        """Return the part that a figure belongs to, and its name there."""
+        if name not in self._places:
+            raise unknown_name(f"figure of {type(self).__name__}", name, self._places)
+        i, inner = self._places[name]
+        return self.parts[i], inner
+
+    def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:  # noqa: D102
+        part, inner = self.place(name)
+        return part.sag_derivative(inner, x, y)
+
+    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
+        return self.sag_derivative(name, x, y)
+
+    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
+        self._check_parameter(name)
+        i, inner = self._places[name]
+        changed = self.parts[i].with_parameter(inner, value)
+        return replace(self, parts=(*self.parts[:i], changed, *self.parts[i + 1 :]))

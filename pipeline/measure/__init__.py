@@ -1,0 +1,1 @@
+"""Shapes, star selection, correlations, diagnostics."""

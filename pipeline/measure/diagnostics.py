@@ -1,0 +1,256 @@
+"""What a weak-lensing person asks of a finished run: residuals of ellipticity and size, correlations, rho statistics.
+
+Residuals at the stars that a model was fitted to flatter it; what a galaxy sees is the residual where no star is. Each
+is never without the other, nor without the residual of each star at the model fitted without it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from ...core.errors import PachonError, ProductError
+from ...core.files import Stamp, described_table, make_folder, write_bytes, write_ecsv, write_json
+from ..ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
+from ..config import load_configuration
+from ..experiment import prepare
+from ..report.diagnostics_plots import residual_map, rho_figure
+from ..report.statistics_plots import correlation_figure
+from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
+from .correlation import Correlation
+from .rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
+from .summary import LONG_RANGE, LONGEST_ARCMIN, correlations, patches, separation_bins
+
+#: Residuals: at the stars, of stars left out, away from them.
+RESIDUALS = ("residual", "left_out", "away")
+#: Those of them whose size is known too.
+SIZED = ("residual", "away")
+FOLDER_NAME = "diagnostics"
+_MEANINGS = {
+    "residual": "observed - model, at the stars",
+    "left_out": "observed - model fitted without the star",
+    "away": "truth - model, where no star is",
+}
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Diagnostics of a run.
+
+    Attributes
+    ----------
+    folder : Path
+        Where the files are.
+    files : tuple of str
+        Their names.
+    missing : dict of str to str
+        CCDs of the configuration that have no product, or one that cannot be read, and why.
+    table : Table
+        A row for each CCD: means and rms of the residuals.
+    overall : dict
+        The same over all CCDs, and figures of the correlations; keys end in their unit.
+    correlations : dict of str to Correlation
+        Of each of :data:`~pachon.pipeline.ccd_product.KINDS`, with errors by jackknife over the CCDs where there are
+        two or more.
+    rho : dict of str to RhoStatistics
+        At the stars (``residual``), and where no star is (``away``).
+    """
+
+    folder: Path
+    files: tuple[str, ...]
+    missing: dict[str, str]
+    table: Table
+    overall: dict[str, Any]
+    correlations: dict[str, Correlation]
+    rho: dict[str, RhoStatistics]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all figures as plain mappings and arrays."""
+        return {
+            "all": self.overall,
+            "ccd": {row["ccd"]: {k: row[k] for k in self.table.colnames[1:]} for row in self.table},
+            "correlation": {kind: correlation_dict(c) for kind, c in self.correlations.items()},
+            "rho": {kind: {name: correlation_dict(c) for name, c in rho.items()} for kind, rho in self.rho.items()},
+            "missing": self.missing,
+            "files": list(self.files),
+        }
+
+
+def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> Diagnostics:
+    """Read the products of a run, and write tables and pictures of the residuals.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of a run, finished or not.
+    out : Path, optional
+        Where to write; a folder ``diagnostics`` within the run's by default.
+    strict : bool
+        Whether a CCD without a product, or with one that cannot be read, is an error; else it is reported and left out.
+
+    Raises
+    ------
+    PachonError
+        If this is no run, no CCD is finished, the products are of another configuration, or nothing can be written;
+        with `strict`, if a single product is missing or damaged.
+    """
+    path = folder / CONFIG_NAME
+    if not path.exists():
+        raise ProductError(f"{folder}: expected the folder of a run, there is no {CONFIG_NAME} in it")
+    config = load_configuration(path)
+    try:
+        experiment = prepare(config)
+    except PachonError as error:
+        raise ProductError(f"{path}: no configuration that pachon run wrote ({error})") from None
+    stamp, names = stamp_of(experiment), config.ccds or ()
+    if not any(product_path(folder, name).exists() for name in names):
+        raise ProductError(f"{folder}: none of its {len(names)} CCDs is finished")
+    products, missing = [], {}
+    for name in names:
+        try:
+            products.append(_product(folder, name, stamp))
+        except ProductError as error:
+            missing[name] = str(error)
+            # Damage happens to single files; a folder without any that can be read has another reason.
+            if strict or len(missing) == len(names):
+                raise
+    columns = _ccd_columns(products)
+    correlated = correlations(products, KINDS)
+    rho = {kind: _rho(products, kind) for kind in SIZED}
+    overall = _overall(products, correlated)
+
+    out = folder / FOLDER_NAME if out is None else out
+    make_folder(out)
+    meta = {"run": stamp.config_hash, "pachon": stamp.version, "seed": stamp.seed}
+    write_ecsv(out / "ccds.ecsv", columns, {"what": "residuals of each CCD", **meta})
+    write_ecsv(out / "correlations.ecsv", correlation_columns(correlated), {"what": "xi of ellipticities", **meta})
+    everything = {f"{kind} {name}": c for kind, r in rho.items() for name, c in r.items()}
+    write_ecsv(out / "rho.ecsv", correlation_columns(everything), {"what": "rho statistics 1 to 5", **meta})
+    figures = {name: columns[name][0] for name in columns}
+    write_bytes(out / "residuals.png", residual_map(experiment.camera, figures))
+    write_bytes(out / "correlations.png", correlation_figure(correlated))
+    write_bytes(out / "rho.png", rho_figure(rho))
+    files = ("ccds.ecsv", "correlations.ecsv", "rho.ecsv", "residuals.png", "correlations.png", "rho.png")
+    table = described_table(columns, meta)
+    result = Diagnostics(out, (*files, "diagnostics.json"), missing, table, overall, correlated, rho)
+    write_json(out / "diagnostics.json", {**meta, **result.as_dict()})
+    return result
+
+
+def _product(folder: Path, name: str, stamp: Stamp) -> CcdProduct:
+    """Return the product of a CCD; the error without one gives the reason, where the run has left one."""
+    path = product_path(folder, name)
+    if path.exists():
+        return read_product(path, stamp, truth_images=False)
+    reason = "has no product yet"
+    with suppress(OSError, ValueError, KeyError):
+        reason = json.loads((folder / SUMMARY_NAME).read_text())["not_modelled"][name]
+    raise ProductError(f"CCD {name}: {reason}")
+
+
+def _growth(stars: Stars) -> np.ndarray:
+    """Return (T - T of the model)/T with T = Q11 + Q22, [n]."""
+    model = trace_of_moments(stars.model_size, stars.model_e1, stars.model_e2)
+    result: np.ndarray = 1.0 - model / trace_of_moments(stars.size, stars.e1, stars.e2)
+    return result
+
+
+def _rho(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
+    stars = [p.stars(kind) for p in products]
+    keys = ("field_x", "field_y", "e1", "e2", "size", "model_e1", "model_e2", "model_size")
+    columns = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
+    return rho_statistics(*columns, patch=patches(stars), **separation_bins(products))
+
+
+def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
+    """Return means and rms of the residuals of some CCDs together."""
+    e = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
+    figures = {
+        f"mean_e1_{kind}": _mean(e[0]),
+        f"mean_e2_{kind}": _mean(e[1]),
+        f"rms_e_{kind}": float(np.sqrt(_mean(e**2))),
+    }
+    if kind in SIZED:
+        growth = np.concatenate([_growth(p.stars(kind)) for p in products])
+        figures |= {f"mean_dt_{kind}": _mean(growth), f"rms_dt_{kind}": float(np.sqrt(_mean(growth**2)))}
+    return figures
+
+
+def _mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else np.nan
+
+
+def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, str, str]]:
+    columns: dict[str, tuple[np.ndarray, str, str]] = {
+        "ccd": (np.array([p.name for p in products]), "", "name of the CCD"),
+        "x_mm": (np.array([round(p.center[0] * 1e3, 6) for p in products]), "mm", "centre on the detector"),
+        "y_mm": (np.array([round(p.center[1] * 1e3, 6) for p in products]), "mm", "centre on the detector"),
+        "stars": (np.array([len(p.observed) for p in products]), "", "observed stars"),
+        "stars_used": (np.array([int(p.observed.used.sum()) for p in products]), "", "stars in the fit"),
+        "truth_psfs": (np.array([len(p.truth) for p in products]), "", "places where the PSF is known"),
+    }
+    for kind in RESIDUALS:
+        rows = [_moments([p], kind) for p in products]
+        for key in rows[0]:
+            what = {"mean": "mean", "rms_": "rms"}[key[:4]]
+            of = "(T - T model)/T" if "_dt_" in key else "e1" if "_e1_" in key else "e2" if "_e2_" in key else "e1, e2"
+            values = np.array([row[key] for row in rows])
+            columns[key] = (values, "", f"{what} of {of}: {_MEANINGS[kind]}")
+    return columns
+
+
+def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlation]) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "ccds": len(products),
+        "stars": sum(len(p.observed) for p in products),
+        "truth_psfs": sum(len(p.truth) for p in products),
+    }
+    for kind in RESIDUALS:
+        figures |= _moments(products, kind)
+    for kind, correlation in correlated.items():
+        r = correlation.r_arcmin
+        inside = np.flatnonzero((r >= LONG_RANGE) & (r <= LONGEST_ARCMIN) & (correlation.n_pairs > 0))
+        largest = inside[np.argmax(np.abs(correlation.xi_plus[inside]))] if len(inside) else None
+        for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", correlation.error_plus)):
+            figures[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])
+    return figures
+
+
+def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tuple[np.ndarray, str, str]]:
+    """Return correlations as the columns of one table, one after the other, by the name of each."""
+    each = [correlation_dict(c) for c in correlated.values()]
+
+    def together(key: str) -> np.ndarray:
+        return np.concatenate([c[key] for c in each])
+
+    kinds = np.repeat(list(correlated), [len(c["r_arcmin"]) for c in each])
+    by = "jackknife over the CCDs" if next(iter(correlated.values())).n_patches else "scatter of the ellipticities"
+    return {
+        "kind": (kinds, "", "what is correlated"),
+        "r_arcmin": (together("r_arcmin"), "arcmin", "mean separation"),
+        "xi_plus": (together("xi_plus"), "", "mean of Re(e e'*)"),
+        "error_plus": (together("error_plus"), "", f"standard error by {by}"),
+        "xi_minus": (together("xi_minus"), "", "mean of Re(e e' exp(-4 i phi))"),
+        "error_minus": (together("error_minus"), "", f"standard error by {by}"),
+        "pairs": (together("pairs"), "", "pairs of stars"),
+    }
+
+
+def correlation_dict(correlation: Correlation) -> dict[str, np.ndarray]:
+    """Return what is written of a correlation."""
+    return {
+        "r_arcmin": correlation.r_arcmin,
+        "xi_plus": correlation.xi_plus,
+        "xi_minus": correlation.xi_minus,
+        "error_plus": correlation.error_plus,
+        "error_minus": correlation.error_minus,
+        "pairs": correlation.n_pairs,
+    }

@@ -1,0 +1,164 @@
+"""Stars from a user's own table: positions, and cutouts in a column or in an image cube."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from astropy.io import fits
+from astropy.table import Table
+from astropy.table.meta import YamlParseError
+
+from ...core.errors import ProductError
+
+
+class StarCutouts(NamedTuple):
+    """Stars to fit a PSF model to.
+
+    Attributes
+    ----------
+    stamps : ndarray, shape [n, ny, nx]
+        As they stand in the file.
+    positions : ndarray, shape [n, 2]
+        In the unit of the table.
+    """
+
+    stamps: np.ndarray
+    positions: np.ndarray
+
+
+def load_stars(
+    catalogue: str | Path,
+    *,
+    x: str = "x",
+    y: str = "y",
+    stamp: str = "stamp",
+    images: str | Path | None = None,
+) -> StarCutouts:
+    """Read stars from a FITS or ECSV table.
+
+    Nothing is subtracted, shifted or left out: :func:`~pachon.pipeline.simulate.stamps.center_stamps` centres stars,
+    :func:`~pachon.pipeline.measure.star_selection.flag_stars` finds those to leave out.
+
+    Parameters
+    ----------
+    catalogue : str or Path
+        The table; of a FITS file its first one. The names of columns may be in any case.
+    x, y : str
+        Columns of the positions, in any unit.
+    stamp : str
+        Column of the stamps, [ny, nx] in every row. Where a FITS file has none, its first image of three axes is
+        taken.
+    images : str or Path, optional
+        FITS file whose first image of three axes, [n, ny, nx], holds the stamps in the order of the table.
+
+    Returns
+    -------
+    StarCutouts
+        Stamps and positions, to be unpacked.
+
+    Raises
+    ------
+    ProductError
+        If a file is missing, cut short, of another kind, or lacks a column; one line that names it.
+    """
+    path = Path(catalogue)
+    data = _bytes(path)
+    hdus: fits.HDUList | None = None
+    if data.startswith(b"SIMPLE"):
+        hdus = _fits(path, data)
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
+        if not tables:
+            raise ProductError(f"{path}: has no table, expected one with columns {x}, {y}")
+        columns = {name: np.asarray(tables[0].data[name]) for name in tables[0].columns.names}
+    elif data.lstrip().startswith(b"# %ECSV"):
+        columns = _ecsv(path, data)
+    else:
+        raise ProductError(f"{path}: neither FITS nor ECSV, expected a table of stars")
+
+    cube = _cube(Path(images), _fits(Path(images), _bytes(Path(images)))) if images is not None else None
+    names = {name.lower(): name for name in columns}
+    if cube is None and stamp.lower() not in names and hdus is not None:
+        cube = _first_cube(hdus)
+    wanted = [x, y] if cube is not None else [x, y, stamp]
+    missing = [name for name in wanted if name.lower() not in names]
+    if missing:
+        also = " and no image of three axes" if stamp in missing and hdus is not None else ""
+        raise ProductError(
+            f"{path}: no column {', '.join(map(repr, missing))}{also}; its columns are {', '.join(columns) or 'none'}"
+        )
+    positions = np.stack([_numbers(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
+    stamps = _numbers(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
+    if len(stamps) != len(positions):
+        raise ProductError(f"{path}: {len(positions)} stars in the table, {len(stamps)} stamps in the images")
+    return StarCutouts(stamps, positions)
+
+
+def _bytes(path: Path) -> bytes:
+    """Return what is in a file."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ProductError(f"cannot read {path}: {error.strerror}") from None
+
+
+def _fits(path: Path, data: bytes) -> fits.HDUList:
+    """Return the parts of a FITS file in memory; other warnings than of its end are the file's own business."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
+            for hdu in hdus:
+                hdu.data  # noqa: B018 - reads it now, within the checks
+        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+            raise ProductError(f"{path}: damaged or not FITS ({' '.join(str(error).split())})") from None
+    cut = [str(w.message) for w in told if "truncated" in str(w.message).lower()]
+    if cut:
+        raise ProductError(f"{path}: cut short ({' '.join(cut[0].split())})")
+    return hdus
+
+
+def _ecsv(path: Path, data: bytes) -> dict[str, np.ndarray]:
+    """Return the columns of an ECSV table; values left empty are NaN."""
+    try:
+        table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
+    except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, YamlParseError) as error:
+        raise ProductError(f"{path}: damaged or no ECSV table ({' '.join(str(error).split())})") from None
+    columns = {}
+    for name in table.colnames:
+        values = table[name]
+        if hasattr(values, "filled"):
+            values = values.astype(float).filled(np.nan) if values.dtype.kind in "fiu" else values.filled()
+        columns[name] = np.asarray(values)
+    return columns
+
+
+def _first_cube(hdus: fits.HDUList) -> np.ndarray | None:
+    """Return the first image of three axes, or None."""
+    for hdu in hdus:
+        if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3:
+            return np.asarray(hdu.data, dtype=np.float64)
+    return None
+
+
+def _cube(path: Path, hdus: fits.HDUList) -> np.ndarray:
+    """Return the first image of three axes of a file that must have one."""
+    cube = _first_cube(hdus)
+    if cube is None:
+        raise ProductError(f"{path}: has no image of three axes, expected the stamps [n, ny, nx]")
+    return cube
+
+
+def _numbers(path: Path, name: str, values: Any, axes: int) -> np.ndarray:
+    """Return a column as float64 in the machine's byte order, with the axes it must have."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or array.ndim != axes:
+        shape = "one number" if axes == 1 else "an image [ny, nx]"
+        raise ProductError(
+            f"{path}: column {name!r} has shape {array.shape} and type {array.dtype}, expected {shape} in every row"
+        )
+    return array.astype(np.float64)

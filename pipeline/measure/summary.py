@@ -1,0 +1,174 @@
+"""Figures that sum up a run: correlations over all CCDs, and what is said of each CCD and of all together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..ccd_product import CcdProduct, Stars
+from ..simulate.photometry import ARCSEC
+from .correlation import Correlation, jackknife_error, shear_correlation
+
+#: What is correlated: truth and truth - model where no star is, observed and observed - model at the stars.
+CORRELATED = ("truth", "observed", "residual", "away")
+#: Pairs are counted from here on [arcmin].
+SHORTEST_ARCMIN = 0.5
+_BINS_PER_DECADE = 6
+_ARCMIN = 60.0 * ARCSEC
+#: The paper's claim of a residual below 1e-7 is for separations from here on [arcmin],
+LONG_RANGE = 10.0
+#: and up to here [arcmin].
+LONGEST_ARCMIN = 180.0
+
+
+def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] = CORRELATED) -> dict[str, Correlation]:
+    """Correlate ellipticities and residuals over all CCDs (Jee & Tyson 2011, Fig. 14).
+
+    Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
+    between CCDs cancels whatever the error of the model is; residuals away from the stars are what a galaxy sees. Both
+    are always given. Errors are by jackknife over the CCDs where there are two or more.
+
+    Parameters
+    ----------
+    products : sequence of CcdProduct
+        CCDs.
+    kinds : sequence of str
+        What is correlated, of :data:`~pachon.pipeline.ccd_product.KINDS`.
+    """
+    bins = separation_bins(products)
+    result = {}
+    for kind in kinds:
+        stars = [p.stars(kind) for p in products]
+        x, y = (np.concatenate([getattr(s, key) for s in stars]) for key in ("field_x", "field_y"))
+        e1, e2 = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
+        result[kind] = shear_correlation(x, y, e1, e2, patch=patches(stars), **bins)
+    return result
+
+
+def patches(stars: Sequence[Stars]) -> np.ndarray | None:
+    """Return the number of the CCD of each star, the patches of a jackknife; None where there is but one CCD."""
+    return np.repeat(np.arange(len(stars)), [len(s) for s in stars]) if len(stars) > 1 else None
+
+
+def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
+    """Return the bins of separation of a run, as arguments: ``min_sep`` and ``max_sep`` [rad], and ``n_bins``."""
+    everywhere = np.concatenate(
+        [np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1
+    )
+    longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
+    bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * _ARCMIN))))
+    return {"min_sep": SHORTEST_ARCMIN * _ARCMIN, "max_sep": longest, "n_bins": bins}
+
+
+def ccd_figures(product: CcdProduct) -> dict[str, Any]:
+    """Return the figures of one CCD; keys end in their unit."""
+    truth, observed = product.truth, product.observed
+    field = np.array([np.median(truth.field_x), np.median(truth.field_y)])
+    return {
+        "x_mm": product.center[0] * 1e3,
+        "y_mm": product.center[1] * 1e3,
+        "field_deg": float(np.rad2deg(np.hypot(*field))),
+        "truth_psfs": len(truth),
+        "stars": len(observed),
+        "stars_used": int(observed.used.sum()),
+        "stars_with_defects": int((observed.defects != 0).sum()),
+        "pixels_rejected": product.model.n_rejected,
+        "fwhm_arcsec": _median(truth.fwhm) / ARCSEC,
+        "mean_e_truth": _mean(np.hypot(truth.e1, truth.e2)),
+        "mean_e_observed": _mean(np.hypot(observed.e1, observed.e2)),
+        "rms_residual_at_stars": _rms(observed.residual_e1, observed.residual_e2),
+        "rms_residual_left_out": _rms(observed.e1 - observed.left_out_e1, observed.e2 - observed.left_out_e2),
+        "rms_residual_away": _rms(truth.residual_e1, truth.residual_e2),
+        "truth_variance_in_components": product.truth_model.explained,
+        "kink_observed": product.model.kink,
+        "kink_truth": product.truth_model.kink,
+    }
+
+
+def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, Any]:
+    """Return the figures of the whole run: of each CCD, of all, and the correlations."""
+    each = {p.name: ccd_figures(p) for p in products}
+    truth = [p.truth for p in products]
+    observed = [p.observed for p in products]
+
+    def column(stars: Sequence[Stars], key: str) -> np.ndarray:
+        return np.concatenate([getattr(s, key) for s in stars])
+
+    fwhm = np.concatenate([t.fwhm for t in truth]) / ARCSEC
+    together = {
+        "ccds": len(products),
+        "truth_psfs": sum(map(len, truth)),
+        "stars": sum(map(len, observed)),
+        "stars_used": sum(figures["stars_used"] for figures in each.values()),
+        "snr_min": float(column(observed, "snr").min()),
+        "fwhm_arcsec": _median(fwhm),
+        "fwhm_min_arcsec": float(np.nanmin(fwhm)),
+        "fwhm_max_arcsec": float(np.nanmax(fwhm)),
+        "mean_e_truth": _mean(np.hypot(column(truth, "e1"), column(truth, "e2"))),
+        "max_e_truth": float(np.nanmax(np.hypot(column(truth, "e1"), column(truth, "e2")))),
+        "mean_e_observed": _mean(np.hypot(column(observed, "e1"), column(observed, "e2"))),
+        "rms_residual_at_stars": _rms(column(observed, "residual_e1"), column(observed, "residual_e2")),
+        "rms_residual_left_out": _rms(
+            column(observed, "e1") - column(observed, "left_out_e1"),
+            column(observed, "e2") - column(observed, "left_out_e2"),
+        ),
+        "rms_residual_away": _rms(column(truth, "residual_e1"), column(truth, "residual_e2")),
+        "truth_variance_in_components": min(p.truth_model.explained for p in products),
+    }
+    for kind, correlation in correlated.items():
+        for name, (low, high) in {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, np.inf)}.items():
+            together[f"xi_plus_{kind}_{name}"] = mean_xi_plus(correlation, low, high)
+            left = left_mean_xi_plus(correlation, low, high)
+            together[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(left)) if len(left) else np.nan
+    return {
+        "all": together,
+        "ccd": each,
+        "correlation": {
+            kind: {
+                "r_arcmin": c.r_arcmin,
+                "xi_plus": c.xi_plus,
+                "xi_minus": c.xi_minus,
+                "error_plus": c.error_plus,
+                "error_minus": c.error_minus,
+                "pairs": c.n_pairs,
+            }
+            for kind, c in correlated.items()
+        },
+    }
+
+
+def mean_xi_plus(correlation: Correlation, low: float, high: float) -> float:
+    """Return the mean of xi+ over the pairs with separations from low to high [arcmin]; NaN where there are none."""
+    return float(_over_pairs(correlation, low, high, correlation.n_pairs, correlation.xi_plus))
+
+
+def left_mean_xi_plus(correlation: Correlation, low: float, high: float) -> np.ndarray:
+    """Return :func:`mean_xi_plus` without each patch in turn, [n_patches], for its jackknife."""
+    return _over_pairs(correlation, low, high, correlation.left_pairs, correlation.left_plus)
+
+
+def _over_pairs(correlation: Correlation, low: float, high: float, pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
+    """Return the mean of xi [..., n_bins] over the pairs [..., n_bins] of a range [arcmin]."""
+    inside = (correlation.r_arcmin >= low) & (correlation.r_arcmin < high)
+    counts, values = pairs[..., inside], xi[..., inside]
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
+
+
+def _mean(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else np.nan
+
+
+def _median(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else np.nan
+
+
+def _rms(e1: np.ndarray, e2: np.ndarray) -> float:
+    """Return the root mean square of one component, of both together."""
+    squares = np.concatenate([e1, e2]) ** 2
+    finite = squares[np.isfinite(squares)]
+    return float(np.sqrt(finite.mean())) if finite.size else np.nan

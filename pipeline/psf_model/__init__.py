@@ -1,0 +1,1 @@
+"""Models of the PSF over a CCD."""

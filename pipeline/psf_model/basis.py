@@ -1,0 +1,191 @@
+"""Bases in which the stars of a CCD are described: eigen-PSFs, the pixels themselves, and shapelets.
+
+A basis is a mean PSF of unit sum and orthonormal components that sum to zero, so that every combination has unit sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.errors import ConfigError
+
+#: Names of the bases.
+BASES = ("pca", "pixels", "shapelets")
+# Scales of shapelets tried first, over the rms width of the mean star, before the best is refined.
+_SCALES = np.geomspace(0.4, 1.6, 13)
+# Most components that the scale is chosen for: with many, any scale will do, and the first of them should do best.
+_FOR_SCALE = 20
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """A mean and components.
+
+    Attributes
+    ----------
+    mean : ndarray, shape [n_pixels]
+        Unit sum.
+    vectors : ndarray, shape [k, n_pixels]
+        Orthonormal, each of sum zero, but for the pixels' own, which are the unit vectors.
+    spectrum : ndarray
+        Singular values of the stars' deviations from their mean, falling.
+    scale : float
+        Of shapelets [pixel]; NaN else.
+    """
+
+    mean: np.ndarray
+    vectors: np.ndarray
+    spectrum: np.ndarray
+    scale: float = np.nan
+
+
+def principal_components(mean: np.ndarray, deviations: np.ndarray, count: int) -> Basis:
+    """Return the eigen-PSFs of largest eigenvalue, the element of largest magnitude of each positive.
+
+    Parameters
+    ----------
+    mean : array
+        Mean PSF, [n_pixels].
+    deviations : array
+        Stars less their mean, [n_stars, n_pixels].
+    count : int
+        Components to keep.
+    """
+    _, singular, vectors = np.linalg.svd(deviations, full_matrices=False)
+    vectors = vectors[:count]
+    largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
+    return Basis(mean, vectors * np.where(largest < 0.0, -1.0, 1.0), singular)
+
+
+def pixel_grid(mean: np.ndarray, deviations: np.ndarray) -> Basis:
+    """Return the basis in which every pixel is its own component."""
+    return Basis(mean, np.eye(len(mean)), np.linalg.svd(deviations, compute_uv=False))
+
+
+def shapelets(
+    mean: np.ndarray, deviations: np.ndarray, count: int, shape: tuple[int, int], scale: float | None
+) -> Basis:
+    """Return Gauss-Hermite functions, Refregier 2003, of the scale that leaves least of the stars.
+
+    The first `count` + 1 shapelets by total order, sampled at the centres of the pixels about the centre of the stamp,
+    and restricted to unit sum, make a mean and `count` components. The mean is the mean star as the shapelets hold it:
+    what they truncate is left out, as in the shapelet method that Jee & Tyson 2011, sec. 3, compare with.
+
+    Parameters
+    ----------
+    mean : array
+        Mean PSF, [n_pixels].
+    deviations : array
+        Stars less their mean, [n_stars, n_pixels].
+    count : int
+        Components.
+    shape : tuple of int
+        (ny, nx) of the stamps.
+    scale : float or None
+        rms width of the Gaussian under the shapelets [pixel]; None chooses the one with the least squares of what is
+        left of all stars.
+
+    Raises
+    ------
+    ConfigError
+        If the stamps have too few pixels to tell the shapelets apart.
+    """
+    if scale is None:
+        scale = _best_scale(mean + deviations, min(count, _FOR_SCALE), shape)
+    base, vectors = _unit_sum_shapelets(count, shape, scale)
+    held = base + (vectors @ (mean - base)) @ vectors
+    return Basis(held, vectors, np.linalg.svd(deviations, compute_uv=False), float(scale))
+
+
+def shapelet_images(count: int, shape: tuple[int, int], scale: float) -> np.ndarray:
+    """Return the first shapelets by total order, [count, ny, nx], sampled at the centres of the pixels.
+
+    Within an order the one along x comes first. Each has unit square integral over the plane [pixel^-1].
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    shape : tuple of int
+        (ny, nx).
+    scale : float
+        rms width of the Gaussian of order zero [pixel].
+    """
+    # An order's amplitude is exp(-r^2 / 2 beta^2): the Gaussian of order zero has rms width beta.
+    order = 0
+    while (order + 1) * (order + 2) // 2 < count:
+        order += 1
+    along_y, along_x = (_hermite_functions(order, (np.arange(n) - (n - 1) / 2.0) / scale) for n in shape)
+    pairs = [(total - m, m) for total in range(order + 1) for m in range(total + 1)][:count]
+    return np.stack([along_y[m][:, None] * along_x[n] for n, m in pairs]) / scale
+
+
+def _hermite_functions(order: int, x: np.ndarray) -> np.ndarray:
+    """Return H_n(x) exp(-x^2/2) / sqrt(2^n n! sqrt(pi)) for n = 0 to `order`, by their recurrence."""
+    rows = [np.pi**-0.25 * np.exp(-0.5 * x**2)]
+    rows.append(np.sqrt(2.0) * x * rows[0])
+    for n in range(1, order):
+        rows.append(np.sqrt(2.0 / (n + 1)) * x * rows[n] - np.sqrt(n / (n + 1)) * rows[n - 1])
+    return np.stack(rows[: order + 1])
+
+
+def _unit_sum_shapelets(count: int, shape: tuple[int, int], scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Gaussian of unit sum [n_pixels] and orthonormal combinations of sum zero [count, n_pixels].
+
+    The first m components span the same combinations of sum zero as the first m + 1 shapelets.
+    """
+    images = shapelet_images(count + 1, shape, scale).reshape(count + 1, -1)
+    base = images[0] / images[0].sum()
+    changes = images[1:] - images[1:].sum(axis=1)[:, None] * base
+    q, r = np.linalg.qr(changes.T)
+    size = np.abs(np.diagonal(r))
+    if count > len(base) - 1 or size.min() < 1e-8 * size.max():
+        raise ConfigError(
+            f"n_components = {count}: stamps of {shape[1]} x {shape[0]} pixels do not tell that many shapelets of "
+            f"scale {scale:.3g} pixels apart"
+        )
+    return base, (q * np.where(np.diagonal(r) < 0.0, -1.0, 1.0)).T
+
+
+def _best_scale(stars: np.ndarray, count: int, shape: tuple[int, int]) -> float:
+    """Return the scale at which the shapelets leave least of the stars [n, n_pixels], by golden section."""
+    width = _rms_width(stars.mean(axis=0).reshape(shape))
+
+    def left(log_scale: float) -> float:
+        try:
+            base, vectors = _unit_sum_shapelets(count, shape, float(np.exp(log_scale)))
+        except ConfigError:
+            return np.inf
+        rest = stars - base
+        return float(((rest - (rest @ vectors.T) @ vectors) ** 2).sum())
+
+    tried = np.log(_SCALES * width)
+    values = [left(t) for t in tried]
+    best = int(np.argmin(values))
+    if not np.isfinite(values[best]):
+        _unit_sum_shapelets(count, shape, width)  # says what is wrong
+    low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+    a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_a, at_b = left(a), left(b)
+    while high - low > 1e-9:
+        if at_a < at_b:
+            high, b, at_b = b, a, at_a
+            a = high - _GOLDEN * (high - low)
+            at_a = left(a)
+        else:
+            low, a, at_a = a, b, at_b
+            b = low + _GOLDEN * (high - low)
+            at_b = left(b)
+    return float(np.exp(0.5 * (low + high)))
+
+
+def _rms_width(image: np.ndarray) -> float:
+    """Return the rms width [pixel] of the part of a star above a tenth of its peak, cheap and deaf to the wings."""
+    y, x = np.indices(image.shape)
+    light = np.where(image > 0.1 * image.max(), image, 0.0).ravel()
+    light /= light.sum()
+    x0, y0 = (light * x.ravel()).sum(), (light * y.ravel()).sum()
+    return float(np.sqrt(0.5 * (light * ((x.ravel() - x0) ** 2 + (y.ravel() - y0) ** 2)).sum() + 0.25))

@@ -1,0 +1,162 @@
+"""Check what a PSF model is fitted to: stars, masks, weights, positions; one clear line for what cannot be used."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+from .polynomial import Extent, term_count
+
+#: Signal-to-noise ratio above which softened weights grow no more.
+SOFTENING = 100.0
+
+
+def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stamps as finite float64 numbers and the masks as bool, both [n, ny, nx].
+
+    Masked pixels may hold anything and become zero.
+    """
+    try:
+        images = np.asarray(stamps, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError("stamps: expected real numbers [n, ny, nx]") from error
+    if images.ndim != 3 or len(images) < 2:
+        raise DomainError(f"stamps have shape {images.shape}: expected [n, ny, nx] with at least 2 stars")
+    bad = np.zeros(images.shape, dtype=bool)
+    if masks is not None:
+        bad = _masks(masks, images.shape)
+        images = np.where(bad, 0.0, images)
+    finite = np.isfinite(images).all(axis=(1, 2))
+    if not finite.all():
+        raise DomainError(f"stamps[{int(np.flatnonzero(~finite)[0])}] has pixels that are not finite")
+    dark = images.sum(axis=(1, 2)) <= 0.0
+    if dark.any():
+        unmasked = " outside its mask" if bad.any() else ""
+        raise DomainError(f"stamps[{int(np.flatnonzero(dark)[0])}] sums to zero or less{unmasked}: expected a star")
+    return images, bad
+
+
+def _masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the masks as bool [n, ny, nx], True where a pixel is not to be used."""
+    bad = np.asarray(masks)
+    if bad.shape != shape or bad.dtype.kind != "b":
+        raise DomainError(
+            f"masks have shape {bad.shape} and type {bad.dtype}: expected bool {list(shape)} as the stamps, True is bad"
+        )
+    if bad.all():
+        raise DomainError("masks: every pixel of every star is masked, no star is left")
+    blind = bad.all(axis=(1, 2))
+    if blind.any():
+        raise DomainError(f"masks[{int(np.flatnonzero(blind)[0])}] masks the whole star: expected it to be left out")
+    never = bad.all(axis=0)
+    if never.any():
+        y, x = np.argwhere(never)[0]
+        raise DomainError(f"masks: pixel [{y}, {x}] is masked in every star, nothing says what the PSF is there")
+    return bad
+
+
+def as_weights(weights: Any, n_stars: int) -> np.ndarray | None:
+    """Return one weight for each star, or None where none are given."""
+    if weights is None:
+        return None
+    try:
+        values = np.asarray(weights, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"weights: expected {n_stars} numbers, one for each star") from error
+    if values.shape != (n_stars,):
+        raise DomainError(f"weights have shape {values.shape}: expected [{n_stars}], one for each star")
+    wrong = ~(np.isfinite(values) & (values >= 0.0))
+    if wrong.any():
+        first = int(np.flatnonzero(wrong)[0])
+        raise DomainError(f"weights[{first}] = {values[first]}: expected a finite number that is not negative")
+    return values
+
+
+def snr_weights(kind: str, snr: np.ndarray) -> np.ndarray | None:
+    """Return weights of stars in the polynomials by their signal-to-noise ratios, [n]; None for equal ones.
+
+    Parameters
+    ----------
+    kind : str
+        ``equal``; ``snr``: S/N squared, the inverse variance of the noise; ``softened``: 1/(1/S^2 + 1/100^2), since
+        what the polynomial itself leaves is not less for brighter stars.
+    snr : array
+        S, signal-to-noise ratio of each star, [n].
+
+    Raises
+    ------
+    ConfigError
+        If there is no such kind.
+    """
+    if kind == "equal":
+        return None
+    if kind not in ("snr", "softened"):
+        raise ConfigError(f"weights = {kind!r}: expected one of equal, snr, softened")
+    return snr**2 if kind == "snr" else 1.0 / (snr**-2.0 + SOFTENING**-2.0)
+
+
+def as_extent(extent: Any, positions: np.ndarray) -> Extent:
+    """Return the given extent, or that of the positions, as four floats."""
+    if extent is None:
+        (xmin, ymin), (xmax, ymax) = positions.min(axis=0), positions.max(axis=0)
+    else:
+        try:
+            xmin, xmax, ymin, ymax = (float(v) for v in extent)
+        except (TypeError, ValueError) as error:
+            raise DomainError(f"extent = {extent!r}: expected (xmin, xmax, ymin, ymax)") from error
+    if not (xmin < xmax and ymin < ymax and np.all(np.isfinite([xmin, xmax, ymin, ymax]))):
+        raise DomainError(
+            f"extent = {(xmin, xmax, ymin, ymax)}: expected (xmin, xmax, ymin, ymax), minima below maxima"
+        )
+    return float(xmin), float(xmax), float(ymin), float(ymax)
+
+
+def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: np.ndarray | None = None) -> None:
+    """Refuse stars that do not determine the polynomials.
+
+    Parameters
+    ----------
+    terms : array
+        Terms of the polynomials at the stars, [n, n_terms].
+    order : int
+        Their total degree.
+    positions : array
+        Of the stars, [n, 2].
+    weights : array, optional
+        Of the stars, [n]; those of weight zero count as absent.
+    """
+    if weights is not None:
+        terms, positions = terms[weights > 0.0], positions[weights > 0.0]
+    n_stars, n_terms = terms.shape
+    if n_stars < n_terms:
+        raise ConfigError(f"order = {order}: its {n_terms} polynomial terms need as many stars, {n_stars} given")
+    if np.linalg.matrix_rank(terms) < n_terms:
+        pair = same_place(positions)
+        twice = f" ({_pair_text(positions, pair)})" if pair else ""
+        raise DomainError(
+            f"positions: the {n_stars} stars do not determine the {term_count(order)} polynomial terms{twice}"
+        )
+
+
+def check_apart(positions: np.ndarray) -> None:
+    """Refuse two stars at one place, where a process without noise cannot pass through both."""
+    pair = same_place(positions)
+    if pair:
+        raise DomainError(f"positions: {_pair_text(positions, pair)}; expected places apart for interpolation = 'gp'")
+
+
+def same_place(positions: np.ndarray) -> tuple[int, int] | None:
+    """Return the first two stars that stand at one place, or None."""
+    first: dict[tuple[float, float], int] = {}
+    for index, (x, y) in enumerate(positions.tolist()):
+        earlier = first.setdefault((x, y), index)
+        if earlier != index:
+            return earlier, index
+    return None
+
+
+def _pair_text(positions: np.ndarray, pair: tuple[int, int]) -> str:
+    x, y = positions[pair[0]].tolist()
+    return f"stars {pair[0]} and {pair[1]} are both at ({x:.9g}, {y:.9g})"

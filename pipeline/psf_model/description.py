@@ -1,0 +1,91 @@
+"""From stamps to what a PSF model interpolates: outliers out, masked pixels filled, a basis chosen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .basis import Basis, pixel_grid, principal_components, shapelets
+from .masked_pixels import fill_unseen, mean_and_flux
+from .outliers import find_outliers, restore_predicted
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """Stars in a basis.
+
+    Attributes
+    ----------
+    basis : Basis
+        Mean and components.
+    coefficients : ndarray, shape [n_stars, k]
+        Projections of the stars.
+    unexplained : ndarray, shape [n_stars]
+        Sum over pixels of the square of what the basis leaves.
+    rejected : ndarray of bool, shape [n_stars, n_pixels]
+        Outliers.
+    """
+
+    basis: Basis
+    coefficients: np.ndarray
+    unexplained: np.ndarray
+    rejected: np.ndarray
+
+
+def describe(
+    images: np.ndarray,
+    masked: np.ndarray,
+    terms: np.ndarray,
+    *,
+    basis: str,
+    count: int,
+    scale: float | None,
+    clip_sigma: float | None,
+    max_iterations: int,
+    replacement: str,
+) -> Description:
+    """Describe the stars of a CCD in a basis.
+
+    Parameters
+    ----------
+    images : array
+        [n_stars, ny, nx], finite, of any flux.
+    masked : array of bool
+        [n_stars, ny, nx] pixels not to be used.
+    terms : array
+        Of the polynomials at the stars, [n_stars, n_terms]; they vouch for stars that stand out as the others foresee,
+        and fill what single pixels have not seen.
+    basis, count, scale, clip_sigma, max_iterations, replacement
+        As in :meth:`~pachon.pipeline.psf_model.model.PsfModel.fit`.
+    """
+    shape = images.shape[1:]
+    pixels, unseen = images.reshape(len(images), -1), masked.reshape(len(images), -1)
+    if unseen.any():
+        guess, flux = mean_and_flux(pixels, unseen)
+        pixels = np.where(unseen, flux[:, None] * guess, pixels)
+    rejected = np.zeros(pixels.shape, dtype=bool)
+    if clip_sigma is not None:
+        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~unseen
+    mean, flux = mean_and_flux(pixels, rejected)
+    if rejected.any():
+        rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
+        mean, flux = mean_and_flux(pixels, rejected)
+    deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
+
+    by_mean = rejected & (replacement == "mean")
+    unseen = unseen | (rejected & ~by_mean)
+    if unseen.any():
+        stars = fill_unseen(mean + deviations, unseen, by_mean, terms)
+        mean = stars.mean(axis=0)
+        deviations = np.where(by_mean, 0.0, stars - mean)
+    if basis == "pixels":
+        return Description(pixel_grid(mean, deviations), deviations, np.zeros(len(deviations)), rejected)
+    if basis == "pca":
+        found = principal_components(mean, deviations, count)
+    else:
+        found = shapelets(mean, deviations, count, shape, scale)
+        deviations = deviations + (mean - found.mean)  # its mean is not that of the stars
+    coefficients = deviations @ found.vectors.T
+    unexplained = ((deviations - coefficients @ found.vectors) ** 2).sum(axis=1)
+    return Description(found, coefficients, unexplained, rejected)

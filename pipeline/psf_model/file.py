@@ -1,0 +1,111 @@
+"""PSF models as FITS extensions, lossless."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.io import fits
+
+from ...core.errors import ProductError
+from .basis import BASES
+
+if TYPE_CHECKING:
+    from .model import PsfModel
+
+
+def model_hdus(model: PsfModel, name: str) -> list[fits.ImageHDU | fits.BinTableHDU]:
+    """Return a model as extensions: NAME_MEAN and so on.
+
+    What only other models than polynomials of principal components have is written only where it differs: header
+    cards BASIS and SCALE, the star's weight and pull, and NAME_KERNEL.
+    """
+    mean = fits.ImageHDU(model.mean, name=f"{name}_MEAN")
+    mean.header["ORDER"] = (model.order, "total degree of the polynomials")
+    k = model.n_components
+    stars = [
+        fits.Column("position", "2D", array=model.positions),
+        fits.Column("coefficient", f"{k}D", array=model.coefficients),
+        fits.Column("unexplained", "D", array=model.unexplained),
+        fits.Column("rejected", "K", array=model.rejected),
+    ]
+    more = []
+    if model.basis != "pca":
+        mean.header["BASIS"] = (model.basis, "kind of the components")
+    if np.isfinite(model.scale):
+        mean.header["SCALE"] = (model.scale, "[pixel] rms width of the shapelets' Gaussian")
+    if model.weights is not None:
+        stars.append(fits.Column("weight", "D", array=model.weights))
+    if model.kernel is not None:
+        stars.append(fits.Column("pull", f"{k}D", array=model.pull))
+        more.append(fits.ImageHDU(model.kernel, name=f"{name}_KERNEL"))
+    # The pixels' own components are unit vectors: thirty times the size of all else, and known.
+    components = [] if model.basis == "pixels" else [fits.ImageHDU(model.components, name=f"{name}_EIGEN")]
+    return [
+        mean,
+        *components,
+        fits.ImageHDU(model.polynomial, name=f"{name}_POLY"),
+        fits.ImageHDU(np.array(model.extent), name=f"{name}_EXTENT"),
+        fits.BinTableHDU.from_columns(
+            [fits.Column("eigenvalue", "D", array=model.eigenvalues)], name=f"{name}_SPECTRUM"
+        ),
+        fits.BinTableHDU.from_columns(stars, name=f"{name}_STARS"),
+        *more,
+    ]
+
+
+def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
+    """Return the fields of a model from extensions written by :func:`model_hdus`.
+
+    Raises
+    ------
+    ProductError
+        If an extension, a column or a card is missing, or the parts do not belong together.
+    """
+    found = {hdu.name: hdu for hdu in hdus}
+
+    def part(key: str) -> Any:
+        return found[f"{name}_{key}".upper()]
+
+    try:
+        mean, stars = part("MEAN"), part("STARS").data
+        basis = mean.header.get("BASIS", "pca")
+        if basis not in BASES:
+            raise ProductError(f"PSF model {name!r}: BASIS = {basis!r}, expected one of {', '.join(BASES)}")
+        polynomial, image = _native(part("POLY").data), _native(mean.data)
+        if basis == "pixels":
+            components = np.eye(image.size).reshape(image.size, *image.shape)
+        else:
+            components = _native(part("EIGEN").data)
+        k = len(components)
+        extent = tuple(float(v) for v in part("EXTENT").data)
+        kernel = found.get(f"{name}_KERNEL".upper())
+        columns = part("STARS").columns.names
+        fields = {
+            "mean": image,
+            "components": components,
+            "coefficients": _native(stars["coefficient"]).reshape(len(stars), -1),
+            "polynomial": polynomial,
+            "eigenvalues": _native(part("SPECTRUM").data["eigenvalue"]),
+            "positions": _native(stars["position"]),
+            "order": int(mean.header["ORDER"]),
+            "extent": extent,
+            "unexplained": _native(stars["unexplained"]),
+            "rejected": np.asarray(stars["rejected"], dtype=np.int64),
+            "basis": basis,
+            "scale": float(mean.header.get("SCALE", np.nan)),
+            "weights": _native(stars["weight"]) if "weight" in columns else None,
+            "kernel": _native(kernel.data) if kernel is not None else None,
+            "pull": _native(stars["pull"]).reshape(len(stars), -1) if kernel is not None else None,
+        }
+    except KeyError as error:
+        raise ProductError(f"no PSF model {name!r} in the FITS file: {error.args[0]} is missing") from error
+    if components.shape[1:] != image.shape or polynomial.shape[1:] != (k,) or fields["coefficients"].shape[1] != k:
+        raise ProductError(f"PSF model {name!r}: mean, components and polynomials have shapes that do not fit together")
+    return fields
+
+
+def _native(array: Any) -> np.ndarray:
+    """Return FITS numbers as float64 in the machine's own byte order."""
+    return np.asarray(array, dtype=np.float64).copy()

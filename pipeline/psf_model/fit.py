@@ -1,0 +1,134 @@
+"""The fit of a PSF model: checks, description of the stars, interpolation over the CCD."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from ...core.errors import ConfigError, DomainError
+from ...core.single_thread import one_blas_thread
+from . import gaussian_process
+from .basis import BASES
+from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms
+from .description import describe
+from .polynomial import as_positions, design_matrix, mapped
+
+#: Components of principal components and of shapelets where no number is given (Jee & Tyson 2011, sec. 3).
+COMPONENTS = 20
+#: Most components from which an automatic choice is made.
+_MOST_COMPONENTS = 65
+
+
+def fit_fields(
+    stamps: Any,
+    positions: Any,
+    *,
+    basis: str,
+    interpolation: str,
+    weights: Any,
+    masks: Any,
+    n_components: Any,
+    order: int | None,
+    extent: Any,
+    scale: float | None,
+    clip_sigma: float | None,
+    max_iterations: int,
+    replacement: str,
+) -> dict[str, Any]:
+    """Return the fields of a model; arguments and errors as those of :meth:`~.PsfModel.fit`.
+
+    An automatic number of components is left at the most from which it is to be chosen.
+    """
+    images, bad = as_stamps(stamps, masks)
+    n_stars, ny, nx = images.shape
+    places = as_positions(positions)
+    if len(places) != n_stars:
+        raise DomainError(f"positions: {len(places)} given, expected one for each of the {n_stars} stamps")
+    for option, value, known in (
+        ("basis", basis, BASES),
+        ("interpolation", interpolation, ("polynomial", "gp")),
+        ("replacement", replacement, ("mean", "polynomial")),
+    ):
+        if value not in known:
+            raise ConfigError(f"{option} = {value!r}: expected one of {', '.join(known)}")
+    limit = min(n_stars - 1, ny * nx)
+    count = _component_count(basis, n_components, n_stars, limit, ny * nx)
+    if scale is not None and (basis != "shapelets" or not (np.isfinite(scale) and scale > 0.0)):
+        raise ConfigError(f"scale = {scale}: expected a positive number of pixels, for shapelets only")
+    if clip_sigma is not None and not clip_sigma > 0.0:
+        raise ConfigError(f"clip_sigma = {clip_sigma}: expected a positive number or None")
+    if max_iterations < 1:
+        raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
+    if order is None:
+        order = 3 if interpolation == "polynomial" else 0
+    star_weights = as_weights(weights, n_stars)
+    if interpolation == "gp":
+        if star_weights is not None:
+            raise ConfigError("weights: expected none with interpolation = 'gp', which finds the noise itself")
+        check_apart(places)
+    span = as_extent(extent, places)
+    terms = design_matrix(places, span, order)
+    with one_blas_thread():
+        check_terms(terms, order, places, star_weights)
+        stars = describe(
+            images,
+            bad,
+            terms,
+            basis=basis,
+            count=count,
+            scale=scale,
+            clip_sigma=clip_sigma,
+            max_iterations=max_iterations,
+            replacement=replacement,
+        )
+        coefficients = stars.coefficients
+        kernel = pull = None
+        if interpolation == "gp":
+            points = mapped(places, span)
+            kernel = gaussian_process.fit_kernels(points, coefficients, terms, shared=basis == "pixels")
+            polynomial, pull, _ = gaussian_process.krige(points, coefficients, terms, kernel)
+        else:
+            q, r = np.linalg.qr(weighted(terms, star_weights))
+            polynomial = scipy.linalg.solve_triangular(r, q.T @ weighted(coefficients, star_weights))
+        return dict(
+            mean=stars.basis.mean.reshape(ny, nx),
+            components=stars.basis.vectors.reshape(-1, ny, nx),
+            coefficients=coefficients,
+            polynomial=polynomial,
+            eigenvalues=stars.basis.spectrum[:limit] ** 2 / (n_stars - 1),
+            positions=places,
+            order=int(order),
+            extent=span,
+            unexplained=stars.unexplained,
+            rejected=stars.rejected.sum(axis=1),
+            basis=basis,
+            scale=stars.basis.scale,
+            weights=star_weights,
+            kernel=kernel,
+            pull=pull,
+        )
+
+
+def weighted(rows: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Return rows of equations times the roots of their weights, for least squares."""
+    return rows if weights is None else rows * np.sqrt(weights)[:, None]
+
+
+def _component_count(basis: str, n_components: Any, n_stars: int, limit: int, n_pixels: int) -> int:
+    """Return how many components to make."""
+    if basis == "pixels":
+        if n_components is not None:
+            raise ConfigError(f"n_components = {n_components}: expected None with basis = 'pixels', which has them all")
+        return n_pixels
+    most = limit if basis == "pca" else n_pixels - 1
+    if n_components == "auto":
+        return min(most, _MOST_COMPONENTS)
+    count = COMPONENTS if n_components is None else n_components
+    if isinstance(count, bool) or not isinstance(count, (int, np.integer)):
+        raise ConfigError(f"n_components = {n_components!r}: expected a whole number, 'auto' or None")
+    if not 1 <= count <= most:
+        reason = f"the stars ({n_stars}) less one" if basis == "pca" else f"the pixels ({n_pixels}) less one"
+        raise ConfigError(f"n_components = {count}: expected 1 to {most}, no more than {reason}")
+    return int(count)

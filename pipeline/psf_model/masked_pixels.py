@@ -1,0 +1,77 @@
+"""Pixels of stars that were not seen, and what the other pixels and the other stars say that they hold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.errors import DomainError
+
+# Passes end when no pixel changes by more of the brightest pixel than this.
+_CONVERGED = 1e-12
+_MOST_PASSES = 100
+# Stars that did not see a pixel are predicted only along the directions that the others determine: an eigenvalue of
+# 1 - H under this would enlarge noise by more than seven.
+_LEAST_ROOM = 0.02
+
+
+def mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean PSF [n_pixels], of unit sum, and the flux of each star [n_stars].
+
+    A star with its rejected pixels replaced by the mean PSF is to have unit sum as well: its flux is the sum of the
+    good pixels over the mean PSF's sum there. The mean depends on the fluxes in turn, so both are iterated.
+    """
+    flux = pixels.sum(axis=1)
+    used = ~rejected
+    used[:, rejected.all(axis=0)] = True  # a pixel that is bad in all stars has no better mean
+    count = used.sum(axis=0)
+    for _ in range(20 if rejected.any() else 1):
+        mean = np.where(used, pixels / flux[:, None], 0.0).sum(axis=0) / count
+        mean /= mean.sum()
+        if rejected.any():
+            flux = np.where(used, pixels, 0.0).sum(axis=1) / np.where(used, mean, 0.0).sum(axis=1)
+    if not np.all(flux > 0.0):
+        raise DomainError(f"stamps[{int(np.flatnonzero(~(flux > 0.0))[0])}] has no flux left outside its outliers")
+    return mean, flux
+
+
+def fill_unseen(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Fill unseen pixels with what the polynomial through the stars that saw them predicts.
+
+    A filled pixel then has no say in the interpolation over the CCD: with the hat matrix H of all stars, the values f
+    of the stars b that did not see a pixel lie on the polynomial of the others, g, if f = H_bb f + H_bg y. Filling
+    changes the sum of a star, and so its flux and the mean, so all are iterated.
+
+    Parameters
+    ----------
+    stars : array
+        [n_stars, n_pixels] of unit sum, the unseen pixels filled with a first guess.
+    unseen : array of bool
+        [n_stars, n_pixels].
+    replaced : array of bool
+        [n_stars, n_pixels] that hold the mean of all stars instead.
+    terms : array
+        Of the polynomial at the stars, [n_stars, n_terms], linearly independent.
+
+    Returns
+    -------
+    array
+        The filled stars, of unit sum.
+    """
+    q, _ = np.linalg.qr(terms)
+    predictors = []
+    for j in np.flatnonzero(unseen.any(axis=0)):
+        bad = unseen[:, j]
+        room = np.linalg.pinv(np.eye(int(bad.sum())) - q[bad] @ q[bad].T, rcond=_LEAST_ROOM, hermitian=True)
+        predictors.append((j, np.flatnonzero(bad), np.flatnonzero(~bad), room @ q[bad] @ q[~bad].T))
+    for _ in range(_MOST_PASSES):
+        filled = stars.copy()
+        for j, bad, good, predictor in predictors:
+            middle = stars[good, j].mean()  # so that a star of whom the others know nothing gets their mean
+            filled[bad, j] = middle + predictor @ (stars[good, j] - middle)
+        filled = np.where(replaced, filled.mean(axis=0), filled)
+        filled /= filled.sum(axis=1)[:, None]
+        change = np.abs(filled - stars).max()
+        stars = filled
+        if change <= _CONVERGED * stars.max():
+            break
+    return stars

@@ -1,0 +1,63 @@
+"""Polynomials of a position on a CCD, of limited total degree."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+
+Extent = tuple[float, float, float, float]
+
+
+def term_count(order: int) -> int:
+    """Return how many terms x^l y^m there are with l + m <= order."""
+    return (order + 1) * (order + 2) // 2
+
+
+def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:
+    """Return the polynomial terms at each position, [n, n_terms].
+
+    The terms are products of Legendre polynomials P_l(u) P_m(v), l + m <= order, in which (u, v) is the position mapped
+    from the extent to [-1, 1]. They span the same functions as x^l y^m (Jee & Tyson 2011, sec. 3) and stay nearly
+    orthogonal for stars spread over the CCD, so that the fit loses no digits.
+
+    Parameters
+    ----------
+    positions : array
+        [n, 2], in the unit of the extent.
+    extent : tuple of float
+        (xmin, xmax, ymin, ymax).
+    order : int
+        Largest total degree.
+    """
+    if order < 0:
+        raise ConfigError(f"order = {order}: expected a polynomial order that is not negative")
+    along_u, along_v = (np.polynomial.legendre.legvander(t, order) for t in mapped(positions, extent).T)
+    columns = [along_u[:, total - m] * along_v[:, m] for total in range(order + 1) for m in range(total + 1)]
+    return np.stack(columns, axis=1)
+
+
+def mapped(positions: Any, extent: Extent) -> np.ndarray:
+    """Return positions [n, 2] mapped from the extent to [-1, 1]."""
+    points = as_positions(positions)
+    xmin, xmax, ymin, ymax = extent
+    u = 2.0 * (points[:, 0] - xmin) / (xmax - xmin) - 1.0
+    v = 2.0 * (points[:, 1] - ymin) / (ymax - ymin) - 1.0
+    return np.stack([u, v], axis=1)
+
+
+def as_positions(positions: Any) -> np.ndarray:
+    """Return positions as a float64 array [n, 2] (one position may be given as [2])."""
+    try:
+        points = np.asarray(positions, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError("positions: expected real numbers [n, 2]") from error
+    if points.ndim == 1:
+        points = points[None]
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise DomainError(f"positions have shape {np.shape(positions)}: expected [n, 2]")
+    if not np.all(np.isfinite(points)):
+        raise DomainError(f"positions[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
+    return points

@@ -1,0 +1,108 @@
+"""What figures of the focal plane share: whiskers, CCD outlines, what each colour means.
+
+Figures are in the detector's frame as the telescope's frame has it: x to the right, y up, in millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from matplotlib.transforms import ScaledTranslation, blended_transform_factory
+
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_of
+from ...models.camera.camera import Camera
+
+#: One colour for one thing, in every figure: blue and red for observed and residual are the paper's.
+TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
+
+
+def ccd_corners(camera: Camera, indices: Iterable[int]) -> np.ndarray:
+    """Return the corners of CCDs [mm], shape [n, 4, 2]."""
+    half = camera.half_size * 1e3
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * half
+    return camera.centers[list(indices), None, :] * 1e3 + square
+
+
+def draw_outlines(axes: Axes, camera: Camera, indices: Iterable[int], color: str = "0.6", width: float = 0.5) -> None:
+    """Draw the outlines of CCDs."""
+    axes.add_collection(
+        PolyCollection(list(ccd_corners(camera, indices)), facecolors="none", edgecolors=color, linewidths=width)
+    )
+
+
+def draw_field_circle(axes: Axes, radius_mm: float, label: str) -> None:
+    """Draw the edge of the field of view."""
+    axes.add_patch(Circle((0.0, 0.0), radius_mm, fill=False, edgecolor="0.35", linewidth=0.8, linestyle=(0, (5, 3))))
+    axes.annotate(
+        label,
+        (0.0, -radius_mm),
+        xytext=(0, -3),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontsize=8,
+        color="0.35",
+    )
+
+
+def whiskers(x: np.ndarray, y: np.ndarray, e1: np.ndarray, e2: np.ndarray, scale: float) -> np.ndarray:
+    """Return the ends of whiskers of length |e| times scale along the elongation, shape [n, 2, 2]; NaN are left out."""
+    magnitude, angle = np.hypot(e1, e2), 0.5 * np.arctan2(e2, e1)
+    half = 0.5 * scale * magnitude[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    center = np.stack([x, y], axis=-1)
+    ends = np.stack([center - half, center + half], axis=1)
+    return ends[np.isfinite(ends).all(axis=(1, 2))]
+
+
+def draw_whiskers(axes: Axes, ends: np.ndarray, color: str, width: float) -> None:
+    """Draw whiskers."""
+    axes.add_collection(LineCollection(list(ends), colors=color, linewidths=width, capstyle="round"))
+
+
+def draw_key_whisker(axes: Axes, ellipticity: float, scale: float, width: float) -> None:
+    """Draw a whisker of a given ellipticity, with its value, above the upper right corner; limits are set by then."""
+    right = axes.get_xlim()[1]
+    above = blended_transform_factory(axes.transData, axes.transAxes) + ScaledTranslation(
+        0.0, 7.0 / 72.0, figure_of(axes).dpi_scale_trans
+    )
+    line = Line2D(
+        [right - ellipticity * scale, right], [1.0, 1.0], transform=above, color="black", linewidth=1.5 * width
+    )
+    line.set_clip_on(False)
+    axes.add_line(line)
+    axes.annotate(
+        f"{100 * ellipticity:g} %",
+        (right - ellipticity * scale, 1.0),
+        xycoords=above,
+        xytext=(-4, 0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=8,
+    )
+
+
+def key_ellipticity(values: np.ndarray) -> float:
+    """Return a round ellipticity near the larger ones of a set, for a key whisker."""
+    finite = values[np.isfinite(values)]
+    typical = float(np.quantile(finite, 0.9)) if finite.size else 0.01
+    rounds = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5])
+    return float(rounds[np.argmin(np.abs(np.log(rounds / max(typical, 1e-4))))])
+
+
+def frame_axes(
+    axes: Axes, limits: tuple[float, float, float, float], x_label: bool = True, y_label: bool = True
+) -> None:
+    """Set limits [mm] with equal scales on both axes, and name the axes."""
+    axes.set_xlim(limits[0], limits[1])
+    axes.set_ylim(limits[2], limits[3])
+    axes.set_aspect("equal")
+    if x_label:
+        axes.set_xlabel("detector x [mm]")
+    if y_label:
+        axes.set_ylabel("detector y [mm]")

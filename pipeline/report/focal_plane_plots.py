@@ -1,0 +1,218 @@
+"""Figures over the focal plane: heights of the CCDs, and whiskers of the ellipticity on top of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ...core.plotting import new_figure, png_bytes, styled
+from ...models.camera.focal_plane import FocalPlane
+from ..ccd_product import CcdProduct, Stars
+from .focal_plane_axes import (
+    AWAY,
+    OBSERVED,
+    RESIDUAL,
+    TRUTH,
+    draw_field_circle,
+    draw_key_whisker,
+    draw_outlines,
+    draw_whiskers,
+    frame_axes,
+    key_ellipticity,
+    whiskers,
+)
+
+_HEIGHT_MAP = "RdBu_r"
+#: More CCDs than this are many: each is small on the page.
+_MANY = 30
+#: Whiskers on one CCD, and a fifth of them where CCDs are many: more make one dark mass.
+_MOST_WHISKERS = 200
+
+
+def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
+    """Draw the heights of all CCDs, the used ones framed and named (Jee & Tyson 2011, Fig. 7).
+
+    Parameters
+    ----------
+    focal_plane : FocalPlane
+        Heights.
+    used : sequence of str
+        CCDs of the run.
+    field_radius : float
+        Radius of the field of view on the detector [m].
+    """
+    camera = focal_plane.camera
+    indices = [camera.ccd_index(name) for name in used]
+    with styled():
+        figure = new_figure(8.2, 7.2)
+        axes = figure.add_subplot()
+        edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
+        limits = (-edge, edge, -edge, edge)
+        image = draw_heights(axes, focal_plane, limits, 900)
+        draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
+        draw_outlines(axes, camera, indices, "black", 1.4)
+        draw_field_circle(axes, field_radius * 1e3, "")
+        frame_axes(axes, limits)
+        framed = f"; framed: the {len(used)} CCDs of this run" if used else ""
+        axes.set_title(f"CCD heights{framed}; dashed: edge of the field of view")
+        bar = figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02)
+        bar.set_label("height along +z, towards the sky [µm]")
+        return png_bytes(figure)
+
+
+def whiskers_figure(
+    products: Sequence[CcdProduct], focal_plane: FocalPlane, field_radius: float, kinds: Sequence[str] | None = None
+) -> bytes:
+    """Draw whiskers of truth, observed stars and residual over the CCDs of the run, all on one scale (Figs. 8, 11, 12).
+
+    Parameters
+    ----------
+    products : sequence of CcdProduct
+        CCDs of the run.
+    focal_plane : FocalPlane
+        Heights, drawn faintly behind.
+    field_radius : float
+        Radius of the field of view on the detector [m].
+    kinds : sequence of str, optional
+        Panels to draw, of ``truth``, ``observed``, ``residual``, ``away``; the first three by default.
+    """
+    kinds = ("truth", "observed", "residual") if kinds is None else kinds
+    centers = np.array([p.center for p in products]) * 1e3
+    half = focal_plane.camera.half_size * 1e3
+    pad = 0.25 * half
+    low, high = centers.min(axis=0) - half - pad, centers.max(axis=0) + half + pad
+    limits = (low[0], high[0], low[1], high[1])
+    key = _common_key(products)
+    # The key is as long as a third of a CCD's half side, or what can still be seen of it over the whole field.
+    scale = max(0.33 * half, 0.012 * float(max(high - low))) / key
+    across = (high[0] - low[0]) / (high[1] - low[1])
+    with styled():
+        # Panels go under each other where the CCDs lie in a row or are many, beside each other where they do not.
+        stacked = across > 1.6 or len(products) > _MANY
+        wide = 9.0 if len(products) > _MANY else 12.0
+        if stacked:
+            figure = new_figure(wide, len(kinds) * ((wide - 1.4) / across + 0.45) + 0.3, "compressed")
+            panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
+        else:
+            figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9, "compressed")
+            panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        image, bounds = None, height_range(focal_plane)
+        most = _MOST_WHISKERS if len(products) <= _MANY else _MOST_WHISKERS // 5
+        for i, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
+            image = draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
+            draw_outlines(axes, focal_plane.camera, range(len(focal_plane.camera)), "0.5", 0.5)
+            draw_field_circle(axes, field_radius * 1e3, "")
+            for product in products:
+                _draw_kind(axes, product, kind, scale, 0.8 if len(products) <= _MANY else 0.5, most)
+            frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
+            axes.set_title(_titled(_TITLES[kind], products, kind, most), loc="left")
+            draw_key_whisker(axes, key, scale, 1.0)
+        if image is not None:
+            bar = figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30)
+            bar.set_label("CCD height [µm]")
+        return png_bytes(figure)
+
+
+def close_up_figure(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> bytes:
+    """Draw whiskers of some CCDs large, one a row: truth, observed, residual at the stars and away from them."""
+    camera = focal_plane.camera
+    kinds = ("truth", "observed", "residual", "away")
+    key = _common_key(products)
+    half = camera.half_size * 1e3
+    scale = 0.2 * half / key
+    with styled():
+        figure = new_figure(13.0, 3.35 * len(products) + 0.4)
+        panels = figure.subplots(len(products), len(kinds), squeeze=False)
+        image, bounds = None, height_range(focal_plane)
+        for last, row, product in zip(range(len(products) - 1, -1, -1), panels, products, strict=True):
+            x, y = np.array(product.center) * 1e3
+            limits = (x - 1.04 * half, x + 1.04 * half, y - 1.04 * half, y + 1.04 * half)
+            for i, (axes, kind) in enumerate(zip(row, kinds, strict=True)):
+                image = draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=bounds)
+                _draw_kind(axes, product, kind, scale, 1.2, _MOST_WHISKERS)
+                draw_outlines(axes, camera, [camera.ccd_index(product.name)], "0.4", 0.7)
+                frame_axes(axes, limits, x_label=last == 0, y_label=i == 0)
+                name = f"{product.name}: " if i == 0 else ""
+                title = name + _SHORT_TITLES[kind]
+                axes.set_title(_titled(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left")
+                draw_key_whisker(axes, key, scale, 1.2)
+        if image is not None:
+            bar = figure.colorbar(image, ax=panels.ravel().tolist(), fraction=0.02, pad=0.01, aspect=40)
+            bar.set_label("CCD height [µm]")
+        return png_bytes(figure)
+
+
+_TITLES = {
+    "truth": "truth: noise-free PSFs",
+    "observed": "observed stars",
+    "residual": "residual at the stars: observed - model",
+    "away": "residual away from the stars: truth - model",
+}
+_SHORT_TITLES = {
+    "truth": "truth",
+    "observed": "observed",
+    "residual": "residual at stars",
+    "away": "residual elsewhere",
+}
+_COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
+
+
+def _titled(title: str, products: Sequence[CcdProduct], kind: str, most: int) -> str:
+    """Return a title that says so where not every star has its whisker."""
+    step = max(_step(product.stars(kind), most) for product in products)
+    return title if step == 1 else f"{title} (one star in {step})"
+
+
+def _step(stars: Stars, most: int) -> int:
+    return max(1, -(-len(stars) // most))
+
+
+def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: float, most: int) -> None:
+    stars = product.stars(kind)
+    ends = whiskers(stars.x * 1e3, stars.y * 1e3, *product.ellipticity(kind), scale)
+    draw_whiskers(axes, ends[:: _step(stars, most)], _COLORS[kind], width)
+
+
+def _common_key(products: Sequence[CcdProduct]) -> float:
+    """Return the ellipticity of the key whisker, from truth and observed stars together."""
+    stars: list[Stars] = [s for p in products for s in (p.truth, p.observed)]
+    return key_ellipticity(np.concatenate([np.hypot(s.e1, s.e2) for s in stars]))
+
+
+def height_range(focal_plane: FocalPlane) -> float:
+    """Return the largest height of any CCD, sign left off [um], a little rounded up; 1 where all is flat."""
+    camera = focal_plane.camera
+    offsets = np.linspace(-1.0, 1.0, 9) * camera.half_size * (1.0 - 1e-9)
+    x = camera.centers[:, 0, None, None] + offsets
+    y = camera.centers[:, 1, None, None] + offsets[:, None]
+    largest = float(np.nanmax(np.abs(focal_plane.height(x, y)))) * 1e6
+    return float(np.ceil(largest)) if largest > 0 else 1.0
+
+
+def draw_heights(
+    axes: Axes,
+    focal_plane: FocalPlane,
+    limits: tuple[float, float, float, float],
+    samples: int,
+    alpha: float = 1.0,
+    bounds: float | None = None,
+) -> Any:
+    """Draw the heights within limits [mm] as an image, gaps left white; the scale is that of the whole focal plane."""
+    bounds = height_range(focal_plane) if bounds is None else bounds
+    left, right, bottom, top = limits
+    step = max(right - left, top - bottom) / samples
+    x = np.arange(left + 0.5 * step, right, step)
+    y = np.arange(bottom + 0.5 * step, top, step)
+    height = focal_plane.height(x[None, :] * 1e-3, y[:, None] * 1e-3) * 1e6
+    return axes.imshow(
+        height,
+        extent=(x[0] - 0.5 * step, x[-1] + 0.5 * step, y[0] - 0.5 * step, y[-1] + 0.5 * step),
+        cmap=_HEIGHT_MAP,
+        vmin=-bounds,
+        vmax=bounds,
+        alpha=alpha,
+        aspect="equal",
+    )

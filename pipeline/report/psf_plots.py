@@ -1,0 +1,172 @@
+"""Figures of PSFs as images: eigen-PSFs and their eigenvalues, and stars observed, modelled and left over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import SymLogNorm
+
+from ...core.plotting import new_figure, png_bytes, styled
+from ..ccd_product import CcdProduct
+from ..simulate.photometry import ARCSEC
+from .focal_plane_axes import AWAY, OBSERVED, TRUTH
+from .tables import percent
+
+
+def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
+    """Draw the mean PSF and the eigen-PSFs of one CCD (Jee & Tyson 2011, Fig. 9).
+
+    Parameters
+    ----------
+    product : CcdProduct
+        The CCD.
+    truth : bool
+        Whether to draw the components of the noise-free PSFs, or of the observed stars.
+    """
+    model = product.truth_model if truth else product.model
+    count = min(model.n_components, 20)
+    columns = 7
+    rows = -(-(count + 1) // columns)
+    extent = _extent(model.mean.shape[0], product.pixel_scale)
+    with styled():
+        figure = new_figure(1.75 * columns + 0.6, 1.95 * rows + 0.5)
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True).ravel()
+        for axes in panels[count + 1 :]:
+            axes.set_axis_off()
+        panels[0].imshow(np.sqrt(np.maximum(model.mean, 0.0)), extent=extent, cmap="viridis", vmin=0.0)
+        panels[0].set_title("mean (square root)", fontsize=8)
+        image = None
+        for k, axes in enumerate(panels[1 : count + 1]):
+            component = model.components[k]
+            edge = float(np.abs(component).max())
+            image = axes.imshow(component / edge, extent=extent, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+            axes.set_title(f"n = {k + 1}: {percent(model.explained_variance[k])}", fontsize=8)
+        # Beyond three times the width of the PSF there is nothing to see.
+        shown = min(extent[1], 3.0 * float(np.nanmedian(product.truth.fwhm)) / ARCSEC)
+        panels[0].set_xlim(-shown, shown)
+        panels[0].set_ylim(-shown, shown)
+        for i, axes in enumerate(panels[: count + 1]):
+            if i % columns == 0:
+                axes.set_ylabel("y [arcsec]")
+            if i + columns > count:
+                axes.set_xlabel("x [arcsec]")
+                axes.tick_params(labelbottom=True)
+        if image is not None:
+            bar = figure.colorbar(image, ax=list(panels), fraction=0.015, pad=0.01, aspect=40)
+            bar.set_label("eigen-PSF, each over its largest magnitude")
+        kind = "noise-free PSFs" if truth else "observed stars"
+        figure.suptitle(
+            f"{product.name}: mean and eigen-PSFs of {model.n_stars} {kind}; "
+            f"{model.n_components} components hold {percent(model.explained)} of the variance",
+            fontsize=10,
+        )
+        return png_bytes(figure)
+
+
+def spectrum_figure(products: Sequence[CcdProduct]) -> bytes:
+    """Draw the eigenvalues of all CCDs, of observed stars and of noise-free PSFs, and where the model cuts them off."""
+    with styled():
+        figure = new_figure(10.0, 4.2)
+        left, right = figure.subplots(1, 2)
+        for product in products:
+            for model, color in ((product.model, OBSERVED), (product.truth_model, TRUTH)):
+                n = np.arange(1, len(model.eigenvalues) + 1)
+                total = model.eigenvalues.sum()
+                left.plot(n, model.eigenvalues, "-", color=color, linewidth=0.8, alpha=0.7)
+                if 0 < model.kink <= len(n):
+                    left.plot(model.kink, model.eigenvalues[model.kink - 1], "o", color=color, markersize=3.5)
+                if total > 0:
+                    missing = 1.0 - np.cumsum(model.eigenvalues) / total
+                    right.plot(n[missing > 1e-15], missing[missing > 1e-15], "-", color=color, linewidth=0.8, alpha=0.7)
+        count = products[0].model.n_components
+        for axes in (left, right):
+            axes.axvline(count + 0.5, color="0.5", linewidth=0.8, linestyle=(0, (4, 3)))
+            axes.set_yscale("log")
+            axes.set_xlabel("component n")
+            axes.set_xlim(0, 2.2 * count)
+        right.axhline(0.01, color=AWAY, linewidth=0.8)
+        right.annotate("1 %", (0.99, 0.01), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
+        values = [m.eigenvalues[: 2 * count] for p in products for m in (p.model, p.truth_model)]
+        positive = np.concatenate(values)
+        positive = positive[positive > 1e-12 * positive.max()]
+        left.set_ylim(0.5 * positive.min(), 2.0 * positive.max())
+        right.set_ylim(1e-6, 1.0)
+        left.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: kink")
+        left.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: kink")
+        left.legend(loc="upper right")
+        left.set_title("eigenvalues, one line a CCD; dashed: components kept", loc="left")
+        left.set_ylabel("variance of unit-sum stamps along n")
+        right.set_title("part of the variance beyond n", loc="left")
+        right.set_ylabel("1 - cumulative fraction")
+        return png_bytes(figure)
+
+
+def stamps_figure(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
+    """Draw observed stars, the model at their places, and what is left in units of the noise.
+
+    Parameters
+    ----------
+    products : sequence of CcdProduct
+        CCDs to take stars from, a group of columns each.
+    per_ccd : int
+        Stars on each, from the brightest to the faintest.
+    """
+    chosen = [(p, i) for p in products for i in _bright_to_faint(p, per_ccd)]
+    extent = _extent(products[0].observed_images.shape[1], products[0].pixel_scale)
+    with styled():
+        figure = new_figure(1.45 * len(chosen) + 1.3, 5.6)
+        panels = figure.subplots(3, len(chosen), sharex=True, sharey=True, squeeze=False)
+        light = noise = None
+        for column, (product, i) in zip(panels.T, chosen, strict=True):
+            stars, position = product.observed, np.array([[product.observed.x[i], product.observed.y[i]]])
+            model = product.model.at(position)[0]
+            observed = np.asarray(product.observed_images[i], dtype=np.float64)
+            sky, rms = product.noise
+            sigma = np.sqrt(np.maximum(stars.electrons[i] * model, 0.0) + sky + rms**2)
+            left_over = (observed - model) * stars.electrons[i] / sigma
+            top = model.max()
+            light = column[0].imshow(_stretched(observed / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
+            column[1].imshow(_stretched(model / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
+            noise = column[2].imshow(
+                left_over, extent=extent, cmap="RdBu_r", norm=SymLogNorm(3.0, vmin=-_FAR_OFF, vmax=_FAR_OFF)
+            )
+            column[0].set_title(f"{product.name}\n{stars.magnitude[i]:.1f} mag, S/N {stars.snr[i]:.0f}", fontsize=8)
+            column[2].set_xlabel("x [arcsec]")
+        for axes, name in zip(panels[:, 0], ("observed", "model", "observed - model"), strict=True):
+            axes.set_ylabel(f"{name}\ny [arcsec]")
+        if light is not None and noise is not None:
+            bar = figure.colorbar(light, ax=panels[:2].ravel().tolist(), fraction=0.02, pad=0.01, aspect=30)
+            ticks = np.array([0.0, 0.01, 0.1, 0.5, 1.0])
+            bar.set_ticks(_stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
+            bar.set_label("over the model's peak (asinh)")
+            bar = figure.colorbar(noise, ax=panels[2].tolist(), fraction=0.02, pad=0.01, aspect=15)
+            steps = (-100, -30, -10, -3, 0, 3, 10, 30, 100)
+            bar.set_ticks(steps, labels=[f"{t}" for t in steps], minor=False)
+            bar.ax.minorticks_off()
+            bar.set_label("pixel noise σ")
+        return png_bytes(figure)
+
+
+_SOFTENING = 0.02
+_FAR_OFF = 100.0
+
+
+def _stretched(values: np.ndarray) -> np.ndarray:
+    return np.arcsinh(np.asarray(values) / _SOFTENING) / np.arcsinh(1.0 / _SOFTENING)
+
+
+_LOW = float(_stretched(np.array(-0.02)))
+
+
+def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
+    """Return used stars spread evenly over the magnitudes, brightest first."""
+    used = np.flatnonzero(product.observed.used)
+    ordered = used[np.argsort(product.observed.magnitude[used], kind="stable")]
+    places = np.unique(np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int))
+    return [int(i) for i in ordered[places]]
+
+
+def _extent(size: int, pixel_scale: float) -> tuple[float, float, float, float]:
+    half = 0.5 * size * pixel_scale / ARCSEC
+    return -half, half, -half, half

@@ -1,0 +1,162 @@
+"""The report of a run: one HTML file with everything in it, pictures included."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..ccd_product import CcdProduct
+from ..config import ReconstructionConfig, to_yaml
+from ..experiment import Experiment, truth_components
+from ..measure.correlation import Correlation
+from .focal_plane_plots import close_up_figure, heights_figure, whiskers_figure
+from .page import Picture, render
+from .psf_plots import eigen_figure, spectrum_figure, stamps_figure
+from .statistics_plots import correlation_figure, scatter_figure
+from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
+
+#: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
+_CLOSE_UPS = 3
+OBSERVED_COMPONENTS = "Eigen-PSFs of the observed stars"
+
+
+def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
+    """Return the report of a run as HTML that refers to no other file.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        What was run.
+    summary : dict
+        Figures, as in ``summary.json``.
+    pictures : sequence of Picture
+        Pictures, as :func:`draw_pictures` gives them.
+    """
+    return render(
+        "report.html",
+        config=experiment.config,
+        telescope=experiment.telescope,
+        summary=summary,
+        headline=headline(summary),
+        caption=PER_CCD_CAPTION,
+        columns=PER_CCD_COLUMNS,
+        ccds=per_ccd(summary),
+        pictures=pictures,
+        configuration=to_yaml(experiment.config),
+        model=_model_words(experiment.config.reconstruction),
+    )
+
+
+def _model_words(fit: ReconstructionConfig) -> str:
+    """Return how the PSF is modelled, in words."""
+    described = {"pca": "principal components a CCD", "shapelets": "shapelets a CCD", "pixels": "each pixel on its own"}
+    basis = described[fit.basis] if fit.components is None else f"{fit.components} {described[fit.basis]}"
+    process = "a Gaussian process over " if fit.interpolation == "gp" else ""
+    weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
+    return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}"
+
+
+def draw_pictures(
+    experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation]
+) -> list[Picture]:
+    """Return the pictures of a run in the order of the report."""
+    config, plane = experiment.config, experiment.focal_plane
+    radius = experiment.field_radius_on_detector
+    close = closest_middle_farthest(products)
+    optics = not config.atmosphere.enabled
+    components = truth_components(config)
+    jackknife = all(c.n_patches for c in correlated.values())
+    errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
+    pictures = [
+        Picture(
+            "Focal plane",
+            heights_figure(plane, [p.name for p in products], radius),
+            "Height of every CCD surface over the nominal focal plane, positive towards the sky. Steps between CCDs "
+            "and rafts, tilts and the ripple within a CCD (the potato chip) come from the height budget, each term "
+            "from its own random stream. The same surface as a mesh: focal_plane.glb.",
+            "Fig. 7 shows one realisation of the same budget (Table 1), ±10 µm in all.",
+        ),
+        Picture(
+            "Whiskers over the field",
+            whiskers_figure(products, plane, radius),
+            "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
+            "panels share one scale, given by the key above their right corner, so lengths can be compared. The "
+            "pattern follows the heights behind it: whiskers jump where the CCD border is a step. Residuals at the "
+            "stars hold the noise of each star itself.",
+            "Fig. 8 (optics alone): |e| above 10 % in most places and near 30 % at the edge of the field, jumping at "
+            "CCD borders."
+            if optics
+            else "Fig. 11 (observed) and Fig. 12 (residual): the pattern of the optics alone (Fig. 8), made rounder by "
+            "the atmosphere, and residuals without visible pattern. The paper compares with the observed stars only.",
+        ),
+        Picture(
+            "Whiskers close up",
+            close_up_figure(close, plane),
+            "The CCD closest to the axis, one half-way out and the farthest one. The last column is what a galaxy "
+            "sees: the error of the model at places where there was no star to fit.",
+            "The paper notes a small-scale variation even within a CCD, from tilt and potato chip, and so fits "
+            "polynomials CCD by CCD.",
+        ),
+        Picture(
+            "Eigen-PSFs of the noise-free PSFs",
+            eigen_figure(close[0], truth=True),
+            f"Mean PSF of one CCD and its first {min(components, 20)} principal components, each with the part of the "
+            "variance along it. Order and signs are fixed, so that runs can be compared.",
+            "Fig. 9: components of 4000 PSFs of the atmosphere alone. The first resemble shapelets; structure gets "
+            "finer with n.",
+        ),
+        Picture(
+            OBSERVED_COMPONENTS,
+            eigen_figure(close[0], truth=False),
+            "The same CCD, from the stars that were observed: components beyond the first few are noise.",
+            "The paper keeps 20 components for observed stars too.",
+        ),
+        Picture(
+            "How many components are needed",
+            spectrum_figure(products),
+            "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
+            "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
+            "is the kink, the point farthest below the straight line from the first eigenvalue to the last.",
+            "The paper finds a kink by eye and that about 20 components suffice; physics asks for over 99 % of the "
+            "variance of the truth.",
+        ),
+        Picture(
+            "Ellipticity before and after",
+            scatter_figure(products),
+            "Left as in the paper: ellipticity of the observed stars, and what is left when the model is subtracted. "
+            "Right: the same for the noise-free PSFs at places where no star was fitted.",
+            "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
+        ),
+        Picture(
+            "Correlation of the ellipticity",
+            correlation_figure(correlated),
+            "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
+            f"{errors}, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
+            "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
+            "triangles, away from the stars, are what a galaxy sees. Where the CCDs lie in a row, long pairs all point "
+            "along it, and an ellipticity common to the field does not average out of ξ-.",
+            "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
+            "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
+        ),
+        Picture(
+            "Stars",
+            stamps_figure(close),
+            "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
+            "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
+            "only that noise is left. A bright star can show more: mean and components are fitted without weights, "
+            "so the noise of the faint stars is in the model.",
+            "",
+        ),
+    ]
+    # Single pixels and shapelets look the same whatever the stars are.
+    return [p for p in pictures if config.reconstruction.basis == "pca" or p.title != OBSERVED_COMPONENTS]
+
+
+def closest_middle_farthest(products: Sequence[CcdProduct]) -> list[CcdProduct]:
+    """Return the CCD closest to the axis, the middle one and the farthest, or all where there are no more."""
+    ordered = sorted(products, key=lambda p: (round(float(np.hypot(*p.center)), 9), p.name))
+    if len(ordered) <= _CLOSE_UPS:
+        return ordered
+    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]

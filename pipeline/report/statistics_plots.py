@@ -1,0 +1,120 @@
+"""Figures of ellipticities as numbers: their scatter, and their correlation against separation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ...core.plotting import new_figure, png_bytes, styled
+from ..ccd_product import CcdProduct, Stars
+from ..measure.correlation import Correlation
+from .focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
+
+_LABELS = {
+    "truth": (TRUTH, "o", "truth, where no star is"),
+    "observed": (OBSERVED, "s", "observed stars"),
+    "residual": (RESIDUAL, "D", "observed - model, at the stars"),
+    "left_out": (LEFT_OUT, "v", "observed - model fitted without the star"),
+    "away": (AWAY, "^", "truth - model, where no star is"),
+}
+
+
+def scatter_figure(products: Sequence[CcdProduct]) -> bytes:
+    """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
+    panels: tuple[tuple[str, Sequence[Stars], str, str, str, str], ...] = (
+        ("at the observed stars", [p.observed for p in products], OBSERVED, RESIDUAL, "observed", "observed - model"),
+        ("where no star is", [p.truth for p in products], TRUTH, AWAY, "truth", "truth - model"),
+    )
+    with styled():
+        figure = new_figure(10.0, 5.2)
+        both = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axes, (title, stars, before, after, name, residual) in zip(both, panels, strict=True):
+            _draw_cloud(axes, stars, ("e1", "e2"), before, name)
+            _draw_cloud(axes, stars, ("residual_e1", "residual_e2"), after, residual)
+            axes.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
+            axes.axvline(0.0, color="0.7", linewidth=0.6, zorder=0)
+            axes.set_aspect("equal")
+            axes.set_xlabel("$e_1$: $(a-b)/(a+b)$ along x")
+            axes.set_title(title, loc="left")
+            axes.legend(loc="upper right")
+        both[0].set_ylabel("$e_2$: along the diagonal x = y")
+        values = np.concatenate([np.abs([s.e1, s.e2]).ravel() for p in products for s in (p.truth, p.observed)])
+        edge = 1.1 * float(np.nanmax(values))
+        both[0].set_xlim(-edge, edge)
+        both[0].set_ylim(-edge, edge)
+        return png_bytes(figure)
+
+
+def _draw_cloud(axes: Axes, stars: Sequence[Stars], keys: tuple[str, str], color: str, name: str) -> None:
+    e1, e2 = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
+    finite = np.isfinite(e1) & np.isfinite(e2)
+    rms = np.sqrt(0.5 * np.mean(e1[finite] ** 2 + e2[finite] ** 2)) if finite.any() else np.nan
+    # Many points would hide those below them.
+    alpha = min(0.6, 600.0 / max(len(e1), 1) + 0.05)
+    axes.plot(e1, e2, ".", color=color, markersize=3.5, alpha=alpha, markeredgewidth=0)
+    axes.plot([], [], "o", color=color, markersize=3.0, label=f"{name}: rms {rms:.2g}")
+
+
+def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
+    """Draw xi+ and xi- against separation (Jee & Tyson 2011, Fig. 14): filled symbols positive, open ones negative."""
+    with styled():
+        figure = new_figure(11.5, 5.4)
+        panels = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axes, sign in zip(panels, ("plus", "minus"), strict=True):
+            for kind, correlation in correlated.items():
+                draw_correlation(axes, correlation, sign, *_LABELS[kind])
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xlabel("separation [arcmin]")
+            axes.set_title(f"$\\xi_{'+' if sign == 'plus' else '-'}$", loc="left")
+            axes.grid(True, which="major", color="0.9", linewidth=0.6)
+            axes.set_axisbelow(True)
+        panels[0].set_ylabel("$|\\xi|$ of the ellipticity")
+        low, high = panels[0].get_ylim()
+        panels[0].set_ylim(max(low, 1e-10), high * 2)
+        for value, text in ((3e-5, "paper: observed"), (1e-8, "paper: residual at the stars")):
+            if panels[0].get_ylim()[0] < value < panels[0].get_ylim()[1]:
+                panels[0].axhline(value, color="0.45", linewidth=0.8, linestyle=(0, (2, 2)), zorder=0)
+                panels[0].annotate(
+                    text,
+                    (0.99, value),
+                    xycoords=("axes fraction", "data"),
+                    fontsize=7,
+                    color="0.35",
+                    ha="right",
+                    va="bottom",
+                )
+        handles, labels = panels[0].get_legend_handles_labels()
+        filled = panels[0].plot([], [], "o", color="0.4", markersize=4.5)[0]
+        hollow = panels[0].plot([], [], "o", color="0.4", markersize=4.5, markerfacecolor="white")[0]
+        figure.legend(
+            [*handles, filled, hollow],
+            [*labels, "positive", "negative"],
+            loc="outside lower center",
+            ncols=3,
+        )
+        return png_bytes(figure)
+
+
+def draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str, marker: str, label: str) -> None:
+    """Draw one correlation of a sign, ``plus`` or ``minus``, with error bars: negative values with open symbols."""
+    r = correlation.r_arcmin
+    xi, error = getattr(correlation, f"xi_{sign}"), getattr(correlation, f"error_{sign}")
+    size = np.abs(xi)
+    some = np.isfinite(xi) & (size > 0.0)
+    # On a logarithmic scale an error bar cannot go through zero: it ends at a tenth of the value instead.
+    below = np.minimum(error, 0.9 * size)
+    axes.errorbar(r[some], size[some], [below[some], error[some]], fmt="none", ecolor=color, elinewidth=0.7, alpha=0.6)
+    axes.plot(r[some], size[some], "-", color=color, linewidth=0.6, alpha=0.5)
+    for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
+        axes.plot(
+            r[chosen],
+            size[chosen],
+            marker,
+            color=color,
+            markersize=4.5,
+            markerfacecolor=face,
+            label=label if face == color else None,
+        )

@@ -1,0 +1,169 @@
+"""The figures of a run as tables that people read, on the terminal and in the report, in an astronomer's units."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ..measure.summary import CORRELATED, LONG_RANGE
+
+_NAMES = {
+    "truth": "truth",
+    "observed": "observed",
+    "residual": "observed - model, at the stars",
+    "away": "truth - model, where no star is",
+}
+
+
+def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the figures of a run: what, and its value with unit."""
+    figures = summary["all"]
+    rows = [
+        ("CCDs", f"{figures['ccds']}"),
+        ("PSFs known without noise", f"{figures['truth_psfs']}"),
+        ("observed stars, used in the fit", f"{figures['stars']}, {figures['stars_used']}"),
+        (
+            "FWHM, median and range",
+            f'{_figure(figures["fwhm_arcsec"])}", '
+            f'{_figure(figures["fwhm_min_arcsec"])} to {_figure(figures["fwhm_max_arcsec"])}"',
+        ),
+        ("mean |e|, truth", _percent(figures["mean_e_truth"])),
+        ("mean |e|, observed stars", _percent(figures["mean_e_observed"])),
+        ("rms e residual, at the stars", _percent(figures["rms_residual_at_stars"])),
+        ("rms e residual, each star left out in turn", _percent(figures["rms_residual_left_out"])),
+        ("rms e residual, where no star is (no noise)", _percent(figures["rms_residual_away"])),
+        ("truth's variance in the components, worst CCD", percent(figures["truth_variance_in_components"])),
+    ]
+    for kind in CORRELATED:
+        near, far = (
+            f"{_power(figures[f'xi_plus_{kind}_{name}'])} ± {_power(figures[f'error_xi_plus_{kind}_{name}'])}"
+            for name in ("short", "long")
+        )
+        rows.append((f"ξ+ of {_NAMES[kind]}, below / beyond {LONG_RANGE:g}'", f"{near} / {far}"))
+    return rows
+
+
+PER_CCD_COLUMNS = (
+    ("CCD", ""),
+    ("field", "deg"),
+    ("FWHM", "arcsec"),
+    ("truth |e|", "%"),
+    ("at stars", "%"),
+    ("left out", "%"),
+    ("no star", "%"),
+    ("variance", "%"),
+    ("kink", ""),
+    ("stars used", ""),
+)
+PER_CCD_CAPTION = (
+    "Mean |e| of the truth, and rms of one component of the residual: observed - model at the stars; the same with "
+    "each star left out of the polynomial fit in turn; truth - model where no star is, which holds no noise of a star. "
+    "Variance: part of the truth's variance that the components hold. Kink: components before the eigenvalues flatten, "
+    "of the observed stars and of the truth."
+)
+
+
+def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row for each CCD, in the columns of :data:`PER_CCD_COLUMNS`."""
+    return [
+        (
+            name,
+            f"{f['field_deg']:.2f}",
+            _figure(f["fwhm_arcsec"]),
+            _bare_percent(f["mean_e_truth"]),
+            _bare_percent(f["rms_residual_at_stars"]),
+            _bare_percent(f["rms_residual_left_out"]),
+            _bare_percent(f["rms_residual_away"]),
+            percent(f["truth_variance_in_components"]).removesuffix(" %"),
+            f"{f['kink_observed']}, {f['kink_truth']}",
+            f"{f['stars_used']} of {f['stars']}",
+        )
+        for name, f in summary["ccd"].items()
+    ]
+
+
+DIAGNOSTICS_COLUMNS = ("residual", "mean e1", "mean e2", "rms e", "mean dT/T", "rms dT/T", "largest ξ+", "at [arcmin]")
+DIAGNOSTICS_CAPTION = (
+    "Ellipticity and size T = Q11 + Q22, less those of the model and, for T, over its own value; rms of one component. "
+    "Largest ξ+ of either sign from 10' to 3 deg, with the jackknife error over the CCDs."
+)
+
+
+def diagnostics_rows(overall: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row for each kind of residual, in the columns of :data:`DIAGNOSTICS_COLUMNS`."""
+
+    def power(key: str) -> str:
+        return _power(overall.get(key, math.nan))
+
+    names = {"residual": _NAMES["residual"], "left_out": "the same, star left out of the fit", "away": _NAMES["away"]}
+    return [
+        (
+            name,
+            *(power(f"{what}_{kind}") for what in ("mean_e1", "mean_e2", "rms_e", "mean_dt", "rms_dt")),
+            f"{power(f'largest_{kind}_xi_plus')} ± {power(f'largest_{kind}_error_plus')}",
+            f"{r:.1f}" if math.isfinite(r := overall[f"largest_{kind}_r_arcmin"]) else "-",
+        )
+        for kind, name in names.items()
+    ]
+
+
+ATTRIBUTION_COLUMNS = (
+    "off",
+    "rms e [%]",
+    "at stars",
+    "no star",
+    "ξ+ truth, below 10'",
+    "beyond",
+    "change",
+    "ξ+ no star, beyond",
+)
+ATTRIBUTION_CAPTION = (
+    "The same stars without one cause. rms of one component of the truth, and of the residuals at the stars and where "
+    "no star is; mean ξ+ below 10' and from there to 3 deg; change: full case less this one beyond 10', with the "
+    "jackknife error over the CCDs."
+)
+
+
+def attribution_rows(figures: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
+    """Return a row for each case of an attribution, in the columns of :data:`ATTRIBUTION_COLUMNS`."""
+
+    def change(each: dict[str, float]) -> str:
+        if "change_xi_plus_truth_long" not in each:
+            return "-"
+        value, error = _power(each["change_xi_plus_truth_long"]), _power(each["error_xi_plus_truth_long"])
+        return f"{value} ± {error}"
+
+    return [
+        (
+            "nothing" if case == "full" else case,
+            *(_bare_percent(each[k]) for k in ("rms_e_truth", "rms_residual_at_stars", "rms_residual_away")),
+            _power(each["xi_plus_truth_short"]),
+            _power(each["xi_plus_truth_long"]),
+            change(each),
+            _power(each["xi_plus_away_long"]),
+        )
+        for case, each in figures.items()
+    ]
+
+
+def percent(fraction: float) -> str:
+    """Return a fraction in per cent, with more digits near all, and never rounded up to all."""
+    if fraction < 0.99:
+        return f"{100 * fraction:.3g} %"
+    return f"{100 * fraction:.2f} %" if fraction < 0.99985 else "> 99.98 %"
+
+
+def _figure(value: float) -> str:
+    return f"{value:.3f}"
+
+
+def _bare_percent(value: float) -> str:
+    return f"{100 * value:.2f}"
+
+
+def _percent(value: float) -> str:
+    return f"{_bare_percent(value)} %"
+
+
+def _power(value: float) -> str:
+    return f"{value:.1e}" if math.isfinite(value) else "-"

@@ -1,0 +1,1 @@
+"""Simulated stars and exposures of CCDs."""

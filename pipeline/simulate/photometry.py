@@ -1,0 +1,265 @@
+"""Photon rates, noise and magnitude limits of the LSST, in electrons.
+
+Zero points, dark sky, extinction, instrument noise and the signal-to-noise formula are those of SMTN-002 ("Calculating
+LSST limiting magnitudes and SNR", throughputs v1.9, airmass 1), whose conventions go back to Ivezic et al. 2019
+(ApJ 873, 111).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import erf
+
+from ...core.errors import DomainError, unknown_name
+from ...core.units import radians
+
+ARCSEC = np.pi / (180.0 * 3600.0)
+PIXEL_SCALE = 0.2 * ARCSEC
+"""Angle of one LSST pixel [rad]."""
+READ_NOISE = 8.8
+"""Read noise of one exposure [e-/pixel]: the upper limit that SMTN-002 takes from the camera requirements (LSE-59)."""
+DARK_CURRENT = 0.2
+"""Dark current [e-/s/pixel]: the upper limit that SMTN-002 takes from the camera requirements (LSE-59)."""
+FULL_WELL = 1.0e5
+"""Largest signal of an unsaturated pixel [e-]: just under the lower of the two measured turn-offs of the photon
+transfer curve, 103 000 (e2v) and 129 000 (ITL) (SITCOMTN-148, Table 6)."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """One LSST filter at the zenith under a dark sky.
+
+    Parameters
+    ----------
+    name : str
+        ``"u"`` to ``"y"``.
+    zero_point : float
+        AB magnitude of a star that gives one electron a second, atmosphere at airmass 1 included (SMTN-002).
+    dark_sky : float
+        Sky brightness at the zenith [AB mag/arcsec^2] (SMTN-002).
+    extinction : float
+        Loss in the atmosphere [mag/airmass] (SMTN-002, ``kAtm``).
+    effective_wavelength : float
+        [m] (SMTN-002).
+    wavelength_range : tuple of float
+        Where the total throughput is at half its maximum [m] (LSST throughputs v1.9, airmass 1.2).
+    """
+
+    name: str
+    zero_point: float
+    dark_sky: float
+    extinction: float
+    effective_wavelength: float
+    wavelength_range: tuple[float, float]
+
+
+BANDS = {
+    band.name: band
+    for band in (
+        Band("u", 26.52, 23.05, 0.47, 366e-9, (349e-9, 396e-9)),
+        Band("g", 28.51, 22.25, 0.21, 482e-9, (403e-9, 551e-9)),
+        Band("r", 28.36, 21.20, 0.13, 622e-9, (550e-9, 690e-9)),
+        Band("i", 28.17, 20.46, 0.10, 754e-9, (692e-9, 821e-9)),
+        Band("z", 27.78, 19.61, 0.07, 869e-9, (818e-9, 922e-9)),
+        Band("y", 26.82, 18.60, 0.17, 971e-9, (924e-9, 1015e-9)),
+    )
+}
+
+
+def band_named(band: str | Band) -> Band:
+    """Return the band of this name (a band is returned as it is).
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such band.
+    """
+    if isinstance(band, Band):
+        return band
+    if band not in BANDS:
+        raise unknown_name("band", band, BANDS)
+    return BANDS[band]
+
+
+def electrons(magnitude: Any, band: str | Band, exposure: float) -> np.ndarray:
+    """Return the electrons that a star gives in one exposure.
+
+    Parameters
+    ----------
+    magnitude : float or array
+        AB magnitude above the atmosphere.
+    band : str or Band
+        Filter.
+    exposure : float
+        Exposure time [s].
+
+    Returns
+    -------
+    array
+        Electrons on the detector, at airmass 1.
+
+    Raises
+    ------
+    DomainError, UnknownNameError
+        If the exposure is not positive or the band does not exist.
+    """
+    band = band_named(band)
+    exposure = _positive("exposure", exposure, "s")
+    return exposure * 10.0 ** (0.4 * (band.zero_point - np.asarray(magnitude, dtype=np.float64)))
+
+
+def magnitude_of(counts: Any, band: str | Band, exposure: float) -> np.ndarray:
+    """Return the AB magnitude of a star that gives this many electrons (the inverse of :func:`electrons`)."""
+    band = band_named(band)
+    exposure = _positive("exposure", exposure, "s")
+    counts = np.asarray(counts, dtype=np.float64)
+    if not np.all(counts > 0.0):
+        raise DomainError(f"counts = {counts}: expected positive numbers of electrons")
+    return band.zero_point - 2.5 * np.log10(counts / exposure)
+
+
+def sky_electrons_per_pixel(
+    band: str | Band, exposure: float, pixel_scale: Any = PIXEL_SCALE, *, sky: float | None = None
+) -> float:
+    """Return the electrons that the sky gives to one pixel.
+
+    Sky brightness is defined at the telescope's pupil, so the sky is not dimmed by the atmosphere as a star is: the
+    zero point without the atmosphere, ``zero_point + extinction``, applies (SMTN-002, "Sky Counts").
+
+    Parameters
+    ----------
+    band : str or Band
+        Filter.
+    exposure : float
+        Exposure time [s].
+    pixel_scale : float or Quantity
+        Side of a pixel [rad].
+    sky : float, optional
+        Sky brightness [AB mag/arcsec^2], the dark sky of the band where left out.
+    """
+    band = band_named(band)
+    exposure = _positive("exposure", exposure, "s")
+    area = (_positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad") / ARCSEC) ** 2
+    brightness = band.dark_sky if sky is None else float(sky)
+    return float(exposure * area * 10.0 ** (0.4 * (band.zero_point + band.extinction - brightness)))
+
+
+def instrument_noise(exposure: float) -> float:
+    """Return the noise of one pixel in one exposure without any light [e-]: read noise and dark current (SMTN-002)."""
+    return float(np.sqrt(READ_NOISE**2 + DARK_CURRENT * _positive("exposure", exposure, "s")))
+
+
+def effective_pixels(fwhm: Any, pixel_scale: Any = PIXEL_SCALE) -> float:
+    """Return the noise-equivalent number of pixels under a star, ``2.266 (FWHM/pixel)^2`` (SMTN-002).
+
+    Parameters
+    ----------
+    fwhm : float or Quantity
+        Effective FWHM, that of the Gaussian with the same number of noise-equivalent pixels [rad].
+    pixel_scale : float or Quantity
+        Side of a pixel [rad].
+    """
+    fwhm = _positive("fwhm", radians(fwhm, "fwhm"), "rad")
+    pixel = _positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad")
+    return float(2.266 * (fwhm / pixel) ** 2)
+
+
+def signal_to_noise(
+    magnitude: Any,
+    band: str | Band,
+    exposure: float,
+    fwhm: Any,
+    *,
+    pixel_scale: Any = PIXEL_SCALE,
+    sky: float | None = None,
+) -> np.ndarray:
+    """Return the signal-to-noise ratio of PSF photometry, ``C / sqrt(C + n_eff (sky + noise^2))`` (SMTN-002).
+
+    Parameters
+    ----------
+    magnitude : float or array
+        AB magnitude above the atmosphere.
+    band : str or Band
+        Filter.
+    exposure : float
+        Exposure time [s].
+    fwhm : float or Quantity
+        Effective FWHM of the star [rad].
+    pixel_scale : float or Quantity
+        Side of a pixel [rad].
+    sky : float, optional
+        Sky brightness [AB mag/arcsec^2], the dark sky of the band where left out.
+    """
+    counts = electrons(magnitude, band, exposure)
+    return counts / np.sqrt(counts + _footprint_variance(band, exposure, fwhm, pixel_scale, sky))
+
+
+def limiting_magnitude(
+    snr: float,
+    band: str | Band,
+    exposure: float,
+    fwhm: Any,
+    *,
+    pixel_scale: Any = PIXEL_SCALE,
+    sky: float | None = None,
+) -> float:
+    """Return the magnitude at which a star has this signal-to-noise ratio (:func:`signal_to_noise` solved for C).
+
+    Raises
+    ------
+    DomainError
+        If the ratio, the exposure, the FWHM or the pixel scale is not positive.
+    """
+    square = _positive("snr", snr, "a ratio") ** 2
+    variance = _footprint_variance(band, exposure, fwhm, pixel_scale, sky)
+    counts = 0.5 * (square + np.sqrt(square**2 + 4.0 * square * variance))
+    return float(magnitude_of(counts, band, exposure))
+
+
+def saturation_magnitude(
+    band: str | Band,
+    exposure: float,
+    fwhm: Any,
+    *,
+    pixel_scale: Any = PIXEL_SCALE,
+    sky: float | None = None,
+    full_well: float = FULL_WELL,
+) -> float:
+    """Return the magnitude at which the brightest pixel of a star, centred on it, reaches the full well.
+
+    The star is taken to be a Gaussian of this FWHM; a turbulent PSF has more light in its wings and so a lower peak,
+    which makes the limit a safe one.
+
+    Raises
+    ------
+    DomainError
+        If an argument is not positive, or the sky alone fills the well.
+    """
+    sigma = _positive("fwhm", radians(fwhm, "fwhm"), "rad") / np.sqrt(8.0 * np.log(2.0))
+    pixel = _positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad")
+    background = sky_electrons_per_pixel(band, exposure, pixel, sky=sky)
+    room = _positive("full_well", full_well, "electrons") - background
+    if room <= 0.0:
+        raise DomainError(f"full_well = {full_well}: expected more than the {background:.0f} electrons of the sky")
+    central = erf(0.5 * pixel / (np.sqrt(2.0) * sigma)) ** 2
+    return float(magnitude_of(room / central, band, exposure))
+
+
+def _footprint_variance(band: str | Band, exposure: float, fwhm: Any, pixel_scale: Any, sky: float | None) -> float:
+    """Return the variance of sky and instrument under a star [e-^2]."""
+    background = sky_electrons_per_pixel(band, exposure, pixel_scale, sky=sky)
+    return effective_pixels(fwhm, pixel_scale) * (background + instrument_noise(exposure) ** 2)
+
+
+def _positive(name: str, value: Any, unit: str) -> float:
+    """Return a positive finite number, or say which argument was not one."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"{name} = {value!r}: expected one positive number ({unit})") from error
+    if not (np.isfinite(number) and number > 0.0):
+        raise DomainError(f"{name} = {value}: expected a positive number ({unit})")
+    return number

@@ -1,0 +1,68 @@
+"""Whether periodic screens are long enough for what a run looks at, so that no turbulence is seen twice."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import scipy.fft
+
+from ...core.errors import ConfigError
+from ...models.camera.camera import Camera
+from ...models.site import Site
+from ...models.telescope import Telescope
+from ...wavefront.atmosphere.layers import line_of_sight
+from ...wavefront.psf.psf import SCREENS
+from ...wavefront.pupil_optics import fields_at
+from ..config import Configuration
+
+
+def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> np.ndarray:
+    """Return how long a piece of each layer is seen from the chosen CCDs during the exposure, along x or y [m].
+
+    It is what the wind blows past, whichever way it goes, and what the field of view and the pupil cover at the
+    distance of the layer.
+
+    Parameters
+    ----------
+    config : Configuration
+        Resolved configuration.
+    telescope, camera, site
+        What it names.
+
+    Returns
+    -------
+    ndarray, shape [n_layer]
+    """
+    air = config.atmosphere
+    chosen = camera.centers[[camera.ccd_index(name) for name in config.ccds or ()]]
+    half = camera.half_size * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    corners = (chosen[:, None] + half).reshape(-1, 2)
+    slopes = np.tan(fields_at(telescope, corners))
+    distances = line_of_sight(np.array(site.altitudes), air.ground_lift_m, math.radians(air.zenith_angle_deg))
+    wind = np.array(site.wind_speeds) * air.exposure_s
+    return wind + distances * np.ptp(slopes, axis=0).max() + telescope.pupil_diameter
+
+
+def check_screens(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> None:
+    """Refuse screens that come round under the chosen CCDs.
+
+    Raises
+    ------
+    ConfigError
+        Naming the layer and how long the screens must be.
+    """
+    air = config.atmosphere
+    if not air.enabled or not SCREENS.get(config.psf.engine):
+        return
+    swept = swept_lengths(config, telescope, camera, site)
+    layer = int(np.argmax(swept))
+    if swept[layer] <= air.screen_length_m:
+        return
+    least = math.ceil(swept[layer])
+    size = scipy.fft.next_fast_len(math.ceil(air.screen_size * least / air.screen_length_m), real=True)
+    raise ConfigError(
+        f"atmosphere.exposure_s = {air.exposure_s:g}: the chosen CCDs see {least} m of the layer at"
+        f" {site.altitudes[layer]:g} m, whose periodic screen comes round after {air.screen_length_m:g} m: expected"
+        f" atmosphere.screen_length_m of at least {least} (and atmosphere.screen_size = {size} to keep its pixel)"
+    )

@@ -1,0 +1,151 @@
+"""Star stamps: photon and read noise on PSF images, and sub-pixel centring."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import fft
+
+from ...core.errors import DomainError
+
+
+def observe_stamps(
+    psf_images: Any,
+    electrons: Any,
+    sky: float,
+    read_noise: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Expose noise-free PSF images: Poisson noise of star and sky, Gaussian read noise, expected sky subtracted.
+
+    The stars are drawn one after the other from the same stream, so the first n stay as they are when more follow.
+
+    Parameters
+    ----------
+    psf_images : array
+        [n, ny, nx] images of unit sum. Pixels below zero, as Fourier ringing leaves them, count as zero in the Poisson
+        mean of star and sky if they outweigh the sky.
+    electrons : float or array
+        Electrons of each star, one for all or [n].
+    sky : float
+        Expected electrons of the sky in one pixel.
+    read_noise : float
+        Rms noise of one pixel without light [e-].
+    rng : numpy.random.Generator
+        The stream to draw from.
+
+    Returns
+    -------
+    array
+        [n, ny, nx] electrons, sky subtracted.
+
+    Raises
+    ------
+    DomainError
+        If an argument is negative, not finite or of the wrong shape.
+    """
+    images = _images(psf_images, "psf_images")
+    if not np.all(np.isfinite(images)):
+        raise DomainError(f"psf_images[{_first_bad(images)}] has pixels that are not finite")
+    try:
+        counts = np.broadcast_to(np.asarray(electrons, dtype=np.float64), (len(images),))
+    except ValueError as error:
+        raise DomainError(f"electrons has shape {np.shape(electrons)}: expected one value or {len(images)}") from error
+    if not (np.all(np.isfinite(counts)) and np.all(counts >= 0.0)):
+        raise DomainError(f"electrons = {electrons}: expected numbers that are not negative")
+    for name, value in (("sky", sky), ("read_noise", read_noise)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise DomainError(f"{name} = {value}: expected a number of electrons that is not negative")
+    result = np.empty(images.shape)
+    for i, image in enumerate(images):
+        light = rng.poisson(np.maximum(counts[i] * image + sky, 0.0))
+        result[i] = light - sky + rng.normal(0.0, read_noise, image.shape)
+    return result
+
+
+def center_stamps(images: Any, x: Any, y: Any, size: int = 31, *, normalize: bool = True) -> np.ndarray:
+    """Shift stars so that their centroid falls on the centre of a pixel, and cut stamps around it.
+
+    The shift multiplies the Fourier transform by a phase: exact for a band-limited image, and it leaves white noise
+    white. Light that crosses an edge comes in at the opposite one, so images should be larger than the stamps by a few
+    pixels, or dark at their edges.
+
+    Parameters
+    ----------
+    images : array
+        [n, ny, nx], or one image [ny, nx].
+    x, y : float or array
+        Centroids from the centre of the image, ``((ny - 1)/2, (nx - 1)/2)``, in pixels, as
+        :func:`~pachon.pipeline.measure.shapes.measure_shapes` gives them.
+    size : int
+        Pixels along one side of the stamp, odd.
+    normalize : bool
+        Whether to divide every stamp by its sum.
+
+    Returns
+    -------
+    array
+        [n, size, size]. All NaN for an image whose centroid is NaN or whose stamp has no positive sum.
+
+    Raises
+    ------
+    DomainError
+        If the size is not odd or the image is smaller than the stamp.
+    """
+    stack = _images(images, "images")
+    count, ny, nx = stack.shape
+    if size < 1 or size % 2 == 0:
+        raise DomainError(f"size = {size}: expected an odd number of pixels")
+    if size > min(ny, nx):
+        raise DomainError(f"size = {size}: expected at most {min(ny, nx)}, the size of the images")
+    try:
+        offsets = np.stack([np.broadcast_to(np.asarray(v, dtype=np.float64), (count,)) for v in (x, y)], axis=1)
+    except ValueError as error:
+        raise DomainError(f"x and y have shapes {np.shape(x)} and {np.shape(y)}: expected {count} centroids") from error
+    # Pixel (ny//2, nx//2) becomes the middle of the stamp: the central one, or the one after the centre of an even
+    # image.
+    rows, columns = (slice(n // 2 - size // 2, n // 2 - size // 2 + size) for n in (ny, nx))
+    middle = np.array([nx // 2 - (nx - 1) / 2.0, ny // 2 - (ny - 1) / 2.0])
+    result = np.full((count, size, size), np.nan)
+    for i, image in enumerate(stack):
+        if not np.all(np.isfinite(offsets[i])):
+            continue
+        stamp = _shift(image, *(middle - offsets[i]))[rows, columns]
+        total = stamp.sum() if normalize else 1.0
+        if total > 0.0:
+            result[i] = stamp / total
+    return result
+
+
+def _shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
+    """Return the band-limited image moved by (dx, dy) pixels.
+
+    The highest frequency of an even grid stands for both its signs, so its phase is the mean of the two, a cosine.
+    """
+    ny, nx = image.shape
+    phase_x = np.exp(-2j * np.pi * fft.rfftfreq(nx) * dx)
+    phase_y = np.exp(-2j * np.pi * fft.fftfreq(ny) * dy)
+    if nx % 2 == 0:
+        phase_x[-1] = np.cos(np.pi * dx)
+    if ny % 2 == 0:
+        phase_y[ny // 2] = np.cos(np.pi * dy)
+    return fft.irfft2(fft.rfft2(image) * phase_y[:, None] * phase_x, s=(ny, nx))
+
+
+def _images(images: Any, name: str) -> np.ndarray:
+    """Return the images as a float64 array [n, ny, nx]."""
+    try:
+        array = np.asarray(images, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"{name}: expected real numbers [n, ny, nx]") from error
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3:
+        raise DomainError(f"{name} has shape {array.shape}: expected [n, ny, nx] or [ny, nx]")
+    return array
+
+
+def _first_bad(images: np.ndarray) -> int:
+    """Return the index of the first image with a pixel that is not finite."""
+    return int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])

@@ -1,0 +1,1 @@
+"""Exact derivatives by backward passes through the surfaces."""

@@ -1,0 +1,1 @@
+"""Warp kernels and functions of the forward trace, on packets of rays."""

@@ -1,0 +1,50 @@
+"""Which rays of a packet meet a solid thing on their way to a surface."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from .packet import LANES, lanes
+from .surface import OK, VIGNETTED
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+#: This much of a way [m] after its start and before its end is not looked at: several times what single precision
+#: resolves over 20 m.
+MARGIN = wp.constant(wp.float32(1.0e-5))
+
+
+@wp.struct
+class PackedObstructions:
+    """Meshes [obstruction], ids of ``wp.Mesh``, and ``blocks`` [surface, obstruction]: on which ways each is met."""
+
+    meshes: wp.array(dtype=wp.uint64)
+    blocks: wp.array2d(dtype=wp.int32)
+
+
+@wp.func
+def past_obstructions(
+    obstructions: PackedObstructions,
+    s: wp.int32,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+    t: lanes,
+    status: lanes,
+):
+    """Statuses after the way from (x, y, z) over a distance t to surface ``s``, all in the telescope frame."""
+    for m in range(obstructions.meshes.shape[0]):
+        if obstructions.blocks[s, m] == 1:
+            for i in range(LANES):
+                length = wp.float32(t[i]) - wp.float32(2.0) * MARGIN
+                # A lane that is vignetted already, or a NaN, needs no question.
+                if status[i] == OK and length > wp.float32(0.0):
+                    heading = wp.vec3(wp.float32(u[i]), wp.float32(v[i]), wp.float32(w[i]))
+                    start = wp.vec3(wp.float32(x[i]), wp.float32(y[i]), wp.float32(z[i])) + MARGIN * heading
+                    if wp.mesh_query_ray_anyhit(obstructions.meshes[m], start, heading, length):
+                        status[i] = VIGNETTED
+    return status

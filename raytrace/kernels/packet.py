@@ -1,0 +1,56 @@
+"""Packets: ``LANES`` rays side by side in one SIMD vector, every quantity of a ray a lane.
+
+A kernel on packets traces the LSST about ten times as fast as the same kernel on single rays, because the compiler
+keeps each quantity in full-width registers. A branch becomes a choice per lane (``wp.where``), so a lane's result
+never depends on its neighbours: cutting a batch differently changes no byte.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+#: Rays in one packet: four 512-bit registers a quantity, so that one vector can wait for its square root while the next
+#: is computed (16 lanes take a fifth longer).
+LANES = 32
+
+lanes = wp.types.vector(LANES, wp.float64)
+lane_flags = wp.types.vector(LANES, wp.int32)
+
+
+@wp.func
+def lanes_sqrt(a: lanes):
+    """Square root of each lane (NaN where negative)."""
+    out = lanes()
+    for i in range(LANES):
+        out[i] = wp.sqrt(a[i])
+    return out
+
+
+def packet_count(n: int) -> int:
+    """Return the number of packets that hold ``n`` rays."""
+    return -(-n // LANES)
+
+
+def to_packets(values: np.ndarray) -> np.ndarray:
+    """Return values as whole packets, the last one filled up with copies of the last value.
+
+    Parameters
+    ----------
+    values : array_like, shape [..., n]
+
+    Returns
+    -------
+    ndarray, shape [..., n_packet, LANES]
+        A view where ``n`` is a multiple of ``LANES`` and the values are contiguous float64, else a copy.
+    """
+    values = np.ascontiguousarray(values, dtype=np.float64)
+    n = values.shape[-1]
+    missing = packet_count(n) * LANES - n
+    if missing:
+        values = np.concatenate([values, np.repeat(values[..., -1:], missing, axis=-1)], axis=-1)
+    return values.reshape(*values.shape[:-1], -1, LANES)

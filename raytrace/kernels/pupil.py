@@ -1,0 +1,101 @@
+"""The kernel that traces the same pupil points for many stars and keeps only what a PSF needs.
+
+A module of its own: with one caller of the surface loop in a module the compiler puts all of it in line, which is
+worth a tenth of the time.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS, kernel_pair
+from .packet import lane_flags, lanes, lanes_sqrt
+from .surface import ZERO
+from .trace import LOOPS, PackedSurfaces, statuses
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def launched(px: lanes, py: lanes, pz: wp.float64, u: wp.float64, v: wp.float64, w: wp.float64, distance: wp.float64):
+    """Start parallel rays through (px, py, pz) on the plane at -distance along the direction of the light."""
+    back = u * px + v * py + lanes(w * pz + distance)
+    return px - u * back, py - v * back, lanes(pz) - w * back
+
+
+@kernel_pair
+def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that traces pupils."""
+    through_telescope = LOOPS[special]
+
+    @wp.kernel(module=module)
+    def trace_pupils(
+        first: wp.int32,
+        surfaces: PackedSurfaces,
+        n_packets: wp.int32,
+        indices: wp.array2d(dtype=wp.float64),
+        medium: wp.array(dtype=wp.int32),
+        direction: wp.array2d(dtype=wp.float64),
+        pupil: wp.array2d(dtype=lanes),
+        pupil_z: wp.float64,
+        distance: wp.float64,
+        reference: wp.array2d(dtype=wp.float64),
+        radius: wp.float64,
+        no_position: wp.array3d(dtype=lanes),
+        no_direction: wp.array3d(dtype=lanes),
+        no_path: wp.array2d(dtype=lanes),
+        no_status: wp.array2d(dtype=lane_flags),
+        displacement_x: wp.array2d(dtype=lanes),
+        displacement_y: wp.array2d(dtype=lanes),
+        path_out: wp.array2d(dtype=lanes),
+        status_out: wp.array2d(dtype=lane_flags),
+    ):
+        """Trace packet ``item % n_packets`` of the pupil for bundle ``item // n_packets`` and keep what a PSF needs.
+
+        A bundle is one star at one wavelength. ``reference`` holds, per bundle, a point of the CCD surface and its
+        normal (-dh/dx, -dh/dy, 1) before normalisation [6]. Kept: where the rays meet the tangent plane of the CCD
+        there, relative to the point, and their optical path to the sphere of that radius about the point, beyond it.
+        """
+        item = first + wp.tid()
+        b = item / n_packets
+        p = item - b * n_packets
+        row = medium[b]
+        n_surfaces = surfaces.kinds.shape[0]
+        du = direction[b, 0]
+        dv = direction[b, 1]
+        dw = direction[b, 2]
+        x, y, z = launched(pupil[0, p], pupil[1, p], pupil_z, du, dv, dw, distance)
+        x, y, z, u, v, w, path, status = through_telescope(
+            surfaces,
+            indices,
+            row,
+            x,
+            y,
+            z,
+            lanes(du),
+            lanes(dv),
+            lanes(dw),
+            lanes(ZERO),
+            p,
+            no_position,
+            no_direction,
+            no_path,
+            no_status,
+        )
+        x = x - lanes(reference[b, 0])
+        y = y - lanes(reference[b, 1])
+        z = z - lanes(reference[b, 2])
+        nx = reference[b, 3]
+        ny = reference[b, 4]
+        nz = reference[b, 5]
+        along = wp.cw_div(nx * x + ny * y + nz * z, nx * u + ny * v + nz * w)
+        displacement_x[b, p] = x - wp.cw_mul(along, u)
+        displacement_y[b, p] = y - wp.cw_mul(along, v)
+        # Distance from here on to the sphere beyond the image: sqrt((q.d)^2 - |q|^2 + R^2) - q.d.
+        qd = wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
+        qq = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
+        ahead = lanes_sqrt(wp.cw_mul(qd, qd) - qq + lanes(radius * radius)) - qd
+        path_out[b, p] = path + indices[row, n_surfaces - 1] * ahead
+        status_out[b, p] = statuses(status)
+
+    return trace_pupils

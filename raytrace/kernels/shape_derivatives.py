@@ -1,0 +1,281 @@
+"""First and second derivatives of the parts that `figure_kernels` adds up, for sweeps that follow how rays change."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from .packet import LANES, lanes, lanes_sqrt
+from .shape import BICONIC, GRID, GRID_HEAD, ODD, POLAR, TOROID, PackedFigures, biconic_sag, toroid_sag
+from .surface import ONE, TWO, ZERO
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+HALF = wp.constant(wp.float64(0.5))
+FOUR = wp.constant(wp.float64(4.0))
+
+
+@wp.func
+def polar_derivatives(
+    numbers: wp.array(dtype=wp.float64), offset: wp.int32, degree: wp.int32, order: wp.int32, x: lanes, y: lanes
+):
+    """Return derivatives x, y, xx, xy, yy of Re f(z, s), f = sum_m q_m(s) z^m, by nested Horner schemes.
+
+    With z = x + iy, s = x^2 + y^2: f_x = f_z + 2 x f_s, f_xx = f_zz + 4 x f_zs + 2 f_s + 4 x^2 f_ss, f_xy = i f_zz +
+    2 (y + ix) f_zs + 4 xy f_ss, f_yy = -f_zz + 4 iy f_zs + 2 f_s + 4 y^2 f_ss.
+    """
+    s = wp.cw_mul(x, x) + wp.cw_mul(y, y)
+    # Real and imaginary parts of the sum and of its derivatives z, s, zz, zs, ss.
+    fr = lanes(ZERO)
+    fi = lanes(ZERO)
+    zr = lanes(ZERO)
+    zi = lanes(ZERO)
+    sr = lanes(ZERO)
+    si = lanes(ZERO)
+    zzr = lanes(ZERO)
+    zzi = lanes(ZERO)
+    zsr = lanes(ZERO)
+    zsi = lanes(ZERO)
+    ssr = lanes(ZERO)
+    ssi = lanes(ZERO)
+    at = offset
+    for i in range(order + 1):
+        m = order - i
+        qr = lanes(ZERO)
+        qi = lanes(ZERO)
+        dr = lanes(ZERO)
+        di = lanes(ZERO)
+        er = lanes(ZERO)
+        ei = lanes(ZERO)
+        for _k in range((degree - m) // 2 + 1):
+            er = wp.cw_mul(er, s) + TWO * dr
+            ei = wp.cw_mul(ei, s) + TWO * di
+            dr = wp.cw_mul(dr, s) + qr
+            di = wp.cw_mul(di, s) + qi
+            qr = wp.cw_mul(qr, s) + lanes(numbers[at])
+            qi = wp.cw_mul(qi, s) + lanes(numbers[at + 1])
+            at += 2
+        # Each pair takes the one that the lines below it change.
+        hr = wp.cw_mul(zzr, x) - wp.cw_mul(zzi, y) + TWO * zr
+        zzi = wp.cw_mul(zzr, y) + wp.cw_mul(zzi, x) + TWO * zi
+        zzr = hr
+        hr = wp.cw_mul(zsr, x) - wp.cw_mul(zsi, y) + sr
+        zsi = wp.cw_mul(zsr, y) + wp.cw_mul(zsi, x) + si
+        zsr = hr
+        hr = wp.cw_mul(zr, x) - wp.cw_mul(zi, y) + fr
+        zi = wp.cw_mul(zr, y) + wp.cw_mul(zi, x) + fi
+        zr = hr
+        hr = wp.cw_mul(fr, x) - wp.cw_mul(fi, y) + qr
+        fi = wp.cw_mul(fr, y) + wp.cw_mul(fi, x) + qi
+        fr = hr
+        hr = wp.cw_mul(sr, x) - wp.cw_mul(si, y) + dr
+        si = wp.cw_mul(sr, y) + wp.cw_mul(si, x) + di
+        sr = hr
+        hr = wp.cw_mul(ssr, x) - wp.cw_mul(ssi, y) + er
+        ssi = wp.cw_mul(ssr, y) + wp.cw_mul(ssi, x) + ei
+        ssr = hr
+    along = FOUR * wp.cw_mul(x, zsr) + TWO * sr + FOUR * wp.cw_mul(wp.cw_mul(x, x), ssr)
+    across = TWO * sr + FOUR * wp.cw_mul(wp.cw_mul(y, y), ssr) - FOUR * wp.cw_mul(y, zsi)
+    mixed = TWO * (wp.cw_mul(y, zsr) - wp.cw_mul(x, zsi)) + FOUR * wp.cw_mul(wp.cw_mul(x, y), ssr)
+    return (
+        zr + TWO * wp.cw_mul(x, sr),
+        TWO * wp.cw_mul(y, sr) - zi,
+        zzr + along,
+        mixed - zzi,
+        across - zzr,
+    )
+
+
+@wp.func
+def odd_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms: wp.int32, x: lanes, y: lanes):
+    """Return derivatives x, y, xx, xy, yy of a_1 r + a_3 r^3 + ...; at r = 0 all are zero."""
+    s = wp.cw_mul(x, x) + wp.cw_mul(y, y)
+    slope = lanes(ZERO)
+    bend = lanes(ZERO)
+    for j in range(terms):
+        # p = sum n a_n r^(n - 1) and 2 dp/ds, n = 2 m + 1: the slope is p / r times x, y.
+        m = terms - 1 - j
+        a = numbers[offset + m] * wp.float64(2 * m + 1)
+        bend = wp.cw_mul(bend, s) + TWO * slope
+        slope = wp.cw_mul(slope, s) + lanes(a)
+    r = lanes_sqrt(s)
+    over = lanes()
+    twist = lanes()
+    for i in range(LANES):
+        over[i] = wp.where(r[i] > ZERO, slope[i] / r[i], ZERO)
+        twist[i] = wp.where(r[i] > ZERO, (bend[i] - slope[i] / s[i]) / r[i], ZERO)
+    return (
+        wp.cw_mul(over, x),
+        wp.cw_mul(over, y),
+        over + wp.cw_mul(twist, wp.cw_mul(x, x)),
+        wp.cw_mul(twist, wp.cw_mul(x, y)),
+        over + wp.cw_mul(twist, wp.cw_mul(y, y)),
+    )
+
+
+@wp.func
+def biconic_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
+    """Return derivatives x, y, xx, xy, yy of u / (1 + w), from z (1 + w) = u and w^2 = 1 - px x^2 - py y^2."""
+    cx = numbers[offset]
+    cy = numbers[offset + 1]
+    px = numbers[offset + 2]
+    py = numbers[offset + 3]
+    w = lanes_sqrt(lanes(ONE) - px * wp.cw_mul(x, x) - py * wp.cw_mul(y, y))
+    z, zx, zy = biconic_sag(numbers, offset, x, y)
+    wx = -wp.cw_div(px * x, w)
+    wy = -wp.cw_div(py * y, w)
+    over = wp.cw_div(lanes(ONE), lanes(ONE) + w)
+    # (1 + w) z_ab = u_ab - z_a w_b - z_b w_a - z w_ab, and w w_ab = -p_ab - w_a w_b.
+    wxx = -wp.cw_div(lanes(px) + wp.cw_mul(wx, wx), w)
+    wyy = -wp.cw_div(lanes(py) + wp.cw_mul(wy, wy), w)
+    wxy = -wp.cw_div(wp.cw_mul(wx, wy), w)
+    return (
+        zx,
+        zy,
+        wp.cw_mul(over, lanes(TWO * cx) - TWO * wp.cw_mul(zx, wx) - wp.cw_mul(z, wxx)),
+        -wp.cw_mul(over, wp.cw_mul(zx, wy) + wp.cw_mul(zy, wx) + wp.cw_mul(z, wxy)),
+        wp.cw_mul(over, lanes(TWO * cy) - TWO * wp.cw_mul(zy, wy) - wp.cw_mul(z, wyy)),
+    )
+
+
+@wp.func
+def toroid_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
+    """Return derivatives x, y, xx, xy, yy of g + h(q, x), dq/dg = q^2, as in `models.shape_freeform.Toroid`."""
+    cx = numbers[offset]
+    cy = numbers[offset + 1]
+    py = numbers[offset + 2]
+    yy = wp.cw_mul(y, y)
+    xx = wp.cw_mul(x, x)
+    b = lanes_sqrt(lanes(ONE) - py * yy)
+    g = wp.cw_div(cy * yy, lanes(ONE) + b)
+    g1 = wp.cw_div(cy * y, b)
+    g2 = wp.cw_div(lanes(cy), wp.cw_mul(b, wp.cw_mul(b, b)))
+    q = wp.cw_div(lanes(cx), lanes(ONE) - cx * g)
+    qq = wp.cw_mul(q, q)
+    w = lanes_sqrt(lanes(ONE) - wp.cw_mul(qq, xx))
+    h = wp.cw_div(wp.cw_mul(q, xx), lanes(ONE) + w)
+    h_q = wp.cw_div(HALF * (xx + wp.cw_mul(h, h)), w)
+    h_qq = wp.cw_mul(h_q, wp.cw_div(wp.cw_mul(q, xx), wp.cw_mul(w, w)) + wp.cw_div(h, w))
+    _z, zx, zy = toroid_sag(numbers, offset, x, y)
+    cube = wp.cw_mul(w, wp.cw_mul(w, w))
+    grown = wp.cw_mul(h_qq, wp.cw_mul(qq, qq)) + TWO * wp.cw_mul(h_q, wp.cw_mul(q, qq))
+    return (
+        zx,
+        zy,
+        wp.cw_div(q, cube),
+        wp.cw_mul(wp.cw_div(x, cube), wp.cw_mul(qq, g1)),
+        wp.cw_mul(g2, lanes(ONE) + wp.cw_mul(h_q, qq)) + wp.cw_mul(wp.cw_mul(g1, g1), grown),
+    )
+
+
+@wp.func
+def grid_derivatives(
+    numbers: wp.array(dtype=wp.float64), offset: wp.int32, nx: wp.int32, ny: wp.int32, x: lanes, y: lanes
+):
+    """Return derivatives x, y, xx, xy, yy of a bicubic grid; beyond it its outermost cells go on."""
+    rate_x = numbers[offset + 2]
+    rate_y = numbers[offset + 3]
+    px = rate_x * (x - lanes(numbers[offset]))
+    py = rate_y * (y - lanes(numbers[offset + 1]))
+    zx = lanes(ZERO)
+    zy = lanes(ZERO)
+    zxx = lanes(ZERO)
+    zxy = lanes(ZERO)
+    zyy = lanes(ZERO)
+    three = wp.float64(3.0)
+    six = wp.float64(6.0)
+    last_x = wp.float64(nx - 1)
+    last_y = wp.float64(ny - 1)
+    # A loop that the compiler does not unroll: the nodes are fetched lane by lane.
+    for i in range(LANES + 0 * nx):
+        a = px[i]
+        b = py[i]
+        column = wp.clamp(wp.int32(wp.where(a > ZERO, wp.min(a, last_x), ZERO)), 0, nx - 2)
+        row = wp.clamp(wp.int32(wp.where(b > ZERO, wp.min(b, last_y), ZERO)), 0, ny - 2)
+        t = a - wp.float64(column)
+        r = b - wp.float64(row)
+        low = offset + GRID_HEAD + 4 * (row * nx + column)
+        ru = r * r * (three - TWO * r)
+        rs = r * (ONE - r) * (ONE - r)
+        re = r * r * (r - ONE)
+        dru = six * r * (ONE - r)
+        drs = (ONE - r) * (ONE - three * r)
+        dre = r * (three * r - TWO)
+        ddru = six - six * TWO * r
+        ddrs = six * r - FOUR
+        ddre = six * r - TWO
+        tu = t * t * (three - TWO * t)
+        ts = t * (ONE - t) * (ONE - t)
+        te = t * t * (t - ONE)
+        dtu = six * t * (ONE - t)
+        dts = (ONE - t) * (ONE - three * t)
+        dte = t * (three * t - TWO)
+        ddtu = six - six * TWO * t
+        ddts = six * t - FOUR
+        ddte = six * t - TWO
+        for side in range(2):
+            at = low + 4 * nx * side
+            # Weights along y, of the value and of the slope at this side, and their derivatives.
+            wu = ru
+            ws = re
+            du = dru
+            ds = dre
+            ddu = ddru
+            dds = ddre
+            if side == 0:
+                wu = ONE - ru
+                ws = rs
+                du = -dru
+                ds = drs
+                ddu = -ddru
+                dds = ddrs
+            step = numbers[at + 4] - numbers[at]
+            lift = numbers[at + 6] - numbers[at + 2]
+            f = numbers[at] + tu * step + ts * numbers[at + 1] + te * numbers[at + 5]
+            g = numbers[at + 2] + tu * lift + ts * numbers[at + 3] + te * numbers[at + 7]
+            fx = dtu * step + dts * numbers[at + 1] + dte * numbers[at + 5]
+            gx = dtu * lift + dts * numbers[at + 3] + dte * numbers[at + 7]
+            fxx = ddtu * step + ddts * numbers[at + 1] + ddte * numbers[at + 5]
+            gxx = ddtu * lift + ddts * numbers[at + 3] + ddte * numbers[at + 7]
+            zx[i] = zx[i] + rate_x * (wu * fx + ws * gx)
+            zy[i] = zy[i] + rate_y * (du * f + ds * g)
+            zxx[i] = zxx[i] + rate_x * rate_x * (wu * fxx + ws * gxx)
+            zxy[i] = zxy[i] + rate_x * rate_y * (du * fx + ds * gx)
+            zyy[i] = zyy[i] + rate_y * rate_y * (ddu * f + dds * g)
+    return zx, zy, zxx, zxy, zyy
+
+
+@wp.func
+def extra_derivatives(figures: PackedFigures, s: wp.int32, x: lanes, y: lanes):
+    """Sum of the parts of surface ``s``: their slopes along x and y, and second derivatives xx, xy, yy [1/m]."""
+    zx = lanes(ZERO)
+    zy = lanes(ZERO)
+    zxx = lanes(ZERO)
+    zxy = lanes(ZERO)
+    zyy = lanes(ZERO)
+    for part in range(figures.span[s, 0], figures.span[s, 1]):
+        kind = figures.parts[part, 0]
+        offset = figures.parts[part, 1]
+        n = figures.parts[part, 2]
+        m = figures.parts[part, 3]
+        a = lanes(ZERO)
+        b = lanes(ZERO)
+        c = lanes(ZERO)
+        d = lanes(ZERO)
+        e = lanes(ZERO)
+        if kind == POLAR:
+            a, b, c, d, e = polar_derivatives(figures.numbers, offset, n, m, x, y)
+        elif kind == ODD:
+            a, b, c, d, e = odd_derivatives(figures.numbers, offset, n, x, y)
+        elif kind == BICONIC:
+            a, b, c, d, e = biconic_derivatives(figures.numbers, offset, x, y)
+        elif kind == TOROID:
+            a, b, c, d, e = toroid_derivatives(figures.numbers, offset, x, y)
+        elif kind == GRID:
+            a, b, c, d, e = grid_derivatives(figures.numbers, offset, n, m, x, y)
+        zx = zx + a
+        zy = zy + b
+        zxx = zxx + c
+        zxy = zxy + d
+        zyy = zyy + e
+    return zx, zy, zxx, zxy, zyy

@@ -1,0 +1,341 @@
+"""The kernels that carry packets of rays through a whole telescope.
+
+Each is made twice from one source (`launch.kernel_pair`): what only few telescopes need slows the loop over the
+surfaces by a seventh even where no surface has it, because it takes registers and keeps the compiler from putting
+functions in line.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS, kernel_pair
+from .aperture import PackedApertures, through_aperture
+from .mesh import PackedMeshes, mesh_distance
+from .obstruction import PackedObstructions, past_obstructions
+from .packet import LANES, lane_flags, lanes
+from .shape import PackedFigures, figured_distance, through_screen
+from .surface import (
+    FAR,
+    MISSED,
+    NOT_CONVERGED,
+    OK,
+    ONE,
+    TOTAL_REFLECTION,
+    VIGNETTED,
+    ZERO,
+    aspheric_distance,
+    conic_distance,
+    polynomial,
+    reflected,
+    refracted,
+)
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+MIRROR = wp.constant(0)
+REFRACT = wp.constant(1)
+PHASE = wp.constant(4)
+
+
+# Columns of the table of numbers, a row per surface: curvature [1/m], conic constant, vertex [m] (3), rotation (9,
+# row by row), clear aperture: centre x, y, inner and outer radius [m]; the curvature of the conic that the search for a
+# landing starts from, another one where the surface has no conic of its own.
+CURVATURE = wp.constant(0)
+CONIC = wp.constant(1)
+VERTEX = wp.constant(2)
+ROTATION = wp.constant(5)
+APERTURE = wp.constant(14)
+FIRST_CURVATURE = wp.constant(18)
+NUMBERS = 19
+# Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
+# (0 no, 1 by a disc or ring, 2 by another aperture), whether something may stand in the way to it, whether its shape
+# has parts beside the conic and its even powers (1) or is a mesh (2).
+INTERACTION = wp.constant(0)
+TERMS = wp.constant(1)
+ROTATED = wp.constant(2)
+STOPPED = wp.constant(3)
+OBSTRUCTED = wp.constant(4)
+FIGURED = wp.constant(5)
+KINDS = 6
+
+
+@wp.struct
+class PackedSurfaces:
+    """A telescope as tables, a row per surface; see :mod:`pachon.raytrace.pack.surfaces`.
+
+    ``special`` is 1 where the loop over its surfaces needs more than the plain one has.
+    """
+
+    special: wp.int32
+    numbers: wp.array2d(dtype=wp.float64)
+    kinds: wp.array2d(dtype=wp.int32)
+    coefficients: wp.array2d(dtype=wp.float64)
+    figures: PackedFigures
+    meshes: PackedMeshes
+    apertures: PackedApertures
+    obstructions: PackedObstructions
+
+
+@wp.func
+def to_local(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: lanes):
+    """Components along the axes of surface ``s``, the columns of its rotation, of vectors of the telescope frame."""
+    return (
+        surfaces.numbers[s, ROTATION] * x
+        + surfaces.numbers[s, ROTATION + 3] * y
+        + surfaces.numbers[s, ROTATION + 6] * z,
+        surfaces.numbers[s, ROTATION + 1] * x
+        + surfaces.numbers[s, ROTATION + 4] * y
+        + surfaces.numbers[s, ROTATION + 7] * z,
+        surfaces.numbers[s, ROTATION + 2] * x
+        + surfaces.numbers[s, ROTATION + 5] * y
+        + surfaces.numbers[s, ROTATION + 8] * z,
+    )
+
+
+@wp.func
+def to_telescope(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: lanes):
+    """Components in the telescope frame of vectors along the axes of surface ``s``."""
+    return (
+        surfaces.numbers[s, ROTATION] * x
+        + surfaces.numbers[s, ROTATION + 1] * y
+        + surfaces.numbers[s, ROTATION + 2] * z,
+        surfaces.numbers[s, ROTATION + 3] * x
+        + surfaces.numbers[s, ROTATION + 4] * y
+        + surfaces.numbers[s, ROTATION + 5] * z,
+        surfaces.numbers[s, ROTATION + 6] * x
+        + surfaces.numbers[s, ROTATION + 7] * y
+        + surfaces.numbers[s, ROTATION + 8] * z,
+    )
+
+
+@wp.func
+def on_the_way(
+    surfaces: PackedSurfaces,
+    s: wp.int32,
+    x: lanes,
+    y: lanes,
+    z: lanes,
+    u: lanes,
+    v: lanes,
+    w: lanes,
+    t: lanes,
+    status: lanes,
+):
+    """Statuses after what may stand in the way over a distance t from a point, given from the vertex of a surface."""
+    vertex_x = lanes(surfaces.numbers[s, VERTEX])
+    vertex_y = lanes(surfaces.numbers[s, VERTEX + 1])
+    vertex_z = lanes(surfaces.numbers[s, VERTEX + 2])
+    return past_obstructions(surfaces.obstructions, s, x + vertex_x, y + vertex_y, z + vertex_z, u, v, w, t, status)
+
+
+@wp.func
+def statuses(status: lanes):
+    """Statuses as integers."""
+    out = lane_flags()
+    for i in range(LANES):
+        out[i] = wp.int32(status[i])
+    return out
+
+
+def surface_loop(special: bool) -> wp.Function:
+    """Return the loop over the surfaces of a telescope, the same source with or without what only few telescopes need.
+
+    Without: figures beside conics with even powers, phase screens, apertures beside discs and rings, obstructions.
+    """
+
+    @wp.func
+    def through_telescope(
+        surfaces: PackedSurfaces,
+        indices: wp.array2d(dtype=wp.float64),
+        row: wp.int32,
+        x: lanes,
+        y: lanes,
+        z: lanes,
+        u: lanes,
+        v: lanes,
+        w: lanes,
+        path: lanes,
+        packet: wp.int32,
+        position_out: wp.array3d(dtype=lanes),
+        direction_out: wp.array3d(dtype=lanes),
+        path_out: wp.array2d(dtype=lanes),
+        status_out: wp.array2d(dtype=lane_flags),
+    ):
+        """Carry a packet through every surface, and write it after the last ones, as many as the outputs have room for.
+
+        Positions and directions are in the telescope frame. The body of the loop stands here in line: as a function of
+        its own it would hand a dozen vectors to and fro through memory, and the trace would take a third longer.
+        """
+        status = lanes(OK)
+        n_surfaces = surfaces.kinds.shape[0]
+        skipped = n_surfaces - position_out.shape[0]
+        for s in range(n_surfaces):
+            before = indices[row, s]
+            after = indices[row, s + 1]
+            x = x - lanes(surfaces.numbers[s, VERTEX])
+            y = y - lanes(surfaces.numbers[s, VERTEX + 1])
+            z = z - lanes(surfaces.numbers[s, VERTEX + 2])
+            turned = surfaces.kinds[s, ROTATED]
+            if turned == 1:
+                x, y, z = to_local(surfaces, s, x, y, z)
+                u, v, w = to_local(surfaces, s, u, v, w)
+
+            c = surfaces.numbers[s, CURVATURE]
+            k = surfaces.numbers[s, CONIC]
+            terms = surfaces.kinds[s, TERMS]
+            t = conic_distance(surfaces.numbers[s, FIRST_CURVATURE], k, x, y, z, u, v, w)
+            if terms > 0:
+                t, running = aspheric_distance(c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t)
+                for i in range(LANES):
+                    status[i] = wp.where(running[i] > ZERO, NOT_CONVERGED, status[i])
+            interaction = surfaces.kinds[s, INTERACTION]
+            if wp.static(special):
+                figured = surfaces.kinds[s, FIGURED]
+                part = lanes()
+                part_x = lanes()
+                part_y = lanes()
+                if figured == 2:
+                    t, part_x, part_y = mesh_distance(surfaces.meshes, s, x, y, z, u, v, w)
+                elif figured == 1:
+                    screen = wp.where(interaction == PHASE, 1, 0)
+                    t, part, part_x, part_y, running = figured_distance(
+                        surfaces.figures, c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t, screen
+                    )
+                    for i in range(LANES):
+                        status[i] = wp.where(running[i] > ZERO, NOT_CONVERGED, status[i])
+            for i in range(LANES):
+                # A NaN fails every comparison; wp.isfinite would be a call per lane and stop the compiler's vectors.
+                status[i] = wp.where(wp.abs(t[i]) < FAR, status[i], wp.where(status[i] <= VIGNETTED, MISSED, status[i]))
+
+            if wp.static(special):
+                if surfaces.kinds[s, OBSTRUCTED] == 1:
+                    # Called from two places: a function with one caller is put in line, which slows the whole loop.
+                    if turned == 1:
+                        sx, sy, sz = to_telescope(surfaces, s, x, y, z)
+                        su, sv, sw = to_telescope(surfaces, s, u, v, w)
+                        status = on_the_way(surfaces, s, sx, sy, sz, su, sv, sw, t, status)
+                    else:
+                        status = on_the_way(surfaces, s, x, y, z, u, v, w, t, status)
+
+            x = x + wp.cw_mul(t, u)
+            y = y + wp.cw_mul(t, v)
+            z = z + wp.cw_mul(t, w)
+            path = path + before * t
+
+            if surfaces.kinds[s, STOPPED] == 1:
+                ax = x - lanes(surfaces.numbers[s, APERTURE])
+                ay = y - lanes(surfaces.numbers[s, APERTURE + 1])
+                a2 = wp.cw_mul(ax, ax) + wp.cw_mul(ay, ay)
+                inner = surfaces.numbers[s, APERTURE + 2]
+                outer = surfaces.numbers[s, APERTURE + 3]
+                for i in range(LANES):
+                    blocked = wp.where(status[i] == OK, VIGNETTED, status[i])
+                    status[i] = wp.where(
+                        a2[i] >= outer * outer, blocked, wp.where(a2[i] < inner * inner, blocked, status[i])
+                    )
+            if wp.static(special):
+                if surfaces.kinds[s, STOPPED] == 2:
+                    status = through_aperture(surfaces.apertures, s, x, y, status)
+
+            if interaction == MIRROR or interaction == REFRACT:
+                # The gradient of the implicit form G is normal to the surface, and its length does not matter.
+                b = z
+                bend = lanes(c)
+                if terms > 0:
+                    value, slope = polynomial(surfaces.coefficients, s, terms, wp.cw_mul(x, x) + wp.cw_mul(y, y))
+                    b = z - value
+                    bend = bend + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
+                nx = -wp.cw_mul(bend, x)
+                ny = -wp.cw_mul(bend, y)
+                if wp.static(special):
+                    if figured > 0:
+                        b = b - part
+                        if terms > 0:
+                            bend = lanes(c) + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
+                        nx = -wp.cw_mul(bend, x) - wp.cw_mul(part_x, lanes(ONE) - ((ONE + k) * c) * b)
+                        ny = -wp.cw_mul(bend, y) - wp.cw_mul(part_y, lanes(ONE) - ((ONE + k) * c) * b)
+                nz = lanes(ONE) - ((ONE + k) * c) * b
+                if interaction == MIRROR:
+                    u, v, w = reflected(u, v, w, nx, ny, nz)
+                else:
+                    u, v, w = refracted(before / after, u, v, w, nx, ny, nz)
+                    for i in range(LANES):
+                        total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
+                        status[i] = wp.where(wp.abs(u[i]) < FAR, status[i], total)
+            if wp.static(special):
+                if interaction == PHASE:
+                    path = path + part
+                    u, v, w = through_screen(before, part_x, part_y, u, v, w)
+                    for i in range(LANES):
+                        total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
+                        status[i] = wp.where(wp.abs(w[i]) < FAR, status[i], total)
+
+            if turned == 1:
+                x, y, z = to_telescope(surfaces, s, x, y, z)
+                u, v, w = to_telescope(surfaces, s, u, v, w)
+            x = x + lanes(surfaces.numbers[s, VERTEX])
+            y = y + lanes(surfaces.numbers[s, VERTEX + 1])
+            z = z + lanes(surfaces.numbers[s, VERTEX + 2])
+            if s >= skipped:
+                o = s - skipped
+                position_out[o, 0, packet] = x
+                position_out[o, 1, packet] = y
+                position_out[o, 2, packet] = z
+                direction_out[o, 0, packet] = u
+                direction_out[o, 1, packet] = v
+                direction_out[o, 2, packet] = w
+                path_out[o, packet] = path
+                status_out[o, packet] = statuses(status)
+        return x, y, z, u, v, w, path, status
+
+    return through_telescope
+
+
+#: The loop for plain telescopes, and that for any.
+LOOPS = (surface_loop(False), surface_loop(True))
+
+
+@kernel_pair
+def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that traces given rays."""
+    through_telescope = LOOPS[special]
+
+    @wp.kernel(module=module)
+    def trace_rays(
+        first: wp.int32,
+        surfaces: PackedSurfaces,
+        indices: wp.array2d(dtype=wp.float64),
+        position: wp.array2d(dtype=lanes),
+        direction: wp.array2d(dtype=lanes),
+        path_in: wp.array(dtype=lanes),
+        position_out: wp.array3d(dtype=lanes),
+        direction_out: wp.array3d(dtype=lanes),
+        path_out: wp.array2d(dtype=lanes),
+        status_out: wp.array2d(dtype=lane_flags),
+    ):
+        """Trace one packet of given rays through every surface; write the last surface, or all of them.
+
+        ``indices`` holds the refractive index before the first surface and after each. Outputs have a leading axis of
+        length 1 (the last surface) or ``n_surfaces``.
+        """
+        p = first + wp.tid()
+        through_telescope(
+            surfaces,
+            indices,
+            0,
+            position[0, p],
+            position[1, p],
+            position[2, p],
+            direction[0, p],
+            direction[1, p],
+            direction[2, p],
+            path_in[p],
+            p,
+            position_out,
+            direction_out,
+            path_out,
+            status_out,
+        )
+
+    return trace_rays

@@ -1,0 +1,1 @@
+"""A telescope as the arrays that the trace kernels read."""

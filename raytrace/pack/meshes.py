@@ -1,0 +1,42 @@
+"""The meshes among a telescope's surfaces as the trace kernels read them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...models.shapes.mesh import MeshSurface
+from ...models.surface import Surface
+from ..kernels.mesh import PackedMeshes
+
+
+def pack_meshes(surfaces: tuple[Surface, ...], device: str = "cpu") -> Any:
+    """Return the shapes that are meshes as a :class:`PackedMeshes` struct on a device."""
+    ids = np.zeros(len(surfaces), dtype=np.uint64)
+    first = np.zeros(len(surfaces), dtype=np.int32)
+    span = np.zeros((len(surfaces), 2))
+    facets = [np.zeros((0, 15))]
+    kept = []
+    for row, shape in enumerate(s.shape for s in surfaces):
+        if not isinstance(shape, MeshSurface):
+            continue
+        mesh = wp.Mesh(
+            points=wp.array(shape.vertices.astype(np.float32), dtype=wp.vec3, device=device),
+            indices=wp.array(shape.faces.ravel(), dtype=wp.int32, device=device),
+        )
+        kept.append(mesh)
+        ids[row], first[row] = mesh.id, sum(len(f) for f in facets)
+        heights = shape.corners[..., 2]
+        span[row] = heights.min(), heights.max()
+        n = len(shape.faces)
+        facets.append(np.concatenate([shape.corners.reshape(n, 9), shape.corner_slopes.reshape(n, 6)], axis=1))
+    packed = PackedMeshes()
+    packed.ids = wp.array(ids, dtype=wp.uint64, device=device)
+    # The kernels know meshes by number only: whoever holds the numbers has to keep the meshes.
+    packed.ids.kept = kept
+    packed.first_facet = wp.array(first, dtype=wp.int32, device=device)
+    packed.span = wp.array(span, dtype=wp.float64, device=device)
+    packed.facets = wp.array(np.concatenate(facets), dtype=wp.float64, device=device)
+    return packed

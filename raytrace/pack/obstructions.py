@@ -1,0 +1,55 @@
+"""The obstructions of a telescope as meshes that the trace kernels can ask."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...models.surface import Interaction
+from ...models.telescope import Telescope
+from ..kernels.obstruction import PackedObstructions
+
+
+def blocked_ways(telescope: Telescope) -> np.ndarray:
+    """Return on the way to which surfaces each obstruction blocks light, shape [n_surface, n_obstruction] bool.
+
+    Light on its way to a mirror, a lens surface or the detector crosses the baffle planes before it: the ways to these
+    go with the way to that. Ways inside a lens, where the medium is not that in front of the telescope, are left out
+    unless an obstruction names where they lead.
+    """
+    surfaces, obstructions = telescope.surfaces, telescope.obstructions
+    blocked = np.zeros((len(surfaces), len(obstructions)), dtype=bool)
+    goals = [s.name for s in surfaces]
+    for row in reversed(range(len(surfaces) - 1)):
+        if surfaces[row].interaction == Interaction.PASS:
+            goals[row] = goals[row + 1]
+    media = [telescope.medium_before, *(s.medium_after for s in surfaces)]
+    for column, obstruction in enumerate(obstructions):
+        for row in range(len(surfaces)):
+            if obstruction.before is None:
+                blocked[row, column] = media[row] == telescope.medium_before
+            else:
+                blocked[row, column] = goals[row] in obstruction.before
+    return blocked
+
+
+def pack_obstructions(telescope: Telescope, device: str = "cpu") -> Any:
+    """Return the telescope's obstructions as a :class:`PackedObstructions` struct on a device."""
+    meshes = []
+    for obstruction in telescope.obstructions:
+        corners = obstruction.triangles.reshape(-1, 3)
+        meshes.append(
+            wp.Mesh(
+                points=wp.array(corners, dtype=wp.vec3, device=device),
+                indices=wp.array(np.arange(len(corners), dtype=np.int32), dtype=wp.int32, device=device),
+            )
+        )
+    packed = PackedObstructions()
+    ids = wp.array(np.array([mesh.id for mesh in meshes], dtype=np.uint64), dtype=wp.uint64, device=device)
+    # The kernels know meshes by number only: whoever holds the numbers has to keep the meshes.
+    ids.kept = meshes
+    packed.meshes = ids
+    packed.blocks = wp.array(blocked_ways(telescope).astype(np.int32), dtype=wp.int32, device=device)
+    return packed

@@ -1,0 +1,146 @@
+"""The shapes of a telescope's surfaces as the trace kernels read them: a conic with even powers, and parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...core.errors import PrescriptionError
+from ...models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...models.shapes.grid import GridSag
+from ...models.shapes.mesh import MeshSurface
+from ...models.shapes.polar_polynomial import PolarPolynomial, from_even_powers
+from ...models.shapes.shape import Plane, Rotational, Shape, Sum
+from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, PackedFigures
+
+
+@dataclass(frozen=True)
+class SplitShape:
+    """A shape as its conic with even powers of the radius, and what is added to it.
+
+    Attributes
+    ----------
+    base : Rotational
+        Conic with even powers; a plane where the shape has none of its own.
+    parts : tuple of Shape
+        What is added; of an odd asphere only its powers, its conic stands apart.
+    first_curvature : float
+        Curvature [1/m] of the surface that the search for a ray's landing starts from: that of the base, or of the
+        sphere that a shape without a base resembles.
+    """
+
+    base: Rotational
+    parts: tuple[Shape, ...]
+    first_curvature: float
+
+
+def split_shape(shape: Shape, *, screen: bool = False) -> SplitShape:
+    """Return a shape as its base and parts; of a phase screen, which is a map, all of it becomes parts."""
+    if isinstance(shape, Rotational) and not screen:
+        return SplitShape(shape, (), shape.curvature)
+    if isinstance(shape, MeshSurface) and not screen:
+        return SplitShape(Plane(), (), 0.0)
+    parts = list(_flat(shape))
+    base: Rotational = Plane()
+    if not screen:
+        for i, part in enumerate(parts):
+            if isinstance(part, Rotational) and not isinstance(part, Plane):
+                base = part
+                del parts[i]
+                break
+    rest = tuple(p for p in parts if not isinstance(p, Plane))
+    first = shape.curvature if isinstance(base, Plane) and not screen else base.curvature
+    return SplitShape(base, rest, first)
+
+
+def _flat(shape: Shape) -> Sequence[Shape]:
+    """Return the terms of a sum, of sums within it too; an odd asphere comes after its own conic."""
+    if isinstance(shape, Sum):
+        return [one for part in shape.parts for one in _flat(part)]
+    return [shape.base, shape] if isinstance(shape, OddAsphere) else [shape]
+
+
+def pack_figures(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
+    """Return the parts of all surfaces as a :class:`PackedFigures` struct on a device.
+
+    Raises
+    ------
+    PrescriptionError
+        If a shape cannot be a part of a sum.
+    """
+    span = np.zeros((len(shapes), 2), dtype=np.int32)
+    rows: list[list[int]] = []
+    numbers: list[np.ndarray] = []
+    offset = 0
+    for row, shape in enumerate(shapes):
+        span[row, 0] = len(rows)
+        for kind, sizes, figures in _parts(shape.parts):
+            rows.append([kind, offset, *sizes])
+            numbers.append(figures)
+            offset += len(figures)
+        span[row, 1] = len(rows)
+    packed = PackedFigures()
+    table = np.array(rows, dtype=np.int32).reshape(-1, PART_COLUMNS)
+    packed.span = wp.array(span, dtype=wp.int32, device=device)
+    packed.parts = wp.array(table, dtype=wp.int32, device=device)
+    packed.numbers = wp.array(np.concatenate([np.zeros(0), *numbers]), dtype=wp.float64, device=device)
+    return packed
+
+
+def _parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarray]]:
+    """Return the kind, two whole numbers and the figures of each part; all polynomials make one part."""
+    found: list[tuple[int, tuple[int, int], np.ndarray]] = []
+    polynomial: PolarPolynomial | None = None
+
+    def add(one: PolarPolynomial) -> None:
+        nonlocal polynomial
+        polynomial = one if polynomial is None else polynomial + one
+
+    for shape in shapes:
+        if isinstance(shape, (XYPolynomial, ZernikeSag)):
+            add(shape.polynomial)
+        elif isinstance(shape, OddAsphere):
+            if shape.coefficients[0::2]:
+                odd = np.array(shape.coefficients[0::2])
+                found.append((int(ODD), (len(odd), 0), odd))
+            add(from_even_powers(shape.coefficients[1::2], first=2))
+        elif isinstance(shape, Rotational):
+            add(from_even_powers(shape.coefficients))
+            found.append(_conic(shape))
+        elif isinstance(shape, Biconic):
+            c = np.array([1.0 / shape.radius_x, 1.0 / shape.radius_y])
+            k = np.array([1.0 + shape.conic_x, 1.0 + shape.conic_y])
+            found.append((int(BICONIC), (0, 0), np.concatenate([c, k * c**2])))
+        elif isinstance(shape, Toroid):
+            cx, cy = 1.0 / shape.radius_x, 1.0 / shape.radius_y
+            found.append((int(TOROID), (0, 0), np.array([cx, cy, (1.0 + shape.conic_y) * cy**2])))
+        elif isinstance(shape, GridSag):
+            head = [shape.x[0], shape.y[0], *(1.0 / step for step in shape.step)]
+            figures = np.concatenate([head, shape.nodes.ravel()])
+            found.append((int(GRID), (len(shape.x), len(shape.y)), figures))
+        else:
+            raise PrescriptionError(f"shape {type(shape).__name__}: expected one that can be part of a sum or a map")
+    if polynomial is not None and np.any(polynomial.terms):
+        found.insert(0, _polar(polynomial))
+    return found
+
+
+def _conic(shape: Rotational) -> tuple[int, tuple[int, int], np.ndarray]:
+    c, p = shape.curvature, (1.0 + shape.conic) * shape.curvature**2
+    return int(BICONIC), (0, 0), np.array([c, c, p, p])
+
+
+def _polar(polynomial: PolarPolynomial) -> tuple[int, tuple[int, int], np.ndarray]:
+    degree, order = polynomial.degree, polynomial.order
+    figures: list[float] = []
+    terms = np.zeros((degree + 1, degree // 2 + 1), dtype=np.complex128)
+    m_max, k_max = (min(a, b) for a, b in zip(terms.shape, polynomial.terms.shape, strict=True))
+    terms[:m_max, :k_max] = polynomial.terms[:m_max, :k_max]
+    for m in range(order, -1, -1):
+        for k in range((degree - m) // 2, -1, -1):
+            figures += [terms[m, k].real, terms[m, k].imag]
+    return int(POLAR), (degree, order), np.array(figures)

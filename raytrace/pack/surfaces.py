@@ -1,0 +1,86 @@
+"""A telescope as the arrays that the trace kernels read, made once per telescope."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...core.launch import start_warp
+from ...models.aperture import Annulus, Aperture, Circle, Complement
+from ...models.shapes.mesh import MeshSurface
+from ...models.surface import Interaction
+from ...models.telescope import Telescope
+from ..kernels.surface import FAR
+from ..kernels.trace import FIGURED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
+from .apertures import pack_apertures
+from .meshes import pack_meshes
+from .obstructions import blocked_ways, pack_obstructions
+from .shapes import pack_figures, split_shape
+
+
+def clear_ring(aperture: Aperture | None) -> tuple[float, float, float, float] | None:
+    """Return centre x, y, inner and outer radius [m] of a clear region; None where it is neither a disc nor a ring."""
+    if aperture is None:
+        return (0.0, 0.0, 0.0, np.inf)
+    if isinstance(aperture, Circle):
+        return (aperture.x, aperture.y, 0.0, aperture.radius)
+    if isinstance(aperture, Annulus):
+        return (aperture.x, aperture.y, aperture.inner, aperture.outer)
+    if isinstance(aperture, Complement) and isinstance(aperture.part, Circle):
+        # A disc in the way leaves a ring without end.
+        return (aperture.part.x, aperture.part.y, aperture.part.radius, float(FAR))
+    return None
+
+
+@lru_cache(maxsize=64)
+def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
+    """Return the telescope's surfaces as a :class:`PackedSurfaces` struct on a device."""
+    start_warp()
+    surfaces = telescope.surfaces
+    numbers = np.empty((len(surfaces), NUMBERS))
+    kinds = np.empty((len(surfaces), KINDS), dtype=np.int32)
+    shapes = [split_shape(s.shape, screen=s.interaction == Interaction.PHASE) for s in surfaces]
+    coefficients = np.zeros((len(surfaces), max([1, *(len(shape.base.coefficients) for shape in shapes)])))
+    blocked = blocked_ways(telescope)
+    general: list[Aperture | None] = []
+    for row, s in enumerate(surfaces):
+        base, terms = shapes[row].base, shapes[row].base.coefficients
+        turned = not np.array_equal(s.matrix, np.eye(3))
+        coefficients[row, : len(terms)] = terms
+        ring = clear_ring(s.aperture)
+        general.append(s.aperture if ring is None else None)
+        stopped = 2 if ring is None else int(s.aperture is not None)
+        frame = (*s.vertex, *s.matrix.ravel())
+        numbers[row] = [base.curvature, base.conic, *frame, *(ring or (0.0,) * 4), shapes[row].first_curvature]
+        kinds[row] = [
+            int(s.interaction),
+            len(terms),
+            turned,
+            stopped,
+            bool(blocked[row].any()),
+            2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
+        ]
+    packed = PackedSurfaces()
+    unusual = kinds[:, FIGURED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
+    packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
+    packed.numbers = wp.array(numbers, dtype=wp.float64, device=device)
+    packed.kinds = wp.array(kinds, dtype=wp.int32, device=device)
+    packed.coefficients = wp.array(coefficients, dtype=wp.float64, device=device)
+    packed.figures = pack_figures(shapes, device)
+    packed.meshes = pack_meshes(surfaces, device)
+    packed.apertures = pack_apertures(general, device)
+    packed.obstructions = pack_obstructions(telescope, device)
+    return packed
+
+
+def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
+    """Return the index before the first surface and after each at one wavelength, shape [n_surface + 1].
+
+    The last but one is therefore that of the medium in which the light meets the detector.
+    """
+    telescope.check_wavelength(wavelength)
+    media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
+    return np.array([medium.index(wavelength) for medium in media], dtype=np.float64)

@@ -1,0 +1,1 @@
+"""Causes of PSF ellipticity, one switched off at a time."""

@@ -1,0 +1,90 @@
+"""Figure of an attribution: what is left of ellipticity, residual and correlation without each cause."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+
+from ...core.plotting import new_figure, png_bytes, styled
+from ...pipeline.measure.correlation import Correlation
+from ...pipeline.report.focal_plane_axes import AWAY, RESIDUAL, TRUTH
+
+_FULL = "full"
+
+
+def attribution_figure(
+    figures: Mapping[str, Mapping[str, float]], correlations: Mapping[str, Mapping[str, Correlation]]
+) -> bytes:
+    """Draw rms ellipticity and residuals as bars, a row for each case, and xi+ of truth and of the residual.
+
+    Parameters
+    ----------
+    figures : mapping of str to mapping
+        Of each case, as in :class:`~pachon.studies.attribution.attribution.Attribution`; ``full`` comes first.
+    correlations : mapping of str to mapping of str to Correlation
+        Of each case.
+    """
+    cases = list(figures)
+    colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {_FULL: "black"}
+    with styled():
+        figure = new_figure(12.5, 3.4 + 0.42 * len(cases) + 3.4)
+        panels = figure.subplots(2, 2, height_ratios=[1.2 + 0.42 * len(cases), 4.6])
+        for axes, keys in zip(
+            panels[0],
+            (
+                (("rms_e_truth", TRUTH, "truth"),),
+                (
+                    ("rms_residual_at_stars", RESIDUAL, "observed - model, at the stars"),
+                    ("rms_residual_away", AWAY, "truth - model, where no star is"),
+                ),
+            ),
+            strict=True,
+        ):
+            _draw_bars(axes, figures, keys)
+        panels[0, 0].set_title("rms of one component of e: truth", loc="left")
+        panels[0, 1].set_title("rms of one component of the residual", loc="left")
+        for axes, kind, title in (
+            (panels[1, 0], "truth", "$|\\xi_+|$ of the truth"),
+            (panels[1, 1], "away", "$|\\xi_+|$ of truth - model, where no star is"),
+        ):
+            for case, each in correlations.items():
+                _draw_curve(axes, each[kind], colors[case], case)
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_xlabel("separation [arcmin]")
+            axes.set_title(f"{title}; open: negative", loc="left")
+            axes.grid(True, which="major", color="0.9", linewidth=0.6)
+            axes.set_axisbelow(True)
+        handles, labels = panels[1, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(cases)))
+        return png_bytes(figure)
+
+
+def _title(case: str) -> str:
+    return "everything on" if case == _FULL else f"{case.replace('_', ' ')} off"
+
+
+def _draw_bars(axes: Axes, figures: Mapping[str, Mapping[str, float]], keys: tuple[tuple[str, str, str], ...]) -> None:
+    rows = np.arange(len(figures))
+    height = 0.7 / len(keys)
+    for i, (key, color, label) in enumerate(keys):
+        values = [each[key] for each in figures.values()]
+        axes.barh(rows + (i - 0.5 * (len(keys) - 1)) * height, values, 0.9 * height, color=color, label=label)
+        axes.axvline(figures[_FULL][key], color=color, linewidth=0.8, linestyle=(0, (3, 2)))
+    axes.set_yticks(rows, [_title(case) for case in figures])
+    axes.invert_yaxis()
+    axes.set_xlim(0.0)
+    if len(keys) > 1:
+        axes.legend(loc="lower right", frameon=True, framealpha=0.9, edgecolor="none")
+
+
+def _draw_curve(axes: Axes, correlation: Correlation, color: object, case: str) -> None:
+    r, xi = correlation.r_arcmin, correlation.xi_plus
+    some = np.isfinite(xi) & (xi != 0.0)
+    width = 1.8 if case == _FULL else 0.9
+    axes.plot(r[some], np.abs(xi[some]), "-", color=color, linewidth=width, label=_title(case))
+    for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
+        axes.plot(r[chosen], np.abs(xi[chosen]), "o", color=color, markersize=3.5, markerfacecolor=face)

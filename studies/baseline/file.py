@@ -1,0 +1,147 @@
+"""The file of a baseline: figures of a telescope, each with unit and tolerance, and what they were computed from.
+
+One figure stands on one line, in the order of the names, with two digits beyond its tolerance: what a change of the
+design does is read off the difference of two versions of the file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ...core.errors import ConfigError
+from ...core.files import write_bytes
+from ...pipeline.config import Positive, Real, first_problem
+
+FORMAT = "pachon baseline"
+#: Version of the format; it is counted up when an older pachon could not read the file, or would read it wrongly.
+VERSION = 1
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class BaselineFigure(_Section):
+    """One figure that is to stay as it is."""
+
+    value: Real = Field(description="the figure")
+    unit: str = Field(description="its unit; empty for a pure number")
+    tolerance: Positive = Field(description="how far it may lie from the value, in the same unit")
+    reason: str = Field(description="why so far: a key of reasons")
+    checked_against: str | None = Field(None, description="independent source that has the same figure, and how near")
+
+
+class BaselinePlan(_Section):
+    """Where the figures are taken."""
+
+    fields_deg: Annotated[tuple[tuple[Real, Real], ...], Field(min_length=1)] = Field(
+        description="field angles (zemax projection) [deg]"
+    )
+    wavelengths_nm: Annotated[tuple[Positive, ...], Field(min_length=1)] = Field(
+        description="wavelengths [nm]; what takes one alone takes the middle one"
+    )
+    pupil: tuple[tuple[Real, Real], ...] = Field(description="points of the entrance pupil, in units of its radius")
+    ccds: tuple[str, ...] = Field((), description="CCDs at whose centres the PSF is taken; the first is modelled")
+
+
+class Baseline(_Section):
+    """Figures of a telescope, and what they were computed from."""
+
+    format: Literal["pachon baseline"] = Field("pachon baseline", description="what the file is")
+    version: int = Field(VERSION, description="version of the format")
+    pachon: str = Field(description="version of pachon that the figures come from")
+    model: str = Field(description="bundled telescope, or path of its file from the folder of this one")
+    model_sha256: str = Field(description="SHA-256 of the prescription as pachon writes it")
+    configuration: str | None = Field(None, description="path of the run configuration from the folder of this file")
+    configuration_sha256: str | None = Field(None, description="SHA-256 of the configuration with all defaults")
+    plan: BaselinePlan
+    reasons: dict[str, str] = Field(description="what decides the tolerances")
+    figures: Annotated[dict[str, BaselineFigure], Field(min_length=1)] = Field(description="the figures by name")
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read a baseline.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is no JSON or no baseline, or is of another version of the format: one line.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_mapping)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path}: no JSON (line {error.lineno}, column {error.colno}: {error.msg})") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: no JSON ({error})") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else type(content).__name__
+        raise ConfigError(f"{path}: format = {found!r}: expected {FORMAT!r}, as pachon baseline save writes it")
+    if content.get("version") != VERSION:
+        raise ConfigError(
+            f"{path}: version = {content.get('version')!r}: expected {VERSION}; "
+            f"the file was written by pachon {content.get('pachon')}"
+        )
+    try:
+        baseline = Baseline.model_validate(content)
+    except ValidationError as error:
+        raise first_problem(error, str(path), Baseline) from None
+    for name, figure in baseline.figures.items():
+        if figure.reason not in baseline.reasons:
+            known = ", ".join(baseline.reasons)
+            raise ConfigError(f"{path}: figures.{name}.reason = {figure.reason!r}: expected one of {known}")
+    return baseline
+
+
+def write_baseline(path: Path, baseline: Baseline) -> None:
+    """Write a baseline, whole or not at all.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be written.
+    """
+    write_bytes(path, baseline_text(baseline).encode())
+
+
+def baseline_text(baseline: Baseline) -> str:
+    """Return the file's text."""
+    content = baseline.model_dump(mode="json", exclude={"figures"})
+    lines = [f" {_json(key)}: {_block(value)}," for key, value in content.items() if value is not None]
+    figures = [
+        f"  {_json(name)}: {_json(baseline.figures[name].model_dump(mode='json', exclude_none=True))}"
+        for name in sorted(baseline.figures)
+    ]
+    return "\n".join(["{", *lines, ' "figures": {', ",\n".join(figures), " }", "}"]) + "\n"
+
+
+def rounded(value: float, tolerance: float) -> float:
+    """Return a value with two digits beyond its tolerance, and zero without a minus sign."""
+    return round(value, 2 - math.floor(math.log10(tolerance))) + 0.0
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _block(value: Any) -> str:
+    """Return JSON of one line, of a mapping one line for each key."""
+    if not isinstance(value, dict):
+        return _json(value)
+    return "{\n" + ",\n".join(f"  {_json(k)}: {_json(v)}" for k, v in value.items()) + "\n }"
+
+
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice!r} occurs twice")
+    return dict(pairs)

@@ -1,0 +1,164 @@
+"""What the study of PSF models tries: each way of modelling a CCD's stars, and which of them answer which question."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+from ...core.errors import ConfigError
+from ...pipeline.config import Configuration
+from ...pipeline.psf_model.basis import BASES
+from ...pipeline.psf_model.fit import COMPONENTS
+from ...pipeline.psf_model.polynomial import term_count
+
+#: Weights of the stars in the polynomials, as :func:`~.snr_weights` names them (equal ones are
+#: the paper's), and a Gaussian process for each component in their place.
+INTERPOLATIONS = ("equal", "snr", "softened", "gp")
+#: Signal-to-noise ratio, or stars without noise.
+NOISE_FREE = math.inf
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way of modelling the PSF of a CCD.
+
+    Attributes
+    ----------
+    stars : int
+        Stars of a CCD.
+    snr : float
+        Signal-to-noise ratio of the faintest star; :data:`NOISE_FREE` for stars without noise.
+    basis : str
+        One of :data:`~pachon.pipeline.psf_model.basis.BASES`.
+    interpolation : str
+        One of :data:`INTERPOLATIONS`.
+    order : int
+        Of the polynomials; 0 under a Gaussian process.
+    components : int
+        Of the basis; 0 for pixels, which are all used.
+    """
+
+    stars: int
+    snr: float = 30.0
+    basis: str = "pca"
+    interpolation: str = "equal"
+    order: int = 3
+    components: int = 20
+
+    @property
+    def terms(self) -> int:
+        """Terms of a polynomial."""
+        return term_count(self.order)
+
+    def settled(self) -> Case:
+        """Return the case as it is fitted: what has no meaning in it is set to one value."""
+        components = self.components
+        if self.basis == "pca":
+            components = min(components, self.stars - 1)
+        elif self.basis == "pixels":
+            components = 0
+        order = 0 if self.interpolation == "gp" else self.order
+        interpolation = self.interpolation
+        if self.snr == NOISE_FREE and interpolation != "gp":
+            interpolation = "equal"
+        return replace(self, components=components, order=order, interpolation=interpolation)
+
+    def __str__(self) -> str:
+        how = "Gaussian process" if self.interpolation == "gp" else f"order {self.order}, {self.interpolation} weights"
+        what = self.basis if self.basis == "pixels" else f"{self.components} components of {self.basis}"
+        return f"{what}, {how}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the study varies.
+
+    Attributes
+    ----------
+    base : Case
+        What is held where something else varies.
+    stars, orders, components, snrs : tuple
+        Values to try, rising, that of the base included.
+    draws : int
+        Draws of the noise to average over.
+    """
+
+    base: Case
+    stars: tuple[int, ...]
+    orders: tuple[int, ...]
+    components: tuple[int, ...]
+    snrs: tuple[float, ...]
+    draws: int = 4
+
+    def cases(self) -> tuple[Case, ...]:
+        """Return the cases that answer the questions of the study, each once.
+
+        Everything at once would be thousands. Each question has its axis through the base, and where the answers may
+        depend on each other (stars and order; order and components at the number of stars at hand) it has a plane.
+        """
+        base = self.base
+        polynomials = INTERPOLATIONS[:-1]
+        found: list[Case] = []
+
+        def sweep(**axes: Sequence[object]) -> None:
+            for values in product(*axes.values()):
+                found.append(replace(base, **dict(zip(axes, values, strict=True))).settled())  # type: ignore[arg-type]
+
+        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials, order=self.orders)
+        sweep(order=self.orders, components=self.components, interpolation=polynomials)
+        sweep(stars=self.stars, components=self.components, interpolation=polynomials)
+        sweep(snr=(NOISE_FREE,), order=self.orders, components=self.components)
+        sweep(snr=self.snrs, order=self.orders, interpolation=polynomials)
+        sweep(basis=BASES, stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials)
+        sweep(basis=BASES, order=self.orders, interpolation=polynomials)
+        sweep(basis=BASES, components=self.components, interpolation=polynomials)
+        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=("gp",))
+        sweep(components=self.components, interpolation=("gp",))
+        sweep(snr=self.snrs, interpolation=("gp",))
+        return tuple(dict.fromkeys(found))
+
+
+def make_plan(
+    config: Configuration,
+    *,
+    stars: Iterable[int] = (10, 20, 40, 80, 160),
+    orders: Iterable[int] = (1, 2, 3, 4, 5, 6),
+    components: Iterable[int] = (5, 10, 20, 40),
+    snrs: Iterable[float] = (30.0, 100.0, 300.0),
+    draws: int = 4,
+) -> Plan:
+    """Return a plan about what a configuration does: its observed stars, S/N and reconstruction are the base.
+
+    Raises
+    ------
+    ConfigError
+        If a number is out of range.
+    """
+    fit = config.reconstruction
+    base = Case(
+        config.stars.observed,
+        config.stars.snr_min,
+        fit.basis,
+        "gp" if fit.interpolation == "gp" else fit.weights,
+        fit.order or 0,
+        fit.components or 0,
+    )
+
+    def values(name: str, given: Iterable[float], own: float, least: float) -> tuple[float, ...]:
+        for value in (*given, own):
+            if not (math.isfinite(value) and value >= least):
+                raise ConfigError(f"{name} = {value:g}: expected finite numbers from {least:g}")
+        return tuple(sorted({*given, own}))
+
+    if draws < 1:
+        raise ConfigError(f"draws = {draws}: expected at least 1")
+    return Plan(
+        base.settled(),
+        tuple(int(n) for n in values("stars", tuple(stars), base.stars, 2)),
+        tuple(int(n) for n in values("orders", tuple(orders), base.order, 0)),
+        tuple(int(n) for n in values("components", tuple(components), base.components or COMPONENTS, 1)),
+        values("snr", tuple(snrs), base.snr, 1.0),
+        draws,
+    )

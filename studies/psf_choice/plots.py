@@ -1,0 +1,221 @@
+"""Figures of the study of PSF models: a panel for each question, error bars over the CCDs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+
+from ...core.plotting import new_figure, png_bytes, styled
+from ...pipeline.psf_model.basis import BASES
+from ...pipeline.report.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
+from .plan import INTERPOLATIONS, NOISE_FREE, Case
+from .study import Study
+
+_HOW = {
+    "equal": (OBSERVED, "o", "equal weights"),
+    "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
+    "softened": (AWAY, "D", "softened weights"),
+    "gp": ("#2a8a57", "^", "Gaussian process"),
+}
+_BASIS = {"pca": (OBSERVED, "o"), "pixels": (AWAY, "s"), "shapelets": (LEFT_OUT, "D")}
+_RMS = "rms of one component of e, no star"
+# Fits with as many terms as stars go through the roof: what lies this many times above the base is cut off.
+_ROOF = 4.0
+_QUIET = (0, (1, 1.5))
+
+
+def stars_figure(result: Study) -> bytes:
+    """Draw the residual of e where no star is against the number of stars, a line for each order.
+
+    A panel for each weighting; dashed: what noise alone should leave of such a fit; dotted: stars without noise.
+    """
+    plan = result.plan
+    colors = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.88, len(plan.orders)))
+    with styled():
+        figure = new_figure(13.0, 4.8)
+        panels = figure.subplots(1, 3, sharex=True, sharey=True)
+        for axes, how in zip(panels, INTERPOLATIONS[:-1], strict=True):
+            for order, color in zip(plan.orders, colors, strict=True):
+                cases = [(n, replace(plan.base, stars=n, order=order, interpolation=how)) for n in plan.stars]
+                _line(axes, result, cases, "rms_e_away", color, "o", f"order {order}")
+                _line(axes, result, cases, "noise_law_away", color, "", None, (0, (4, 2)))
+                if how == "equal":
+                    quiet = [(n, replace(c, snr=NOISE_FREE)) for n, c in cases]
+                    _line(axes, result, quiet, "rms_e_away", color, "", None, _QUIET)
+            _log(axes, plan.stars, "stars of a CCD", _HOW[how][2])
+        panels[0].set_ylabel(_RMS)
+        _roof(panels[0], result)
+        panels[0].plot([], [], color="0.4", linestyle=(0, (4, 2)), linewidth=0.9, label="noise alone, in theory")
+        panels[0].plot([], [], color="0.4", linestyle=_QUIET, linewidth=0.9, label="stars without noise")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
+        figure.suptitle(f"How many stars, which order (faintest star S/N {plan.base.snr:g})", x=0.01, ha="left")
+        return png_bytes(figure)
+
+
+def choices_figure(result: Study) -> bytes:
+    """Draw what is gained by other choices: order, components, basis, interpolation, S/N, and what CCDs share."""
+    plan, base = result.plan, result.plan.base
+    with styled():
+        figure = new_figure(17.0, 9.0)
+        panels = figure.subplots(2, 4)
+        _flattery(panels[0, 0], result)
+        _components(panels[0, 1], result)
+        _bases(panels[0, 2], result)
+        _snrs(panels[0, 3], result)
+        for axes, key, what in (
+            (panels[1, 0], "rms_e_away", _RMS),
+            (panels[1, 1], "rms_size_away", "rms of the relative size, no star"),
+        ):
+            for how, (color, marker, label) in _HOW.items():
+                best = [(n, c) for n in plan.stars if (c := result.best_order(n, how))]
+                _line(axes, result, best, key, color, marker, f"{label}, best order" if how != "gp" else label)
+            paper = [(n, replace(base, stars=n)) for n in plan.stars]
+            _line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
+            _log(axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e"))
+            axes.set_ylabel(what)
+        _roof(panels[1, 0], result)
+        _shared(panels[1, 2], result, "mean_e", "rms over CCDs of their mean of e", "what a CCD has in common")
+        _shared(panels[1, 3], result, "xi_plus", "$|\\xi_+|$, 10' to 3 deg; open: negative", "correlation between CCDs")
+        for axes in panels.flat:
+            # On a logarithmic scale: room for the legend above the curves.
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high * (high / low) ** 0.45)
+            axes.legend(loc="upper right", fontsize=7)
+        return png_bytes(figure)
+
+
+def _flattery(axes: Axes, result: Study) -> None:
+    """Draw the residual at the stars and where no star is against the order."""
+    plan, base = result.plan, result.plan.base
+    cases = [(order, replace(base, order=order)) for order in plan.orders]
+    for kind, color, marker, what, where in (
+        ("at_stars", RESIDUAL, "D", "observed", "at the stars"),
+        ("away", AWAY, "^", "truth", "no star"),
+    ):
+        _line(axes, result, cases, f"rms_e_{kind}", color, marker, f"{what} - model, {where}")
+        _line(axes, result, cases, f"noise_law_{kind}", color, "", f"noise alone, {where}, in theory", (0, (4, 2)))
+    quiet = [(order, replace(c, snr=NOISE_FREE)) for order, c in cases]
+    _line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
+    _log_values(axes)
+    axes.set_xlabel("order of the polynomials")
+    axes.set_ylabel("rms of one component of e")
+    axes.set_title(f"order: {base.stars} stars, {_HOW[base.interpolation][2]}", loc="left")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+
+
+def _components(axes: Axes, result: Study) -> None:
+    plan, base = result.plan, result.plan.base
+    for how, (color, marker, label) in _HOW.items():
+        orders = dict.fromkeys((base.order,) if how == "gp" else (base.order, _best_order(result, how)))
+        for order, line in zip(orders, ("-", (0, (4, 2))), strict=False):
+            cases = [(k, replace(base, components=k, order=order, interpolation=how)) for k in plan.components]
+            words = label if how == "gp" else f"{label}, order {order}"
+            _line(axes, result, cases, "rms_e_away", color, marker, words, line)
+    quiet = [(k, replace(base, components=k, snr=NOISE_FREE)) for k in plan.components]
+    _line(axes, result, quiet, "rms_e_away", TRUTH, "", f"order {base.order}, stars without noise", _QUIET)
+    _log(axes, plan.components, "components", f"components: {base.stars} stars")
+    axes.set_ylabel(_RMS)
+
+
+def _bases(axes: Axes, result: Study) -> None:
+    plan, base = result.plan, result.plan.base
+    for basis in BASES:
+        color, marker = _BASIS[basis]
+        cases = [(n, replace(base, basis=basis, stars=n)) for n in plan.stars]
+        _line(axes, result, cases, "rms_e_away", color, marker, basis)
+        quiet = [(n, replace(c, snr=NOISE_FREE)) for n, c in cases]
+        _line(axes, result, quiet, "rms_e_away", color, "", f"{basis}, stars without noise", _QUIET)
+    _log(axes, plan.stars, "stars of a CCD", f"basis: {_HOW[base.interpolation][2]}, order {base.order}")
+    axes.set_ylabel(_RMS)
+    _roof(axes, result)
+
+
+def _snrs(axes: Axes, result: Study) -> None:
+    plan, base = result.plan, result.plan.base
+    for how, (color, marker, label) in _HOW.items():
+        orders = dict.fromkeys((base.order,) if how == "gp" else (base.order, _best_order(result, how)))
+        for order, line in zip(orders, ("-", (0, (4, 2))), strict=False):
+            cases = [(snr, replace(base, snr=snr, order=order, interpolation=how)) for snr in plan.snrs]
+            words = label if how == "gp" else f"{label}, order {order}"
+            _line(axes, result, cases, "rms_e_away", color, marker, words, line)
+    _log(axes, plan.snrs, "S/N of the faintest star", f"S/N: {base.stars} stars")
+    axes.set_ylabel(_RMS)
+
+
+def _shared(axes: Axes, result: Study, key: str, label: str, title: str) -> None:
+    """Draw what all places of a CCD, or several CCDs, have in common, at the stars and where no star is."""
+    plan, base = result.plan, result.plan.base
+    other = result.best_order(base.stars, "softened")
+    ways: dict[str, tuple[Case, Any]] = {f"order {base.order}, {_HOW[base.interpolation][2]}": (base, "-")}
+    if other is not None:
+        ways[f"order {other.order}, softened weights"] = (other, (0, (4, 2)))
+    for name, (way, line) in ways.items():
+        cases = [(n, replace(way, stars=n)) for n in plan.stars]
+        for kind, color, marker, where in (("at_stars", RESIDUAL, "D", "at the stars"), ("away", AWAY, "^", "no star")):
+            ending = "_long" if key == "xi_plus" else ""
+            _line(axes, result, cases, f"{key}_{kind}{ending}", color, marker, f"{where}: {name}", line)
+    _log(axes, plan.stars, "stars of a CCD", title)
+    axes.set_ylabel(label)
+
+
+def _best_order(result: Study, how: str) -> int:
+    best = result.best_order(result.plan.base.stars, how)
+    return result.plan.base.order if best is None else best.order
+
+
+def _line(
+    axes: Axes,
+    result: Study,
+    cases: Iterable[tuple[float, Case]],
+    key: str,
+    color: Any,
+    marker: str,
+    label: str | None,
+    linestyle: Any = "-",
+) -> None:
+    """Draw a figure of cases against something, those that could be fitted; negative values open."""
+    rows = [(x, found) for x, case in cases if (found := result.figures.get(case.settled())) is not None]
+    points = np.array([(x, found[key], found.get(f"error_{key}", np.nan)) for x, found in rows]).reshape(-1, 3)
+    # A perfect fit leaves rounding alone, which has no place on the scale.
+    x, value, error = points[np.isfinite(points[:, 1]) & (np.abs(points[:, 1]) > 1e-12)].T
+    size = np.abs(value)
+    axes.plot(x, size, color=color, linestyle=linestyle, linewidth=1.0, marker="", zorder=2)
+    if marker:
+        # On a logarithmic scale an error bar cannot go through zero: it ends at a tenth of the value instead.
+        bars = [np.minimum(error, 0.9 * size), error]
+        some = np.isfinite(error)
+        axes.errorbar(x[some], size[some], [b[some] for b in bars], fmt="none", ecolor=color, elinewidth=0.8, alpha=0.7)
+    for chosen, face in ((value > 0.0, color), (value < 0.0, "white")):
+        axes.plot(
+            x[chosen], size[chosen], linestyle="", marker=marker, color=color, markersize=4.0, markerfacecolor=face
+        )
+    axes.plot([], [], color=color, linestyle=linestyle, linewidth=1.0, marker=marker, markersize=4.0, label=label)
+
+
+def _log(axes: Axes, ticks: Sequence[float], label: str, title: str) -> None:
+    axes.set_xscale("log")
+    _log_values(axes)
+    axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    axes.set_xticks([], minor=True)
+    axes.set_xlabel(label)
+    axes.set_title(title, loc="left")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def _log_values(axes: Axes) -> None:
+    axes.set_yscale("log")
+    if not np.isfinite(axes.dataLim.minposy):
+        axes.set_ylim(1e-4, 1e-1)  # nothing to draw, of which no limits can be made
+
+
+def _roof(axes: Axes, result: Study) -> None:
+    base = result.figures.get(result.plan.base)
+    low, high = axes.get_ylim()
+    if base is not None:
+        axes.set_ylim(low, min(high, _ROOF * base["rms_e_away"]))

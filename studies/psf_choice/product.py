@@ -1,0 +1,100 @@
+"""What a study of PSF models leaves in its folder: table, figures, pictures, configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.files import write_bytes, write_ecsv, write_json
+from ...pipeline.config import Configuration, to_yaml
+from ...pipeline.experiment import prepare
+from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN
+from ...pipeline.run_folder import CONFIG_NAME, stamp_of
+from .plan import INTERPOLATIONS
+from .plots import choices_figure, stars_figure
+from .study import Study, study_configuration
+
+
+def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str, ...]:
+    """Write table, figures, pictures and configuration, and return the names of the files.
+
+    Parameters
+    ----------
+    result : Study
+        What to write.
+    folder : Path
+        Where; it exists.
+    config : Configuration
+        Resolved configuration that the study is about.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be written.
+    """
+    stamp = stamp_of(prepare(study_configuration(config, result.plan)))
+    meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed, "draws": result.plan.draws}
+    write_ecsv(folder / "study.ecsv", study_columns(result), {"what": "PSF models against the truth", **meta})
+    write_bytes(folder / "study_stars.png", stars_figure(result))
+    write_bytes(folder / "study_choices.png", choices_figure(result))
+    write_json(folder / "study.json", {**study_summary(result), **meta})
+    heading = (f"pachon {version('pachon')}: the configuration that the study is about.",)
+    write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
+    return "study.ecsv", "study_stars.png", "study_choices.png", "study.json", CONFIG_NAME
+
+
+def study_summary(result: Study) -> dict[str, Any]:
+    """Return what a study came to: its base, what it recommends, the best order of each number of stars."""
+    plan, chosen = result.plan, result.recommended()
+    orders = {
+        how: {str(n): best.order for n in plan.stars if (best := result.best_order(n, how))}
+        for how in INTERPOLATIONS[:-1]
+    }
+    return {
+        "base": {**vars(plan.base), "figures": result.figures.get(plan.base)},
+        "recommended": None if chosen is None else {**vars(chosen), "figures": result.figures[chosen]},
+        "best_order": orders,
+        "fitted": len(result.figures),
+        "not_fitted": {f"{case.stars} stars, S/N {case.snr:g}, {case}": why for case, why in result.problems.items()},
+    }
+
+
+def study_columns(result: Study) -> dict[str, tuple[np.ndarray, str, str]]:
+    """Return a table with a row for each case, those that could not be fitted included, as ECSV columns."""
+    cases = [*result.figures, *result.problems]
+    about = {
+        "stars": "stars of a CCD",
+        "snr": "S/N of the faintest star; infinite without noise",
+        "basis": "description of the stars",
+        "interpolation": "how positions enter",
+        "order": "of the polynomials",
+        "components": "of the basis; 0: all pixels",
+    }
+    columns = {key: (np.array([getattr(c, key) for c in cases]), "", what) for key, what in about.items()}
+    for key in next(iter(result.figures.values()), {}):
+        values: list[Mapping[str, float]] = [result.figures.get(case, {}) for case in cases]
+        columns[key] = (np.array([v.get(key, np.nan) for v in values]), "", _meaning(key))
+    problems = np.array([result.problems.get(case, "") for case in cases])
+    columns["problem"] = (problems, "", "why it could not be fitted")
+    return columns
+
+
+def _meaning(key: str) -> str:
+    if key.startswith("error_"):
+        return "standard error over the CCDs: " + _meaning(key.removeprefix("error_"))
+    where = "observed - model, at the stars" if "at_stars" in key else "truth - model, where no star is"
+    what = {
+        "rms_e": "rms of one component of e",
+        "rms_size": "rms of the relative size",
+        "mean_e": "rms over CCDs of their mean of one component of e",
+        "noise_law": "rms of one component of e that noise alone should leave",
+        "lost": "places whose model has no shape",
+    }
+    if key.startswith("xi_plus"):
+        span = f"below {LONG_RANGE:g}" if key.endswith("short") else f"{LONG_RANGE:g} to {LONGEST_ARCMIN:g}"
+        return f"xi+ {span} arcmin, {where}"
+    return next(f"{words}, {where}" for start, words in what.items() if key.startswith(start))

@@ -1,0 +1,1 @@
+"""The figures of Jee & Tyson (2011)."""

@@ -1,0 +1,231 @@
+"""Figures of Jee & Tyson (2011) that show the pipeline's run: eigen-PSFs, whiskers, scatter and correlations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...core.files import image_hdu, table_hdu
+from ...pipeline.ccd_product import CcdProduct
+from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN, mean_xi_plus
+from ...pipeline.report.focal_plane_plots import whiskers_figure
+from ...pipeline.report.psf_plots import eigen_figure, spectrum_figure
+from ...pipeline.report.report import closest_middle_farthest
+from ...pipeline.report.statistics_plots import correlation_figure, scatter_figure
+from ...pipeline.report.tables import percent
+from .optics import optics_ellipticity
+from .parts import Bench, Columns, EcsvData, FitsData, Reproduced
+
+#: With fewer PSFs than this the part of the variance in 20 components says little.
+_ENOUGH = 200
+#: Stars at which PSFs with and without the atmosphere are compared, on every CCD and in all.
+_COMPARED, _MOST_COMPARED = 3, 189
+
+
+def eigen_psfs(bench: Bench) -> Reproduced:
+    """Show mean, eigen-PSFs and eigenvalues (Fig. 9)."""
+    products = bench.pipeline.products
+    product = closest_middle_farthest(products)[0]
+    model = product.truth_model
+    explained = np.array([p.truth_model.explained for p in products])
+    kinks = np.array([p.model.kink for p in products])
+    worst = float(explained.min())
+    n = np.arange(1, len(model.eigenvalues) + 1)
+    values = {
+        "N": (n, "", "rank"),
+        "EIGENVAL": (model.eigenvalues, "", "variance of unit-sum stamps along it"),
+        "FRACTION": (model.eigenvalues / model.eigenvalues.sum(), "", "part of the variance"),
+    }
+    few = "too few PSFs, of which 20 components hold nearly all whatever they are: "
+    source = (
+        f"{model.n_stars} PSFs of one CCD, optics and heights included; the paper draws the components of 4000 PSFs of"
+        " the atmosphere alone, over all CCDs"
+    )
+    hdus = [
+        image_hdu("MEAN", model.mean, "mean PSF of unit sum"),
+        image_hdu("EIGENPSF", model.components, "eigen-PSFs, orthonormal, by falling eigenvalue"),
+        table_hdu("EIGENVAL", values),
+    ]
+    return Reproduced(
+        {"": eigen_figure(product, truth=True), "_eigenvalues": spectrum_figure(products)},
+        {"": FitsData(hdus, [("CCD", product.name, ""), ("NPSF", model.n_stars, "noise-free PSFs")])},
+        "the first eigen-PSFs resemble shapelets, later ones are finer; about 20 suffice, over 99 % of the variance",
+        f"{model.n_components} components hold {percent(worst)} of the variance of the noise-free PSFs on the worst of"
+        f" {len(products)} CCDs, {percent(float(np.median(explained)))} on the median one; observed stars: kink at"
+        f" {np.median(kinks):.0f}",
+        ("agrees" if worst > 0.99 else "differs") if model.n_stars >= _ENOUGH else "cannot be compared",
+        (few if model.n_stars < _ENOUGH else "") + source,
+        {
+            "ccd": product.name,
+            "components": model.n_components,
+            "explained_worst": worst,
+            "explained_median": float(np.median(explained)),
+            "kink_observed_median": float(np.median(kinks)),
+        },
+    )
+
+
+def whiskers_of_stars(bench: Bench) -> Reproduced:
+    """Show whiskers of the PSFs with the atmosphere (Fig. 11)."""
+    made = bench.pipeline
+    e = np.concatenate([np.hypot(p.truth.e1, p.truth.e2) for p in made.products])
+    mean, largest = float(np.nanmean(e)), float(np.nanmax(e))
+    alike, ratio = _against_optics(bench)
+    png = whiskers_figure(made.products, made.experiment.focal_plane, bench.field_radius, ("truth",))
+    return Reproduced(
+        {"": png},
+        {"": EcsvData(_star_columns(made.products, "truth"), {"what": "noise-free PSFs"})},
+        "the pattern of the optics alone (Fig. 8), smaller: the atmosphere makes PSFs rounder; heights still show",
+        f"mean |e| {100 * mean:.2f} %, at most {100 * largest:.1f} %, on {len(made.products)} CCDs; at the same places"
+        f" {100 * ratio:.0f} % of that without an atmosphere (mean taken off), with a correlation of {alike:.2f}",
+        "agrees" if alike > 0.5 and ratio < 0.5 else "differs",
+        "the paper gives no number; what the air adds to all stars alike is taken off before the patterns are compared",
+        {
+            "mean_e": mean,
+            "largest_e": largest,
+            "ccds": len(made.products),
+            "correlation_with_optics_alone": alike,
+            "rms_over_that_of_optics_alone": ratio,
+        },
+    )
+
+
+def _against_optics(bench: Bench) -> tuple[float, float]:
+    """Return how the pattern goes with that of the optics alone: its correlation with it, and its rms over that."""
+    products = bench.pipeline.products
+    each = min(_COMPARED, max(1, _MOST_COMPARED // len(products)))
+    stars = [p.truth for p in products]
+    x, y, e1, e2 = (np.concatenate([getattr(s, key)[:each] for s in stars]) for key in ("x", "y", "e1", "e2"))
+    alone = optics_ellipticity(bench, np.stack([x, y], axis=1))
+    both = e1 + 1j * e2
+    good = np.isfinite(alone) & np.isfinite(both)
+    alone, both = alone[good] - alone[good].mean(), both[good] - both[good].mean()
+    norm = np.sqrt(np.sum(np.abs(alone) ** 2) * np.sum(np.abs(both) ** 2))
+    ratio = np.sqrt(np.sum(np.abs(both) ** 2) / np.sum(np.abs(alone) ** 2))
+    return float(np.sum(alone * np.conj(both)).real / norm), float(ratio)
+
+
+def whiskers_of_residual(bench: Bench) -> Reproduced:
+    """Show whiskers of the residual, at the stars and away from them (Fig. 12)."""
+    made = bench.pipeline
+    figures = made.summary["all"]
+    png = whiskers_figure(made.products, made.experiment.focal_plane, bench.field_radius, ("residual", "away"))
+    at, away = figures["rms_residual_at_stars"], figures["rms_residual_away"]
+    observed = _rms(made.products, "observed", ("e1", "e2"))
+    return Reproduced(
+        {"": png},
+        {
+            "": EcsvData(_star_columns(made.products, "residual"), {"what": "observed - model, at the stars"}),
+            "_away": EcsvData(_star_columns(made.products, "away"), {"what": "truth - model, where no star is"}),
+        },
+        "residuals at the stars are small and without visible pattern",
+        f"rms of a component: observed {100 * observed:.2f} %, residual at the stars {100 * at:.2f} %, away from them"
+        f" {100 * away:.2f} %",
+        "agrees" if at < 0.6 * observed else "differs",
+        "residuals at the stars hold the noise of each star, of S/N from 30, which sets their size here; the paper,"
+        " which gives no number, does not look away from the stars",
+        {"rms_observed": observed, "rms_residual_at_stars": at, "rms_residual_away": away},
+    )
+
+
+def scatter(bench: Bench) -> Reproduced:
+    """Show the scatter of the ellipticity before and after the correction (Fig. 13)."""
+    products = bench.pipeline.products
+    before = _rms(products, "observed", ("e1", "e2"))
+    after = _rms(products, "observed", ("residual_e1", "residual_e2"))
+    # Noise adds to the variance of the PSFs themselves, which the noise-free ones show.
+    noise = float(np.sqrt(max(before**2 - _rms(products, "truth", ("e1", "e2")) ** 2, 0.0)))
+    stars = [p.observed for p in products]
+    left = [np.concatenate([getattr(s, k) for s in stars]) for k in ("residual_e1", "residual_e2")]
+    mean = [float(np.nanmean(v)) for v in left]
+    error = after / np.sqrt(np.isfinite(left[0]).sum())
+    columns = _star_columns(products, "observed")
+    for key in ("residual_e1", "residual_e2"):
+        columns[key] = (np.concatenate([getattr(s, key) for s in stars]), "", "observed - model")
+    centred = max(abs(m) for m in mean) < 3.0 * error
+    return Reproduced(
+        {"": scatter_figure(products)},
+        {"": EcsvData(columns, {"what": "observed stars"})},
+        "residuals are much more compact than the observed ellipticities, and centred on the origin",
+        f"rms of a component {100 * before:.2f} % before, {100 * after:.2f} % after; mean residual"
+        f" ({1e4 * mean[0]:+.1f}, {1e4 * mean[1]:+.1f})e-4, its error {1e4 * error:.1f}e-4",
+        "agrees" if after < 0.6 * before and centred else "differs",
+        f"{before / after:.1f} times as compact: the noise of the stars, of S/N from 30, is {100 * noise:.2f} % by the"
+        " difference to the noise-free PSFs, and no model of the PSF takes it away",
+        {
+            "rms_before": before,
+            "rms_after": after,
+            "rms_noise": noise,
+            "mean_residual": mean,
+            "error_of_mean": float(error),
+        },
+    )
+
+
+def correlation(bench: Bench) -> Reproduced:
+    """Show the correlation of the ellipticity: raw, residual at the stars, and away from them (Fig. 14)."""
+    made = bench.pipeline
+    correlated = made.correlated
+    columns: Columns = {"separation_arcmin": (correlated["observed"].r_arcmin, "arcmin", "of the observed stars")}
+    for kind, c in correlated.items():
+        columns[f"r_{kind}_arcmin"] = (c.r_arcmin, "arcmin", "mean separation of the pairs")
+        columns[f"xi_plus_{kind}"] = (c.xi_plus, "", "xi+")
+        columns[f"xi_minus_{kind}"] = (c.xi_minus, "", "xi-")
+        columns[f"error_{kind}"] = (c.error_plus, "", "error of xi+ by jackknife over the CCDs")
+        columns[f"pairs_{kind}"] = (c.n_pairs, "", "pairs")
+    raw = mean_xi_plus(correlated["observed"], LONG_RANGE, LONGEST_ARCMIN)
+    at, away = (mean_xi_plus(correlated[k], LONG_RANGE, LONGEST_ARCMIN) for k in ("residual", "away"))
+    near = mean_xi_plus(correlated["away"], 0.0, LONG_RANGE)
+    every = len(made.products) == len(bench.camera)
+    c = correlated["residual"]
+    inside = (c.r_arcmin >= LONG_RANGE) & (c.r_arcmin <= LONGEST_ARCMIN) & (c.n_pairs > 0)
+    worst = np.argmax(np.abs(c.xi_plus[inside]))
+    largest, error = float(np.abs(c.xi_plus[inside][worst])), float(c.error_plus[inside][worst])
+    reached = abs(at) < 1e-7 and 1e-5 < raw < 9e-5
+    return Reproduced(
+        {"": correlation_figure(correlated)},
+        {"": EcsvData(columns, {"what": "correlation of the ellipticity, TreeCorr", "ccds": len(made.products)})},
+        "xi+ about 3e-5 before, about 1e-8 after the correction, at the stars; below 1e-7 from 10' to 3°",
+        f"from 10' to 3°: {raw:.1e} before; {at:+.0e} after, at the stars (one bin at most {largest:.0e}, its error"
+        f" {error:.0e}); {away:+.0e} away from the stars, {near:.0e} there within 10'",
+        ("agrees" if reached else "differs") if every else "cannot be compared",
+        (
+            "in the mean over pairs at the stars, where residuals of each CCD sum to zero by construction; where there"
+            " is no star, which is where galaxies are, the residual is larger"
+            if every
+            else f"{len(made.products)} of {len(bench.camera)} CCDs have too few pairs to tell 1e-8 from nothing;"
+            " residuals of each CCD sum to zero at its stars by construction, and are larger away from them"
+        ),
+        {
+            "xi_plus_observed_10_to_180_arcmin": raw,
+            "xi_plus_residual_10_to_180_arcmin": at,
+            "xi_plus_away_10_to_180_arcmin": away,
+            "xi_plus_away_below_10_arcmin": near,
+            "largest_residual_bin": largest,
+            "error_of_a_bin": error,
+        },
+    )
+
+
+def _rms(products: Sequence[CcdProduct], kind: str, keys: tuple[str, str]) -> float:
+    values = np.concatenate([getattr(getattr(p, kind), key) for p in products for key in keys])
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _star_columns(products: Sequence[CcdProduct], kind: str) -> Columns:
+    """Return places and ellipticities of one kind: truth, observed, residual or away."""
+    stars = [p.stars(kind) for p in products]
+    places = ("x", "y", "field_x", "field_y")
+    x, y, field_x, field_y = (np.concatenate([getattr(s, key) for s in stars]) for key in places)
+    e1, e2 = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
+    names = np.repeat([p.name for p in products], [len(s) for s in stars])
+    return {
+        "ccd": (names, "", "name of the CCD"),
+        "x_mm": (x * 1e3, "mm", "detector x"),
+        "y_mm": (y * 1e3, "mm", "detector y"),
+        "field_x_deg": (np.rad2deg(field_x), "deg", "field angle x"),
+        "field_y_deg": (np.rad2deg(field_y), "deg", "field angle y"),
+        "e1": (e1, "", "ellipticity (a-b)/(a+b) along x"),
+        "e2": (e2, "", "ellipticity along x = y"),
+    }

@@ -1,0 +1,137 @@
+"""The points of a sweep: one at a time, on a grid, at random, or from a table."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from scipy.stats import norm, qmc
+
+from ...core.errors import ConfigError
+from ...core.random_streams import stream
+from .file import Design, SweepFile, SweptParameter
+
+#: Values of the parameters at one point, by name.
+Point = dict[str, Any]
+# A normal distribution on a grid is covered to so many standard deviations on either side.
+_SIGMAS = 2.0
+
+
+def design_points(sweep: SweepFile) -> list[Point]:
+    """Return the points of a sweep in the order that they are numbered.
+
+    One at a time, the first point has every parameter at its nominal value, and the others differ from it in one; a
+    parameter's marks are among its values, and for every name of a mark there is one more point with all parameters
+    that have it there, which shows how single effects add. A random design covers the unit cube and maps it through
+    each parameter's distribution: evenly over a range or a list, by quantiles of a normal distribution. Latin hypercube
+    and Sobol points are SciPy's (``scipy.stats.qmc``), scrambled with the design's seed.
+
+    Raises
+    ------
+    ConfigError
+        If a table of points cannot be read or does not fit the parameters.
+    """
+    design = sweep.design
+    if design.kind == "table":
+        return _from_table(Path(design.file or ""))
+    names = list(sweep.parameters)
+    if design.kind == "one_at_a_time":
+        return _one_at_a_time(sweep)
+    if design.kind == "grid":
+        levels = [_levels(p, design) for p in sweep.parameters.values()]
+        return [dict(zip(names, values, strict=True)) for values in itertools.product(*levels)]
+    cube = _cube(design, len(names))
+    columns = [_quantiles(p, u) for p, u in zip(sweep.parameters.values(), cube.T, strict=True)]
+    return [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
+
+
+def point_count(sweep: SweepFile) -> int:
+    """Return how many points a sweep has, without making them: a grid can be larger than memory."""
+    design = sweep.design
+    if design.kind == "grid":
+        count = 1
+        for parameter in sweep.parameters.values():
+            count *= len(parameter.values) if parameter.values is not None else parameter.points or design.points
+        return count
+    if design.kind in ("one_at_a_time", "table"):
+        return len(design_points(sweep))
+    return design.points
+
+
+def _one_at_a_time(sweep: SweepFile) -> list[Point]:
+    parameters = sweep.parameters
+    nominal = {name: p.nominal for name, p in parameters.items()}
+    points = [nominal]
+    for name, parameter in parameters.items():
+        levels = _levels(parameter, sweep.design)
+        extra = [v for v in parameter.marks.values() if v not in levels]
+        values = [*levels, *dict.fromkeys(extra)]
+        if extra:
+            values.sort()
+        points += [{**nominal, name: value} for value in values if value != parameter.nominal]
+    for mark in dict.fromkeys(mark for p in parameters.values() for mark in p.marks):
+        marked = {name: p.marks[mark] for name, p in parameters.items() if mark in p.marks}
+        if len(marked) > 1:
+            points.append({**nominal, **marked})
+    return points
+
+
+def _levels(parameter: SweptParameter, design: Design) -> list[Any]:
+    """Return the values of one parameter on a grid or one at a time."""
+    count = parameter.points or design.points
+    if parameter.values is not None:
+        return list(parameter.values)
+    if parameter.range is not None:
+        return [float(v) for v in np.linspace(*parameter.range, count)] if count > 1 else [parameter.range[1]]
+    mean, sigma = parameter.normal or (0.0, 0.0)
+    return [float(v) for v in mean + sigma * np.linspace(-_SIGMAS, _SIGMAS, count)]
+
+
+def _cube(design: Design, dimensions: int) -> np.ndarray:
+    """Return points of the open unit cube, [points, dimensions]."""
+    rng = stream(design.seed, "sweep", design.kind)
+    if design.kind == "monte_carlo":
+        # A row a point: more points leave the first ones as they are.
+        cube = rng.random((design.points, dimensions))
+    elif design.kind == "latin_hypercube":
+        cube = qmc.LatinHypercube(dimensions, rng=rng).random(design.points)
+    else:
+        # Sobol sets are balanced in powers of two, of which this takes the first points.
+        power = int(np.ceil(np.log2(max(design.points, 1))))
+        cube = qmc.Sobol(dimensions, rng=rng).random_base2(power)[: design.points]
+    return np.clip(cube, 1e-12, 1.0 - 1e-12)
+
+
+def _quantiles(parameter: SweptParameter, u: np.ndarray) -> list[Any]:
+    """Return the values of one parameter at places of the unit interval."""
+    if parameter.values is not None:
+        return [parameter.values[int(v * len(parameter.values))] for v in u]
+    if parameter.range is not None:
+        low, high = parameter.range
+        return [float(v) for v in low + (high - low) * u]
+    mean, sigma = parameter.normal or (0.0, 0.0)
+    return [float(v) for v in mean + sigma * norm.ppf(u)]
+
+
+def _from_table(path: Path) -> list[Point]:
+    """Return the rows of an ECSV table as points."""
+    try:
+        table = Table.read(path, format="ascii.ecsv")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; expected an ECSV table of points") from None
+    except Exception as error:
+        # astropy's readers raise many kinds of errors at what is no table.
+        raise ConfigError(f"{path}: no ECSV table ({' '.join(str(error).split())[:120]})") from None
+    if not len(table):
+        raise ConfigError(f"{path}: no rows; expected at least one point")
+    points = []
+    for number, row in enumerate(table):
+        point = {name: row[name].item() if hasattr(row[name], "item") else row[name] for name in table.colnames}
+        for name, value in point.items():
+            if np.ma.is_masked(row[name]) or (isinstance(value, float) and not np.isfinite(value)):
+                raise ConfigError(f"{path}: row {number}, {name} = {row[name]}: expected a value")
+        points.append(point)
+    return points

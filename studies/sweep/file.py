@@ -1,0 +1,162 @@
+"""What a sweep is made of: one YAML file with a configuration to start from, parameters, a design and metrics.
+
+::
+
+    name: raft_heights
+    base: {psf: {engine: long_exposure}, stars: {observed: 20}}    # a configuration, or the path of its file
+    parameters:
+      focal_plane.raft_um: {nominal: 0, range: [0, 13], marks: {specification: 4.8, simulated: 6.5}}
+      M2.dz_um: {nominal: 0, normal: [0, 20]}
+      band: {nominal: r, values: [g, r, i]}
+    design: {kind: one_at_a_time, points: 9}
+    metrics: [fwhm, rms_e, xi_raw]
+    compensators: [Camera.dz_um]
+
+A parameter is a key of the configuration, a raft or CCD with a motion (``R22.dz_um``, ``R22_S11.rx_urad``), or a value
+of the prescription (``M2.dz_um``, ``M1.Z5_nm``): see :mod:`pachon.studies.sweep.point`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, ValidationError
+
+from ...core.errors import ConfigError, PrescriptionError
+from ...core.yaml_reader import read_yaml
+from ...pipeline.config import Real, Section, digest, first_problem, plain_number
+
+#: Folder of the sweeps that come along.
+EXAMPLES = Path(__file__).parent / "examples"
+
+
+Value = Annotated[float | str | bool | int, BeforeValidator(plain_number)]
+
+
+class SweptParameter(Section):
+    """The values that one parameter takes: a list, a range, or a normal distribution."""
+
+    nominal: Value | None = Field(None, description="value where the parameter is not varied")
+    values: tuple[Value, ...] | None = Field(None, description="the values themselves")
+    range: tuple[Real, Real] | None = Field(None, description="lowest and highest value, evenly likely between")
+    normal: tuple[Real, Real] | None = Field(None, description="mean and standard deviation")
+    points: Annotated[int, Field(strict=True, ge=2)] | None = Field(
+        None, description="points along the range in a grid or one at a time; the design's own by default"
+    )
+    marks: dict[str, Real] = Field(default_factory=dict, description="named values that the report points out")
+
+
+class Design(Section):
+    """Which combinations of values are computed."""
+
+    kind: Literal["one_at_a_time", "grid", "monte_carlo", "latin_hypercube", "sobol", "table"] = Field(
+        "one_at_a_time", description="how points are chosen"
+    )
+    points: Annotated[int, Field(strict=True, ge=1)] = Field(
+        5, description="points of a random design, or along each range of a grid or one at a time"
+    )
+    seed: Annotated[int, Field(strict=True, ge=0)] = Field(1, description="seed of a random design")
+    file: str | None = Field(None, description="ECSV table of the points, a column a parameter, for kind table")
+    replicas: Annotated[int, Field(strict=True, ge=1)] = Field(
+        1, description="times each point is computed, each time with another seed of heights, turbulence and stars"
+    )
+
+
+class SweepFile(Section):
+    """All that decides what a sweep computes."""
+
+    name: str = Field("sweep", description="what the report calls it")
+    base: dict[str, Any] | str = Field(default_factory=dict, description="configuration to start from, or its file")
+    parameters: dict[str, SweptParameter] = Field(default_factory=dict, description="what is varied")
+    design: Design = Design()
+    metrics: tuple[str, ...] = Field(("fwhm", "rms_e", "xi_raw"), description="what is measured at each point")
+    compensators: tuple[str, ...] = Field((), description="motions solved for the sharpest image before measuring")
+    xi_target: Annotated[Real, Field(gt=0)] | None = Field(
+        None, description="xi+ that the report shares out between the causes"
+    )
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that decides the figures of the sweep, the contents of the files that it names included."""
+        named: list[Any] = [self.design.file]
+        if isinstance(self.base, dict):
+            air = self.base.get("atmosphere")
+            named += [self.base.get("telescope"), air.get("site") if isinstance(air, dict) else None]
+        files = [path for path in named if isinstance(path, str) and Path(path).is_file()]
+        contents = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files}
+        return digest({"sweep": self.model_dump(mode="json"), "files": contents})
+
+
+def load_sweep(path: Path) -> SweepFile:
+    """Read a sweep file; the configuration that it names is read into it.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is not YAML, or a key or value is not as expected: one line.
+    """
+    content = _content(path)
+    if isinstance(content.get("base"), str):
+        content["base"] = _content(path.parent / content["base"])
+    folder = path.parent
+    content["design"] = _with_path(content.get("design", {}), "file", folder)
+    base = _with_path(content.get("base", {}), "telescope", folder)
+    if isinstance(base, dict) and "atmosphere" in base:
+        base = {**base, "atmosphere": _with_path(base["atmosphere"], "site", folder)}
+    content["base"] = base
+    return read_sweep(content, str(path))
+
+
+def _with_path(section: Any, key: str, folder: Path) -> Any:
+    """Return a section in which a key that names a file, as seen from a folder, has its absolute path."""
+    if isinstance(section, dict) and isinstance(section.get(key), str) and (folder / section[key]).is_file():
+        return {**section, key: str((folder / section[key]).resolve())}
+    return section
+
+
+def read_sweep(content: dict[str, Any], source: str) -> SweepFile:
+    """Return the sweep that plain mappings describe; `source` names them in error messages."""
+    try:
+        sweep = SweepFile.model_validate(content)
+    except ValidationError as error:
+        raise first_problem(error, source, SweepFile) from None
+    _check(sweep, source)
+    return sweep
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        top = read_yaml(path)
+    except PrescriptionError as error:
+        raise ConfigError(str(error)) from None
+    return {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
+
+
+def _check(sweep: SweepFile, source: str) -> None:
+    """Check what several values must be together."""
+    table = sweep.design.kind == "table"
+    if table and sweep.design.file is None:
+        raise ConfigError(f"{source}: design.file is missing: kind table expects the path of an ECSV table of points")
+    if not table and sweep.design.file is not None:
+        raise ConfigError(f"{source}: design.file = {sweep.design.file}: expected with kind table only")
+    if not table and not sweep.parameters:
+        raise ConfigError(f"{source}: parameters = {{}}: expected at least one parameter to vary")
+    for name, parameter in sweep.parameters.items():
+        place = f"{source}: parameters.{name}"
+        given = [key for key in ("values", "range", "normal") if getattr(parameter, key) is not None]
+        if len(given) != 1 and not table:
+            found = " and ".join(given) or "none of them"
+            raise ConfigError(f"{place} has {found}: expected one of values, range, normal")
+        if parameter.values is not None and not parameter.values:
+            raise ConfigError(f"{place}.values = []: expected at least one value")
+        if parameter.range is not None and not parameter.range[0] < parameter.range[1]:
+            low, high = parameter.range
+            raise ConfigError(f"{place}.range = [{low:g}, {high:g}]: expected the lower value first, then a higher one")
+        if parameter.normal is not None and not parameter.normal[1] > 0:
+            raise ConfigError(f"{place}.normal = {list(parameter.normal)}: expected a standard deviation above 0")
+        if parameter.nominal is None and sweep.design.kind == "one_at_a_time":
+            raise ConfigError(
+                f"{place}.nominal is missing: one at a time needs the value that others are varied around"
+            )

@@ -1,0 +1,166 @@
+"""The report of a sweep: one HTML file with its pictures, and its figures as JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import ProductError
+from ...core.files import make_folder, write_bytes, write_json
+from ...pipeline.report.page import Picture, render
+from . import plots as figures_sweep
+from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary
+from .file import SweepFile
+from .store import SweepStore
+from .table import SweepTable, read_table
+
+# Figures with pictures of their own; all are in the tornado chart and in the table.
+_SHOWN = 4
+# Points of a random design from which slices have a meaning.
+_ENOUGH = 24
+
+
+def write_report(store: SweepStore, folder: Path) -> Path:
+    """Write ``report.html``, ``summary.json`` and the pictures of a sweep into a folder, and return the report's path.
+
+    Raises
+    ------
+    ProductError
+        If nothing has been computed yet, or the folder cannot be written.
+    """
+    table, sweep = read_table(store), store.sweep
+    if not len(table) or not table.metrics:
+        raise ProductError(f"{store.path}: no point has been computed yet")
+    make_folder(folder)
+    figures = summary(table, sweep)
+    pictures = sweep_pictures(table, sweep)
+    for name, picture in pictures:
+        write_bytes(folder / f"{name}.png", picture.png)
+    write_json(folder / "summary.json", {**figures, "pachon": store.about["pachon"], "digest": store.about["digest"]})
+    page = render(
+        "sweep.html",
+        sweep=sweep,
+        summary=figures,
+        pictures=[picture for _, picture in pictures],
+        pachon=store.about["pachon"],
+        points=len(store.points()),
+        rows=_rows(table),
+        problems=[(int(n), p) for n, p in zip(table.number, table.problem, strict=True) if p][:20],
+    )
+    report = folder / "report.html"
+    write_bytes(report, page.encode())
+    return report
+
+
+def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Picture]]:
+    """Return the pictures that the design of a sweep allows, with the names of their files."""
+    # Correlations go first: they are what a sweep is for.
+    drawn = {m: curves(table, sweep, m) for m in sorted(table.metrics, key=lambda m: (not m.startswith("xi"), m))}
+    drawn = {metric: each for metric, each in drawn.items() if each}
+    pictures: list[tuple[str, Picture]] = []
+    if drawn:
+        pictures += _one_at_a_time(table, sweep, drawn)
+    numeric = [n for n, v in table.parameters.items() if v.dtype.kind in "fi" and len(np.unique(v)) > 2]
+    random = sweep.design.kind in ("monte_carlo", "latin_hypercube", "sobol", "table", "grid")
+    if random and len(table) >= _ENOUGH and numeric:
+        pictures += _random(table, numeric)
+    return pictures
+
+
+def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Curve]]) -> list[tuple[str, Picture]]:
+    pictures = [
+        (
+            "tornado",
+            Picture(
+                "What matters most",
+                figures_sweep.tornado_figure(drawn),
+                "How far each figure moves from its nominal value over the range of each parameter, others nominal: "
+                "blue below the nominal value of the parameter, red above. Upright strokes are the named values.",
+            ),
+        )
+    ]
+    for metric in list(drawn)[:_SHOWN]:
+        shows = f"{metric} against each parameter, the others nominal; the band is the spread over the replicas."
+        picture = Picture(f"{metric}, one at a time", figures_sweep.curves_figure(drawn[metric]), shows)
+        pictures.append((f"curves_{metric}", picture))
+    marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
+    for metric in (m for m in drawn if m.startswith("xi")):
+        found = [b for mark in marks if (b := budget(table, sweep, metric, mark)) is not None]
+        if found:
+            picture = Picture(f"Error budget of {metric}", figures_sweep.budget_figure(found), _budget_words(found))
+            pictures.append((f"budget_{metric}", picture))
+    if sweep.xi_target is not None:
+        for metric in (m for m in drawn if m.startswith("xi")):
+            allowed = allowances(drawn[metric], sweep.xi_target)
+            words = "; ".join(
+                f"{a.parameter}: {a.alone:.3g} alone, {a.shared:.3g} with an equal share"
+                for a in allowed
+                if np.isfinite(a.alone)
+            )
+            picture = Picture(
+                f"What each term may be for {metric} below {sweep.xi_target:g}",
+                figures_sweep.allowance_figure(drawn[metric], allowed, sweep.xi_target),
+                words or "No term reaches the target within twice its range.",
+            )
+            pictures.append((f"allowance_{metric}", picture))
+    return pictures
+
+
+def _budget_words(found: list[Budget]) -> str:
+    """Say how the effects add, and where they do not."""
+    words = []
+    for one in found:
+        if np.isfinite(one.together) and one.total:
+            apart = abs(one.together - one.total)
+            # Within two standard errors, or a tenth where there is but one replica to judge by, they are the same.
+            same = apart < (2.0 * one.together_error if np.isfinite(one.together_error) else 0.1 * abs(one.total))
+            error = f" +- {one.together_error:.2g}" if np.isfinite(one.together_error) else ""
+            words.append(
+                f"{one.mark}: single effects sum to {one.total:.3g}, all at once make {one.together:.3g}{error}: "
+                + ("they add, as far as this tells." if same else "they do not simply add.")
+            )
+    return "Independent errors add in their squares, which xi is made of. " + " ".join(words)
+
+
+def _random(table: SweepTable, numeric: list[str]) -> list[tuple[str, Picture]]:
+    ranks = {metric: rank_correlations(table, metric) for metric in table.metrics}
+    ranks = {metric: each for metric, each in ranks.items() if each}
+    if not ranks:
+        return []
+    pictures = [
+        (
+            "ranks",
+            Picture(
+                "What matters most",
+                figures_sweep.correlations_figure(ranks),
+                "Spearman's rank correlation of each figure with each parameter, all of them varied at once.",
+            ),
+        )
+    ]
+    for metric in list(ranks)[:_SHOWN]:
+        names = sorted(ranks[metric], key=lambda n: -abs(ranks[metric][n][0]))
+        shows = f"{metric} of every point; the line joins the medians of eight slices, the band their quartiles."
+        pictures.append(
+            (f"scatter_{metric}", Picture(metric, figures_sweep.scatter_figure(table, metric, names), shows))
+        )
+        if len(names) > 1:
+            shows = f"{metric} over pairs of the parameters that it depends on most."
+            picture = Picture(f"{metric} over pairs", figures_sweep.pairs_figure(table, metric, names), shows)
+            pictures.append((f"pairs_{metric}", picture))
+    return pictures
+
+
+def _rows(table: SweepTable) -> list[dict[str, Any]]:
+    """Return range and median of each figure."""
+    return [
+        {
+            "name": name,
+            "low": float(np.nanmin(values)),
+            "median": float(np.nanmedian(values)),
+            "high": float(np.nanmax(values)),
+        }
+        for name, values in table.metrics.items()
+        if np.isfinite(values).any()
+    ]

@@ -1,0 +1,259 @@
+"""The file of a sweep: SQLite in WAL mode, a row a point, each written once and whole.
+
+Figures are kept as JSON with as many digits as a double has, apart from how long they took and on which worker: two
+stores of one sweep hold the same figures, byte for byte, whoever computed them and however often it was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import ConfigError, ProductError
+from ...pipeline.config import differences
+from .file import SweepFile, read_sweep
+
+#: Of the tables; a store of another format is refused.
+FORMAT = 1
+_TABLES = """
+CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE points (number INTEGER PRIMARY KEY, parameters TEXT NOT NULL, seed INTEGER NOT NULL);
+CREATE TABLE results (
+    number INTEGER PRIMARY KEY REFERENCES points (number),
+    metrics TEXT,
+    problem TEXT,
+    seconds REAL NOT NULL,
+    worker TEXT NOT NULL,
+    pachon TEXT NOT NULL
+);
+"""
+
+
+@dataclass(frozen=True)
+class SweepPoint:
+    """A point to compute: its number, the values of its parameters, and the seed of its random numbers."""
+
+    number: int
+    parameters: dict[str, Any]
+    seed: int
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """What one point came to.
+
+    Attributes
+    ----------
+    number : int
+        Number of the point.
+    metrics : dict of str to float, or None
+        Figures by name; None where the point could not be computed.
+    problem : str or None
+        One line that says why.
+    seconds : float
+        How long it took.
+    worker : str
+        Who computed it.
+    """
+
+    number: int
+    metrics: dict[str, float] | None
+    problem: str | None
+    seconds: float
+    worker: str
+
+
+class SweepStore:
+    """A sweep's file, open.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it must exist. See :func:`create_store`.
+
+    Raises
+    ------
+    ProductError
+        If it is no sweep store, of another format, or damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise ProductError(f"{path}: no such file; expected the store of a sweep, such as pachon sweep makes")
+        self.path = path
+        with self._guarded():
+            self._connection = sqlite3.connect(path, timeout=30.0)
+            about = dict(self._connection.execute("SELECT key, value FROM about"))
+        if about.get("format") != str(FORMAT):
+            raise ProductError(f"{path}: store of format {about.get('format')}: expected {FORMAT}")
+        self.about = about
+
+    def __enter__(self) -> SweepStore:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; what the write-ahead log holds goes into it."""
+        with self._guarded():
+            self._connection.close()
+
+    @property
+    def sweep(self) -> SweepFile:
+        """The sweep that the store was made for."""
+        return read_sweep(json.loads(self.about["sweep"]), str(self.path))
+
+    def points(self) -> list[SweepPoint]:
+        """Return all points in order."""
+        with self._guarded():
+            rows = self._connection.execute("SELECT number, parameters, seed FROM points ORDER BY number").fetchall()
+        return [SweepPoint(number, json.loads(parameters), seed) for number, parameters, seed in rows]
+
+    def results(self) -> list[PointResult]:
+        """Return what has been computed, in the order of the points."""
+        with self._guarded():
+            rows = self._connection.execute(
+                "SELECT number, metrics, problem, seconds, worker FROM results ORDER BY number"
+            ).fetchall()
+        return [_result(*row) for row in rows]
+
+    def finished(self) -> set[int]:
+        """Return the numbers of the points that have been computed."""
+        with self._guarded():
+            return {number for (number,) in self._connection.execute("SELECT number FROM results")}
+
+    def forget_problems(self) -> int:
+        """Drop the points that could not be computed, to compute them again; return how many there were."""
+        with self._guarded(), self._connection:
+            return self._connection.execute("DELETE FROM results WHERE problem IS NOT NULL").rowcount
+
+    def write(self, result: PointResult) -> None:
+        """Write one point, whole; one that is there already stays as it is.
+
+        Raises
+        ------
+        ProductError
+            If it cannot be written; what is there already stays.
+        """
+        row = (
+            result.number,
+            None if result.metrics is None else exact_json(result.metrics),
+            result.problem,
+            result.seconds,
+            result.worker,
+            version("pachon"),
+        )
+        with self._guarded(), self._connection:
+            self._connection.execute("INSERT OR IGNORE INTO results VALUES (?, ?, ?, ?, ?, ?)", row)
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise _problem(self.path, error) from None
+
+
+def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
+    """Make the file of a sweep with all its points and no results; under another name first, so never half of it.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.unlink(missing_ok=True)
+        connection = sqlite3.connect(partial)
+        try:
+            connection.executescript(_TABLES)
+            about = {
+                "format": str(FORMAT),
+                "pachon": version("pachon"),
+                # The order of the parameters is that of the file, as people wrote it.
+                "sweep": json.dumps(sweep.model_dump(mode="json"), ensure_ascii=False, allow_nan=False),
+                "digest": sweep.digest,
+                **extra,
+            }
+            with connection:
+                connection.executemany("INSERT INTO about VALUES (?, ?)", about.items())
+                rows = ((p.number, exact_json(p.parameters), p.seed) for p in points)
+                connection.executemany("INSERT INTO points VALUES (?, ?, ?)", rows)
+            # Readers do not wait for the writer, and a point costs one write.
+            connection.execute("PRAGMA journal_mode = WAL")
+        finally:
+            connection.close()
+        for leftover in _beside(path):
+            leftover.unlink(missing_ok=True)
+        partial.replace(path)
+    except sqlite3.Error as error:
+        raise _problem(path, error) from None
+    except OSError as error:
+        raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
+    finally:
+        with suppress(OSError):
+            for leftover in (partial, *_beside(partial)):
+                leftover.unlink(missing_ok=True)
+
+
+def check_same_sweep(store: SweepStore, sweep: SweepFile) -> None:
+    """Refuse to go on with another sweep than the store was made for.
+
+    Raises
+    ------
+    ConfigError
+        If they differ: one line that names what differs.
+    """
+    if store.about.get("digest") == sweep.digest:
+        return
+    changed = differences(json.loads(store.about["sweep"]), sweep.model_dump(mode="json"))
+    shown = "; ".join(changed[:4]) + (f"; and {len(changed) - 4} more" if len(changed) > 4 else "")
+    raise ConfigError(f"{store.path}: store of another sweep ({shown or 'other file contents'}); give another -o")
+
+
+def exact_json(value: Any) -> str:
+    """Return canonical JSON in which every double keeps all its digits; not-a-number becomes null."""
+    return json.dumps(_finite(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and value - value != 0.0:
+        return None
+    return value
+
+
+def _result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:
+    figures = None if metrics is None else {k: float("nan") if v is None else v for k, v in json.loads(metrics).items()}
+    return PointResult(number, figures, problem, seconds, worker)
+
+
+def _beside(path: Path) -> Sequence[Path]:
+    """Return the files that SQLite keeps beside a store."""
+    return [path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal")]
+
+
+def _problem(path: Path, error: sqlite3.Error) -> ProductError:
+    """Return SQLite's complaint as one line that says what to do."""
+    text = str(error)
+    if "full" in text or "disk I/O" in text:
+        return ProductError(f"cannot write {path}: {text}; what was computed before is kept, go on with --resume")
+    if "readonly" in text or "unable to open" in text:
+        return ProductError(f"cannot write {path}: {text}; expected a file and a folder that can be written")
+    if "locked" in text:
+        return ProductError(f"cannot write {path}: {text}; is another sweep writing to it?")
+    if "malformed" in text or "not a database" in text or "no such table" in text:
+        return ProductError(f"{path}: damaged, or no store of a sweep ({text}); pachon sweep export saves what it can")
+    return ProductError(f"{path}: {text}")

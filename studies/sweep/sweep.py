@@ -1,0 +1,156 @@
+"""A sweep from its file to its store: which points are missing, who computes them, and what is written when."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...core.errors import ConfigError, ProductError
+from ...core.memory import available_bytes, readable
+from ...core.progress import Reporter
+from ...core.random_streams import stream
+from ...pipeline.config import Configuration
+from .design import design_points, point_count
+from .file import SweepFile
+from .point import PointMeasurement, check_sweep
+from .store import SweepPoint, SweepStore, check_same_sweep, create_store
+from .workers import Measure, SerialWorker, Workers
+
+#: More points than this are a mistake: at a second each they would take a year.
+MOST_POINTS = 30_000_000
+# What a point takes in the store [bytes], and in memory while the design is made.
+_BYTES_ON_DISK, _BYTES_IN_MEMORY = 1500, 2500
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """What a sweep came to.
+
+    Attributes
+    ----------
+    path : Path
+        The store.
+    points : int
+        Points of the sweep.
+    kept, computed, failed : int
+        Points that were there before, that were computed now, and that could not be computed, of all.
+    """
+
+    path: Path
+    points: int
+    kept: int
+    computed: int
+    failed: int
+
+
+def run_sweep(
+    sweep: SweepFile,
+    path: Path,
+    *,
+    folder: Path | None = None,
+    resume: bool = False,
+    workers: Callable[[Measure], Workers] = SerialWorker,
+    reporter: Reporter | None = None,
+) -> SweepOutcome:
+    """Compute the points of a sweep that its store does not hold yet.
+
+    The figures of a point depend on the sweep's file alone: not on who computes them, in which order, or how often the
+    sweep was interrupted.
+
+    Parameters
+    ----------
+    sweep : SweepFile
+        What to compute.
+    path : Path
+        The store, a SQLite file.
+    folder : Path, optional
+        Folder that relative paths in the configuration start from; the current one by default.
+    resume : bool
+        Go on with a store that is there; points that could not be computed are tried again.
+    workers : callable
+        Makes the workers from the function that computes a point.
+    reporter : Reporter, optional
+        Who tells how far it is; nobody by default.
+
+    Raises
+    ------
+    ConfigError
+        If the store belongs to another sweep, or there is one and ``resume`` is False.
+    PachonError
+        If a name or value of the sweep is not possible, the store cannot be written, or the workers are lost.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    folder = Path() if folder is None else folder
+    if path.exists() and not resume:
+        raise ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
+    if not path.exists():
+        check_room(sweep, path)
+        points = numbered_points(sweep, folder)
+        check_sweep(sweep, points, folder)
+        create_store(path, sweep, points, {"folder": str(folder.resolve())})
+    with SweepStore(path) as store:
+        check_same_sweep(store, sweep)
+        store.forget_problems()
+        done = store.finished()
+        points = store.points()
+        missing = [p for p in points if p.number not in done]
+        if done:
+            reporter.line(f"{len(done)} of {len(points)} points are there already")
+        if missing:
+            who = workers(PointMeasurement(sweep, str(folder.resolve())))
+            with reporter.stage(f"{sweep.name}: {len(missing)} points, {who.description}", len(missing)) as stage:
+                for number, result in enumerate(who.results(missing), start=1):
+                    store.write(result)
+                    stage.advance()
+                    if result.problem is not None:
+                        reporter.line(f"point {result.number}: {result.problem}")
+                    if number % max(1, len(missing) // 20) == 0:
+                        stage.step("points", number, len(missing))
+        failed = sum(result.problem is not None for result in store.results())
+    return SweepOutcome(path, len(points), len(done), len(missing), failed)
+
+
+def numbered_points(sweep: SweepFile, folder: Path) -> list[SweepPoint]:
+    """Return the points of a sweep with their numbers and seeds.
+
+    All points of a replica share one seed, the first that of the configuration: random numbers are common, and what
+    differs between points is the doing of their parameters.
+    """
+    base = sweep.base if isinstance(sweep.base, dict) else {}
+    first = base.get("seed", Configuration.model_fields["seed"].default)
+    points = design_points(sweep)
+    seeds = [first, *(int(stream(first, "replica", i).integers(2**31)) for i in range(1, sweep.design.replicas))]
+    return [
+        SweepPoint(replica * len(points) + i, point, seed)
+        for replica, seed in enumerate(seeds)
+        for i, point in enumerate(points)
+    ]
+
+
+def check_room(sweep: SweepFile, path: Path) -> None:
+    """Refuse a sweep whose points fit neither memory nor disk, before anything is made.
+
+    Raises
+    ------
+    ConfigError
+        One line with what it would take and what there is.
+    """
+    count = point_count(sweep) * sweep.design.replicas
+    place = next(parent for parent in (path.resolve().parent, *path.resolve().parents) if parent.exists())
+    try:
+        disk = shutil.disk_usage(place).free
+    except OSError as error:
+        raise ProductError(f"{place}: {error.strerror}") from None
+    for what, need, there in (
+        ("memory", count * _BYTES_IN_MEMORY, available_bytes()),
+        ("disk", count * _BYTES_ON_DISK, disk),
+    ):
+        if there is not None and need > 0.8 * there:
+            raise ConfigError(
+                f"sweep {sweep.name}: {count:,} points take about {readable(need)} of {what}, {readable(there)} are "
+                "free: expected fewer points"
+            )
+    if count > MOST_POINTS:
+        raise ConfigError(f"sweep {sweep.name}: {count:,} points: expected at most {MOST_POINTS:,}")

@@ -1,0 +1,184 @@
+"""The table of a sweep: a row a point, for people and other programs."""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from ...core.errors import ConfigError, ProductError
+from ...core.files import described_table, write_bytes
+from .store import SweepStore
+
+#: Formats of an export, by the ending of the file.
+FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
+_UNITS = ("um", "nm", "mm", "m", "urad", "rad", "deg", "arcsec", "s")
+
+
+@dataclass(frozen=True)
+class SweepTable:
+    """Parameters and figures of the points that have been computed.
+
+    Attributes
+    ----------
+    name : str
+        Name of the sweep.
+    number, seed : ndarray of int, shape [n]
+        Number of each point and the seed of its random numbers.
+    parameters : dict of str to ndarray, shape [n]
+        Values of each parameter.
+    metrics : dict of str to ndarray, shape [n]
+        Figures; NaN where a point could not be computed.
+    problem : ndarray of str, shape [n]
+        Why a point could not be computed; empty where it was.
+    seconds : ndarray, shape [n]
+        How long each took.
+    """
+
+    name: str
+    number: np.ndarray
+    seed: np.ndarray
+    parameters: dict[str, np.ndarray]
+    metrics: dict[str, np.ndarray]
+    problem: np.ndarray
+    seconds: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+
+def read_table(store: SweepStore) -> SweepTable:
+    """Return what a store holds, in the order of the points."""
+    points = {p.number: p for p in store.points()}
+    results = store.results()
+    rows = [points[r.number] for r in results]
+    names = list(dict.fromkeys(name for p in points.values() for name in p.parameters))
+    metrics = list(dict.fromkeys(name for r in results for name in r.metrics or {}))
+    order = list(store.sweep.parameters) or names
+    names.sort(key=lambda n: order.index(n) if n in order else len(order))
+    return SweepTable(
+        name=store.sweep.name,
+        number=np.array([r.number for r in results], dtype=np.int64),
+        seed=np.array([p.seed for p in rows], dtype=np.int64),
+        parameters={n: np.array([p.parameters.get(n) for p in rows]) for n in names},
+        metrics={n: np.array([(r.metrics or {}).get(n, np.nan) for r in results], dtype=np.float64) for n in metrics},
+        problem=np.array([r.problem or "" for r in results], dtype=str),
+        seconds=np.array([r.seconds for r in results], dtype=np.float64),
+    )
+
+
+def export_table(store: SweepStore, path: Path) -> int:
+    """Write the points of a store as ECSV, CSV, FITS or Parquet, and return how many there are.
+
+    Raises
+    ------
+    ConfigError
+        If the ending of the file names no format, or Parquet is asked for without the package ``pyarrow``.
+    ProductError
+        If the file cannot be written, or nothing has been computed.
+    """
+    table = read_table(store)
+    if not len(table):
+        raise ProductError(f"{store.path}: no point has been computed yet")
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise ConfigError(f"{path}: expected a file that ends in {', '.join(FORMATS)}")
+    meta = {"what": f"sweep {table.name}", "pachon": store.about["pachon"], "digest": store.about["digest"]}
+    write_bytes(path, _encoded(_columns(table, meta), kind, path))
+    return len(table)
+
+
+def salvage(path: Path, out: Path) -> int:
+    """Read what can be read of a damaged store, point by point, write it as a table, and return how many points.
+
+    Raises
+    ------
+    ProductError
+        If nothing can be read.
+    """
+    rows = list(_readable_rows(path))
+    if not rows:
+        raise ProductError(f"{path}: nothing can be read of it; was it a store of a sweep?")
+    import json
+
+    kind = FORMATS.get(out.suffix.lower())
+    if kind is None:
+        raise ConfigError(f"{out}: expected a file that ends in {', '.join(FORMATS)}")
+    figures = [(number, json.loads(parameters), json.loads(metrics or "{}")) for number, parameters, metrics in rows]
+    table = Table({"number": [number for number, _, _ in figures]}, meta={"what": f"saved from {path.name}"})
+    for part in (1, 2):
+        for name in dict.fromkeys(name for row in figures for name in row[part]):
+            values = [row[part].get(name) for row in figures]
+            table[name] = [np.nan if v is None else v for v in values]
+    write_bytes(out, _encoded(table, kind, out))
+    return len(rows)
+
+
+def _readable_rows(path: Path) -> Any:
+    """Yield number, parameters and metrics of every point that a damaged file still gives."""
+    try:
+        connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    except sqlite3.Error:
+        return
+    try:
+        last = next(iter(connection.execute("SELECT max(number) FROM points")), (None,))[0]
+    except sqlite3.Error:
+        last = None
+    for number in range(0 if last is None else last + 1):
+        try:
+            yield from connection.execute(
+                "SELECT number, parameters, metrics FROM results JOIN points USING (number) WHERE number = ?", (number,)
+            )
+        except sqlite3.Error:
+            continue
+    connection.close()
+
+
+def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
+    columns: dict[str, tuple[np.ndarray, str, str]] = {
+        "number": (table.number, "", "number of the point"),
+        "seed": (table.seed, "", "seed of its random numbers"),
+    }
+    columns |= {name: (_plain(values), _unit(name), "parameter") for name, values in table.parameters.items()}
+    columns |= {name: (values, _unit(name), "figure") for name, values in table.metrics.items()}
+    columns["problem"] = (table.problem, "", "why it could not be computed")
+    columns["seconds"] = (table.seconds, "s", "how long it took")
+    return described_table(columns, meta)
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    """Return a column as numbers or as text: a parameter that is left out at some points has no number there."""
+    if values.dtype.kind != "O":
+        return values
+    if any(isinstance(v, str) for v in values):
+        return np.array(["" if v is None else str(v) for v in values])
+    return np.array([np.nan if v is None else float(v) for v in values])
+
+
+def _unit(name: str) -> str:
+    ending = name.rpartition("_")[2]
+    return ending if "_" in name and ending in _UNITS else ""
+
+
+def _encoded(table: Table, kind: str, path: Path) -> bytes:
+    if kind.startswith("ascii"):
+        text = io.StringIO()
+        table.write(text, format=kind)
+        return text.getvalue().encode()
+    data = io.BytesIO()
+    if kind == "fits":
+        table.write(data, format="fits")
+        return data.getvalue()
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        raise ConfigError(f"{path}: Parquet needs the package pyarrow: pip install 'pachon[parquet]'") from None
+    arrays = {name: pyarrow.array(np.asarray(table[name]).tolist()) for name in table.colnames}
+    parquet.write_table(pyarrow.table(arrays), data)
+    return data.getvalue()

@@ -1,0 +1,94 @@
+"""Encircled energy against closed forms and brute force."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_simpson
+from scipy.special import j1
+
+import pachon
+from pachon.core.errors import ConfigError, DomainError
+from pachon.design.images.diffraction import fft_psf
+from pachon.design.images.encircled_energy import encircled_energy, energy_curve, energy_of_psf
+
+WAVE = 500e-9
+
+
+def test_a_gaussian_about_its_centroid():
+    y, x = np.indices((61, 61))
+    image = np.exp(-0.5 * ((x - 33.3) ** 2 + (y - 28.6) ** 2) / 16.0)
+    radii = np.array([0.0, 2.0, 4.0, 8.0])
+    energy = np.interp(radii, *energy_curve(0.5 * image / image.sum()))
+    # A pixel counts as a square of even light: it adds 1/12 to the variance of 16.
+    assert energy == pytest.approx(0.5 * (1.0 - np.exp(-0.5 * radii**2 / (16.0 + 1.0 / 12.0))), abs=1e-3)
+
+
+def test_pixels_are_squares_of_even_light():
+    image = np.zeros((9, 11))
+    image[2:7, 4:9] = 2.0
+    radius, light = energy_curve(image, center=(6.0, 4.0))
+    # A circle within the square of 5 x 5 holds its own area; parts of a quarter of a pixel know it to some per cent.
+    assert np.interp([1.1, 2.3], radius, light) == pytest.approx(2.0 * np.pi * np.array([1.1, 2.3]) ** 2, rel=0.03)
+    assert np.interp(3.6, radius, light) == pytest.approx(50.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("obscuration", [0.0, 0.6])
+def test_a_perfect_pupil(paraboloid, obscuration):
+    telescope = paraboloid(f_number=50.0, obscuration=obscuration)
+    radii = 50.0 * WAVE * np.array([0.5, 1.0, 2.0, 4.0, 8.0])
+    found = encircled_energy(telescope, [[0.0, 0.0]], WAVE, radii=radii, pupil_points=300).fraction[0]
+    # The pattern of an annulus (Born & Wolf, sec. 8.6.2), integrated over circles.
+    e = obscuration
+    v = np.linspace(1e-9, 30.0, 6001)
+    amplitude = (2.0 * j1(v) / v - (e**2 * 2.0 * j1(e * v) / (e * v) if e else 0.0)) / (1.0 - e**2)
+    theory = 0.5 * (1.0 - e**2) * cumulative_simpson(amplitude**2 * v, x=v, initial=0.0)
+    # The rim of the lattice, and light that comes round after 300 Airy units: a thousandth.
+    assert found == pytest.approx(np.interp(np.pi * radii / (50.0 * WAVE), v, theory), abs=1.5e-3)
+
+
+def test_rays_of_a_defocused_annulus_fill_a_ring(paraboloid):
+    telescope = paraboloid(f_number=20.0, obscuration=0.5, shift=1e-3)
+    radii = np.linspace(5e-6, 26e-6, 22)
+    energy = encircled_energy(telescope, [[0.0, 0.0]], kind="geometric", radii=radii)
+    # Rays through the height r of the pupil land at r / f times the defocus, but for a thousandth at f/20.
+    inner, outer = 0.5 * 25e-6, 25e-6
+    share = np.clip((radii**2 - inner**2) / (outer**2 - inner**2), 0.0, 1.0)
+    assert energy.fraction[0] == pytest.approx(share, abs=3e-3)
+    assert energy.radius_holding(0.5)[0] == pytest.approx(np.sqrt(0.5 * (inner**2 + outer**2)), rel=0.01)
+
+
+def test_light_that_falls_beside_the_image_is_missed(paraboloid):
+    psf = fft_psf(paraboloid(f_number=20.0), [[0.0, 0.0]], WAVE, pixels=24)
+    energy = energy_of_psf(psf)
+    assert energy.fraction[0, -1] < psf.inside[0] < 1.0
+    assert np.isnan(energy.radius_holding(0.999)[0])
+    with pytest.raises(DomainError, match="the images' edge"):
+        energy_of_psf(psf, np.array([1.0]))
+
+
+def test_over_the_field_of_the_lsst():
+    telescope = pachon.load_telescope("lsst_v3.3_i")
+    fields = np.deg2rad([[0.0, 0.0], [0.0, 0.7], [0.0, 1.0], [0.0, 1.4], [0.0, 1.75]])
+    energy = encircled_energy(telescope, fields, 750e-9, pixels=160)
+    summary = energy.summary()
+    radius = summary["ee80_radius_arcsec"]
+    assert radius == pytest.approx(np.rad2deg(energy.radius_holding(0.8) * energy.plate_scale) * 3600.0)
+    # FFT PSFs of batoid for this design gave 0.091, 0.088, 0.078 and 0.091; they hold the wings to about 40 um.
+    assert radius[[0, 2, 3, 4]] == pytest.approx([0.091, 0.088, 0.078, 0.091], rel=0.035)
+    assert summary["ee50_radius_um"].max() < summary["ee80_radius_um"].min()
+    assert energy.plot().get_size_inches()[0] > 5
+
+
+def test_what_cannot_be_had_is_an_error(lsst_r, paraboloid):
+    with pytest.raises(ConfigError, match="kind = 'both'"):
+        encircled_energy(lsst_r, kind="both")
+    for radii in ([-1e-6, 1e-6], [2e-6, 1e-6], [math.nan]):
+        with pytest.raises(DomainError, match="ascending lengths"):
+            encircled_energy(lsst_r, radii=radii)
+    with pytest.raises(DomainError, match="share = 1"):
+        encircled_energy(lsst_r, [[0.0, 0.0]], kind="geometric").radius_holding(1)
+    with pytest.raises(DomainError, match="image of shape"):
+        energy_curve(np.full((3, 3), np.nan))
+    with pytest.raises(DomainError, match="expected light"):
+        energy_curve(np.zeros((3, 3)))

@@ -1,0 +1,98 @@
+"""Modulation transfer against closed forms and the transform of the image."""
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import DomainError
+from pachon.design.images.diffraction import fft_psf
+from pachon.design.images.mtf import annulus_mtf, mtf
+from pachon.design.metrics.spots import spots
+
+WAVE = 500e-9
+
+
+def shared_area(shift, obscuration, n=1201):
+    """Brute force: the part of an annular pupil that it shares with itself, shifted by a part of its diameter."""
+    u = (2.0 * np.arange(n) + 1.0) / n - 1.0
+    x, y = np.meshgrid(u, u)
+
+    def inside(x):
+        r = np.hypot(x, y)
+        return (r <= 1.0) & (r >= obscuration)
+
+    return np.array([(inside(x - s) & inside(x + s)).sum() for s in shift]) / inside(x).sum()
+
+
+@pytest.mark.parametrize("obscuration", [0.0, 0.3, 0.62])
+def test_closed_form_of_an_annulus(obscuration):
+    shift = np.array([0.0, 0.05, 0.19, 0.31, 0.5, 0.62, 0.81, 0.95, 1.0, 1.2])
+    # A lattice of 1201 points knows areas to a thousandth.
+    assert annulus_mtf(shift, obscuration) == pytest.approx(shared_area(shift, obscuration), abs=1.5e-3)
+
+
+@pytest.mark.parametrize("obscuration", [0.0, 0.612])
+def test_a_perfect_pupil(paraboloid, obscuration):
+    result = mtf(paraboloid(f_number=30.0, obscuration=obscuration), [[0.0, 0.0]], WAVE)
+    expected = annulus_mtf(result.frequency * WAVE * 30.0, obscuration)
+    for found in (result.tangential, result.sagittal, result.tangential_limit, result.sagittal_limit):
+        # What the rim leaves of a cell is averaged before cells are multiplied: a thousandth at 256 points.
+        assert found[0] == pytest.approx(expected, abs=2e-3)
+    assert result.cutoff[0] == pytest.approx(1.0 / (WAVE * 30.0), rel=1e-3)
+
+
+def test_it_is_the_transform_of_the_image(lsst_r):
+    field = [np.deg2rad([0.0, 1.2])]
+    result = mtf(lsst_r, field, [560e-9, 690e-9], pupil_points=192)
+    psf = fft_psf(lsst_r, field, [560e-9, 690e-9], pixel=0.2e-6, pixels=320, pupil_points=256)
+    some = np.array([8, 20, 45, 90])
+    for row, along in ((result.tangential[0], 1), (result.sagittal[0], 0)):
+        profile = psf.image[0].sum(axis=1 if along == 1 else 0)
+        phase = np.exp(-2j * np.pi * np.outer(result.frequency[some], psf.axis))
+        # The image leaves 3 % of the light in its wings beside it, which is what the two may differ by.
+        assert np.abs(phase @ profile) == pytest.approx(row[some], abs=0.03)
+
+
+def test_tangential_turns_with_the_field(lsst_r):
+    angles = np.deg2rad([[0.0, 1.2], [1.2, 0.0], [-0.72, 0.96]])
+    # Rotating the slopes, not the angles, keeps the telescope the same.
+    slope = np.tan(np.deg2rad(1.2))
+    angles[2] = np.arctan([-0.6 * slope, 0.8 * slope])
+    result = mtf(lsst_r, angles, pupil_points=128)
+    for row in (result.tangential, result.sagittal, result.tangential_limit, result.geometric_sagittal):
+        # Lattices that are turned cut the rims in other places.
+        assert row[1] == pytest.approx(row[0], abs=4e-3)
+        assert row[2] == pytest.approx(row[0], abs=4e-3)
+    assert np.abs(result.tangential - result.sagittal).max() > 0.1
+
+
+def test_rays_alone_are_the_transform_of_the_spot(lsst_r):
+    field = [np.deg2rad([0.0, 1.2])]
+    result = mtf(lsst_r, field, pupil_points=64)
+    spot = spots(lsst_r, field)
+    lit = spot.weight[0, 0] > 0
+    y, w = spot.displacement[0, 0, lit, 1], spot.weight[0, 0, lit]
+    expected = [abs((w * np.exp(2j * np.pi * f * y)).sum()) / w.sum() for f in result.frequency]
+    assert result.geometric_tangential[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_bounds_and_summary(lsst_r):
+    result = mtf(lsst_r, pupil_points=96)
+    assert (result.tangential <= result.tangential_limit + 5e-3).all()
+    assert (result.sagittal <= result.sagittal_limit + 5e-3).all()
+    assert result.tangential[:, 0] == pytest.approx(1.0)
+    summary = result.summary()
+    half = summary["half_contrast_cycles_per_mm"]
+    assert half.shape == (5, 2)
+    assert half[0] == pytest.approx(half[0, 0], rel=1e-3)
+    # 10.3 m of focal length: 20 cycles/mm are one per arc second.
+    assert half / summary["half_contrast_cycles_per_arcsec"] == pytest.approx(20.0, rel=5e-3)
+    assert result.plot().get_size_inches()[0] > 5
+
+
+def test_what_cannot_be_had_is_an_error(lsst_r, paraboloid):
+    with pytest.raises(DomainError, match="pupil_points = 4"):
+        mtf(lsst_r, pupil_points=4)
+    with pytest.raises(DomainError, match="too few for spots"):
+        mtf(paraboloid(f_number=20.0, shift=5e-3), [[0.0, 0.0]], WAVE, pupil_points=16)
+    with pytest.raises(DomainError, match="contrast = 2"):
+        mtf(lsst_r, [[0.0, 0.0]], pupil_points=16).frequency_at(2)

@@ -1,0 +1,65 @@
+"""Wavelets: aimed rays, light, and what cannot be imaged."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import DomainError
+from pachon.design.images.diffraction import fft_psf
+from pachon.design.images.mtf import mtf
+from pachon.design.images.wavelets import lattice_wavelets, spot_reach, traced_wavelets
+from pachon.design.metrics.spots import spots
+from pachon.design.metrics.vignetting import vignetting
+from pachon.design.pupil_sampling import gauss_annulus, square_annulus
+
+
+@pytest.mark.parametrize("angle", [(0.0, 0.0), (0.0, 1.75), (-0.9, 1.1)])
+def test_the_light_of_a_lattice_is_what_is_not_vignetted(lsst_r, angle):
+    field = np.deg2rad(angle)
+    center = spots(lsst_r, field).reference[0]
+    lattice = lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 128)
+    expected = vignetting(lsst_r, [field], 620e-9, rays=40000)
+    # A cell that a rim crosses is known to 1/36 of it, and there are some 600 of them among 8000.
+    assert lattice.wavelets.light == pytest.approx(expected.fraction[0], abs=1e-3)
+
+
+def test_both_kinds_have_the_same_peak_if_perfect(lsst_r):
+    field = np.deg2rad([0.4, 0.9])
+    center = spots(lsst_r, field).reference[0]
+    traced = traced_wavelets(lsst_r, field, 620e-9, center, square_annulus(4.18, 0.612, 200))
+    aimed = lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 200).wavelets
+    assert aimed.perfect_peak == pytest.approx(traced.perfect_peak, rel=2e-3)
+    assert aimed.light == pytest.approx(traced.light, rel=2e-3)
+
+
+def test_a_turned_lattice_has_the_same_light_in_other_cells(lsst_r):
+    field = np.deg2rad([0.4, 0.9])
+    center = spots(lsst_r, field).reference[0]
+    one, other = (lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 128, angle=a) for a in (0.0, 0.7))
+    assert other.wavelets.light == pytest.approx(one.wavelets.light, abs=1e-3)
+    rows = other.wavelets.cosine[:, 1:] - other.wavelets.cosine[:, :-1]
+    assert rows == pytest.approx(np.broadcast_to(other.spacing * np.array([np.cos(0.7), np.sin(0.7)]), rows.shape))
+
+
+def test_rays_that_go_astray_beyond_a_rim_do_no_harm():
+    # At the edge of its field a third of HSC's rays are stopped, some of them by total reflection.
+    telescope = pachon.load_telescope("hsc")
+    field = np.array([0.0, telescope.field_radius])
+    center = spots(telescope, field).reference[0]
+    lattice = lattice_wavelets(telescope, field, 770e-9, center, 0.4 / 128)
+    expected = vignetting(telescope, [field], 770e-9, rays=40000).fraction[0]
+    assert expected < 0.7
+    assert lattice.wavelets.light == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_few_stray_rays_do_not_set_the_scale(paraboloid):
+    diagram = spots(paraboloid(f_number=20.0, shift=1e-3), [[0.0, 0.0]], sampling=gauss_annulus(0.05, 0.0, 20, 60))
+    # 99 % of the light of a disc of 25 um, and a tenth more.
+    assert spot_reach(diagram) == pytest.approx(1.1 * np.sqrt(0.99) * 25e-6, rel=0.02)
+
+
+def test_parallel_light_makes_no_image(paraboloid):
+    telescope = paraboloid(focal_length=1e7, f_number=1e8)
+    for measure in (fft_psf, mtf):
+        with pytest.raises(DomainError, match="focal ratio"):
+            measure(telescope, [[0.0, 0.0]])

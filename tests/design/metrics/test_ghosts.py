@@ -1,0 +1,152 @@
+"""Ghosts against closed forms: Fresnel's equations, a plane-parallel plate, energy."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import DomainError, UnknownNameError
+from pachon.design.metrics.ghost_paths import fresnel_reflectivity, ghost_pairs, ghost_path
+from pachon.design.metrics.ghosts import ghosts
+from pachon.models.media.medium import ConstantIndex
+from pachon.models.surface import Conic, Interaction, Plane, Surface
+from pachon.models.telescope import VACUUM, Telescope
+from pachon.raytrace.rays import RayStatus
+
+GLASS = ConstantIndex(1.5)
+FOCAL, F_NUMBER, THICKNESS = 2.0, 20.0, 0.01
+
+
+@pytest.fixture(scope="module")
+def with_plate():
+    """A paraboloid with a plane-parallel plate 0.2 m in front of its focus; the detector where the light comes to."""
+    front = FOCAL - 0.2
+    # A plate shifts the focus by t (1 - 1/n), but for a thousandth of it at f/20.
+    focus = FOCAL + THICKNESS * (1.0 - 1.0 / 1.5)
+    surfaces = (
+        Surface("mirror", Interaction.MIRROR, Conic(2.0 * FOCAL, -1.0), (0.0, 0.0, 0.0), VACUUM),
+        Surface("front", Interaction.REFRACT, Plane(), (0.0, 0.0, front), GLASS),
+        Surface("back", Interaction.REFRACT, Plane(), (0.0, 0.0, front + THICKNESS), VACUUM),
+        Surface("detector", Interaction.DETECTOR, Plane(), (0.0, 0.0, focus), VACUUM),
+    )
+    return Telescope(
+        name="plate",
+        surfaces=surfaces,
+        stop_z=0.0,
+        pupil_diameter=FOCAL / F_NUMBER,
+        pupil_obscuration=0.0,
+        launch_distance=5.0,
+        reference_sphere_radius=FOCAL,
+        field_radius=0.01,
+        field_limit=0.02,
+        wavelength_range=(3e-7, 1e-6),
+        default_wavelength=5e-7,
+    )
+
+
+def test_fresnel():
+    # Normal incidence; Brewster's angle, where only the polarisation across the plane is reflected; beyond the limit.
+    assert fresnel_reflectivity(np.array(1.0), 1.0, 1.5) == pytest.approx(0.04)
+    brewster = np.arctan(1.5)
+    across = np.cos(2.0 * brewster) ** 2
+    assert fresnel_reflectivity(np.cos(brewster), 1.0, 1.5) == pytest.approx(0.5 * across)
+    # The same from inside, at the angle that Snell's law gives.
+    inside = np.sqrt(1.0 - (np.sin(0.7) / 1.5) ** 2)
+    assert fresnel_reflectivity(inside, 1.5, 1.0) == pytest.approx(float(fresnel_reflectivity(np.cos(0.7), 1.0, 1.5)))
+    assert fresnel_reflectivity(np.cos(0.8), 1.5, 1.0) == 1.0
+    assert fresnel_reflectivity(np.array(0.3), 1.2, 1.2) == pytest.approx(0.0)
+
+
+def test_the_ghost_of_a_plate(with_plate):
+    found = ghosts(with_plate, (0.0, 0.0), detector_reflectivity=0.0)
+    plate = next(g for g in found.ghosts if (g.first, g.second) == ("back", "front"))
+    # Twice more through the glass: the focus is 2 t / n nearer.
+    assert plate.focus == pytest.approx(-2.0 * THICKNESS / 1.5, rel=3e-3)
+    # 98 % of an even disc is a circle of 99 % of its radius.
+    assert plate.diameter == pytest.approx(0.99 * 2.0 * THICKNESS / 1.5 / F_NUMBER, rel=5e-3)
+    # Two reflections of 4 %; both ways cross both surfaces once more.
+    assert plate.flux == pytest.approx(0.04**2, rel=1e-3)
+    area = 0.25 * np.pi * (2.0 * THICKNESS / 1.5 / F_NUMBER) ** 2
+    assert plate.peak == pytest.approx(plate.flux / area, rel=0.08)
+    assert plate.centroid == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+def test_ghosts_by_the_detector(with_plate):
+    found = ghosts(with_plate, (0.0, 0.005), detector_reflectivity=0.2, reflectivity={"front": 0.01, "back": 0.03})
+    light = {(g.first, g.second): g.flux for g in found.ghosts}
+    assert light.keys() == {("back", "front"), ("detector", "front"), ("detector", "back")}
+    assert light["detector", "back"] == pytest.approx(0.2 * 0.03)
+    # To the front and back again through the back.
+    assert light["detector", "front"] == pytest.approx(0.2 * 0.97 * 0.01 * 0.97)
+    assert light["back", "front"] == pytest.approx(0.03 * 0.01)
+    assert found.flux == pytest.approx(sum(light.values()))
+    assert [g.peak for g in found.ghosts] == sorted((g.peak for g in found.ghosts), reverse=True)
+    # A mirror image of the converging light about the back of the plate: twice the way from there to the detector.
+    back = next(g for g in found.ghosts if g.second == "back")
+    way = with_plate.surfaces[3].vertex[2] - with_plate.surfaces[2].vertex[2]
+    assert back.focus == pytest.approx(-2.0 * way, rel=3e-3)
+
+
+def test_the_maps_hold_the_light(lsst_r):
+    found = ghosts(lsst_r, rays=4000)
+    cell = np.diff(found.edges)[0] ** 2
+    sharp = [g for g in found.ghosts if g.diameter < 0.1]
+    for ghost in sharp:
+        own = (ghost.irradiance * np.outer(np.diff(ghost.edges[1]), np.diff(ghost.edges[0]))).sum()
+        # 2 % of the light, the outermost, is left out, but for what lies in the corners of the map.
+        assert 0.979 * ghost.flux < own <= ghost.flux * (1 + 1e-9)
+    assert len(sharp) >= 4
+    assert 0.8 * sum(g.flux for g in sharp) < (found.irradiance * cell).sum() <= found.flux
+
+
+def test_the_ghosts_of_the_lsst(lsst_r):
+    found = ghosts(lsst_r, detector_reflectivity=0.3)
+    assert len(ghost_pairs(lsst_r)) == 36
+    summary = found.summary()
+    brightest = next(g for g in found.ghosts if g.first.startswith("Filter") and g.second.startswith("Filter"))
+    # The filter is 17.9 mm thick; its surfaces are not quite parallel, so this holds to a tenth.
+    index = float(lsst_r.surface("Filter_entrance").medium_after.index(found.wavelength))
+    assert brightest.focus == pytest.approx(-2.0 * 17.9e-3 / index, rel=0.15)
+    assert summary["flux"].sum() == pytest.approx(summary["total_flux"])
+    assert summary["peak_magnitudes_per_arcsec2"][0] < summary["peak_magnitudes_per_arcsec2"][-1]
+    assert found.plot().get_size_inches()[0] > 5
+
+
+def test_a_way_is_a_telescope_in_order(lsst_r):
+    names = lsst_r.surface_names
+    way = ghost_path(lsst_r, names.index("L3_entrance"), names.index("L2_exit"))
+    met = way.telescope.surface_names[6:]
+    assert met == (
+        *("L2_exit", "Filter_entrance", "Filter_exit", "L3_entrance"),
+        *("Filter_exit#2", "Filter_entrance#2", "L2_exit#2"),
+        *("Filter_entrance#3", "Filter_exit#3", "L3_entrance#2", "L3_exit", "Detector"),
+    )
+    media = [s.medium_after for s in way.telescope.surfaces]
+    glass, air = lsst_r.surface("L3_entrance").medium_after, lsst_r.medium_before
+    # Light is in glass after the filter's first surface on every pass, and in air where it was reflected.
+    assert [media[7], media[10], media[13]] == [glass] * 3
+    assert [media[8], media[9], media[11], media[12]] == [air] * 4
+
+
+def test_light_comes_back_on_its_own_way(with_plate):
+    # A ray along the axis goes to and fro along it, and its path is the sum of all ways.
+    way = ghost_path(with_plate, 3, 1)
+    rays = pachon.launch_rays(with_plate, (0.0, 0.0), 5e-7, ([0.0], [0.0]))
+    direct, ghost = pachon.trace(with_plate, rays), pachon.trace(way.telescope, rays)
+    assert ghost.status[0] == RayStatus.OK
+    gap = with_plate.surfaces[3].vertex[2] - with_plate.surfaces[2].vertex[2]
+    assert ghost.path_length[0] - direct.path_length[0] == pytest.approx(2.0 * (gap + 1.5 * THICKNESS))
+
+
+def test_what_cannot_be_had_is_an_error(lsst_r, with_plate, paraboloid):
+    with pytest.raises(DomainError, match="lens surface"):
+        ghosts(paraboloid())
+    with pytest.raises(UnknownNameError, match="did you mean L3_exit"):
+        ghosts(lsst_r, reflectivity={"L3_exxit": 0.01})
+    with pytest.raises(DomainError, match=r"reflectivity of front = 1\.5"):
+        ghosts(with_plate, reflectivity=1.5)
+    with pytest.raises(DomainError, match="rays = 10"):
+        ghosts(with_plate, rays=10)
+    with pytest.raises(DomainError, match="expected 0 <= second < first"):
+        ghost_path(with_plate, 1, 2)
+    with pytest.raises(DomainError, match="'mirror': expected a lens surface"):
+        ghost_path(with_plate, 2, 0)

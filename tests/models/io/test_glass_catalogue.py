@@ -1,0 +1,132 @@
+"""Glass catalogues in AGF format: indices of the makers, encodings, and what is refused."""
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import PrescriptionError, UnknownNameError
+from pachon.models.io.glass_catalogue import GlassCatalogue
+from pachon.models.media.air import Air
+from pachon.models.media.medium import Sellmeier
+
+LINE_D, LINE_F, LINE_C = 0.5875618e-6, 0.4861327e-6, 0.6562725e-6
+BK7 = """CC a catalogue of one glass, Größe
+NM N-BK7 2 517642.251 1.5168 64.17 0 1
+GC a comment
+ED 7.1 8.3 2.51 -0.0009 0
+CD 1.03961212E+00 6.00069867E-03 2.31792344E-01 2.00179144E-02 1.01046945E+00 1.03560653E+02 0 0 0 0
+TD 1.86E-06 1.31E-08 -1.37E-11 4.34E-07 6.27E-10 1.7E-01 2.0E+01
+OD 1.0 1.0 0.0 1.0 2.3 2.3
+LD 3.0E-01 2.5E+00
+IT 3.0E-01 5.0E-02 2.5E+01
+"""
+
+
+def written(tmp_path, text, encoding="utf-8"):
+    path = tmp_path / "mine.agf"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize("name", list(GlassCatalogue.bundled()))
+def test_bundled_glasses_have_the_index_and_abbe_number_that_their_makers_state(name):
+    entry = GlassCatalogue.bundled().entry(name)
+    d, f, c = (float(entry.medium.index(w)) for w in (LINE_D, LINE_F, LINE_C))
+    # Makers state nd to five or six figures (fits of their formula to melts are good to 3e-6), Vd to two decimals.
+    assert d == pytest.approx(entry.nd, abs=3.2e-6)
+    assert (d - 1) / (f - c) == pytest.approx(entry.vd, abs=5.5e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "nanometres", "index"),
+    [
+        # Schott data sheets: N-BK7 at h, e and t; SF11 at e; Malitson's fused silica at 1.0 um.
+        ("N-BK7", 404.6561, 1.53024),
+        ("N-BK7", 546.0740, 1.51872),
+        ("N-BK7", 1013.98, 1.50731),
+        ("SF11", 546.0740, 1.79190),
+        ("F_SILICA", 1000.0, 1.450417),
+    ],
+)
+def test_indices_at_other_lines(name, nanometres, index):
+    assert float(GlassCatalogue.bundled()[name].index(nanometres * 1e-9)) == pytest.approx(index, abs=6e-6)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "iso-8859-1"])
+def test_catalogues_are_read_in_any_encoding(tmp_path, encoding):
+    catalogue = GlassCatalogue.read(written(tmp_path, BK7, encoding))
+    assert list(catalogue) == ["N-BK7"]
+    glass = catalogue["n-bk7"]
+    assert glass == GlassCatalogue.bundled()["N-BK7"]
+    assert isinstance(glass, Sellmeier)
+    assert glass.wavelength_range == (0.3e-6, 2.5e-6)
+    assert "N-BK7" in catalogue
+    assert "F2" not in catalogue
+    assert len(catalogue) == 1
+
+
+def test_every_formula_number_is_known(tmp_path):
+    text = "".join(f"NM GLASS{n} {n} 0 1.5 60\nCD 2.25 0.01 0.01\nLD 0.4 1.0\n" for n in range(1, 14))
+    catalogue = GlassCatalogue.read(written(tmp_path, text))
+    assert len(catalogue) == 13
+    for name in catalogue:
+        assert np.isfinite(catalogue[name].index(0.6e-6)), name
+
+
+def test_sellmeier_numbers_have_three_four_and_five_terms(tmp_path):
+    figures = [0.6, 0.004, 0.4, 0.013, 0.8, 97.0, 0.01, 120.0, 0.02, 150.0]
+    for number, terms in ((2, 3), (6, 4), (11, 5)):
+        listed = " ".join(map(str, figures[: 2 * terms]))
+        glass = GlassCatalogue.read(written(tmp_path, f"NM A {number} 0 1.5 60\nCD {listed}\nLD 0.3 2\n"))["A"]
+        expected = 1 + sum(
+            b * 0.36 / (0.36 - c) for b, c in zip(figures[: 2 * terms : 2], figures[1 : 2 * terms : 2], strict=True)
+        )
+        assert float(glass.index(0.6e-6)) ** 2 == pytest.approx(expected, rel=1e-14)
+
+
+def test_in_vacuum_is_the_index_against_vacuum():
+    # The d line is 587.5618 nm in air; air of 20 deg C and one atmosphere has 1.000272 there (Schott, TIE-29).
+    catalogue = GlassCatalogue.bundled()
+    found = catalogue.in_vacuum("N-BK7").index(1.000272 * LINE_D)
+    assert float(found) == pytest.approx(1.5168 * 1.000272, abs=1e-6)
+    assert catalogue.in_vacuum("S-LAH64").air == Air(temperature=298.15)
+
+
+def test_an_unknown_glass_is_refused_with_its_neighbours(tmp_path):
+    with pytest.raises(UnknownNameError, match=r"unknown glass of the bundled catalogue 'N-BK8': did you mean .*N-BK7"):
+        GlassCatalogue.bundled()["N-BK8"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("NM N-BK7 2", "NM N-BK7 14", "line 2: NM N-BK7 14 .* expected a dispersion formula from 1 to 13"),
+        ("NM N-BK7 2", "NM N-BK7 two", "a number in place of 'two'"),
+        ("NM N-BK7 2 517642.251 1.5168 64.17 0 1", "NM", "expected a name and the number"),
+        ("1.03961212E+00", "1.0396_1212", "a number in place of '1.0396_1212'"),
+        ("1.03961212E+00", "nan", "a number in place of 'nan'"),
+        ("0 0 0 0", "1 0 0 0", "line 5: CD .*6 coefficients for this formula"),
+        ("CD", "CC", "glass N-BK7 has no line CD"),
+        ("GC", "XX", "line 3: XX a comment: expected CD, TD, LD"),
+        ("LD 3.0E-01 2.5E+00", "LD 2.5 0.3", "line 2: glass N-BK7: wavelength_range"),
+        ("2.0E+01", "-3E+02", "absolute zero"),
+        ("NM", "CC", "expected a glass catalogue"),
+    ],
+)
+def test_a_line_that_is_not_understood_is_named(tmp_path, old, new, expected):
+    assert old in BK7
+    with pytest.raises(PrescriptionError, match=expected) as error:
+        GlassCatalogue.read(written(tmp_path, BK7.replace(old, new, 1)))
+    assert str(error.value).startswith(str(tmp_path / "mine.agf"))
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    with pytest.raises(PrescriptionError, match=r"none\.agf: no such file"):
+        GlassCatalogue.read(tmp_path / "none.agf")
+
+
+def test_a_binary_file_is_refused(tmp_path):
+    path = tmp_path / "b.agf"
+    path.write_bytes(b"\x00\x01\x02NM")
+    with pytest.raises(PrescriptionError, match="not a text file"):
+        GlassCatalogue.read(path)

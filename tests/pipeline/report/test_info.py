@@ -1,0 +1,36 @@
+"""What `pachon info` says of telescopes that are not centred, and of apertures that are not discs."""
+
+import json
+
+import pytest
+
+from pachon.models.first_order import first_order
+from pachon.models.io.prescription import bundled_names, load_telescope
+from pachon.pipeline.report.info import FIRST_ORDER_KEYS, describe, figure_rows, surface_rows
+
+
+@pytest.mark.parametrize("name", bundled_names())
+def test_every_bundled_telescope_can_be_described(name):
+    telescope = load_telescope(name)
+    description = describe(telescope)
+    json.dumps(description)
+    assert len(surface_rows(description)) == len(telescope.surfaces)
+    assert all(value for _, value in figure_rows(description))
+    # As built or folded, a telescope has no axis to have first-order figures about.
+    centred = not name.startswith(("rubin", "auxtel"))
+    assert all((description[key] is not None) == centred for key in FIRST_ORDER_KEYS)
+    if centred:
+        assert description["focal_length_m"] == first_order(telescope).focal_length
+
+
+def test_apertures_of_every_kind_are_named():
+    description = describe(load_telescope("decam"))
+    rows = {row["name"]: (row["type"], row["clear_m"], row["aperture"]) for row in description["surfaces"]}
+    assert rows["PM"] == ("mirror", [0.6684, 2.005], "annulus: [0.6684, 2.005]")
+    assert rows["CAGE_MID"] == ("baffle", [0.7896, None], "obscuration: {circle: 0.7896}")
+    assert rows["SPIDER"][1] is None
+    assert rows["SPIDER"][2].startswith("obscuration: {union: [{rectangle: [0.019, 5], angle: -45}")
+    text = {row[0]: row[-1] for row in surface_rows(description)}
+    assert text["PM"] == "0.6684 to 2.005"
+    assert text["CAGE_MID"] == "from 0.7896"
+    assert text["SPIDER"] == "another region"

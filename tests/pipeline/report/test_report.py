@@ -1,0 +1,128 @@
+"""The report: one file that needs no other, with a picture and words for each thing it shows."""
+
+import base64
+import dataclasses
+import json
+import re
+import struct
+from html.parser import HTMLParser
+
+import matplotlib
+import numpy as np
+import pytest
+
+from pachon.core.plotting import new_figure, png_bytes
+from pachon.pipeline.ccd_product import read_product
+from pachon.pipeline.experiment import prepare
+from pachon.pipeline.report.focal_plane_axes import key_ellipticity, whiskers
+from pachon.pipeline.report.report import build_report, closest_middle_farthest
+from pachon.pipeline.report.tables import percent
+from pachon.wavefront.opd import wavefront_opd
+from pachon.wavefront.zernike import fit_zernikes
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+class Reader(HTMLParser):
+    """Collect what the page refers to, and check that every element that opens closes."""
+
+    def __init__(self):
+        super().__init__()
+        self.references, self.images, self.open = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "img", "link", "br"):
+            self.open.append(tag)
+        for key, value in attrs:
+            if key in ("src", "href"):
+                self.references.append(value)
+            if key == "src":
+                self.images.append(value)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def page(finished_run):
+    return (finished_run / "report.html").read_text()
+
+
+def test_the_report_refers_to_nothing_outside_itself(page):
+    reader = Reader()
+    reader.feed(page)
+    assert reader.open == []
+    for reference in reader.references:
+        assert reference.startswith(("data:image/png;base64,", "#"))
+    # Pictures aside: four megabytes of base64 hold any four letters by chance.
+    text = re.sub(r'data:image/png;base64,[^"]+', "", page)
+    assert "http" not in text
+    assert "@import" not in text
+    assert "<script" not in text
+    anchors = {r[1:] for r in reader.references if r.startswith("#")}
+    assert anchors <= set(re.findall(r'id="([^"]+)"', page))
+
+
+def test_every_picture_is_a_png_without_date_or_software(page):
+    reader = Reader()
+    reader.feed(page)
+    assert len(reader.images) == 9
+    for image in reader.images:
+        data = base64.b64decode(image.partition(",")[2])
+        assert data.startswith(PNG)
+        width, height = struct.unpack(">II", data[16:24])
+        assert min(width, height) >= 300
+        assert b"Software" not in data
+        assert b"tIME" not in data
+
+
+def test_each_picture_says_what_it_shows_and_what_the_paper_shows(page):
+    for number in (7, 9, 11, 12, 13, 14):
+        assert f"Fig. {number}" in page
+    assert page.count("<figure>") == 9
+    for word in ("arcsec", "R22_S11", "R24_S12", "seed 1", "config.yaml"):
+        assert word in page
+
+
+def test_text_of_a_user_is_escaped(finished_run, tiny):
+    experiment = prepare(tiny())
+    telescope = dataclasses.replace(experiment.telescope, description="<b>mine</b> & yours")
+    experiment = dataclasses.replace(experiment, telescope=telescope)
+    page = build_report(experiment, json.loads((finished_run / "summary.json").read_text()), [])
+    assert "&lt;b&gt;mine&lt;/b&gt; &amp; yours" in page
+
+
+def test_a_whisker_lies_along_the_elongation_with_its_length():
+    # e1 > 0: along x; e1 < 0: along y; e2 > 0: along x = y.
+    e1, e2 = np.array([0.1, -0.1, 0.0, np.nan]), np.array([0.0, 0.0, 0.2, 0.0])
+    x, y = np.array([0.0, 1.0, 2.0, 3.0]), np.zeros(4)
+    ends = whiskers(x, y, e1, e2, 10.0)
+    assert ends.shape == (3, 2, 2)
+    np.testing.assert_allclose(ends[:, 1] - ends[:, 0], [[1, 0], [0, 1], [2**0.5, 2**0.5]], atol=1e-12)
+    np.testing.assert_allclose(ends.mean(axis=1), [[0, 0], [1, 0], [2, 0]], atol=1e-12)
+
+
+def test_the_key_whisker_is_round_and_near_the_larger_ones():
+    assert key_ellipticity(np.full(10, 0.011)) == 0.01
+    assert key_ellipticity(np.full(10, 0.09)) == 0.1
+    assert key_ellipticity(np.array([np.nan])) == 0.01
+
+
+def test_shares_are_never_rounded_up_to_all():
+    assert percent(0.5) == "50 %"
+    assert percent(0.99123) == "99.12 %"
+    assert percent(0.9999999) == "> 99.98 %"
+
+
+def test_the_ccds_shown_large_are_the_closest_the_middle_and_the_farthest(finished_run):
+    products = [read_product(finished_run / f"ccd_{name}.fits") for name in ("R24_S12", "R22_S11")]
+    assert [p.name for p in closest_middle_farthest(products)] == ["R22_S11", "R24_S12"]
+
+
+def test_figures_do_not_depend_on_the_users_matplotlib(lsst_r):
+    opd = wavefront_opd(lsst_r, (0.0, 0.01), 620e-9, grid=32)
+    fit = fit_zernikes(opd, 4.18, 0.612, 11)
+    plain = png_bytes(opd.plot(fit, "lsst"))
+    with matplotlib.rc_context({"font.size": 20.0, "axes.facecolor": "black"}):
+        assert png_bytes(opd.plot(fit, "lsst")) == plain
+    assert new_figure(2, 2).canvas.manager is None

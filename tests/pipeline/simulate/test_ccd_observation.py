@@ -1,0 +1,157 @@
+"""Defects, selection and the kinds of models, as a configuration asks for them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import ConfigError, DomainError
+from pachon.pipeline.config import with_options
+from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.measure.star_selection import StarFlag
+from pachon.pipeline.psf_model.checks import snr_weights
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd, model_ccd
+from pachon.pipeline.simulate.ccd_observation import observe_ccd
+
+NAME = "R22_S11"
+N = 40
+
+
+@pytest.fixture(scope="module")
+def experiment(tiny):
+    return prepare(tiny(ccds=(NAME,), stars__observed=N))
+
+
+@pytest.fixture(scope="module")
+def exposure(experiment):
+    return expose_ccd(experiment, NAME, threads=1)
+
+
+@pytest.fixture(scope="module")
+def plain(experiment, exposure):
+    return model_ccd(experiment, exposure)
+
+
+def asked(experiment, **options):
+    """The experiment with other stars or another model; the PSFs of its stars do not depend on them."""
+    return dataclasses.replace(experiment, config=resolve(with_options(experiment.config, **options)))
+
+
+def seen(experiment, exposure, electrons=2e5, **options):
+    stars = exposure.observed
+    chosen = asked(experiment, **options)
+    return observe_ccd(chosen, NAME, stars.image, stars.pixel_scale, np.full(N, electrons), noisy=True)
+
+
+def test_without_defects_nothing_is_looked_for(plain):
+    assert not plain.observed.defects.any()
+    assert plain.observed.used.all()
+
+
+def test_defects_spoil_as_many_stars_as_asked_and_leave_the_others(experiment, exposure):
+    clean = seen(experiment, exposure)
+    for options in ({"stars__neighbours": 0.25}, {"stars__cosmic_rays": 0.25}):
+        spoilt = seen(experiment, exposure, **options)
+        same = (spoilt.images == clean.images).all(axis=(1, 2))
+        # Binomial: 10 +- 2.7 of 40, three standard deviations.
+        assert 2 <= N - same.sum() <= 18
+    # All have the same electrons, so that the peaks' order is that of their noise; a tenth of 40 is four.
+    full = seen(experiment, exposure, stars__saturated=0.1)
+    assert (full.images != clean.images).any(axis=(1, 2)).sum() == 4
+
+
+def test_stars_with_defects_are_found_and_left_out(experiment, exposure):
+    options = {"stars__neighbours": 0.15, "stars__cosmic_rays": 0.15, "stars__saturated": 0.1}
+    clean, spoilt = seen(experiment, exposure), seen(experiment, exposure, **options)
+    found = seen(experiment, exposure, reconstruction__flag_stars=True, **options)
+    np.testing.assert_array_equal(found.images, spoilt.images)
+    touched = (spoilt.images != clean.images).any(axis=(1, 2))
+    # Stars of S/N over 200: the study of the selection found every such defect, and flagged 2 good stars of 640.
+    assert np.array_equal(found.defects != 0, touched)
+    assert ((found.defects & StarFlag.SATURATED) != 0).sum() == 4
+    assert np.array_equal(found.used, ~touched)
+    assert np.isnan(found.shapes.e1[touched]).all()
+    np.testing.assert_array_equal(found.shapes.e1[~touched], clean.shapes.e1[~touched])
+    # Who does not look uses them all.
+    assert spoilt.used.sum() > found.used.sum()
+
+
+def test_without_noise_there_are_no_defects(experiment, exposure):
+    product = model_ccd(
+        asked(experiment, stars__neighbours=1.0, reconstruction__flag_stars=True), exposure, noisy=False
+    )
+    assert product.observed.used.all()
+
+
+def test_a_ccd_all_of_whose_stars_are_rejected_is_one_line(experiment, exposure):
+    defects = {"stars__neighbours": 1.0, "stars__cosmic_rays": 1.0, "stars__snr_min": 200.0}
+    chosen = asked(experiment, reconstruction__flag_stars=True, **defects)
+    with pytest.raises(
+        DomainError, match=rf"^CCD {NAME}: \d of 40 stars left \(\d+ neighbour.*\): expected at least 5$"
+    ):
+        model_ccd(chosen, exposure)
+
+
+@pytest.mark.parametrize(
+    ("options", "basis", "components", "weights"),
+    [
+        ({"reconstruction__basis": "pixels", "reconstruction__components": None}, "pixels", 961, "equal"),
+        ({"reconstruction__basis": "shapelets", "reconstruction__components": 12}, "shapelets", 12, "equal"),
+        ({"reconstruction__weights": "snr"}, "pca", 4, "snr"),
+        ({"reconstruction__weights": "softened"}, "pca", 4, "softened"),
+        ({"reconstruction__interpolation": "gp"}, "pca", 4, "equal"),
+    ],
+)
+def test_the_configuration_chooses_the_model(experiment, exposure, plain, options, basis, components, weights):
+    config = experiment.config
+    if basis == "pixels":
+        fit = config.reconstruction.model_copy(update={"components": None, "basis": "pixels"})
+        chosen = dataclasses.replace(experiment, config=resolve(config.model_copy(update={"reconstruction": fit})))
+    else:
+        chosen = asked(experiment, stars__truth=60, **options)
+    product = model_ccd(chosen, exposure)
+    model = product.model
+    assert (model.basis, model.n_components, model.order) == (basis, components, 1)
+    assert (model.kernel is not None) == ("reconstruction__interpolation" in options)
+    expected = snr_weights(weights, product.observed.snr)
+    assert (model.weights is None) == (expected is None)
+    if expected is not None:
+        np.testing.assert_array_equal(model.weights, expected)
+    assert not np.array_equal(product.truth.model_e1, plain.truth.model_e1)
+    # The noise-free PSFs are described by principal components all the same.
+    assert product.truth_model.basis == "pca"
+    # Another description of the same stars is about as good.
+    assert np.isfinite(product.observed.left_out_e1).all()
+    assert np.std(product.truth.residual_e1) < 3.0 * np.std(plain.truth.residual_e1)
+
+
+def test_weights_are_between_equal_and_inverse_variance():
+    snr = np.array([30.0, 100.0, 1000.0])
+    assert snr_weights("equal", snr) is None
+    np.testing.assert_allclose(snr_weights("snr", snr), [900.0, 1e4, 1e6])
+    np.testing.assert_allclose(snr_weights("softened", snr), [900.0 / 1.09, 5e3, 1e4 / 1.01])
+    with pytest.raises(ConfigError, match="expected one of equal, snr, softened"):
+        snr_weights("none", snr)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"basis": "pixels", "components": 20}, "components = 20: expected null with basis = pixels"),
+        ({"interpolation": "gp", "weights": "snr"}, "weights = snr: expected equal with interpolation = gp"),
+        ({"basis": "shapelet"}, 'reconstruction.basis = "shapelet": expected one of pca, pixels, shapelets'),
+        ({"components": 40}, "components = 40: expected at most 39, one less than stars.observed = 40"),
+    ],
+)
+def test_models_that_cannot_be_are_one_line(tiny, options, message):
+    with pytest.raises(ConfigError, match=message):
+        tiny(stars__observed=N, stars__truth=100, **{f"reconstruction__{key}": v for key, v in options.items()})
+
+
+def test_defaults_follow_basis_and_interpolation(tiny):
+    config = tiny()
+    fresh = type(config)(**{"reconstruction": {"interpolation": "gp"}})
+    assert resolve(fresh).reconstruction.order == 0
+    assert resolve(fresh).reconstruction.components == 20
+    assert resolve(type(config)(**{"reconstruction": {"basis": "pixels"}})).reconstruction.components is None
+    assert resolve(type(config)()).reconstruction.order == 3

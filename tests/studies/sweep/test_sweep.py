@@ -1,0 +1,304 @@
+"""Whole sweeps, through the command line: who computes, what is killed, and what the figures are afterwards."""
+
+import os
+import re
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pachon.commands.cli import main
+from pachon.core.errors import ConfigError
+from pachon.studies.sweep.file import load_sweep, read_sweep
+from pachon.studies.sweep.metrics import METRICS
+from pachon.studies.sweep.store import SweepStore
+from pachon.studies.sweep.sweep import check_room
+
+SWEEP = """
+name: small
+base: {ccds: [R23], wavelengths_nm: [624], stars: {truth: 12}, psf: {engine: long_exposure},
+       reconstruction: {components: 5, truth_order: 2}}
+parameters:
+  focal_plane.raft_um: {nominal: 0, range: [0, 10], marks: {specification: 4.8}}
+  M2.dz_um: {nominal: 0, range: [-10, 10]}
+  R23_S11.rx_urad: {nominal: 0, values: [0, 100]}
+  reconstruction.order: {nominal: 3, values: [3, 2]}
+design: {kind: latin_hypercube, points: 18}
+metrics: [fwhm, rms_e]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "small.yaml").write_text(SWEEP)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def figures(path):
+    """Every point's number and figures, as the bytes that the store holds."""
+    with sqlite3.connect(path) as connection:
+        rows = connection.execute("SELECT number, metrics, problem FROM results ORDER BY number").fetchall()
+    connection.close()
+    return rows
+
+
+def count(path):
+    if not os.path.exists(path):
+        return 0
+    try:
+        with sqlite3.connect(path) as connection:
+            (number,) = connection.execute("SELECT count(*) FROM results").fetchone()
+        connection.close()
+        return number
+    except sqlite3.Error:
+        return 0
+
+
+def start(*arguments, **options):
+    with open("said.txt", "wb") as said:
+        return subprocess.Popen([sys.executable, "-m", "pachon.commands.cli", *arguments], stderr=said, **options)
+
+
+def said_by(process):
+    """Wait for a command to end, and return what it said on standard error."""
+    process.wait(60)
+    with open("said.txt", encoding="utf-8") as said:
+        return said.read().strip()
+
+
+def wait_for(path, number, process, seconds=90.0):
+    """Wait until a store holds so many points."""
+    end = time.monotonic() + seconds
+    while count(path) < number:
+        assert process.poll() is None, said_by(process)
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reference")
+    (folder / "small.yaml").write_text(SWEEP)
+    assert main(["sweep", str(folder / "small.yaml"), "--processes", "1", "--threads", "2", "--quiet"]) == 0
+    return figures(folder / "small.sweep")
+
+
+def test_points_differ_where_their_parameters_do(reference):
+    assert len(reference) == 18
+    assert all(problem is None for _, _, problem in reference)
+    assert len({metrics for _, metrics, _ in reference}) == 18
+
+
+def test_two_processes_give_the_same_bytes_also_when_the_driver_is_killed(folder, reference):
+    driver = start("sweep", "small.yaml", "--processes", "2", start_new_session=True)
+    wait_for("small.sweep", 5, driver)
+    os.killpg(driver.pid, signal.SIGKILL)
+    driver.wait()
+    assert 5 <= count("small.sweep") < 18
+    assert main(["sweep", "small.yaml"]) == 2, "without --resume a store is not touched"
+    assert main(["sweep", "small.yaml", "--processes", "2", "--resume", "--quiet"]) == 0
+    assert figures("small.sweep") == reference
+
+
+def test_a_killed_worker_process_is_one_line_and_loses_nothing(folder, reference):
+    driver = start("sweep", "small.yaml", "--processes", "2")
+    wait_for("small.sweep", 4, driver)
+    with SweepStore(folder / "small.sweep") as store:
+        workers = {int(r.worker.rpartition(":")[2]) for r in store.results()} - {driver.pid}
+    os.kill(workers.pop(), signal.SIGKILL)
+    last = said_by(driver).splitlines()[-1]
+    assert driver.returncode == 2
+    assert re.search("a worker process died.*what was computed is kept, go on with --resume", last)
+    assert main(["sweep", "small.yaml", "--processes", "1", "--resume", "--quiet"]) == 0
+    assert figures("small.sweep") == reference
+
+
+def test_ctrl_c_keeps_what_is_written(folder, reference):
+    driver = start("sweep", "small.yaml", "--processes", "2")
+    wait_for("small.sweep", 4, driver)
+    driver.send_signal(signal.SIGINT)
+    assert "go on with: pachon sweep small.yaml -o small.sweep --resume" in said_by(driver)
+    assert driver.returncode == 130
+    assert main(["sweep", "small.yaml", "--resume", "--quiet"]) == 0
+    assert figures("small.sweep") == reference
+
+
+@pytest.fixture
+def cluster():
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+    def scheduler():
+        where = ["--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--no-dashboard"]
+        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", *where], **quiet)
+
+    def worker():
+        how = [address, "--nthreads", "1", "--no-dashboard", "--no-nanny"]
+        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", *how], **quiet)
+
+    running = {"scheduler": scheduler(), "workers": [worker(), worker()]}
+    running["restart"] = lambda: running.update(
+        scheduler=scheduler(), workers=[*running["workers"], worker(), worker()]
+    )
+    running["address"] = address
+    yield running
+    for process in (running["scheduler"], *running["workers"]):
+        process.kill()
+        process.wait()
+
+
+def test_a_dask_cluster_that_loses_its_driver_a_worker_and_its_scheduler(folder, reference, cluster):
+    driver = start("sweep", "small.yaml", "--scheduler", cluster["address"])
+    wait_for("small.sweep", 3, driver)
+    driver.kill()
+    driver.wait()
+    driver = start("sweep", "small.yaml", "--scheduler", cluster["address"], "--resume")
+    wait_for("small.sweep", 6, driver)
+    cluster["workers"][0].kill()
+    wait_for("small.sweep", 8, driver)
+    cluster["scheduler"].kill()
+    last = said_by(driver).splitlines()[-1]
+    assert driver.returncode == 2
+    assert "the Dask scheduler is lost; what was computed is kept, go on with --resume" in last
+    assert 8 <= count("small.sweep") < 18
+    for process in (cluster["scheduler"], *cluster["workers"]):
+        process.kill()
+        process.wait()
+    cluster["restart"]()
+    assert main(["sweep", "small.yaml", "--scheduler", cluster["address"], "--resume", "--quiet"]) == 0
+    assert figures("small.sweep") == reference
+
+
+def test_a_changed_sweep_is_refused_with_what_differs(folder, capsys):
+    (folder / "small.yaml").write_text(SWEEP.replace("points: 18", "points: 1"))
+    assert main(["sweep", "small.yaml", "--quiet"]) == 0
+    (folder / "small.yaml").write_text(SWEEP.replace("points: 18", "points: 2"))
+    assert main(["sweep", "small.yaml", "--resume", "--quiet"]) == 2
+    assert "small.sweep: store of another sweep (design.points: 1 -> 2); give another -o" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("M2.dz_um", "M7.dz_um"), "'M7': did you mean M3 or M2 or M1"),
+        (("M2.dz_um", "M2.dz"), "changes.M2.dz: expected its unit at the end, such as M2.dz_um"),
+        (("focal_plane.raft_um", "focal_plane.raf_um"), "focal_plane.raf_um"),
+        (("R23_S11.rx_urad", "R23_S11.rx_um"), "unknown motion of R23_S11 'rx_um': did you mean rx_urad"),
+        (("fwhm, rms_e", "fwhm, rms_ee"), "unknown metric 'rms_ee': did you mean rms_e"),
+        (("ccds: [R23]", "ccds: [R99]"), "R99"),
+        (("values: [3, 2]", "values: [3, -2]"), "reconstruction.order = -2: expected a number from 0"),
+        (("name: small", "name: small\nxi_target: -1"), "xi_target = -1: expected a number above 0"),
+    ],
+)
+def test_bad_sweeps_end_with_one_line_before_anything_is_computed(folder, capsys, change, message):
+    (folder / "small.yaml").write_text(SWEEP.replace(*change))
+    assert main(["sweep", "small.yaml"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert not (folder / "small.sweep").exists()
+
+
+def test_every_metric_gives_finite_figures(folder):
+    metrics = ", ".join(m for m in METRICS if m != "reconstruction")
+    (folder / "small.yaml").write_text(
+        SWEEP.replace("fwhm, rms_e", metrics).replace("points: 18", "points: 1").replace("[R23]", "[R23_S11, R23_S12]")
+    )
+    assert main(["sweep", "small.yaml", "--quiet"]) == 0
+    with SweepStore(folder / "small.sweep") as store:
+        (result,) = store.results()
+    names = set(result.metrics)
+    # No CCD lies in some rings of the field, and few stars have few close pairs; all else is a number.
+    empty = {name for name, value in result.metrics.items() if value != value and not name.startswith(("xi_p", "xi_m"))}
+    assert empty == {"mean_e_0_to_0.5_deg", "mean_e_1.5_to_1.8_deg"}
+    assert {"fwhm_arcsec", "rms_e", "border_jump_e", "xi_raw_short", "ee80_arcsec", "throughput_min", "Z4_nm"} <= names
+
+
+def test_more_points_than_there_is_room_for_are_refused_before_starting(folder):
+    content = {
+        "parameters": {f"M1.Z{j}_nm": {"range": [0, 1]} for j in range(4, 16)},
+        "design": {"kind": "grid", "points": 20},
+    }
+    with pytest.raises(ConfigError, match=r"4,096,000,000,000,000 points take about .* of memory, .* are free"):
+        check_room(read_sweep(content, "test"), folder / "s.sweep")
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(folder, capsys, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("pachon.studies.sweep.workers.CONNECT_SECONDS", 1.0)
+    assert main(["sweep", "small.yaml", "--scheduler", "tcp://127.0.0.1:9"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "--scheduler = tcp://127.0.0.1:9: no answer within 1 s" in error
+    assert len(error.splitlines()) == 1
+
+
+def test_an_address_that_is_none_is_one_line(folder, capsys):
+    pytest.importorskip("distributed")
+    assert main(["sweep", "small.yaml", "--scheduler", "login1:8786"]) == 2
+    assert "--scheduler = login1:8786: expected an address such as tcp://host:8786" in capsys.readouterr().err
+
+
+def test_workers_with_another_version_are_refused(monkeypatch):
+    from pachon.studies.sweep import workers as sweep_workers
+
+    class Client:
+        def run(self, function, on_error):
+            return {"tcp://a": "0.0.1"}
+
+    with pytest.raises(ConfigError, match=r"worker tcp://a: has pachon 0\.0\.1, expected"):
+        sweep_workers.check_versions(Client())
+
+
+def test_points_that_cannot_be_computed_are_reported_and_the_others_go_on(folder, capsys):
+    # A CCD at the rim of the field sees no light when M2 is moved by half a metre.
+    text = SWEEP.replace("range: [-10, 10]", "values: [0, 3.0e+6]").replace("points: 18", "points: 6")
+    (folder / "small.yaml").write_text(text)
+    assert main(["sweep", "small.yaml"]) == 0
+    rows = figures("small.sweep")
+    failed = [problem for _, _, problem in rows if problem]
+    assert 0 < len(failed) < 6
+    assert all("\n" not in problem for problem in failed)
+    assert main(["sweep", "status", "small.sweep"]) == 0
+    assert failed[0][:40] in capsys.readouterr().out.replace("\n", "")
+
+
+def test_sweep_files_may_name_the_file_of_their_configuration(folder):
+    (folder / "base.yaml").write_text("seed: 5\nccds: [R22_S11]\n")
+    (folder / "two.yaml").write_text("base: base.yaml\nparameters: {band: {nominal: r, values: [r, i]}}\n")
+    assert load_sweep(folder / "two.yaml").base == {"seed": 5, "ccds": ["R22_S11"]}
+
+
+def test_a_wavelength_is_a_parameter(folder):
+    text = "base: {ccds: [R22_S11], stars: {truth: 12}, psf: {engine: long_exposure}, reconstruction: {components: 5, "
+    text += (
+        "truth_order: 2}}\nparameters: {wavelengths_nm: {values: [560, 690]}}\ndesign: {kind: grid}\nmetrics: [fwhm]\n"
+    )
+    (folder / "small.yaml").write_text(text)
+    assert main(["sweep", "small.yaml", "--quiet"]) == 0
+    with SweepStore(folder / "small.sweep") as store:
+        blue, red = (result.metrics["fwhm_arcsec"] for result in store.results())
+    # Seeing falls as the wavelength to the power -1/5; optics and detector are there too, the outer scale takes more.
+    assert 0.9 < red / blue < (690 / 560) ** -0.2
+
+
+def test_compensators_are_solved_at_every_point(folder):
+    text = SWEEP.replace("metrics:", "compensators: [Camera.dz_um]\nmetrics:").replace(
+        "latin_hypercube, points: 18", "grid"
+    )
+    text = text.replace("M2.dz_um: {nominal: 0, range: [-10, 10]}", "Camera.dz_um: {nominal: 0, values: [0, 10]}")
+    text = re.sub(r"  focal_plane.*\n|  R23_S11.*\n|  reconstruction.order.*\n", "", text)
+    (folder / "small.yaml").write_text(text)
+    assert main(["sweep", "small.yaml", "--quiet"]) == 0
+    with SweepStore(folder / "small.sweep") as store:
+        still, moved = (result.metrics for result in store.results())
+    # The camera goes back by what it was moved; the solver stops at 1e-9 of the mean square radius of the spots.
+    assert moved["solved Camera.dz_um"] - still["solved Camera.dz_um"] == pytest.approx(-10.0, abs=0.02)
+    assert moved["rms_e"] == pytest.approx(still["rms_e"], rel=1e-3)

@@ -1,0 +1,1 @@
+"""Turbulence, phase screens, refraction."""

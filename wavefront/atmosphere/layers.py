@@ -1,0 +1,79 @@
+"""The layers of an atmosphere: their heights, weights and winds, checked."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError
+from ...core.random_streams import stream
+from ...models.site import WEIGHT_TOLERANCE, Site
+
+
+def checked_layers(
+    site: Site,
+    altitudes: ArrayLike | None,
+    weights: ArrayLike | None,
+    wind_speeds: ArrayLike | None,
+    wind_directions: ArrayLike | None,
+    seed: int,
+    epoch: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return heights [m], weights of sum 1, wind speeds [m/s] and directions [rad] of the layers, checked."""
+    height = np.array(site.altitudes if altitudes is None else altitudes, dtype=np.float64).reshape(-1)
+    count = len(height)
+    if wind_directions is None:
+        known = site.wind_directions if altitudes is None else (None,) * count
+        wind_directions = [
+            2.0 * math.pi * layer_random(seed, epoch, n, "wind", 1)[0] if direction is None else direction
+            for n, direction in enumerate(known)
+        ]
+    given = {
+        "altitudes": height,
+        "weights": np.array(site.weights if weights is None else weights, dtype=np.float64),
+        "wind_speeds": np.array(site.wind_speeds if wind_speeds is None else wind_speeds, dtype=np.float64),
+        "wind_directions": np.array(wind_directions, dtype=np.float64),
+    }
+    for name, values in given.items():
+        if values.shape != (count,) or count == 0:
+            raise DomainError(f"{name} of shape {values.shape}: expected one number for each of the {count} layers")
+        low = -math.inf if name == "wind_directions" else 0.0
+        if not np.all(np.isfinite(values) & (values >= low)):
+            raise DomainError(f"{name} = {values.tolist()}: expected finite numbers{' from 0' if low == 0.0 else ''}")
+    total = float(given["weights"].sum())
+    if abs(total - 1.0) > WEIGHT_TOLERANCE:
+        raise DomainError(f"weights = {given['weights'].tolist()}: expected fractions that sum to 1, not {total:.6g}")
+    return height, given["weights"] / total, given["wind_speeds"], given["wind_directions"]
+
+
+def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.ndarray:
+    """Return how far layers are along a line of sight [m].
+
+    Parameters
+    ----------
+    heights : ndarray
+        Heights above the telescope [m].
+    ground_lift : float
+        Height given to a layer at exactly 0 [m].
+    zenith : float
+        Angle of the line of sight from the zenith [rad].
+    """
+    return np.where(heights == 0.0, ground_lift, heights) / math.cos(zenith)
+
+
+def check_drift(distances: np.ndarray, speeds: np.ndarray, exposure: float, length: float) -> None:
+    """Refuse an exposure in which a layer comes round on its periodic screen."""
+    layer = int(np.argmax(speeds))
+    drift = float(speeds[layer]) * exposure
+    if drift >= length:
+        raise DomainError(
+            f"screen_length = {length:g}: expected more than {drift:g} m, which layer {layer} at {distances[layer]:g} m"
+            f" drifts in {exposure:g} s: screens are periodic, and light would meet the same turbulence again"
+        )
+
+
+def layer_random(seed: int, epoch: int, layer: int, name: str, count: int) -> np.ndarray:
+    """Return random numbers from 0 to 1 of the stream of one layer."""
+    return stream(seed, "atmosphere", epoch, layer, name).random(count)

@@ -1,0 +1,376 @@
+r"""Von Karman turbulence in closed form: spectrum, structure functions, long exposures.
+
+Everything is *optical path* in metres, which does not depend on the wavelength: the phase is
+:math:`2 \pi \psi / \lambda`. The spectrum of the phase at the wavelength of the Fried parameter (Jee & Tyson 2011,
+eq. 1, which rounds the constant to 0.023) is
+
+.. math:: W(\nu) = c \, r_0^{-5/3} (\nu^2 + L_0^{-2})^{-11/6}, \qquad
+          c = \frac{\Gamma(11/6)^2}{2 \pi^{11/3}} \left[\tfrac{24}{5} \Gamma(6/5)\right]^{5/6} = 0.0228956,
+
+with :math:`\nu` in cycles per metre, the constant that makes the Kolmogorov structure function exactly
+:math:`6.88388 (r/r_0)^{5/3}` (Fried 1966; Conan 2000). Fried parameters are those at 500 nm.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+from scipy.special import gamma, j0, kv
+
+from ...core.errors import DomainError
+
+#: Wavelength at which Fried parameters are given [m].
+REFERENCE_WAVELENGTH = 500e-9
+_KOLMOGOROV = (24.0 / 5.0 * gamma(6.0 / 5.0)) ** (5.0 / 6.0)
+#: Constant of the phase spectrum in cycles per metre.
+SPECTRUM_CONSTANT = float(gamma(11.0 / 6.0) ** 2 / (2.0 * math.pi ** (11.0 / 3.0)) * _KOLMOGOROV)
+_PATH_PER_RADIAN = REFERENCE_WAVELENGTH / (2.0 * math.pi)
+# The exponent of the closed forms, and the number of terms with which its series is exact to rounding below unity.
+_NU = 5.0 / 6.0
+_SERIES_TERMS = 10
+
+
+def require_positive(value: float, name: str, unit: str = "") -> float:
+    """Return a finite, positive float, or raise :class:`DomainError` naming the argument."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0.0):
+        raise DomainError(f"{name} = {value!r}: expected a positive, finite number{' of ' + unit if unit else ''}")
+    return number
+
+
+def fried_parameter(r0: float, wavelength: ArrayLike) -> np.ndarray:
+    """Return the Fried parameter [m] at a wavelength [m]; ``r0`` [m] is that at 500 nm."""
+    return r0 * (np.asarray(wavelength, dtype=np.float64) / REFERENCE_WAVELENGTH) ** 1.2
+
+
+def path_spectrum(frequency: ArrayLike, r0: float, outer_scale: float) -> np.ndarray:
+    """Return the power spectrum of the optical path.
+
+    Parameters
+    ----------
+    frequency : array_like
+        Spatial frequency [cycles/m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+
+    Returns
+    -------
+    ndarray
+        Two-sided, two-dimensional spectrum [m^2 per (cycles/m)^2]; its integral over the plane is the variance.
+
+    Raises
+    ------
+    DomainError
+        If the Fried parameter or the outer scale is not positive.
+    """
+    r0, outer_scale = require_positive(r0, "r0", "metres"), require_positive(outer_scale, "outer_scale", "metres")
+    nu = np.asarray(frequency, dtype=np.float64)
+    scale = SPECTRUM_CONSTANT * _PATH_PER_RADIAN**2 * r0 ** (-5.0 / 3.0)
+    return scale * (nu * nu + outer_scale**-2) ** (-11.0 / 6.0)
+
+
+def path_variance(r0: float, outer_scale: float) -> float:
+    """Return the variance of the optical path [m^2], half the structure function at infinite separation."""
+    r0, outer_scale = require_positive(r0, "r0", "metres"), require_positive(outer_scale, "outer_scale", "metres")
+    factor = gamma(11.0 / 6.0) * gamma(5.0 / 6.0) / (2.0 * math.pi ** (8.0 / 3.0)) * _KOLMOGOROV
+    return float(factor * (outer_scale / r0) ** (5.0 / 3.0) * _PATH_PER_RADIAN**2)
+
+
+def structure_function(separation: ArrayLike, r0: float, outer_scale: float) -> np.ndarray:
+    r"""Return the structure function of the optical path.
+
+    :math:`D(r) = 2 \sigma^2 [1 - \frac{2^{1/6}}{\Gamma(5/6)} x^{5/6} K_{5/6}(x)]` with :math:`x = 2 \pi r / L_0`
+    (Conan 2000; Tokovinin 2002, eq. 16).
+
+    Parameters
+    ----------
+    separation : array_like
+        Distance of the two points [m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+
+    Returns
+    -------
+    ndarray
+        Mean squared difference of path [m^2]; times ``(2 pi / wavelength)^2`` it is that of the phase.
+
+    Raises
+    ------
+    DomainError
+        If the Fried parameter or the outer scale is not positive.
+    """
+    variance = path_variance(r0, outer_scale)
+    x = 2.0 * math.pi * np.abs(np.asarray(separation, dtype=np.float64)) / outer_scale
+    small = np.minimum(x, 1.0)
+    large = np.maximum(x, 1.0)
+    # Near zero the closed form is the small difference of two near-equal numbers; the power series is not.
+    quarter = small * small / 4.0
+    growing, falling = np.zeros_like(small), np.zeros_like(small)
+    term_growing, term_falling = np.ones_like(small), np.ones_like(small)
+    for k in range(1, _SERIES_TERMS + 1):
+        falling = falling + term_falling
+        term_growing = term_growing * quarter / (k * (k - _NU))
+        term_falling = term_falling * quarter / (k * (k + _NU))
+        growing = growing + term_growing
+    ratio = gamma(-_NU) / gamma(_NU) * 4.0**-_NU
+    series = -ratio * small ** (2.0 * _NU) * falling - growing
+    closed = 1.0 - 2.0 ** (1.0 - _NU) / gamma(_NU) * large**_NU * kv(_NU, large)
+    return 2.0 * variance * np.where(x < 1.0, series, closed)
+
+
+def _gauss_panels(end: float, panels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of Gauss-Legendre quadrature from 0 to ``end``, in equal panels of 32 nodes."""
+    node, weight = np.polynomial.legendre.leggauss(32)
+    width = end / panels
+    nodes = width * (np.arange(panels)[:, np.newaxis] + 0.5 * (node + 1.0))
+    return nodes.ravel(), np.tile(0.5 * width * weight, panels)
+
+
+def _low_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
+    """Return the structure function [m^2] of the modes at and below the cut-off."""
+    # nu = sinh(t) / L0 spreads the knee of the spectrum at 1/L0 evenly over the nodes.
+    end = math.asinh(cutoff / (2.0 * math.pi) * outer_scale)
+    # A panel spans at most 2 in t and 24 rad of the Bessel function's phase: exact to rounding with 32 nodes.
+    longest = float(np.max(separation, initial=0.0))
+    t, weight = _gauss_panels(end, math.ceil(end / 2.0) + math.ceil(end * cutoff * longest / 24.0))
+    nu = np.sinh(t) / outer_scale
+    weight = weight * 4.0 * math.pi * nu * np.cosh(t) / outer_scale * path_spectrum(nu, r0, outer_scale)
+    result = np.empty_like(separation)
+    rows = max(1, 4_000_000 // t.size)
+    for first in range(0, separation.size, rows):
+        part = separation[first : first + rows, np.newaxis]
+        result[first : first + rows] = (1.0 - j0(2.0 * math.pi * nu * part)) @ weight
+    return result
+
+
+def high_structure_function(separation: ArrayLike, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
+    """Return the structure function of the modes above a cut-off wavenumber alone.
+
+    It is the closed form less an integral over the finite disc of wavenumbers below the cut-off, so modes of
+    every wavenumber above are in it, beyond the Nyquist limit of any screen too.
+
+    Parameters
+    ----------
+    separation : array_like
+        Distance of the two points [m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    cutoff : float
+        Cut-off wavenumber [rad/m].
+
+    Returns
+    -------
+    ndarray
+        Mean squared difference of path [m^2], shape of ``separation``.
+
+    Raises
+    ------
+    DomainError
+        If the Fried parameter, the outer scale or the cut-off is not positive.
+    """
+    cutoff = require_positive(cutoff, "cutoff", "radians per metre")
+    b = np.abs(np.asarray(separation, dtype=np.float64))
+    total = structure_function(b, r0, outer_scale)
+    flat = b.ravel()
+    longest = float(np.max(flat, initial=0.0))
+    # The subtracted part is band-limited, so cubic interpolation at 1/20 rad of its fastest mode is exact to 1e-8
+    # of the modes' variance; it is used where it needs fewer integrals than there are separations.
+    knots = math.ceil(20.0 * cutoff * longest) + 5
+    if knots < flat.size:
+        grid = np.linspace(0.0, max(longest, 1e-3 / cutoff), knots)
+        low = CubicSpline(
+            grid, _low_structure_function(grid, r0, outer_scale, cutoff), bc_type=("clamped", "not-a-knot")
+        )(flat)
+    else:
+        low = _low_structure_function(flat, r0, outer_scale, cutoff)
+    return np.maximum(total - low.reshape(b.shape), 0.0)
+
+
+def slope_variance(r0: float, outer_scale: float, cutoff: float, lag: float = 0.0) -> float:
+    """Return the variance of one component of the slope of the modes at and below a cut-off wavenumber.
+
+    It is half of the integral of ``(k sinc(k lag / 2))^2 W`` over the disc of frequencies, ``k = 2 pi nu``.
+
+    Parameters
+    ----------
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    cutoff : float
+        Cut-off wavenumber [rad/m].
+    lag : float
+        Distance over which the slope is taken [m]; 0 for the gradient.
+
+    Returns
+    -------
+    float
+        Variance [rad^2].
+    """
+    # nu = sinh(t) / L0 spreads the knee of the spectrum at 1/L0 evenly over the nodes.
+    t, weight = _gauss_panels(math.asinh(cutoff / (2.0 * math.pi) * outer_scale), 8)
+    nu = np.sinh(t) / outer_scale
+    squared = (2.0 * math.pi * nu * np.sinc(nu * lag)) ** 2
+    return float(
+        np.sum(weight * np.cosh(t) / outer_scale * math.pi * nu * squared * path_spectrum(nu, r0, outer_scale))
+    )
+
+
+def _lens_area(distance: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:
+    """Return the common area [m^2] of two discs whose centres are a distance apart [m]."""
+    a, b = max(radius_a, radius_b), min(radius_a, radius_b)
+    if b == 0.0:
+        return np.zeros_like(distance)
+    d = np.clip(distance, a - b, a + b)
+    safe = np.maximum(d, 1e-12 * a)
+    cos_a = np.clip((d * d + a * a - b * b) / (2.0 * safe * a), -1.0, 1.0)
+    cos_b = np.clip((d * d + b * b - a * a) / (2.0 * safe * b), -1.0, 1.0)
+    kite = np.maximum((a + b - d) * (d + a - b) * (d - a + b) * (d + a + b), 0.0)
+    area = a * a * np.arccos(cos_a) + b * b * np.arccos(cos_b) - 0.5 * np.sqrt(kite)
+    return np.where(distance <= a - b, math.pi * b * b, area)
+
+
+def diffraction_otf(separation: ArrayLike, diameter: float, obscuration: float = 0.0) -> np.ndarray:
+    """Return the optical transfer function of an annular pupil, as its autocorrelation (O'Neill 1956).
+
+    Parameters
+    ----------
+    separation : array_like
+        Baseline in the pupil [m]: wavelength times angular frequency.
+    diameter : float
+        Outer diameter [m].
+    obscuration : float
+        Inner over outer diameter.
+
+    Returns
+    -------
+    ndarray
+        Transfer function, 1 at zero and 0 from the diameter on.
+
+    Raises
+    ------
+    DomainError
+        If the diameter is not positive or the obscuration not in [0, 1).
+    """
+    outer = 0.5 * require_positive(diameter, "diameter", "metres")
+    if not 0.0 <= obscuration < 1.0:
+        raise DomainError(f"obscuration = {obscuration!r}: expected a ratio of diameters in [0, 1)")
+    inner = obscuration * outer
+    b = np.abs(np.asarray(separation, dtype=np.float64))
+    common = _lens_area(b, outer, outer) - 2.0 * _lens_area(b, outer, inner) + _lens_area(b, inner, inner)
+    return np.maximum(common, 0.0) / (math.pi * (outer**2 - inner**2))
+
+
+def long_exposure_otf(
+    separation: ArrayLike,
+    wavelength: float,
+    r0: float,
+    outer_scale: float,
+    *,
+    diameter: float | None = None,
+    obscuration: float = 0.0,
+) -> np.ndarray:
+    """Return the optical transfer function of an infinitely long exposure.
+
+    Parameters
+    ----------
+    separation : array_like
+        Baseline in the pupil [m]: wavelength times angular frequency.
+    wavelength : float
+        Wavelength [m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    diameter : float, optional
+        Pupil diameter [m]; without it, of the atmosphere alone.
+    obscuration : float
+        Inner over outer diameter of the pupil.
+
+    Returns
+    -------
+    ndarray
+        ``exp(-D/2)``, times the transfer function of the pupil where a diameter is given.
+
+    Raises
+    ------
+    DomainError
+        If the wavelength, the Fried parameter, the outer scale or the pupil is outside its range.
+    """
+    wavenumber = 2.0 * math.pi / require_positive(wavelength, "wavelength", "metres")
+    otf = np.exp(-0.5 * wavenumber**2 * structure_function(separation, r0, outer_scale))
+    if diameter is not None:
+        otf = otf * diffraction_otf(separation, diameter, obscuration)
+    return otf
+
+
+def long_exposure_fwhm(
+    wavelength: float, r0: float, outer_scale: float, *, diameter: float | None = None, obscuration: float = 0.0
+) -> float:
+    """Return the full width at half maximum of an infinitely long exposure.
+
+    The point spread function is the Hankel transform of :func:`long_exposure_otf`, by quadrature.
+
+    Parameters
+    ----------
+    wavelength : float
+        Wavelength [m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    diameter : float, optional
+        Pupil diameter [m]; without it, of the atmosphere alone.
+    obscuration : float
+        Inner over outer diameter of the pupil.
+
+    Returns
+    -------
+    float
+        Full width at half maximum [rad].
+
+    Raises
+    ------
+    DomainError
+        If an argument is outside its range, or if the turbulence is so weak that without a pupil the image has a
+        core of no width.
+    """
+    wavenumber = 2.0 * math.pi / require_positive(wavelength, "wavelength", "metres")
+    floor = math.exp(-(wavenumber**2) * path_variance(r0, outer_scale))
+    if diameter is None and floor > 1e-8:
+        raise DomainError(
+            f"outer_scale = {outer_scale!r}: with r0 = {r0!r} m expected one so large that no coherent core remains"
+            " (give the diameter of the pupil to see that core)"
+        )
+    fried = float(fried_parameter(r0, wavelength))
+    # Beyond 7 Fried parameters Kolmogorov turbulence has left exp(-88); an outer scale slows that down.
+    longest = 7.0 * fried
+    while (diameter is None or longest < diameter) and (
+        long_exposure_otf(longest, wavelength, r0, outer_scale) > max(1e-12, 2.0 * floor)
+    ):
+        longest *= 1.5
+    if diameter is not None:
+        longest = min(longest, diameter)
+    b, weight = _gauss_panels(longest, 32)
+    otf = long_exposure_otf(b, wavelength, r0, outer_scale, diameter=diameter, obscuration=obscuration) * b * weight
+
+    def excess(angle: float) -> float:
+        return float(np.sum(otf * (j0(wavenumber * b * angle) - 0.5)))
+
+    upper = 0.1 * wavelength / fried if diameter is None else 0.1 * wavelength / max(fried, diameter)
+    while excess(upper) > 0.0:
+        upper *= 1.5
+    return 2.0 * float(brentq(excess, 0.0, upper, xtol=1e-8 * upper))

@@ -1,0 +1,1 @@
+"""PSF engines and their kernels."""

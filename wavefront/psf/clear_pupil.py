@@ -1,0 +1,172 @@
+"""Rings and spokes over an annular pupil, and how much of each spoke the apertures of a telescope leave clear."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ...core.errors import DomainError
+from ...core.launch import launch
+from ...models.telescope import Telescope
+from ...raytrace.kernels.packet import lane_flags, lanes, packet_count, to_packets
+from ...raytrace.kernels.trace import trace_rays
+from ...raytrace.pack.surfaces import clear_ring, pack_surfaces, refractive_indices
+from .clear_pupil_kernels import find_edges
+from .sample_packets import shared
+
+# Spokes to a ring: the phase of a blur goes round the pupil some three times faster than across its ring.
+_SPOKES_TO_A_RING = 3.2
+# Polynomials of a higher degree along the ring than these have say nothing new.
+_MOST_RINGS = 12
+# Rays on a spoke from which the rims of apertures are found, by parabolas.
+_EDGE_RINGS = 3
+
+
+@dataclass(frozen=True)
+class SpokePupil:
+    """Points on rings and spokes, with the rule that integrates over the pupil.
+
+    Along each spoke this is Gauss-Lobatto quadrature in the square of the radius, in which area is even; it has points
+    on both rims. Around, it is the trapezoidal rule.
+
+    Attributes
+    ----------
+    radius : ndarray, shape [n_ring]
+        Rising radii of the rings [m].
+    share : ndarray, shape [n_ring]
+        Part of the pupil within each ring, 0 to 1.
+    quadrature : ndarray, shape [n_ring]
+        Weights of the rings, of sum 1.
+    unit : ndarray, shape [n_spoke, 2]
+        Directions of the spokes; a multiple of four, symmetric about both axes and the diagonals.
+    """
+
+    radius: np.ndarray
+    share: np.ndarray
+    quadrature: np.ndarray
+    unit: np.ndarray
+
+    @classmethod
+    def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
+        """Return about so many points of an annulus of given diameter [m] and linear obscuration."""
+        if not count >= 10:
+            raise DomainError(f"n_pupil = {count!r}: expected at least 10 pupil points")
+        n_ring = min(math.ceil(math.sqrt(count / _SPOKES_TO_A_RING)), _MOST_RINGS)
+        n_spoke = 4 * max(1, round(count / (4 * n_ring)))
+        legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
+        node = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])
+        share = 0.5 * (node + 1.0)
+        angle = 2.0 * math.pi * (np.arange(n_spoke) + 0.5) / n_spoke
+        return cls(
+            radius=0.5 * diameter * np.sqrt(obscuration**2 + (1.0 - obscuration**2) * share),
+            share=share,
+            quadrature=1.0 / (n_ring * (n_ring - 1) * legendre(node) ** 2),
+            unit=np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+        )
+
+    @property
+    def n_spoke(self) -> int:
+        """Number of spokes."""
+        return len(self.unit)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Pupil coordinates [m], shape [n_ring * n_spoke, 2], ring by ring."""
+        return (self.radius[:, None, None] * self.unit).reshape(-1, 2)
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """One over the differences of the radii [1/m], shape [n_ring, n_ring]; 0 on the diagonal."""
+        difference = self.radius[:, None] - self.radius
+        return np.divide(1.0, difference, out=np.zeros_like(difference), where=difference != 0.0)
+
+
+def clear_edges(
+    telescope: Telescope, direction: np.ndarray, unit: np.ndarray, wavelength: float, threads: int | None = None
+) -> np.ndarray:
+    """Return between which radii of the entrance pupil light passes all apertures.
+
+    On each spoke the clear part is taken to be one piece, as it is where apertures are discs and rings about the light:
+    spiders, other apertures and obstructions are refused.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    direction : ndarray, shape [n_star, 3]
+        Directions in which the light travels.
+    unit : ndarray, shape [n_spoke, 2]
+        Directions of the spokes in the pupil.
+    wavelength : float
+        Vacuum wavelength [m].
+    threads : int, optional
+        Number of threads.
+
+    Returns
+    -------
+    ndarray, shape [n_star, n_spoke, 2]
+        Inner and outer radius [m]; equal where a spoke is dark.
+
+    Raises
+    ------
+    DomainError
+        If something other than discs and rings stops the light.
+    """
+    _check_rings(telescope)
+    n_star, n_spoke = len(direction), len(unit)
+    outer = 0.5 * telescope.pupil_diameter
+    radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
+    point = np.empty((3, _EDGE_RINGS * n_spoke))
+    point[:2] = (radius[:, None, None] * unit).reshape(-1, 2).T
+    point[2] = telescope.stop_z
+    # Summed by hand: a matrix product may round otherwise for another number of stars.
+    along = sum(direction[:, axis, None] * point[axis] for axis in range(3)) + telescope.launch_distance
+    start = (point[:, None] - direction.T[:, :, None] * along).reshape(3, -1)
+    heading = np.repeat(direction.T, point.shape[1], axis=1)
+    n_ray = start.shape[1]
+    n_surface, n_packet = len(telescope.surfaces), packet_count(n_ray)
+    places = wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu")
+    surfaces = pack_surfaces(telescope)
+    launch(
+        trace_rays,
+        n_packet,
+        [
+            surfaces,
+            wp.array(refractive_indices(telescope, wavelength)[None], dtype=wp.float64, device="cpu"),
+            wp.array(to_packets(start), dtype=lanes, device="cpu", copy=False),
+            wp.array(to_packets(heading), dtype=lanes, device="cpu", copy=False),
+            wp.zeros(n_packet, dtype=lanes, device="cpu"),
+            places,
+            wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu"),
+            wp.empty((n_surface, n_packet), dtype=lanes, device="cpu"),
+            wp.empty((n_surface, n_packet), dtype=lane_flags, device="cpu"),
+        ],
+        threads=threads,
+    )
+    edges = np.empty((n_star, n_spoke, 2))
+    launch(
+        find_edges,
+        n_star * n_spoke,
+        [
+            surfaces,
+            shared(places.numpy().reshape(n_surface, 3, -1), wp.float64),
+            shared(radius, wp.float64),
+            n_spoke,
+            shared(edges, wp.float64),
+        ],
+        threads=threads,
+    )
+    return edges
+
+
+def _check_rings(telescope: Telescope) -> None:
+    other = [f"the aperture of {s.name}" for s in telescope.surfaces if clear_ring(s.aperture) is None]
+    other += [f"the obstruction {o.name}" for o in telescope.obstructions]
+    if other:
+        raise DomainError(
+            f"engine = 'long_exposure': expected nothing but discs and rings to stop light; {telescope.name} has "
+            f"{other[0]}{f' and {len(other) - 1} more' if other[1:] else ''} (use engine = 'fast' or 'wave')"
+        )

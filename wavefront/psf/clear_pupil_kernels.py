@@ -1,0 +1,119 @@
+"""The kernel that finds which part of a pupil the apertures of a telescope leave clear."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from ...raytrace.kernels.trace import APERTURE, ROTATION, STOPPED, VERTEX, PackedSurfaces
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def squared_distance(
+    surfaces: PackedSurfaces, s: wp.int32, position: wp.array3d(dtype=wp.float64), ray: wp.int32
+) -> wp.float64:
+    """Square of a ray's distance from the centre of the clear aperture of surface ``s``, in its own x and y [m^2]."""
+    x = position[s, 0, ray] - surfaces.numbers[s, VERTEX]
+    y = position[s, 1, ray] - surfaces.numbers[s, VERTEX + 1]
+    z = position[s, 2, ray] - surfaces.numbers[s, VERTEX + 2]
+    r = ROTATION
+    along_x = surfaces.numbers[s, r] * x + surfaces.numbers[s, r + 3] * y + surfaces.numbers[s, r + 6] * z
+    along_y = surfaces.numbers[s, r + 1] * x + surfaces.numbers[s, r + 4] * y + surfaces.numbers[s, r + 7] * z
+    along_x = along_x - surfaces.numbers[s, APERTURE]
+    along_y = along_y - surfaces.numbers[s, APERTURE + 1]
+    return along_x * along_x + along_y * along_y
+
+
+@wp.func
+def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
+    """Where the parabola through the values a, b, c at 0, 1, 2 lies below a square: from and to, equal if nowhere."""
+    zero = wp.float64(0.0)
+    two = wp.float64(2.0)
+    half = wp.float64(0.5)
+    low = zero
+    high = zero
+    bend = half * (a - two * b + c)
+    slope = b - a - bend
+    start = a - square
+    # A NaN fails both comparisons; a squared distance that runs linearly bends upwards, and how little does not matter.
+    if bend > zero:
+        inner = slope * slope - wp.float64(4.0) * bend * start
+        if inner > zero:
+            # The two roots without the difference of near-equal numbers.
+            far = -half * (slope + wp.where(slope < zero, -wp.sqrt(inner), wp.sqrt(inner)))
+            one = far / bend
+            other = wp.where(far == zero, zero, start / far)
+            low = wp.clamp(wp.min(one, other), zero, two)
+            high = wp.clamp(wp.max(one, other), zero, two)
+    elif bend <= zero:
+        end = c - square
+        if start < zero and end < zero:
+            high = two
+        elif start < zero:
+            high = two * start / (start - end)
+        elif end < zero:
+            low = two * start / (start - end)
+            high = two
+    return low, high
+
+
+@wp.kernel
+def find_edges(
+    first: wp.int32,
+    surfaces: PackedSurfaces,
+    position: wp.array3d(dtype=wp.float64),
+    radius: wp.array(dtype=wp.float64),
+    n_spoke: wp.int32,
+    edges: wp.array3d(dtype=wp.float64),
+):
+    """Find between which radii one spoke of the pupil of one star is clear.
+
+    Where a ray crosses a surface is nearly linear in its place in the pupil, so the square of its distance from the
+    centre of the aperture there is a parabola along the spoke: three rays tell where it passes the rim.
+
+    Arguments: position [surface, 3, (star * 3 + ring) * n_spoke + spoke]: telescope frame [m]; radius [3] of the rays
+    in the pupil, at equal steps [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.
+    """
+    item = first + wp.tid()
+    star = item // n_spoke
+    spoke = item % n_spoke
+    ray = 3 * star * n_spoke + spoke
+    half = wp.float64(0.5)
+    step = radius[1] - radius[0]
+    inside = radius[0]
+    outside = radius[2]
+    for s in range(surfaces.kinds.shape[0]):
+        if surfaces.kinds[s, STOPPED] == 1:
+            a = squared_distance(surfaces, s, position, ray)
+            b = squared_distance(surfaces, s, position, ray + n_spoke)
+            c = squared_distance(surfaces, s, position, ray + 2 * n_spoke)
+            missed = a != a or b != b or c != c
+            rim = surfaces.numbers[s, APERTURE + 3] * surfaces.numbers[s, APERTURE + 3]
+            low, high = within(a, b, c, rim)
+            if missed:
+                # Rays that miss a surface pass beyond its rim: what is clear ends before the first of them.
+                low = wp.float64(0.0)
+                high = wp.float64(0.0)
+                if a < rim:
+                    high = wp.where(b < rim, wp.float64(1.0), wp.float64(0.0))
+                elif c < rim:
+                    low = wp.where(b < rim, wp.float64(1.0), wp.float64(2.0))
+                    high = wp.float64(2.0)
+            inside = wp.max(inside, radius[0] + step * low)
+            outside = wp.min(outside, radius[0] + step * high)
+            hole = surfaces.numbers[s, APERTURE + 2] * surfaces.numbers[s, APERTURE + 2]
+            low, high = within(a, b, c, hole)
+            # A parabola may dip a little below zero where rays meet.
+            if hole > wp.float64(0.0) and high > low:
+                # The larger of the two pieces that the hole leaves.
+                if low > wp.float64(2.0) - high:
+                    outside = wp.min(outside, radius[0] + step * low)
+                else:
+                    inside = wp.max(inside, radius[0] + step * high)
+    if inside >= outside:
+        inside = half * (inside + outside)
+        outside = inside
+    edges[star, spoke, 0] = inside
+    edges[star, spoke, 1] = outside

@@ -1,0 +1,339 @@
+r"""The fast PSF engine: geometric optics for the long waves of the atmosphere, filters for everything else.
+
+Each pair of a pupil point and a time step is a ray. Its angle is the gradient of the low screens where it crosses them;
+the Jacobian of the star turns that into a displacement on its CCD, to which the traced transverse aberration of the
+optics is added. All rays of a star are binned on a fine grid, at every wavelength from one pass over the atmosphere.
+What geometric optics leaves out multiplies the transform of that image: the ensemble average of the high modes (the
+"second kick" of Peterson et al. 2015, as a filter), diffraction by the annular pupil, charge diffusion, the pixel, and
+a phase ramp for atmospheric dispersion and the place within the pixel.
+
+The filter of the atmosphere is chosen so that the mean over many exposures is right. With the structure function
+:math:`D(b)` of the whole atmosphere and the variance :math:`g` of one component of the low gradient, rays alone give
+:math:`\exp(-g b^2 / 2)` (both in radians of phase), so the rest is :math:`\exp(-D_{rest}/2)` with
+:math:`D_{rest} = D - g b^2`. It starts as the structure function of the high modes does, and falls below that where low
+modes already bend over a baseline, which makes plain geometric optics blur too much. Where the rays have
+left little light it would turn round and fall without end: from its maximum on it is held. That leaves the mean FWHM in
+the r band 0.1 % too wide for a cut-off of 1/r0 and 0.5 % for 1.4/r0 (plain high modes as the filter: 1.0 and 2.1 %).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import scipy.fft
+import warp as wp
+
+from ...core.errors import DomainError
+from ...core.launch import launch, thread_count
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...raytrace.rays import field_direction
+from ..aberration import ResidualWavefront
+from ..atmosphere.atmosphere import SLOPE_LAG, Atmosphere
+from ..atmosphere.turbulence import diffraction_otf, slope_variance, structure_function
+from ..pupil_optics import PupilOptics, trace_pupils
+from .fast_kernels import combine_wavelengths, deposit_rays
+from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length, square_transfer
+from .pupil_lattice import PupilLattice
+from .sample_packets import indices, samples, shared, to_packets
+
+#: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
+PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
+#: Side of the fine periodic grid over that of the stamp, with and without an atmosphere, whose wings come back round.
+#: With 1.25 they would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are,
+#: at 1e-4 of the peak; with 2 they leave 1.1 and 1.2 times.
+GRID_MARGIN, GRID_MARGIN_STILL = 2.0, 1.25
+#: Cells to a pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
+#: the mean over many rays; an undisturbed spot may be no larger than one cell of a quarter of a pixel.
+OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
+# Stars of one batch, fewer where their grids would fill more than this many bytes.
+_BATCH, _BATCH_BYTES = 128, 1 << 25
+# Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
+_TABLE_SIZE = 4096
+
+
+def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
+    """Return the structure function that rays through the low modes leave to the filter.
+
+    Parameters
+    ----------
+    separation : ndarray
+        Rising baselines in the pupil [m].
+    r0 : float
+        Fried parameter at 500 nm [m].
+    outer_scale : float
+        Outer scale [m].
+    cutoff : float
+        Cut-off wavenumber of the low modes [rad/m].
+
+    Returns
+    -------
+    ndarray
+        Path squared [m^2], not falling, shape of ``separation``.
+    """
+    rest = structure_function(separation, r0, outer_scale)
+    rest = rest - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
+    return np.maximum.accumulate(np.maximum(rest, 0.0))
+
+
+class FastPsfEngine:
+    """Renders stars by rays through the low modes of the atmosphere, and filters.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    plane : ImagePlane
+        Stamp and detector.
+    focal_plane : FocalPlane, optional
+        CCD heights.
+    atmosphere : Atmosphere, optional
+        The exposure.
+    dispersion : ndarray, shape [n_wave, 2]
+        Shift in field angle of each wavelength [rad].
+    n_pupil : int, optional
+        About how many pupil points to use; the lattice is a whole number of screen pixels wide.
+    oversampling : int, optional
+        Cells of the fine grid to a pixel.
+    projection : str
+        Meaning of the field angles.
+    aberration : ResidualWavefront, optional
+        Added to the traced wavefront.
+    threads : int, optional
+        Number of threads; no byte depends on it.
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        wavelengths: np.ndarray,
+        plane: ImagePlane,
+        *,
+        dispersion: np.ndarray,
+        focal_plane: FocalPlane | None = None,
+        atmosphere: Atmosphere | None = None,
+        n_pupil: int | None = None,
+        oversampling: int | None = None,
+        projection: str = "zemax",
+        aberration: ResidualWavefront | None = None,
+        threads: int | None = None,
+    ) -> None:
+        if n_pupil is None:
+            n_pupil = PUPIL_POINTS_STILL if atmosphere is None else PUPIL_POINTS
+        if oversampling is None:
+            oversampling = OVERSAMPLING_STILL if atmosphere is None else OVERSAMPLING
+        if not n_pupil >= 10:
+            raise DomainError(f"n_pupil = {n_pupil!r}: expected at least 10 pupil points")
+        if int(oversampling) != oversampling or not 1 <= oversampling <= 32:
+            raise DomainError(f"oversampling = {oversampling!r}: expected a whole number of cells, 1 to 32 to a pixel")
+        self._telescope = telescope
+        self._wavelengths = wavelengths
+        self._plane = plane
+        self._dispersion = dispersion
+        self._focal_plane = focal_plane
+        self._atmosphere = atmosphere
+        self._oversampling = int(oversampling)
+        self._projection = projection
+        self._aberration = aberration
+        self._threads = threads
+        self._place_pupil(n_pupil)
+        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
+        #: Effective focal length on the axis [m].
+        self.focal_length = float(focal_length(center.jacobian)[0])
+        self._make_grid()
+        self._filter_step, self._filter = self._filter_table()
+        if atmosphere is None:
+            self._screens, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
+        else:
+            screens = atmosphere.kept_screens("slopes", threads)
+            self._screens = screens.reshape(len(screens), -1)
+            self._units = np.array([atmosphere.slope_unit(n) for n in range(len(screens))], dtype=np.float32)
+
+    @property
+    def batch(self) -> int:
+        """Number of stars to render at a time."""
+        star_bytes = 4 * len(self._wavelengths) * self._grid_size**2
+        return max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
+
+    def _place_pupil(self, n_pupil: int) -> None:
+        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
+        spacing = 0.5 * diameter * math.sqrt(math.pi * (1.0 - obscuration**2) / n_pupil)
+        self._stride = 1
+        if self._atmosphere is not None:
+            pixel = self._atmosphere.screen_pixel
+            self._stride = max(1, round(spacing / pixel))
+            spacing = self._stride * pixel
+            if self._atmosphere.screen_length < diameter + 2.0 * pixel:
+                raise DomainError(
+                    f"screen_length = {self._atmosphere.screen_length!r}: expected screens wider than the pupil,"
+                    f" {diameter} m"
+                )
+        self._lattice = PupilLattice.fill(diameter, obscuration, spacing)
+        self._weights = self._lattice.weights(diameter, obscuration)
+
+    def _make_grid(self) -> None:
+        """Lay out the fine grid and its frequencies."""
+        self._cell = self._plane.pixel_size / self._oversampling
+        margin = GRID_MARGIN_STILL if self._atmosphere is None else GRID_MARGIN
+        size = math.ceil(margin * self._plane.stamp_size * self._oversampling)
+        # even, for the half plane of frequencies of a real transform
+        self._grid_size = 2 * scipy.fft.next_fast_len(-(-size // 2), real=True)
+        self._ky = 2.0 * math.pi * scipy.fft.fftfreq(self._grid_size, self._cell)
+        self._kx = 2.0 * math.pi * scipy.fft.rfftfreq(self._grid_size, self._cell)
+        ky = self._ky[:, None]
+        # Binning into cells averaged over a cell already: take that back.
+        detector = self._plane.transfer(self._kx, ky) / square_transfer(self._kx, ky, self._cell)
+        self._detector = detector.astype(np.float32)
+
+    def _filter_table(self) -> tuple[float, np.ndarray]:
+        """Return the step of the baselines [m] and the filter at them, shape [n_wave, n]."""
+        # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
+        longest = 1.5 * self.focal_length * float(self._wavelengths.max()) / (2.0 * self._cell)
+        baseline = np.linspace(0.0, longest, _TABLE_SIZE)
+        otf = diffraction_otf(baseline, self._telescope.pupil_diameter, self._telescope.pupil_obscuration)
+        table = np.repeat(otf[None], len(self._wavelengths), axis=0)
+        atmosphere = self._atmosphere
+        if atmosphere is not None:
+            rest = rest_structure_function(baseline, atmosphere.r0, atmosphere.outer_scale, atmosphere.cutoff)
+            table *= np.exp(-0.5 * (2.0 * math.pi / self._wavelengths[:, None]) ** 2 * rest)
+        return float(baseline[1]), table.astype(np.float32)
+
+    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
+        """Render one batch of stars.
+
+        Parameters
+        ----------
+        fields : ndarray, shape [n_star, 2]
+            Field angles [rad].
+        offsets : ndarray, shape [n_star, 2]
+            Places of the reference points from the centre of the middle pixel [pixels].
+        recenter : callable, optional
+            As :func:`~pachon.wavefront.psf.psf.make_psfs` takes it.
+
+        Returns
+        -------
+        RenderedStars
+        """
+        optics = trace_pupils(
+            self._telescope,
+            fields,
+            self._wavelengths,
+            self._lattice.points,
+            self._focal_plane,
+            self._projection,
+            self._threads,
+            aberration=self._aberration,
+        )
+        n_star, n = len(fields), self._grid_size
+        light = optics.lit * self._weights
+        deposit = self._deposit(optics, light)
+        # One transform a star, so that its bytes do not depend on its neighbours.
+        spectra = np.empty((*deposit.shape[:-1], n // 2 + 1), dtype=np.complex64)
+        self._for_each(n_star, lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])))
+        combined = self._combine(spectra, optics, offsets)
+        n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
+        # A dark star has no light to divide by.
+        total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * n_time
+        stamps = self._stamps(combined, total)
+        if recenter is not None:
+            shift = recenter(stamps)
+            offsets = offsets - shift
+            # A move of the whole star is a ramp of phase; the rays need not be traced nor binned again.
+            turn = 1j * self._plane.pixel_size * shift[:, :, None]
+            combined *= np.exp(turn[:, 1] * self._ky).astype(np.complex64)[:, :, None]
+            combined *= np.exp(turn[:, 0] * self._kx).astype(np.complex64)[:, None, :]
+            stamps = self._stamps(combined, total)
+        return RenderedStars(stamps, optics.lit.mean(axis=2), optics.reference, offsets)
+
+    def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""
+        n, side = self._grid_size, self._plane.stamp_size
+        span = slice(0, side * self._oversampling, self._oversampling)
+        stamps = np.empty((len(combined), side, side))
+        self._for_each(
+            len(combined), lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span])
+        )
+        # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
+        stamps *= (self._oversampling**2 / light)[:, None, None]
+        return stamps
+
+    def _for_each(self, count: int, job: Callable[[int], None]) -> None:
+        with ThreadPoolExecutor(thread_count(self._threads)) as pool:
+            list(pool.map(job, range(count)))
+
+    def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
+        """Return the rays of each star, with their light, on the fine grid, [n_star, n_wave, grid_size, grid_size]."""
+        n_star, n_wave = optics.lit.shape[:2]
+        atmosphere = self._atmosphere
+        if atmosphere is None:
+            pixel, screen_size, n_layer, n_time = 1.0, 1, 0, 1
+            start, step = np.zeros((n_star, 1, 2)), np.zeros((1, 2))
+        else:
+            pixel, screen_size = atmosphere.screen_pixel, atmosphere.screen_size
+            n_layer, n_time = atmosphere.layer_count, len(atmosphere.times)
+            direction = field_direction(optics.fields[:, 0], optics.fields[:, 1], self._projection)
+            start = (atmosphere.pupil_centers(direction, atmosphere.times[0]) + self._lattice.origin) / pixel
+            step = -atmosphere.velocities * (atmosphere.exposure / n_time) / pixel
+        column, row = self._lattice.column * self._stride, self._lattice.row * self._stride
+        lattice = to_packets(row * screen_size + column, np.int32)
+        # Rays that were lost have no place to land; they carry no light either.
+        landed = np.where(optics.lit[..., None], optics.displacement, 0.0) / self._cell
+        displacement = np.stack([to_packets(landed[..., axis], np.float32) for axis in (0, 1)], axis=-2)
+        cells_per_slope = optics.jacobian.reshape(n_star, 4) / self._cell
+        image = np.zeros((n_star, n_wave * self._grid_size**2), dtype=np.float32)
+        launch(
+            deposit_rays,
+            n_star,
+            [
+                shared(self._screens, wp.int32),
+                shared(self._units, wp.float32),
+                screen_size,
+                n_layer,
+                n_time,
+                shared(start, wp.float64),
+                shared(step, wp.float64),
+                shared(lattice, indices),
+                int(max(column.max(), row.max())) + 1,
+                shared(cells_per_slope.astype(np.float32), wp.float32),
+                shared(displacement, samples),
+                shared(to_packets(light, np.float32, fill="constant"), samples),
+                self._grid_size,
+                wp.empty((n_star, len(lattice), 2), dtype=samples, device="cpu"),
+                shared(image, wp.float32),
+            ],
+            threads=self._threads,
+        )
+        return image.reshape(n_star, n_wave, self._grid_size, self._grid_size)
+
+    def _combine(self, spectra: np.ndarray, optics: PupilOptics, offsets: np.ndarray) -> np.ndarray:
+        """Return the filtered sum over wavelengths of the transforms of each star, shape [n_star, ky, kx]."""
+        n_star, _, n_row, n_column = spectra.shape
+        metric = optics.jacobian @ np.swapaxes(optics.jacobian, 1, 2)
+        shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)
+        # The deposit has its origin in the middle cell; the first pixel of the stamp is wanted in the first.
+        middle = self._plane.middle * self._plane.pixel_size - self._grid_size // 2 * self._cell
+        shift = shift + (offsets * self._plane.pixel_size + middle)[:, None, :]
+        combined = np.empty((n_star, n_row, n_column), dtype=np.complex64)
+        launch(
+            combine_wavelengths,
+            n_star * n_row,
+            [
+                shared(spectra, wp.vec2f),
+                float(self._kx[1]),
+                shared(metric.reshape(n_star, 4)[:, [0, 1, 3]].astype(np.float32), wp.float32),
+                shared((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
+                shared(self._filter, wp.float32),
+                self._filter_step,
+                shared(self._detector, wp.float32),
+                shared(np.exp(-1j * shift[..., :1] * self._kx).astype(np.complex64), wp.vec2f),
+                shared(np.exp(-1j * shift[..., 1:] * self._ky).astype(np.complex64), wp.vec2f),
+                shared(combined, wp.vec2f),
+            ],
+            threads=self._threads,
+        )
+        return combined

@@ -1,0 +1,164 @@
+"""Kernels of the fast PSF engine: rays through the frozen layers onto a fine grid, and the filters in frequency."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from .sample_packets import LANES, indices, samples
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def nearest_sample(position: wp.float64, size: wp.int32):
+    """Take a screen coordinate [pixels] modulo the screen and return the nearest sample."""
+    # float64: a fraction of a pixel after a kilometre of wind would lose its digits in float32.
+    shifted = position + wp.float64(0.5)
+    wrapped = shifted - wp.float64(size) * wp.floor(shifted / wp.float64(size))
+    return wp.int32(wrapped) % size
+
+
+@wp.func
+def unpack(counts: indices, unit: wp.float32):
+    """Slopes along x and y [rad] from the lower and the upper 16 bits."""
+    x = samples()
+    y = samples()
+    for i in range(LANES):
+        x[i] = unit * wp.float32((counts[i] << 16) >> 16)
+        y[i] = unit * wp.float32(counts[i] >> 16)
+    return x, y
+
+
+@wp.kernel
+def deposit_rays(
+    first: wp.int32,
+    screens: wp.array2d(dtype=wp.int32),
+    unit: wp.array(dtype=wp.float32),
+    screen_size: wp.int32,
+    n_layer: wp.int32,
+    n_time: wp.int32,
+    start: wp.array3d(dtype=wp.float64),
+    step: wp.array2d(dtype=wp.float64),
+    lattice: wp.array(dtype=indices),
+    reach: wp.int32,
+    cells_per_slope: wp.array2d(dtype=wp.float32),
+    displacement: wp.array4d(dtype=samples),
+    weight: wp.array3d(dtype=samples),
+    grid_size: wp.int32,
+    slope: wp.array3d(dtype=samples),
+    image: wp.array2d(dtype=wp.float32),
+):
+    """Deposit all rays of one star, at every wavelength, on its fine grid.
+
+    The pupil points lie on the lattice of the screens, and the slopes are read at the nearest sample: that displaces a
+    layer as a whole by part of a pixel, another at every time, and is lost in the mean over the exposure.
+
+    Arguments: screens [layer, y * size + x]: packed slopes; unit [layer] of their counts [rad]; start [star, layer, 2]:
+    screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per time step];
+    lattice [packet]: row * size + column of the pupil points [pixels]; reach: the largest row or column, plus one;
+    cells_per_slope [star, 4]: Jacobian, row by row, over the cell of the grid; displacement [star, wave, packet, 2] by
+    the optics [cells]; weight [star, wave, packet] of the light; slope [star, packet, 2]: room for the slopes of all
+    layers [rad]; image [star, (wave * size + y) * size + x], with the origin in the cell size // 2.
+    """
+    star = first + wp.tid()
+    n_packet = lattice.shape[0]
+    n_wave = weight.shape[1]
+    xx = cells_per_slope[star, 0]
+    xy = cells_per_slope[star, 1]
+    yx = cells_per_slope[star, 2]
+    yy = cells_per_slope[star, 3]
+    origin = wp.float32(grid_size // 2) + wp.float32(0.5)
+    for t in range(n_time):
+        for packet in range(n_packet):
+            slope[star, packet, 0] = samples()
+            slope[star, packet, 1] = samples()
+        for layer in range(n_layer):
+            time = wp.float64(t)
+            corner_x = nearest_sample(start[star, layer, 0] + time * step[layer, 0], screen_size)
+            corner_y = nearest_sample(start[star, layer, 1] + time * step[layer, 1], screen_size)
+            corner = corner_y * screen_size + corner_x
+            counts = indices()
+            # Two loops in place of one with a choice inside: the compiler vectorizes these.
+            if corner_x + reach <= screen_size and corner_y + reach <= screen_size:
+                for packet in range(n_packet):
+                    offset = lattice[packet]
+                    for i in range(LANES):
+                        counts[i] = screens[layer, corner + offset[i]]
+                    slope_x, slope_y = unpack(counts, unit[layer])
+                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
+            else:
+                for packet in range(n_packet):
+                    offset = lattice[packet]
+                    for i in range(LANES):
+                        # columns and rows are added apart: a column past the border must not run on into the next row
+                        x = (corner_x + offset[i] % screen_size) % screen_size
+                        y = (corner_y + offset[i] // screen_size) % screen_size
+                        counts[i] = screens[layer, y * screen_size + x]
+                    slope_x, slope_y = unpack(counts, unit[layer])
+                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
+        for packet in range(n_packet):
+            bend_x = slope[star, packet, 0]
+            bend_y = slope[star, packet, 1]
+            moved_x = bend_x * xx + bend_y * xy
+            moved_y = bend_x * yx + bend_y * yy
+            for wave in range(n_wave):
+                cell_x = moved_x + displacement[star, wave, packet, 0]
+                cell_y = moved_y + displacement[star, wave, packet, 1]
+                light = weight[star, wave, packet]
+                for i in range(LANES):
+                    # No branch, so that the lanes stay together; light beyond the grid is left out.
+                    column = wp.int32(cell_x[i] + origin)
+                    row = wp.int32(cell_y[i] + origin)
+                    near_column = wp.clamp(column, 0, grid_size - 1)
+                    near_row = wp.clamp(row, 0, grid_size - 1)
+                    caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
+                    cell = (wave * grid_size + near_row) * grid_size + near_column
+                    image[star, cell] = image[star, cell] + caught
+
+
+@wp.kernel
+def combine_wavelengths(
+    first: wp.int32,
+    spectra: wp.array4d(dtype=wp.vec2f),
+    frequency: wp.float32,
+    metric: wp.array2d(dtype=wp.float32),
+    baseline: wp.array(dtype=wp.float32),
+    table: wp.array2d(dtype=wp.float32),
+    table_step: wp.float32,
+    detector: wp.array2d(dtype=wp.float32),
+    ramp_x: wp.array3d(dtype=wp.vec2f),
+    ramp_y: wp.array3d(dtype=wp.vec2f),
+    combined: wp.array3d(dtype=wp.vec2f),
+):
+    """Filter the transforms of one star's wavelengths and add them up, one row of frequencies an item.
+
+    Arguments: spectra [star, wave, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy of
+    jacobian @ jacobian.T [m^2/rad^2]; baseline [wave]: wavelength / 2 pi [m]; table [wave, sample]: filter against the
+    baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all wavelengths; ramp_x
+    [star, wave, kx], ramp_y [star, wave, ky]: phase factors; combined [star, ky, kx]: the sum.
+    """
+    item = first + wp.tid()
+    n_row = spectra.shape[2]
+    star = item // n_row
+    row = item % n_row
+    ky = wp.float32(wp.where(2 * row > n_row, row - n_row, row)) * frequency
+    for column in range(spectra.shape[3]):
+        kx = wp.float32(column) * frequency
+        squared = metric[star, 0] * kx * kx + wp.float32(2.0) * metric[star, 1] * kx * ky + metric[star, 2] * ky * ky
+        separation = wp.sqrt(wp.max(squared, wp.float32(0.0))) / table_step
+        total = wp.vec2f(0.0, 0.0)
+        for wave in range(spectra.shape[1]):
+            place = wp.min(separation * baseline[wave], wp.float32(table.shape[1]) - wp.float32(1.001))
+            knot = wp.int32(place)
+            part = place - wp.float32(knot)
+            value = table[wave, knot] + part * (table[wave, knot + 1] - table[wave, knot])
+            px = ramp_x[star, wave, column]
+            py = ramp_y[star, wave, row]
+            re = px[0] * py[0] - px[1] * py[1]
+            im = px[0] * py[1] + px[1] * py[0]
+            s = spectra[star, wave, row, column]
+            total = total + wp.vec2f(s[0] * re - s[1] * im, s[0] * im + s[1] * re) * value
+        combined[star, row, column] = total * detector[row, column]

@@ -1,0 +1,116 @@
+r"""The detector end of the PSF engines: the grid of a stamp, and what pixels, diffusion and jitter do to it.
+
+An image :math:`I(X)` on the focal plane has the transform :math:`\tilde I(k) = \int I(X) e^{-i k \cdot X} dX`, with k
+in radians per metre of the focal plane. A pupil baseline b belongs to :math:`k = (2 \pi / \lambda) J^{-T} b`, where J
+is the Jacobian of the position on the focal plane with respect to the direction of the incoming light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.errors import DomainError
+
+
+@dataclass(frozen=True)
+class ImagePlane:
+    """The pixels of a stamp and the detector behind them.
+
+    Attributes
+    ----------
+    stamp_size : int
+        Pixels on a side.
+    pixel_size : float
+        Side of a square pixel [m].
+    diffusion : float
+        Root mean square of the charge diffusion along each axis [m].
+    jitter : float
+        Root mean square along each axis of how far the pointing of the telescope moves images during an exposure [m].
+    """
+
+    stamp_size: int
+    pixel_size: float
+    diffusion: float
+    jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        if int(self.stamp_size) != self.stamp_size or self.stamp_size < 3:
+            raise DomainError(f"stamp_size = {self.stamp_size!r}: expected a whole number of at least 3 pixels")
+        if not (math.isfinite(self.pixel_size) and self.pixel_size > 0.0):
+            raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
+        if not (math.isfinite(self.diffusion) and self.diffusion >= 0.0):
+            raise DomainError(f"diffusion = {self.diffusion!r}: expected a length in metres from 0")
+        if not (math.isfinite(self.jitter) and self.jitter >= 0.0):
+            raise DomainError(f"jitter = {self.jitter!r}: expected a length in metres from 0")
+
+    @property
+    def side(self) -> float:
+        """Side of the stamp [m]."""
+        return self.stamp_size * self.pixel_size
+
+    @property
+    def middle(self) -> int:
+        """Index of the middle pixel, where a star without an offset has its reference point."""
+        return self.stamp_size // 2
+
+    @property
+    def pixel_centers(self) -> np.ndarray:
+        """Coordinates of the pixel centres along an axis from the middle pixel [m]."""
+        return (np.arange(self.stamp_size) - self.middle) * self.pixel_size
+
+    def transfer(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
+        """Return the transfer function of a square pixel, Gaussian charge diffusion and Gaussian pointing jitter.
+
+        Parameters
+        ----------
+        kx, ky : ndarray
+            Wavenumbers on the focal plane [rad/m], broadcast against each other.
+
+        Returns
+        -------
+        ndarray
+            Real factor of each wavenumber, 1 at zero.
+        """
+        variance = self.diffusion**2 + self.jitter**2
+        return square_transfer(kx, ky, self.pixel_size) * np.exp(-0.5 * variance * (kx * kx + ky * ky))
+
+
+#: Tells where stars are seen on their stamps [n, ny, nx]: places (x, y) from the centre of the middle pixel [pixels].
+Recenter = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class RenderedStars:
+    """What an engine makes of some stars.
+
+    Attributes
+    ----------
+    image : ndarray, shape [n_star, ny, nx]
+        Fraction of the light that reaches the focal plane in each pixel, float64; 0 where no light does.
+    throughput : ndarray, shape [n_star, n_wave]
+        Lit fraction of the pupil.
+    reference : ndarray, shape [n_star, 3]
+        Point of the CCD at the star's place on the stamp, telescope frame [m].
+    offset : ndarray, shape [n_star, 2]
+        Place (x, y) of the reference point from the centre of the middle pixel [pixels].
+    """
+
+    image: np.ndarray
+    throughput: np.ndarray
+    reference: np.ndarray
+    offset: np.ndarray
+
+
+def square_transfer(kx: np.ndarray, ky: np.ndarray, side: float) -> np.ndarray:
+    """Return the transfer function of averaging over a square of given side [m] at wavenumbers [rad/m]."""
+    scale = 0.5 * side / np.pi
+    return np.sinc(kx * scale) * np.sinc(ky * scale)
+
+
+def focal_length(jacobian: np.ndarray) -> np.ndarray:
+    """Return the effective focal length [m] of Jacobians [..., 2, 2]: the geometric mean of the two principal ones."""
+    return np.sqrt(np.abs(np.linalg.det(jacobian)))

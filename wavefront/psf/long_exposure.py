@@ -1,0 +1,329 @@
+r"""The long-exposure PSF engine: what an endless exposure would show, through the optics, without a random number.
+
+The mean transfer function over all turbulence is a product (Roddier 1981, sec. 4): of :math:`e^{-D(b)/2}` with the
+von Karman structure function of the whole atmosphere, of the detector, and of the optics,
+
+.. math:: \frac{1}{A} \int P(p + b/2) \, P(p - b/2) \, e^{i k [W(p + b/2) - W(p - b/2)]} \, dp.
+
+The atmosphere leaves nothing of baselines b beyond some 0.6 m, over which the path W of the optics is straight but for
+its third derivative. So the phase is that of where the ray through p lands, and the integral is one over the clear
+pupil, less the strips along its rims where one of the two points has left it. The rays there land farther out than
+others do: to multiply the image of all rays by the transfer function of diffraction, as if those strips were spread
+evenly, would make e wrong by 1e-3 and the FWHM by 0.5 %.
+
+Rays are traced on rings and spokes. The rims of the clear pupil are found on each spoke, from how far rays pass from
+the rims of the apertures; the points of a Gauss-Lobatto rule in the square of the radius, two of which lie on the rims,
+are put between them, and landing points interpolated along the spoke. Unlike a count of rays that pass, this moves
+smoothly when the telescope is perturbed. A strip along a rim is as wide as half the baseline across the rim; its phase
+is that of its middle, to first order.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ...core.errors import ConfigError, DomainError
+from ...core.launch import launch
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...raytrace.rays import field_direction
+from ..aberration import ResidualWavefront
+from ..atmosphere.atmosphere import Atmosphere
+from ..atmosphere.turbulence import diffraction_otf, structure_function
+from ..pupil_optics import PupilOptics, trace_pupils
+from .clear_pupil import SpokePupil, clear_edges
+from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length
+from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
+from .sample_packets import LANES, samples, shared
+
+#: Pupil points by default: 16 spokes of 5 rings.
+PUPIL_POINTS = 80
+#: Side of the periodic image over that of the stamp: wings that come round make the edge of a stamp of 6 arcsec 1.4
+#: times as bright as it should be, and change ellipticities by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
+GRID_MARGIN = 1.25
+# What atmosphere and detector leave of a frequency that is left out; with pixels of 10 um all of these together make
+# 2e-6 of the peak of the image.
+_NEGLIGIBLE = 1e-5
+# What they may leave of a baseline as long as the pupil's ring is wide, where the strips along its rims would meet.
+_LARGEST_LEFT = 1e-3
+# Stars of one batch, fewer where the room for their waves would fill more than this many bytes.
+_BATCH, _BATCH_BYTES = 256, 1 << 24
+# Samples of the filter against the baseline: linear interpolation is then good to 1e-6.
+_TABLE_SIZE = 2048
+
+
+class LongExposureEngine:
+    """Renders stars as the mean over all turbulence shows them.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    plane : ImagePlane
+        Stamp and detector.
+    dispersion : ndarray, shape [n_wave, 2]
+        Shift in field angle of each wavelength [rad].
+    focal_plane : FocalPlane, optional
+        CCD heights.
+    atmosphere : Atmosphere
+        Gives the Fried parameter and the outer scale; its screens are not made.
+    n_pupil : int, optional
+        About how many pupil points to trace.
+    projection : str
+        Meaning of the field angles.
+    aberration : ResidualWavefront, optional
+        Added to the traced wavefront.
+    threads : int, optional
+        Number of threads; no byte depends on it.
+
+    Raises
+    ------
+    ConfigError
+        If there is no atmosphere.
+    DomainError
+        If ``n_pupil`` is too small, or so much is left of long baselines that this engine is not for them.
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        wavelengths: np.ndarray,
+        plane: ImagePlane,
+        *,
+        dispersion: np.ndarray,
+        focal_plane: FocalPlane | None = None,
+        atmosphere: Atmosphere | None = None,
+        n_pupil: int | None = None,
+        projection: str = "zemax",
+        aberration: ResidualWavefront | None = None,
+        threads: int | None = None,
+    ) -> None:
+        if atmosphere is None:
+            raise ConfigError(
+                "engine = 'long_exposure': expected an atmosphere, whose mean it takes ('wave' does without one)"
+            )
+        self._telescope = telescope
+        self._wavelengths = np.asarray(wavelengths, dtype=np.float64)
+        self._plane = plane
+        self._dispersion = np.ascontiguousarray(dispersion, dtype=np.float64)
+        self._focal_plane = focal_plane
+        self._atmosphere = atmosphere
+        self._projection = projection
+        self._aberration = aberration
+        self._threads = threads
+        self._pupil = SpokePupil.fill(
+            telescope.pupil_diameter, telescope.pupil_obscuration, PUPIL_POINTS if n_pupil is None else n_pupil
+        )
+        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
+        #: Effective focal length on the axis [m].
+        self.focal_length = float(focal_length(center.jacobian)[0])
+        #: Side of the periodic image [m].
+        self.period = GRID_MARGIN * plane.side
+        self._choose_frequencies()
+        self._tabulate_filter()
+        self._tabulate_pixels()
+
+    @property
+    def batch(self) -> int:
+        """Number of stars to render at a time."""
+        star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points)
+        return max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
+
+    def _baselines(self) -> np.ndarray:
+        """Return the baseline of one step of frequency at each wavelength [m], shape [n_wave]."""
+        return self._wavelengths * self.focal_length / self.period
+
+    def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
+        """Return what the atmosphere leaves of baselines [m] at each wavelength, shape [n_wave, ...]."""
+        atmosphere = self._atmosphere
+        structure = structure_function(baseline, atmosphere.r0, atmosphere.outer_scale)
+        wavenumber = (2.0 * math.pi / self._wavelengths).reshape(-1, *(1,) * baseline.ndim)
+        return np.exp(-0.5 * wavenumber**2 * structure)
+
+    def _choose_frequencies(self) -> None:
+        """Choose the largest frequency worth adding up."""
+        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
+        width = 0.5 * diameter * (1.0 - obscuration)
+        step = self._baselines()
+        largest = math.ceil(width / step.min())
+        count = np.arange(1, largest + 1)
+        k = 2.0 * math.pi / self.period * count
+        diagonal = math.sqrt(0.5) * k
+        detector = [self._plane.transfer(*along) for along in ((k, 0 * k), (0 * k, k), (diagonal, diagonal))]
+        left = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)]) * np.max(np.abs(detector), axis=0)
+        beyond = left[np.arange(len(step)), np.minimum(np.ceil(width / step).astype(int), largest) - 1]
+        if beyond.max() > _LARGEST_LEFT:
+            raise DomainError(
+                f"engine = 'long_exposure': expected turbulence that leaves at most {_LARGEST_LEFT:g} of a baseline of"
+                f" {width:.3g} m, the width of the pupil's ring; r0 = {self._atmosphere.r0:.3g} m leaves"
+                f" {beyond.max():.2g} (use engine = 'wave')"
+            )
+        wanted = np.flatnonzero((left > _NEGLIGIBLE).any(axis=0))
+        #: Largest frequency along either axis, in steps of one over the period.
+        self._reach = int(count[wanted[-1]]) if wanted.size else 1
+
+    def _tabulate_filter(self) -> None:
+        """Tabulate what multiplies the strips and points of the pupil: the atmosphere, and what strips leave out."""
+        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
+        width = 0.5 * diameter * (1.0 - obscuration)
+        # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
+        baseline = np.linspace(0.0, 1.5 * self._reach * self._baselines().max(), _TABLE_SIZE)
+        # Strips as wide as half the baseline overlap a little: to third order in the baseline, less than 1e-3.
+        ring = np.minimum(baseline, width)
+        overlap = diffraction_otf(ring, diameter, obscuration) / (1.0 - 2.0 * ring / (math.pi * width))
+        table = self._turbulence(baseline) * overlap / len(self._wavelengths)
+        self._filter = np.ascontiguousarray(table, dtype=np.float32)
+        # The baseline of frequency k is wavelength / 2 pi |J^T k|.
+        self._filter_steps = (self._wavelengths / (self.period * baseline[1])).astype(np.float32)
+
+    def _tabulate_pixels(self) -> None:
+        """Tabulate the detector over the frequencies, and the waves over the pixels."""
+        reach, plane = self._reach, self._plane
+        n_row, n_packet = reach + 1, -(-(reach + 1) // LANES)
+        row, column = np.arange(n_row), np.arange(n_packet * LANES)
+        # Rows 0 to n that a packet of columns needs, of a disc of frequencies.
+        self._rows = (np.sqrt(reach**2 - column[::LANES] ** 2).astype(int) + 1).astype(np.int32)
+        k = 2.0 * math.pi / self.period
+        inside = column**2 + row[:, None] ** 2 <= reach**2
+        # Only one half of the plane is added up: columns m > 0 stand for -m too, and row 0 is added for +0 and -0.
+        scale = np.where(column > 0, 2.0, 1.0) * np.where(row > 0, 1.0, 0.5)[:, None]
+        scale = np.where(inside, (plane.pixel_size / self.period) ** 2 * scale, 0.0)
+        detector = [scale * plane.transfer(k * column, sign * k * row[:, None]) for sign in (1.0, -1.0)]
+        self._detector = np.stack(detector).reshape(2, n_row, n_packet, LANES).astype(np.float32)
+        angle = k * np.outer(plane.pixel_centers, row)
+        self._pixel_rows = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
+        across = -(-plane.stamp_size // LANES)
+        columns = np.zeros((2, n_row, across * LANES), dtype=np.float32)
+        columns[:, :, : plane.stamp_size] = np.stack([np.cos(angle.T), np.sin(angle.T)])
+        self._pixel_columns = columns.reshape(2, n_row, across, LANES)
+
+    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
+        """Render one batch of stars.
+
+        Parameters
+        ----------
+        fields : ndarray, shape [n_star, 2]
+            Field angles [rad].
+        offsets : ndarray, shape [n_star, 2]
+            Places of the reference points from the centre of the middle pixel [pixels].
+        recenter : callable, optional
+            As :func:`~pachon.wavefront.psf.psf.make_psfs` takes it.
+
+        Returns
+        -------
+        RenderedStars
+        """
+        optics = trace_pupils(
+            self._telescope,
+            fields,
+            self._wavelengths,
+            self._pupil.points,
+            self._focal_plane,
+            self._projection,
+            self._threads,
+            aberration=self._aberration,
+        )
+        # Apertures cut every wavelength alike but for 3e-4 of the light at the very edge of the LSST's field.
+        middle = float(self._wavelengths[len(self._wavelengths) // 2])
+        direction = field_direction(optics.fields[:, 0], optics.fields[:, 1], self._projection)
+        edges = clear_edges(self._telescope, direction, self._pupil.unit, middle, self._threads)
+        area = math.pi / self._pupil.n_spoke * (edges[..., 1] ** 2 - edges[..., 0] ** 2).sum(axis=1)
+        spectrum = self._transform(optics, edges, area)
+        stamps = self._sample(spectrum, offsets)
+        if recenter is not None:
+            offsets = offsets - recenter(stamps)
+            stamps = self._sample(spectrum, offsets)
+        inner, outer = self._pupil.radius[[0, -1]]
+        throughput = area / (math.pi * (outer**2 - inner**2))
+        return RenderedStars(
+            stamps, np.repeat(throughput[:, None], len(self._wavelengths), axis=1), optics.reference, offsets
+        )
+
+    def _transform(self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray) -> np.ndarray:
+        """Return the transfer functions of stars without the detector, as the kernel lays them out."""
+        pupil = self._pupil
+        n_star, n_wave, n_point = optics.lit.shape
+        n_row, n_packet = self._detector.shape[1:3]
+        landed = np.isfinite(optics.displacement).all(axis=(1, 3)).astype(np.float64)
+        place = np.empty((n_star, n_wave, 2, n_point), dtype=np.float32)
+        light = np.empty((n_star, n_point), dtype=np.float32)
+        cut = np.empty((n_star, 2 * pupil.n_spoke, 2), dtype=np.float32)
+        lean = np.empty((n_star, n_wave, 2 * pupil.n_spoke, 2), dtype=np.float32)
+        launch(
+            place_points,
+            n_star * pupil.n_spoke,
+            [
+                shared(pupil.radius, wp.float64),
+                shared(pupil.inverse, wp.float64),
+                shared(pupil.share, wp.float64),
+                shared(pupil.quadrature, wp.float64),
+                shared(pupil.unit, wp.vec2d),
+                shared(edges, wp.float64),
+                shared(optics.displacement, wp.float32),
+                shared(landed, wp.float64),
+                shared(optics.jacobian, wp.mat22d),
+                shared(self._dispersion, wp.vec2d),
+                self.period,
+                shared(area, wp.float64),
+                shared(place, wp.float32),
+                shared(light, wp.float32),
+                shared(cut, wp.float32),
+                shared(lean, wp.float32),
+            ],
+            threads=self._threads,
+        )
+        metric = optics.jacobian @ np.swapaxes(optics.jacobian, 1, 2)
+        along_x, along_y = (np.empty((n_star, n_point, n_packet, 2, LANES), dtype=np.float32) for _ in range(2))
+        spectrum = np.empty((n_star, 4, n_row, n_packet, LANES), dtype=np.float32)
+        launch(
+            transform_pupils,
+            n_star,
+            [
+                pupil.n_spoke,
+                shared(place, wp.float32),
+                shared(light, wp.float32),
+                shared(cut, wp.float32),
+                shared(lean, wp.float32),
+                shared(self._wavelengths.astype(np.float32), wp.float32),
+                shared(self._rows, wp.int32),
+                shared(metric.reshape(n_star, 4)[:, [0, 1, 3]].astype(np.float32), wp.float32),
+                shared(self._filter, wp.float32),
+                shared(self._filter_steps, wp.float32),
+                shared(along_x, samples),
+                shared(along_y, samples),
+                shared(along_y.reshape(n_star, -1), wp.float32),
+                shared(spectrum, samples),
+            ],
+            threads=self._threads,
+        )
+        return spectrum
+
+    def _sample(self, spectrum: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """Return the stamps of transfer functions, shape [n_star, stamp_size, stamp_size]."""
+        n_star, side = len(spectrum), self._plane.stamp_size
+        n_packet = self._detector.shape[2]
+        lines = np.empty((n_star, n_packet, 2, LANES), dtype=np.float32)
+        image = np.empty((n_star, side, self._pixel_columns.shape[2], LANES), dtype=np.float32)
+        launch(
+            sample_pixels,
+            n_star,
+            [
+                shared(spectrum, samples),
+                shared(self._detector, samples),
+                shared(self._rows, wp.int32),
+                shared((offsets * (self._plane.pixel_size / self.period)).astype(np.float32), wp.float32),
+                shared(self._pixel_rows, wp.vec2f),
+                shared(self._pixel_columns, samples),
+                shared(np.empty_like(spectrum), samples),
+                shared(lines, samples),
+                shared(lines.reshape(n_star, -1), wp.float32),
+                shared(image, samples),
+            ],
+            threads=self._threads,
+        )
+        return image.reshape(n_star, side, -1)[:, :, :side].astype(np.float64)

@@ -1,0 +1,362 @@
+"""Kernels of the long-exposure engine: points over the clear pupil of each star, their transform, and the pixels."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from .sample_packets import LANES, samples
+from .wave_kernels import unit_circle
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def basis(
+    radius: wp.array(dtype=wp.float64),
+    inverse: wp.array2d(dtype=wp.float64),
+    landed: wp.array2d(dtype=wp.float64),
+    star: wp.int32,
+    spoke: wp.int32,
+    n_spoke: wp.int32,
+    k: wp.int32,
+    at: wp.float64,
+):
+    """Value and slope at a radius of the polynomial that is 1 at ring ``k`` and 0 at the others whose rays landed."""
+    value = landed[star, k * n_spoke + spoke]
+    slope = wp.float64(0.0)
+    for ring in range(radius.shape[0]):
+        if ring != k and landed[star, ring * n_spoke + spoke] > wp.float64(0.0):
+            factor = (at - radius[ring]) * inverse[k, ring]
+            slope = slope * factor + value * inverse[k, ring]
+            value = value * factor
+    return value, slope
+
+
+@wp.func
+def rim_vector(
+    edges: wp.array3d(dtype=wp.float64), unit: wp.array(dtype=wp.vec2d), star: wp.int32, spoke: wp.int32, end: wp.int32
+):
+    """Piece of the inner (0) or outer (1) rim that belongs to a spoke, as a vector along it [m]."""
+    n_spoke = unit.shape[0]
+    ahead = (spoke + 1) % n_spoke
+    behind = (spoke + n_spoke - 1) % n_spoke
+    angle = wp.float64(wp.TAU) / wp.float64(n_spoke)
+    # The chord over two spokes is half as long as the two arcs of a circle that belong to one, but for this factor.
+    scale = wp.float64(0.5) * angle / wp.sin(angle)
+    return scale * (edges[star, ahead, end] * unit[ahead] - edges[star, behind, end] * unit[behind])
+
+
+@wp.kernel
+def place_points(
+    first: wp.int32,
+    radius: wp.array(dtype=wp.float64),
+    inverse: wp.array2d(dtype=wp.float64),
+    share: wp.array(dtype=wp.float64),
+    quadrature: wp.array(dtype=wp.float64),
+    unit: wp.array(dtype=wp.vec2d),
+    edges: wp.array3d(dtype=wp.float64),
+    displacement: wp.array4d(dtype=wp.float32),
+    landed: wp.array2d(dtype=wp.float64),
+    jacobian: wp.array(dtype=wp.mat22d),
+    dispersion: wp.array(dtype=wp.vec2d),
+    period: wp.float64,
+    area: wp.array(dtype=wp.float64),
+    place: wp.array4d(dtype=wp.float32),
+    light: wp.array2d(dtype=wp.float32),
+    cut: wp.array3d(dtype=wp.float32),
+    lean: wp.array4d(dtype=wp.float32),
+):
+    """Lay the points of one spoke over the clear pupil of one star, and find what a baseline cuts off at its ends.
+
+    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m]; share
+    [ring]: part of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]:
+    direction; edges [star, spoke, 2] [m]; displacement [star, wave, ring * n_spoke + spoke, 2] of the traced points
+    [m]; landed [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion
+    [wave] [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of
+    the traced ones and rims as [2, n_spoke]: place [star, wave, 2, point] [periods]; light [star, point]: part of the
+    pupil; cut [star, rim, 2]: part of the pupil per metre of wavelength and step of frequency; lean [star, wave, rim,
+    2]: phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
+    """
+    item = first + wp.tid()
+    n_spoke = unit.shape[0]
+    n_ring = radius.shape[0]
+    star = item // n_spoke
+    spoke = item % n_spoke
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    tau = wp.float64(wp.TAU)
+    angle = tau / wp.float64(n_spoke)
+    start = edges[star, spoke, 0] * edges[star, spoke, 0]
+    span = edges[star, spoke, 1] * edges[star, spoke, 1] - start
+    known = zero
+    for ring in range(n_ring):
+        known = known + landed[star, ring * n_spoke + spoke]
+    clear = span > zero and known > zero
+    for ring in range(n_ring):
+        point = ring * n_spoke + spoke
+        light[star, point] = wp.float32(0.0)
+        if clear:
+            light[star, point] = wp.float32(half * span * angle * quadrature[ring] / area[star])
+        at = wp.sqrt(start + span * share[ring])
+        end = wp.where(ring == 0, 0, 1)
+        rim = end * n_spoke + spoke
+        outermost = ring == 0 or ring == n_ring - 1
+        # b x t / 2 is the area that half a baseline b sweeps over a piece t of the rim.
+        across = wp.vec2d(zero, zero)
+        depth = zero
+        if outermost and clear:
+            along = rim_vector(edges, unit, star, spoke, end)
+            j = jacobian[star]
+            across = wp.vec2d(j[0, 0] * along[1] - j[0, 1] * along[0], j[1, 0] * along[1] - j[1, 1] * along[0])
+            across = across * (half / (period * area[star]))
+            if at > zero:
+                depth = wp.where(end == 0, -half, half) * area[star] / (at * angle)
+        for wave in range(displacement.shape[1]):
+            landing = jacobian[star] * dispersion[wave]
+            slope = wp.vec2d(zero, zero)
+            for k in range(n_ring):
+                if landed[star, k * n_spoke + spoke] > zero:
+                    value, rate = basis(radius, inverse, landed, star, spoke, n_spoke, k, at)
+                    x = wp.float64(displacement[star, wave, k * n_spoke + spoke, 0])
+                    y = wp.float64(displacement[star, wave, k * n_spoke + spoke, 1])
+                    landing = landing + wp.vec2d(value * x, value * y)
+                    slope = slope + wp.vec2d(rate * x, rate * y)
+            place[star, wave, 0, point] = wp.float32(landing[0] / period)
+            place[star, wave, 1, point] = wp.float32(landing[1] / period)
+            if outermost:
+                lean[star, wave, rim, 0] = wp.float32(depth * tau / period * slope[0])
+                lean[star, wave, rim, 1] = wp.float32(depth * tau / period * slope[1])
+        if outermost:
+            cut[star, rim, 0] = wp.float32(across[0])
+            cut[star, rim, 1] = wp.float32(across[1])
+
+
+@wp.func
+def lane_numbers(packet: wp.int32):
+    """Numbers of the lanes of a packet, counted over all packets."""
+    number = samples()
+    for i in range(LANES):
+        number[i] = wp.float32(packet * LANES + i)
+    return number
+
+
+@wp.func
+def magnitudes(values: samples):
+    """Magnitude of each lane."""
+    out = samples()
+    for i in range(LANES):
+        out[i] = wp.abs(values[i])
+    return out
+
+
+@wp.func
+def filtered(
+    table: wp.array2d(dtype=wp.float32),
+    wave: wp.int32,
+    per_step: wp.float32,
+    metric: wp.array2d(dtype=wp.float32),
+    star: wp.int32,
+    column: samples,
+    row: wp.float32,
+):
+    """Value of the filter of a wavelength at the baselines of a row of frequencies, by linear interpolation."""
+    last = wp.float32(table.shape[1]) - wp.float32(1.001)
+    value = samples()
+    for i in range(LANES):
+        squared = (
+            metric[star, 0] * column[i] * column[i]
+            + wp.float32(2.0) * metric[star, 1] * column[i] * row
+            + metric[star, 2] * row * row
+        )
+        at = wp.min(wp.sqrt(wp.max(squared, wp.float32(0.0))) * per_step, last)
+        knot = wp.int32(at)
+        before = table[wave, knot]
+        value[i] = before + (at - wp.float32(knot)) * (table[wave, knot + 1] - before)
+    return value
+
+
+@wp.kernel
+def transform_pupils(
+    first: wp.int32,
+    n_spoke: wp.int32,
+    place: wp.array4d(dtype=wp.float32),
+    light: wp.array2d(dtype=wp.float32),
+    cut: wp.array3d(dtype=wp.float32),
+    lean: wp.array4d(dtype=wp.float32),
+    wavelength: wp.array(dtype=wp.float32),
+    rows: wp.array(dtype=wp.int32),
+    metric: wp.array2d(dtype=wp.float32),
+    table: wp.array2d(dtype=wp.float32),
+    per_step: wp.array(dtype=wp.float32),
+    along_x: wp.array4d(dtype=samples),
+    along_y: wp.array4d(dtype=samples),
+    at_y: wp.array2d(dtype=wp.float32),
+    spectrum: wp.array4d(dtype=samples),
+):
+    """Add up the transfer functions of one star's wavelengths, over columns m and rows +n and -n of frequencies.
+
+    Arguments: place, light, cut, lean as ``place_points`` leaves them; wavelength [wave] [m]; rows [packet of columns]
+    that are wanted; metric [star, 3]: xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against the
+    baseline; per_step [wave]: samples of the table per step of frequency, for a unit Jacobian; along_x, along_y [star,
+    point, packet, 2]: room for cosines and sines; at_y: along_y as plain numbers [star, ...]; spectrum [star, 4, row,
+    packet]: real and imaginary parts at +n, and at -n.
+    """
+    star = first + wp.tid()
+    n_wave = place.shape[1]
+    n_point = place.shape[3]
+    n_packet = rows.shape[0]
+    inner_end = n_spoke
+    outer_start = n_point - n_spoke
+    for packet in range(n_packet):
+        for row in range(rows[packet]):
+            for part in range(4):
+                spectrum[star, part, row, packet] = samples()
+    for wave in range(n_wave):
+        for point in range(n_point):
+            x = place[star, wave, 0, point]
+            y = place[star, wave, 1, point]
+            scale = light[star, point]
+            if point < inner_end or point >= outer_start:
+                scale = wp.float32(1.0)
+            for packet in range(n_packet):
+                number = lane_numbers(packet)
+                cosine, sine = unit_circle(-x * number)
+                along_x[star, point, packet, 0] = scale * cosine
+                along_x[star, point, packet, 1] = scale * sine
+            for packet in range(along_y.shape[2]):
+                number = lane_numbers(packet)
+                cosine, sine = unit_circle(-y * number)
+                along_y[star, point, packet, 0] = cosine
+                along_y[star, point, packet, 1] = sine
+        stride = 2 * LANES * along_y.shape[2]
+        for packet in range(n_packet):
+            number = lane_numbers(packet)
+            for row in range(rows[packet]):
+                ky = wp.float32(row)
+                here = (row // LANES) * 2 * LANES + row % LANES
+                cc = samples()
+                ss = samples()
+                cs = samples()
+                sc = samples()
+                for point in range(inner_end, outer_start):
+                    a = along_x[star, point, packet, 0]
+                    b = along_x[star, point, packet, 1]
+                    c = at_y[star, point * stride + here]
+                    d = at_y[star, point * stride + here + LANES]
+                    cc = cc + c * a
+                    ss = ss + d * b
+                    cs = cs + d * a
+                    sc = sc + c * b
+                # At -n the sine along y has the other sign.
+                re_plus = cc - ss
+                im_plus = cs + sc
+                re_minus = cc + ss
+                im_minus = sc - cs
+                for rim in range(2 * n_spoke):
+                    point = rim
+                    if rim >= n_spoke:
+                        point = rim + outer_start - n_spoke
+                    a = along_x[star, point, packet, 0]
+                    b = along_x[star, point, packet, 1]
+                    c = at_y[star, point * stride + here]
+                    d = at_y[star, point * stride + here + LANES]
+                    cc = c * a
+                    ss = d * b
+                    cs = d * a
+                    sc = c * b
+                    width_x = (wavelength[wave] * cut[star, rim, 0]) * number
+                    width_y = wavelength[wave] * cut[star, rim, 1] * ky
+                    lean_x = lean[star, wave, rim, 0] * number
+                    lean_y = lean[star, wave, rim, 1] * ky
+                    whole = samples(light[star, point])
+                    width = magnitudes(width_x + samples(width_y))
+                    phase = wp.cw_mul(wp.cw_mul(width, width), lean_x + samples(lean_y))
+                    left = whole - width
+                    re = cc - ss
+                    im = cs + sc
+                    re_plus = re_plus + wp.cw_mul(left, re) + wp.cw_mul(phase, im)
+                    im_plus = im_plus + wp.cw_mul(left, im) - wp.cw_mul(phase, re)
+                    width = magnitudes(width_x - samples(width_y))
+                    phase = wp.cw_mul(wp.cw_mul(width, width), lean_x - samples(lean_y))
+                    left = whole - width
+                    re = cc + ss
+                    im = sc - cs
+                    re_minus = re_minus + wp.cw_mul(left, re) + wp.cw_mul(phase, im)
+                    im_minus = im_minus + wp.cw_mul(left, im) - wp.cw_mul(phase, re)
+                value = filtered(table, wave, per_step[wave], metric, star, number, ky)
+                spectrum[star, 0, row, packet] = spectrum[star, 0, row, packet] + wp.cw_mul(value, re_plus)
+                spectrum[star, 1, row, packet] = spectrum[star, 1, row, packet] + wp.cw_mul(value, im_plus)
+                value = filtered(table, wave, per_step[wave], metric, star, number, -ky)
+                spectrum[star, 2, row, packet] = spectrum[star, 2, row, packet] + wp.cw_mul(value, re_minus)
+                spectrum[star, 3, row, packet] = spectrum[star, 3, row, packet] + wp.cw_mul(value, im_minus)
+
+
+@wp.kernel
+def sample_pixels(
+    first: wp.int32,
+    spectrum: wp.array4d(dtype=samples),
+    detector: wp.array3d(dtype=samples),
+    rows: wp.array(dtype=wp.int32),
+    offset: wp.array2d(dtype=wp.float32),
+    pixel_rows: wp.array2d(dtype=wp.vec2f),
+    pixel_columns: wp.array3d(dtype=samples),
+    waves: wp.array4d(dtype=samples),
+    lines: wp.array3d(dtype=samples),
+    line: wp.array2d(dtype=wp.float32),
+    image: wp.array3d(dtype=samples),
+):
+    """Sample the image of one star at the centres of its pixels.
+
+    Arguments: spectrum as ``transform_pupils`` leaves it; detector [2, row, packet]: its transfer function at +n and
+    -n, with the scale of the sum, columns m > 0 twice and row 0 half; offset [star, 2] of the image [periods];
+    pixel_rows [y, row]: cosine and sine; pixel_columns [2, column, packet of x]: cosines and sines; waves [star, 4,
+    row, packet]: room for what goes with the cosine along y, and with the sine; lines [star, packet, 2]: room for a
+    line of pixels, transformed along y; line: the same as plain numbers [star, ...]; image [star, y, packet of x].
+    """
+    star = first + wp.tid()
+    n_packet = rows.shape[0]
+    for packet in range(n_packet):
+        cosine, sine = unit_circle(-offset[star, 0] * lane_numbers(packet))
+        for row in range(rows[packet]):
+            turn = wp.float32(wp.TAU) * offset[star, 1] * wp.float32(row)
+            cosine_y = wp.cos(turn)
+            sine_y = -wp.sin(turn)
+            plus = detector[0, row, packet]
+            minus = detector[1, row, packet]
+            re = wp.cw_mul(plus, cosine_y * cosine - sine_y * sine)
+            im = wp.cw_mul(plus, cosine_y * sine + sine_y * cosine)
+            a = spectrum[star, 0, row, packet]
+            b = spectrum[star, 1, row, packet]
+            re_plus = wp.cw_mul(a, re) - wp.cw_mul(b, im)
+            im_plus = wp.cw_mul(a, im) + wp.cw_mul(b, re)
+            re = wp.cw_mul(minus, cosine_y * cosine + sine_y * sine)
+            im = wp.cw_mul(minus, cosine_y * sine - sine_y * cosine)
+            a = spectrum[star, 2, row, packet]
+            b = spectrum[star, 3, row, packet]
+            re_minus = wp.cw_mul(a, re) - wp.cw_mul(b, im)
+            im_minus = wp.cw_mul(a, im) + wp.cw_mul(b, re)
+            waves[star, 0, row, packet] = re_plus + re_minus
+            waves[star, 1, row, packet] = im_plus + im_minus
+            waves[star, 2, row, packet] = im_minus - im_plus
+            waves[star, 3, row, packet] = re_plus - re_minus
+    for y in range(pixel_rows.shape[0]):
+        for packet in range(n_packet):
+            re = samples()
+            im = samples()
+            for row in range(rows[packet]):
+                turn_y = pixel_rows[y, row]
+                re = re + turn_y[0] * waves[star, 0, row, packet] + turn_y[1] * waves[star, 2, row, packet]
+                im = im + turn_y[0] * waves[star, 1, row, packet] + turn_y[1] * waves[star, 3, row, packet]
+            lines[star, packet, 0] = re
+            lines[star, packet, 1] = im
+        for packet_x in range(image.shape[2]):
+            total = samples()
+            for column in range(pixel_columns.shape[1]):
+                here = (column // LANES) * 2 * LANES + column % LANES
+                total = (
+                    total
+                    + line[star, here] * pixel_columns[0, column, packet_x]
+                    - line[star, here + LANES] * pixel_columns[1, column, packet_x]
+                )
+            image[star, y, packet_x] = total

@@ -1,0 +1,243 @@
+"""Point spread functions of many stars, by any of the engines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+from ...core.units import metres, radians
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ..aberration import ResidualWavefront
+from ..atmosphere.atmosphere import Atmosphere
+from ..pupil_optics import trace_pupils
+from .fast import FastPsfEngine
+from .image_plane import ImagePlane, Recenter, focal_length
+from .long_exposure import LongExposureEngine
+from .wave import WavePsfEngine
+
+ENGINES = ("fast", "wave", "long_exposure")
+#: Kinds of screens that an engine keeps of an atmosphere, as its ``kept_screens`` names them.
+SCREENS = {"fast": ("slopes",), "wave": ("low", "high"), "long_exposure": ()}
+#: Value of :attr:`Psfs.flags` for a star none of whose light reaches the focal plane; its image is zero.
+DARK = 1
+
+
+@dataclass(frozen=True)
+class Psfs:
+    """Images of stars.
+
+    Attributes
+    ----------
+    image : ndarray of float32, shape [n_star, ny, nx]
+        Fraction of the light of the stamp in each pixel: of unit sum. ``[y, x]`` along the axes of the detector.
+    pixel_scale : float
+        Angle on the sky of a pixel [rad], at the centre of the field.
+    fields : ndarray, shape [n_star, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    reference : ndarray, shape [n_star, 3]
+        Where the chief ray of the middle wavelength meets the CCD, telescope frame [m]: the centre of pixel
+        ``[size // 2, size // 2]`` plus the star's offset.
+    offset : ndarray, shape [n_star, 2]
+        Place (x, y) of that point from the centre of the middle pixel [pixels].
+    throughput : ndarray, shape [n_star, n_wave]
+        Lit fraction of the annular pupil.
+    inside : ndarray, shape [n_star]
+        Fraction of the light that falls on the stamp.
+    flags : ndarray of int, shape [n_star]
+        0, or :data:`DARK`.
+    """
+
+    image: np.ndarray
+    pixel_scale: float
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    reference: np.ndarray
+    offset: np.ndarray
+    throughput: np.ndarray
+    inside: np.ndarray
+    flags: np.ndarray
+
+
+def make_psfs(
+    telescope: Telescope,
+    fields: Any,
+    wavelengths: Any,
+    *,
+    focal_plane: FocalPlane | None = None,
+    atmosphere: Atmosphere | None = None,
+    aberration: ResidualWavefront | None = None,
+    engine: str = "fast",
+    seed: int = 0,
+    stamp_size: int = 31,
+    pixel_size: Any = 10e-6,
+    diffusion: Any = 4e-6,
+    jitter: Any = 0.0,
+    offsets: Any = None,
+    recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
+    dispersion: Any = None,
+    n_pupil: int | None = None,
+    oversampling: int | None = None,
+    padding: bool | None = None,
+    pupil_spacing: float | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Psfs:
+    """Make the point spread functions of stars, as pixels see them.
+
+    A star's image depends on the star and the exposure alone: no byte of it depends on the other stars of the call, on
+    the threads or on how the work is cut.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n_star, 2]
+        Field angles [rad], of the light's own travel.
+    wavelengths : array_like or Quantity, shape [n_wave]
+        Vacuum wavelengths [m], of equal numbers of photons before the telescope.
+    focal_plane : FocalPlane, optional
+        CCD heights; the nominal flat plane if not given.
+    atmosphere : Atmosphere, optional
+        The exposure; none outside the atmosphere.
+    aberration : ResidualWavefront, optional
+        What active optics leaves uncorrected; none by default.
+    engine : {"fast", "wave", "long_exposure"}
+        Geometric optics with filters, Fourier optics (the truth, slow), or the mean over all turbulence (quickest, best
+        with many stars a call; it needs an atmosphere, of which it takes the Fried parameter and the outer scale only).
+    seed : int
+        Accepted so that a call reads alike for every engine. None of these draws a random number: those of the
+        exposure hang on the atmosphere's own seed.
+    stamp_size : int
+        Pixels on a side of a stamp.
+    pixel_size : float or Quantity
+        Side of a pixel [m].
+    diffusion : float or Quantity
+        Root mean square of the charge diffusion along each axis [m].
+    jitter : float or Quantity
+        Root mean square of the telescope's pointing along each axis during the exposure [rad]: a Gaussian blur, the
+        same for all stars.
+    offsets : array_like, shape [n_star, 2], optional
+        Place of each star (x, y) from the centre of the middle pixel [pixels]; 0 by default.
+    recenter : callable, optional
+        Tells where stars are seen on their stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns
+        places (x, y) from the centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more,
+        moved by so much that it is seen at the centre; that is exact, unlike a shift of the pixels, and costs little.
+    dispersion : array_like or Quantity, shape [n_wave, 2], optional
+        Shift in field angle of each wavelength by the atmosphere [rad], such as
+        :func:`~pachon.wavefront.atmosphere.refraction.dispersion_shift` gives.
+    n_pupil, oversampling : int, optional
+        About how many pupil points (fast and long_exposure), and cells of the fine grid to a pixel (fast).
+    padding, pupil_spacing : bool, float, optional
+        Wave engine: whether to keep all baselines, and the distance of pupil points [m].
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+    progress : callable, optional
+        Called with the number of stars done, after each batch.
+
+    Returns
+    -------
+    Psfs
+
+    Raises
+    ------
+    ConfigError
+        If there is no such engine or projection, or the engine needs an atmosphere.
+    DomainError
+        If an argument is outside its range or of the wrong shape, or a star falls between the CCDs.
+    """
+    if engine not in ENGINES:
+        raise ConfigError(f"engine = {engine!r}: expected one of {', '.join(ENGINES)}")
+    angles = _table(radians(fields, "fields"), "fields", None)
+    telescope.check_field(angles[:, 0], angles[:, 1])
+    lengths = metres(wavelengths, "wavelengths").reshape(-1)
+    if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
+        raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
+    places = np.zeros((len(angles), 2)) if offsets is None else _table(offsets, "offsets", len(angles))
+    shifts = np.zeros((len(lengths), 2))
+    if dispersion is not None:
+        shifts = _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
+    plane = ImagePlane(
+        stamp_size,
+        float(metres(pixel_size, "pixel_size")),
+        float(metres(diffusion, "diffusion")),
+        _on_detector(jitter, telescope, lengths),
+    )
+    maker: FastPsfEngine | WavePsfEngine | LongExposureEngine
+    common: dict[str, Any] = {
+        "dispersion": shifts,
+        "focal_plane": focal_plane,
+        "atmosphere": atmosphere,
+        "aberration": aberration,
+        "projection": projection,
+        "threads": threads,
+    }
+    if engine == "fast":
+        maker = FastPsfEngine(telescope, lengths, plane, n_pupil=n_pupil, oversampling=oversampling, **common)
+    elif engine == "long_exposure":
+        maker = LongExposureEngine(telescope, lengths, plane, n_pupil=n_pupil, **common)
+    else:
+        maker = WavePsfEngine(telescope, lengths, plane, padding=padding, pupil_spacing=pupil_spacing, **common)
+
+    pixel_scale = plane.pixel_size / maker.focal_length
+    seen: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
+    image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
+    throughput = np.empty((len(angles), len(lengths)))
+    reference, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
+    for first in range(0, len(angles), maker.batch):
+        part = slice(first, min(first + maker.batch, len(angles)))
+        stars = maker.render(angles[part], places[part], seen)
+        inside[part] = stars.image.sum(axis=(1, 2))
+        image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
+        throughput[part], reference[part], offset[part] = stars.throughput, stars.reference, stars.offset
+        if progress is not None:
+            progress(part.stop)
+    return Psfs(
+        image=image,
+        pixel_scale=pixel_scale,
+        fields=angles,
+        wavelengths=lengths,
+        reference=reference,
+        offset=offset,
+        throughput=throughput,
+        inside=inside,
+        flags=np.where(throughput.any(axis=1), 0, DARK),
+    )
+
+
+def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
+    """Return how far an angle [rad] moves images on the detector [m], at the centre of the field."""
+    angle = radians(jitter, "jitter")
+    if angle.size != 1 or not (np.isfinite(angle) & (angle >= 0.0)).all():
+        raise DomainError(f"jitter = {jitter!r}: expected an angle in radians from 0")
+    if not angle.any():
+        return 0.0
+    center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)))
+    return float(angle.item() * focal_length(center.jacobian)[0])
+
+
+def _table(values: Any, name: str, count: int | None) -> np.ndarray:
+    """Return pairs of finite numbers as a float64 array of shape [count, 2]."""
+    try:
+        table = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"{name} = {values!r}: expected pairs of numbers") from error
+    if count is None and table.size:
+        table = np.atleast_2d(table)
+    if count is None and not table.size:
+        table = table.reshape(0, 2)
+    if table.ndim != 2 or table.shape[1] != 2 or (count is not None and len(table) != count):
+        expected = f"[{'n' if count is None else count}, 2]"
+        raise DomainError(f"{name} of shape {table.shape}: expected {expected}")
+    if not np.isfinite(table).all():
+        raise DomainError(f"{name}: expected finite numbers only")
+    return table

@@ -1,0 +1,316 @@
+r"""The wave PSF engine: the truth that the fast engine is held to.
+
+The field on the focal plane at X from the reference point is the sum over the pupil of
+
+.. math:: A \, e^{i k (\psi + w)} \, e^{-i k X \cdot (J^{-T} p)},
+
+with the path :math:`\psi` of the atmosphere and :math:`w` of the optics (to the reference sphere, less the chief
+ray's), the entrance-pupil coordinate p, and the Jacobian J of the position on the focal plane with respect to the
+direction of the incoming light: :math:`J^{-T} p` are the direction cosines of the light at the focus, less the chief
+ray's. The pupil is a square lattice along the axes of the screens, on which these are interpolated row by row; the
+Fourier transform of the lattice has its points at regular steps of :math:`J^{-1} X`, an angle on the sky. The squared
+modulus is averaged over time steps; its transform is the optical transfer function (OTF) at the differences of lattice
+points, the baselines, and the pixels are sums over these.
+
+Averaged over time, turbulence leaves no OTF at baselines beyond 1.5 m, and of what a short exposure still has there,
+charge diffusion leaves exp(-17) (4 um rms, 620 nm, f = 10.3 m). The grid then needs no padding to twice the pupil: it
+is wider than the pupil by 1.5 m, so that baselines up to there are free of those that come round. Without an
+atmosphere, or with too little diffusion, it is padded and all baselines are kept.
+
+Transforms are those of SciPy in single precision. On 480 to 512 points a side FFTW and MKL take half its time and ducc0
+as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. They
+would cost hundreds of megabytes for one make of processor (MKL) or another licence (FFTW), and bytes that depend on the
+machine or on a timing.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+import scipy.fft
+import warp as wp
+
+from ...core.errors import DomainError
+from ...core.launch import launch, thread_count
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...raytrace.rays import field_direction
+from ..aberration import ResidualWavefront
+from ..atmosphere.atmosphere import Atmosphere
+from ..pupil_optics import PupilOptics, trace_pupils
+from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length
+from .pupil_lattice import PupilLattice
+from .sample_packets import LANES, indices, samples, shared
+from .wave_kernels import add_squares, pupil_fields
+
+#: Longest baseline [m] that an unpadded grid keeps.
+LONGEST_BASELINE = 1.5
+#: Largest distance of pupil points [m] under an atmosphere: the scale below which turbulence is left out.
+LARGEST_SPACING = 0.02
+#: Largest distance of pupil points [m] for the optics alone, which vary over metres: what limits it is the image, which
+#: repeats itself after lambda / spacing (3" at 0.04 m), and the rim of the pupil.
+LARGEST_SPACING_OPTICS = 0.04
+# What charge diffusion may leave of longer baselines for a grid without padding.
+_NEGLIGIBLE = 1e-4
+
+
+class WavePsfEngine:
+    """Renders stars by Fourier optics.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    plane : ImagePlane
+        Stamp and detector.
+    focal_plane : FocalPlane, optional
+        CCD heights.
+    atmosphere : Atmosphere, optional
+        The exposure.
+    dispersion : ndarray, shape [n_wave, 2]
+        Shift in field angle of each wavelength [rad].
+    padding : bool, optional
+        Keep all baselines, up to the diameter of the pupil; by default where there is no atmosphere or next to no
+        charge diffusion.
+    pupil_spacing : float, optional
+        Distance of the pupil points [m]; by default so small that the image repeats itself outside the stamp only, and
+        at most :data:`LARGEST_SPACING`, or :data:`LARGEST_SPACING_OPTICS` without an atmosphere.
+    projection : str
+        Meaning of the field angles.
+    aberration : ResidualWavefront, optional
+        Added to the traced wavefront.
+    threads : int, optional
+        Number of threads, one star each; no byte depends on it.
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        wavelengths: np.ndarray,
+        plane: ImagePlane,
+        *,
+        dispersion: np.ndarray,
+        focal_plane: FocalPlane | None = None,
+        atmosphere: Atmosphere | None = None,
+        padding: bool | None = None,
+        pupil_spacing: float | None = None,
+        projection: str = "zemax",
+        aberration: ResidualWavefront | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self._telescope = telescope
+        self._wavelengths = wavelengths
+        self._plane = plane
+        self._dispersion = dispersion
+        self._focal_plane = focal_plane
+        self._atmosphere = atmosphere
+        self._projection = projection
+        self._aberration = aberration
+        self._threads = threads
+        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
+        #: Effective focal length on the axis [m].
+        self.focal_length = float(focal_length(center.jacobian)[0])
+        self._lay_grid(padding, pupil_spacing)
+        self._take_screens()
+
+    @property
+    def batch(self) -> int:
+        """Number of stars to render at a time."""
+        return thread_count(self._threads)
+
+    def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
+        if spacing is None:
+            largest = LARGEST_SPACING_OPTICS if self._atmosphere is None else LARGEST_SPACING
+            spacing = min(largest, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
+        if not (math.isfinite(spacing) and spacing > 0.0):
+            raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
+        if padding is None:
+            k = 2.0 * math.pi * LONGEST_BASELINE / (float(self._wavelengths.max()) * self.focal_length)
+            left = math.exp(-0.5 * (k * self._plane.diffusion) ** 2)
+            padding = self._atmosphere is None or left > _NEGLIGIBLE
+        diameter = self._telescope.pupil_diameter
+        longest = diameter if padding else LONGEST_BASELINE
+        self._lattice = PupilLattice.fill(diameter, self._telescope.pupil_obscuration, spacing)
+        self._packets = -(-self._lattice.size // LANES)
+        across = max(math.ceil((diameter + longest) / spacing), self._packets * LANES)
+        # Multiples of 4 fill whole packets.
+        self._size = 4 * scipy.fft.next_fast_len(-(-across // 4))
+        self._reach = min(math.floor(longest / spacing), (self._size - 1) // 2)
+
+    def _take_screens(self) -> None:
+        """Take the spline coefficients of the low and the high screens [m], and lay the lattice over them."""
+        atmosphere = self._atmosphere
+        if atmosphere is None:
+            self._screens = [np.zeros((1, 1), dtype=np.float32)] * 2
+            self._sides, self._steps = np.ones(2, dtype=np.int64), np.ones(2)
+        else:
+            self._screens = [
+                atmosphere.kept_screens(scale, self._threads).reshape(atmosphere.layer_count, -1)
+                for scale in ("low", "high")
+            ]
+            self._sides = np.array([atmosphere.screen_size, atmosphere.fine_size])
+            self._steps = self._lattice.spacing / np.array([atmosphere.screen_pixel, atmosphere.fine_pixel])
+        # Packets of samples that a row of the pupil spans: four taps wide at least, and a fraction of a sample more.
+        spans = np.ceil(self._steps * self._packets * LANES) + 5
+        self._runs = tuple(int(-(-span // LANES)) for span in spans)
+
+    def _screen_arguments(self) -> tuple[list[Any], int]:
+        """Return the screens as the kernel takes them, and the number of layers."""
+        arguments: list[Any] = []
+        for screens, side, run in zip(self._screens, self._sides, self._runs, strict=True):
+            arguments += [shared(screens, wp.float32), int(side), run]
+        return arguments, 0 if self._atmosphere is None else self._atmosphere.layer_count
+
+    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
+        """Render one batch of stars.
+
+        Parameters
+        ----------
+        fields : ndarray, shape [n_star, 2]
+            Field angles [rad].
+        offsets : ndarray, shape [n_star, 2]
+            Places of the reference points from the centre of the middle pixel [pixels].
+        recenter : callable, optional
+            As :func:`~pachon.wavefront.psf.psf.make_psfs` takes it.
+
+        Returns
+        -------
+        RenderedStars
+        """
+        with ThreadPoolExecutor(thread_count(self._threads)) as pool:
+            stars = list(pool.map(self._render_star, fields, offsets, [recenter] * len(fields)))
+        return RenderedStars(*(np.concatenate(parts) for parts in zip(*map(astuple, stars), strict=True)))
+
+    def _render_star(self, field: np.ndarray, offset: np.ndarray, recenter: Recenter | None) -> RenderedStars:
+        optics = trace_pupils(
+            self._telescope,
+            field[None],
+            self._wavelengths,
+            self._lattice.points,
+            self._focal_plane,
+            self._projection,
+            threads=1,
+            aberration=self._aberration,
+        )
+        spectra = self._filtered(self._expose(field, optics), optics.jacobian[0])
+        image = self._sample(spectra, optics.jacobian[0], offset)
+        if recenter is not None:
+            offset = offset - recenter(image[None])[0]
+            image = self._sample(spectra, optics.jacobian[0], offset)
+        area = 0.25 * math.pi * self._telescope.pupil_diameter**2 * (1.0 - self._telescope.pupil_obscuration**2)
+        throughput = optics.lit[0].sum(axis=1) * self._lattice.spacing**2 / area
+        return RenderedStars(image[None], throughput[None], optics.reference, offset[None])
+
+    def _expose(self, field: np.ndarray, optics: PupilOptics) -> np.ndarray:
+        """Return the squared field on the focal plane, averaged over time, shape [n_wave, size, size].
+
+        Scaled so that the means over the grid add up to 1 over the wavelengths.
+        """
+        n_wave, size, line = len(self._wavelengths), self._size, self._lattice.size
+        lit = optics.lit[0]
+        if not lit.any():
+            return np.zeros((n_wave, size, size))
+        turns = optics.path[0] / self._wavelengths[:, None]
+        turns = np.where(lit, turns - np.rint(turns), 0.0)
+        phase, amplitude = (self._rows(values) for values in (turns, lit))
+        used = np.asarray(amplitude.any(axis=(0, 3)), dtype=np.int32)
+        fields = np.zeros((n_wave, size, size), dtype=np.complex64)
+        squares = [wp.zeros(2 * size * size // LANES, dtype=samples, device="cpu") for _ in range(n_wave)]
+        screens, n_layer = self._screen_arguments()
+        after: list[Any] = [
+            shared(used, wp.int32),
+            shared((1.0 / self._wavelengths).astype(np.float32), wp.float32),
+            shared(phase, samples),
+            shared(amplitude, samples),
+            wp.empty((line, max(self._runs) * LANES), dtype=wp.float32, device="cpu"),
+            wp.empty((line, self._packets), dtype=samples, device="cpu"),
+            shared(fields, wp.vec2f),
+        ]
+        steps = self._screen_places(field)
+        for places in steps:
+            launch(pupil_fields, line, [*screens, n_layer, *self._taps(places), *after], threads=1)
+            for wave in range(n_wave):
+                focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
+                launch(add_squares, len(focused), [shared(focused, samples), squares[wave]], threads=1)
+        parts = np.stack([square.numpy() for square in squares]).reshape(n_wave, size, size, 2)
+        return parts.sum(axis=-1, dtype=np.float64) / (len(steps) * lit.sum())
+
+    def _rows(self, values: np.ndarray) -> np.ndarray:
+        """Return values [n_wave, n_pupil] as float32 packets along the pupil's rows, [n_wave, row, packet, LANES]."""
+        line = self._lattice.size
+        rows = np.zeros((len(values), line, self._packets * LANES), dtype=np.float32)
+        rows[:, self._lattice.row, self._lattice.column] = values
+        return rows.reshape(len(values), line, self._packets, LANES)
+
+    def _screen_places(self, field: np.ndarray) -> np.ndarray:
+        """Return where the first lattice point is seen on each screen at each time [pixels], [n_time, n_screen, 2].
+
+        Screens are counted layer by layer, low before high.
+        """
+        atmosphere = self._atmosphere
+        if atmosphere is None:
+            return np.zeros((1, 2, 2))
+        direction = field_direction(field[0], field[1], self._projection)
+        corner = atmosphere.pupil_centers(direction, atmosphere.times) + self._lattice.origin
+        both = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
+        return both.reshape(len(atmosphere.times), -1, 2)
+
+    def _taps(self, places: np.ndarray) -> list[Any]:
+        """Return which samples of the screens the lattice lies between at one time, and their weights."""
+        sides, steps = np.tile(self._sides, len(places) // 2), np.tile(self._steps, len(places) // 2)
+        start = places - sides[:, None] * np.floor(places / sides[:, None])
+        whole = np.floor(start)
+        along = (start - whole)[..., None] + steps[:, None, None] * np.arange(self._packets * LANES)
+        sample = np.floor(along)
+        u = (along - sample).astype(np.float32)
+        v = 1.0 - u
+        weights = np.stack(
+            [v**3, 4.0 + u * u * (3.0 * u - 6.0), 4.0 + v * v * (3.0 * v - 6.0), u**3], axis=-1
+        ) * np.float32(1.0 / 6.0)
+        first = whole.astype(np.int32)
+        sample = sample.astype(np.int32)
+        # The spline's first tap is one sample before the point.
+        column = (first[:, 0] - 1) % sides
+        row = (first[:, 1, None] + sample[:, 1]) % sides[:, None]
+        packed = (len(places), self._packets, LANES)
+        of_columns = np.ascontiguousarray(np.moveaxis(weights[:, 0].reshape(*packed, 4), -1, 1))
+        return [
+            shared(np.ascontiguousarray(column, dtype=np.int32), wp.int32),
+            shared(np.ascontiguousarray(row, dtype=np.int32), wp.int32),
+            shared(np.ascontiguousarray(weights[:, 1]), wp.vec4f),
+            shared(np.ascontiguousarray(sample[:, 0].reshape(packed)), indices),
+            shared(of_columns, samples),
+        ]
+
+    def _filtered(self, intensity: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+        """Return the OTF times the transfer function of the detector, shape [n_wave, baseline y, baseline x]."""
+        step = np.arange(-self._reach, self._reach + 1)
+        # the wavenumber on the focal plane of a baseline of one step in x and in y, by the sign of the transform
+        per_step = -2.0 * math.pi * self._lattice.spacing * np.linalg.inv(jacobian)
+        spectra = np.empty((len(intensity), len(step), len(step)), dtype=np.complex128)
+        for wave, wavelength in enumerate(self._wavelengths):
+            k = (per_step[0, :, None, None] * step + per_step[1, :, None, None] * step[:, None]) / wavelength
+            spectra[wave] = scipy.fft.ifft2(intensity[wave])[np.ix_(step, step)] * self._plane.transfer(*k)
+        return spectra
+
+    def _sample(self, spectra: np.ndarray, jacobian: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Return the stamp: the spectra of all wavelengths evaluated at the pixel centres."""
+        side = self._plane.stamp_size
+        step = np.arange(-self._reach, self._reach + 1)
+        x, y = np.meshgrid(self._plane.pixel_centers, self._plane.pixel_centers)
+        pixels = np.stack([x, y], axis=-1).reshape(-1, 2) - offset * self._plane.pixel_size
+        angles = np.linalg.solve(jacobian, pixels.T)
+        image = np.zeros(side * side)
+        for wave, wavelength in enumerate(self._wavelengths):
+            k_step = 2.0 * math.pi * self._lattice.spacing / wavelength
+            turn = -1j * k_step * (angles - self._dispersion[wave][:, None])
+            rows = np.exp(turn[1][:, None] * step) @ spectra[wave]
+            total = np.einsum("px,px->p", rows, np.exp(turn[0][:, None] * step)).real
+            image += (self._plane.pixel_size * k_step / (2.0 * math.pi)) ** 2 / abs(np.linalg.det(jacobian)) * total
+        return image.reshape(side, side)

@@ -1,0 +1,218 @@
+"""Kernels of the wave PSF engine: the path of the atmosphere at every pupil point, the field of each wavelength."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from .sample_packets import LANES, indices, samples
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def blend_rows(
+    screens: wp.array2d(dtype=wp.float32),
+    layer: wp.int32,
+    size: wp.int32,
+    row: wp.int32,
+    weight: wp.vec4f,
+    column: wp.int32,
+    packets: wp.int32,
+    item: wp.int32,
+    blended: wp.array2d(dtype=wp.float32),
+):
+    """Interpolate a periodic screen of cubic B-spline coefficients in y, along a run of columns.
+
+    ``row`` is the second of the four rows that ``weight`` belongs to, ``column`` the first of the run.
+    """
+    before = ((row + size - 1) % size) * size
+    first = row * size
+    second = ((row + 1) % size) * size
+    after = ((row + 2) % size) * size
+    for packet in range(packets):
+        values = samples()
+        start = column + packet * LANES
+        # Two loops in place of one with a choice inside: the compiler vectorizes the first.
+        if start + LANES <= size:
+            for i in range(LANES):
+                at = start + i
+                values[i] = (
+                    weight[0] * screens[layer, before + at]
+                    + weight[1] * screens[layer, first + at]
+                    + weight[2] * screens[layer, second + at]
+                    + weight[3] * screens[layer, after + at]
+                )
+        else:
+            for i in range(LANES):
+                at = (start + i) % size
+                values[i] = (
+                    weight[0] * screens[layer, before + at]
+                    + weight[1] * screens[layer, first + at]
+                    + weight[2] * screens[layer, second + at]
+                    + weight[3] * screens[layer, after + at]
+                )
+        for i in range(LANES):
+            blended[item, packet * LANES + i] = values[i]
+
+
+@wp.func
+def unit_circle(turns: samples):
+    """Cosine and sine of an angle given in turns, to 1e-7; unlike the library's functions, polynomials vectorize.
+
+    Taylor series over an eighth of a turn to either side of the nearest quarter: the first term left out is below
+    3e-8.
+    """
+    cosine = samples()
+    sine = samples()
+    for i in range(LANES):
+        quarter = wp.floor(wp.float32(4.0) * turns[i] + wp.float32(0.5))
+        angle = (wp.float32(4.0) * turns[i] - quarter) * wp.float32(wp.HALF_PI)
+        s = angle * angle
+        near_sine = angle * (
+            wp.float32(1.0)
+            + s
+            * (
+                wp.float32(-1.0 / 6.0)
+                + s * (wp.float32(1.0 / 120.0) + s * (wp.float32(-1.0 / 5040.0) + s * wp.float32(1.0 / 362880.0)))
+            )
+        )
+        near_cosine = wp.float32(1.0) + s * (
+            wp.float32(-0.5)
+            + s * (wp.float32(1.0 / 24.0) + s * (wp.float32(-1.0 / 720.0) + s * wp.float32(1.0 / 40320.0)))
+        )
+        quadrant = wp.int32(quarter) & 3
+        odd = (quadrant & 1) == 1
+        c = wp.where(odd, near_sine, near_cosine)
+        d = wp.where(odd, near_cosine, near_sine)
+        cosine[i] = wp.where(quadrant == 1 or quadrant == 2, -c, c)
+        sine[i] = wp.where(quadrant >= 2, -d, d)
+    return cosine, sine
+
+
+@wp.func
+def lay_row(
+    screens: wp.array2d(dtype=wp.float32),
+    layer: wp.int32,
+    size: wp.int32,
+    scale: wp.int32,
+    item: wp.int32,
+    column: wp.array(dtype=wp.int32),
+    row: wp.array2d(dtype=wp.int32),
+    row_weight: wp.array2d(dtype=wp.vec4f),
+    sample: wp.array2d(dtype=indices),
+    column_weight: wp.array3d(dtype=samples),
+    run: wp.int32,
+    lit: wp.array2d(dtype=wp.int32),
+    blended: wp.array2d(dtype=wp.float32),
+    path: wp.array2d(dtype=samples),
+):
+    """Add one screen to the path along one row of the pupil; ``scale`` counts the screens of both scales."""
+    blend_rows(screens, layer, size, row[scale, item], row_weight[scale, item], column[scale], run, item, blended)
+    for packet in range(path.shape[1]):
+        if lit[item, packet] == 1:
+            at = sample[scale, packet]
+            before = column_weight[scale, 0, packet]
+            first = column_weight[scale, 1, packet]
+            second = column_weight[scale, 2, packet]
+            after = column_weight[scale, 3, packet]
+            here = samples()
+            for i in range(LANES):
+                k = at[i]
+                here[i] = (
+                    before[i] * blended[item, k]
+                    + first[i] * blended[item, k + 1]
+                    + second[i] * blended[item, k + 2]
+                    + after[i] * blended[item, k + 3]
+                )
+            path[item, packet] = path[item, packet] + here
+
+
+@wp.kernel
+def pupil_fields(
+    first: wp.int32,
+    low: wp.array2d(dtype=wp.float32),
+    low_size: wp.int32,
+    low_run: wp.int32,
+    high: wp.array2d(dtype=wp.float32),
+    high_size: wp.int32,
+    high_run: wp.int32,
+    n_layer: wp.int32,
+    column: wp.array(dtype=wp.int32),
+    row: wp.array2d(dtype=wp.int32),
+    row_weight: wp.array2d(dtype=wp.vec4f),
+    sample: wp.array2d(dtype=indices),
+    column_weight: wp.array3d(dtype=samples),
+    lit: wp.array2d(dtype=wp.int32),
+    turns_per_meter: wp.array(dtype=wp.float32),
+    optics: wp.array3d(dtype=samples),
+    amplitude: wp.array3d(dtype=samples),
+    blended: wp.array2d(dtype=wp.float32),
+    path: wp.array2d(dtype=samples),
+    field: wp.array3d(dtype=wp.vec2f),
+):
+    """Write the complex field of every wavelength along one row of the pupil, at one time.
+
+    The pupil is a square lattice along the axes of the screens, so interpolation is done row by row: first between the
+    rows of a screen, then along the row so gained.
+
+    Arguments: low, high [layer, y * size + x]: spline coefficients of path [m], of which a row of the pupil spans
+    ``run`` packets; screens are counted layer by layer, low before high: column [screen]: first column of the run; row
+    [screen, item] and row_weight [screen, item]: second of the four rows about a row of the pupil, and their weights;
+    sample [screen, packet]: first of the four columns about a point, counted along the run; column_weight
+    [screen, 4, packet]; lit [item, packet]: 1 where a packet holds light; turns_per_meter [wave]; optics
+    [wave, item, packet]: phase [turns]; amplitude [wave, item, packet]; blended [item, column], path [item, packet]:
+    room for a row of a screen and for the path [m]; field [wave, y, x], of which the pupil fills the first corner.
+    """
+    item = first + wp.tid()
+    for packet in range(path.shape[1]):
+        path[item, packet] = samples()
+    for layer in range(n_layer):
+        scale = 2 * layer
+        lay_row(
+            low,
+            layer,
+            low_size,
+            scale,
+            item,
+            column,
+            row,
+            row_weight,
+            sample,
+            column_weight,
+            low_run,
+            lit,
+            blended,
+            path,
+        )
+        scale = scale + 1
+        lay_row(
+            high,
+            layer,
+            high_size,
+            scale,
+            item,
+            column,
+            row,
+            row_weight,
+            sample,
+            column_weight,
+            high_run,
+            lit,
+            blended,
+            path,
+        )
+    for packet in range(path.shape[1]):
+        if lit[item, packet] == 1:
+            for wave in range(turns_per_meter.shape[0]):
+                cosine, sine = unit_circle(path[item, packet] * turns_per_meter[wave] + optics[wave, item, packet])
+                light = amplitude[wave, item, packet]
+                for i in range(LANES):
+                    field[wave, item, packet * LANES + i] = wp.vec2f(light[i] * cosine[i], light[i] * sine[i])
+
+
+@wp.kernel
+def add_squares(first: wp.int32, parts: wp.array(dtype=samples), squares: wp.array(dtype=samples)):
+    """Add the squares of real and imaginary parts, side by side as a field holds them, to their sums over time."""
+    item = first + wp.tid()
+    squares[item] = squares[item] + wp.cw_mul(parts[item], parts[item])
