@@ -39,7 +39,7 @@ def exposed(longest: Atmosphere, exposure: float, lift: float) -> Atmosphere:
     count = max(300, round(exposure / 0.05))
     return through_screens(
         longest,
-        longest.kept_screens("slopes"),
+        longest.screens("slopes"),
         exposure=exposure,
         times=(np.arange(count) + 0.5) * (exposure / count),
         altitudes=np.where(longest.altitudes == 0.0, lift, longest.altitudes),

@@ -58,7 +58,7 @@ def through_screens(atmosphere: Atmosphere, screens: np.ndarray, **changes) -> A
     """Return an atmosphere that sees given slopes, packed as its own are, with other times, offsets or heights."""
 
     class Borrowing(Atmosphere):
-        def kept_screens(self, kind, threads=None):
+        def screens(self, kind, threads=None):
             return screens
 
     values = {f.name: getattr(atmosphere, f.name) for f in dataclasses.fields(atmosphere) if f.init}
@@ -169,7 +169,7 @@ def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, d
     own = Atmosphere.from_site(SITE, seed, screen_size=SIZE, screen_length=LENGTH)
     layers = galsim_layers(own, seed)
     seen = {
-        "pachon": through_screens(own, own.kept_screens("slopes", 1)),
+        "pachon": through_screens(own, own.screens("slopes", 1)),
         "shared": through_galsim_screens(own, layers),
     }
     own.release()
@@ -181,7 +181,7 @@ def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, d
     for exposure in range(exposures):
         start = exposure * EPOCH_STEP
         for name, atmosphere in seen.items():
-            later = through_screens(atmosphere, atmosphere.kept_screens("slopes"), times=atmosphere.times + start)
+            later = through_screens(atmosphere, atmosphere.screens("slopes"), times=atmosphere.times + start)
             images = pachon_stars(telescope, later, fields)
             shapes[name][exposure], width[name][exposure] = ellipticity(images), fwhm(images, PIXEL)
         halves = [galsim_stars(layers, fields, rng, photons // 2, start) for _ in range(2)]

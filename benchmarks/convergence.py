@@ -47,8 +47,8 @@ class Field:
             # The screens do not depend on the time step; making them again would only take time.
             air = self.air[seed]
             steps = round(air.exposure / time_step)
-            atmosphere = air.seen_at((np.arange(steps) + 0.5) * (air.exposure / steps), air.exposure)
-            atmosphere.kept_screens("slopes")
+            atmosphere = air.at_times((np.arange(steps) + 0.5) * (air.exposure / steps), air.exposure)
+            atmosphere.screens("slopes")
             start = time.perf_counter()
             psfs = pachon.make_psfs(
                 self.telescope,

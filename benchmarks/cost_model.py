@@ -64,7 +64,7 @@ def time_stars(telescope, focal_plane, rounds, threads, count=96):
     for _ in range(rounds + 1):
         for i, (waves, steps, points, layers) in enumerate(STARS):
             atmosphere = atmospheres[steps, layers]
-            atmosphere.kept_screens("slopes")
+            atmosphere.screens("slopes")
             start = time.perf_counter()
             pachon.make_psfs(
                 telescope,
@@ -94,7 +94,7 @@ def time_screens(threads):
             "cerro_pachon", 3, screen_size=size, screen_length=size * 1300 / 8192, exposure=5.0
         )
         start = time.perf_counter()
-        atmosphere.kept_screens("slopes", threads)
+        atmosphere.screens("slopes", threads)
         seconds[size] = (time.perf_counter() - start) / (6 * size**2)
     return seconds
 

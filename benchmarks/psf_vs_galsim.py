@@ -61,7 +61,7 @@ def noise_of_photons(layers: galsim.PhaseScreenList, fields: np.ndarray, photons
 
 def error_of_samples(engine, atmosphere: Atmosphere, fine: Atmosphere, fields: np.ndarray, exposures: int) -> float:
     """Return the rms difference of a component of e from fine sampling of the same exposures."""
-    screens = atmosphere.kept_screens("slopes")
+    screens = atmosphere.screens("slopes")
     square = []
     for exposure in range(exposures):
         start = 60.0 * exposure
@@ -85,7 +85,7 @@ def main() -> None:
     options = {"screen_size": arguments.size, "screen_length": length}
     atmosphere = Atmosphere.from_site(SITE, 1, **options)
     fine = Atmosphere.from_site(SITE, 1, time_step=FINE_STEP, **options)
-    atmosphere.kept_screens("slopes")
+    atmosphere.screens("slopes")
     fields = np.random.default_rng(0).uniform(-FIELD, FIELD, (STARS, 2))
     samples = PUPIL_POINTS * len(atmosphere.times)
     print(f"pachon {pachon.__version__}, GalSim {galsim.__version__}; one thread each")

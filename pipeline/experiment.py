@@ -144,7 +144,7 @@ class Experiment:
             Number of threads; all processors by default. No byte depends on it.
         """
         for kind in self.screen_kinds:
-            _given(self.atmosphere).kept_screens(kind, threads)
+            _given(self.atmosphere).screens(kind, threads)
 
     @cached_property
     def field_radius_on_detector(self) -> float:

@@ -276,14 +276,6 @@ def _expose(
 ) -> Exposed:
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
-    told = 0
-
-    def tell(done: int) -> None:
-        nonlocal told
-        if advance is not None:
-            advance(done - told)
-        told = done
-
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
     seen = _seen_through(experiment)
     psfs = make_psfs(
@@ -303,9 +295,9 @@ def _expose(
         dispersion=experiment.dispersion,
         n_pupil=config.psf.n_pupil,
         threads=threads,
-        progress=tell,
+        progress=advance,
     )
-    return Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.throughput.mean(axis=1))
+    return Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
 
 
 class _Seen(NamedTuple):

@@ -158,7 +158,7 @@ def speckles(bench: Bench) -> Reproduced:
                 telescope,
                 np.zeros((1, 2)),
                 [_SPECKLE_WAVELENGTH],
-                atmosphere=air.seen_at(new),
+                atmosphere=air.at_times(new),
                 engine="wave",
                 pixel_size=_SPECKLE_PIXEL * ARCSEC * telescope.reference_sphere_radius,
                 stamp_size=_SPECKLE_STAMP,
@@ -293,7 +293,7 @@ def ellipticity(bench: Bench) -> Reproduced:
 def beginning(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
     """Return the beginning of a longer exposure, through the same screens, in 100 moments or more."""
     count = max(100, round(exposure / time_step))
-    return air.seen_at((np.arange(count) + 0.5) * (exposure / count), exposure)
+    return air.at_times((np.arange(count) + 0.5) * (exposure / count), exposure)
 
 
 def _atmosphere_ellipticity(bench: Bench, air: Atmosphere, fields: np.ndarray) -> np.ndarray:

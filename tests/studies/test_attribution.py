@@ -166,7 +166,7 @@ def test_a_lifted_ground_layer_is_the_same_air(tiny):
     assert (full.atmosphere.altitudes[0], lifted.atmosphere.altitudes[0]) == (0.0, attribution.GROUND_LIFT)
     asked = prepare(resolve(with_options(tiny(), atmosphere__ground_lift_m=attribution.GROUND_LIFT)))
     np.testing.assert_array_equal(lifted.atmosphere.altitudes, asked.atmosphere.altitudes)
-    assert lifted.atmosphere.kept_screens("slopes") is full.atmosphere.kept_screens("slopes")
+    assert lifted.atmosphere.screens("slopes") is full.atmosphere.screens("slopes")
 
 
 def test_causes_that_are_off_are_no_causes(tiny):

@@ -20,10 +20,10 @@ from pachon.models.io.prescription import load_telescope
 from pachon.models.site import load_site
 from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
+from pachon.studies.reproduce import reproduce as module
 from pachon.studies.reproduce.atmosphere import beginning
 from pachon.studies.reproduce.parts import PAPER, SMALL, Bench, Scale
 from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
-from pachon.studies.reproduce import reproduce as module
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.refraction import air_refractivity
 
@@ -190,7 +190,7 @@ def test_the_beginning_of_an_exposure_looks_through_the_same_air():
     part = beginning(air, 5.0, 0.1)
     assert part.times[-1] < 5.0 < part.times[-1] + 0.1
     assert len(part.times) == 100
-    assert part.kept_screens("slopes") is air.kept_screens("slopes")
+    assert part.screens("slopes") is air.screens("slopes")
     down = np.array([0.0, 0.0, -1.0])
     assert np.array_equal(part.pupil_centers(down, 3.0), air.pupil_centers(down, 3.0))
 

@@ -328,7 +328,7 @@ class Atmosphere:
             "fixed_modulus": self.fixed_modulus,
         }
 
-    def kept_screens(self, kind: str, threads: int | None = None) -> np.ndarray:
+    def screens(self, kind: str, threads: int | None = None) -> np.ndarray:
         """Return the screens of all layers, made once and kept for whoever asks next.
 
         Parameters
@@ -370,8 +370,8 @@ class Atmosphere:
                 self._cache[kind] = screens
             return self._cache[kind]
 
-    def seen_at(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
-        """Return the same air seen at other times: an atmosphere that shares the kept screens with this one.
+    def at_times(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
+        """Return the same turbulence at other times: an atmosphere that shares the kept screens with this one.
 
         Screens that either has made are kept for both, and :meth:`release` of either forgets them for both.
 

@@ -150,7 +150,7 @@ class FastPsfEngine:
         if atmosphere is None:
             self._screens, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
         else:
-            screens = atmosphere.kept_screens("slopes", threads)
+            screens = atmosphere.screens("slopes", threads)
             self._screens = screens.reshape(len(screens), -1)
             self._units = np.array([atmosphere.slope_unit(n) for n in range(len(screens))], dtype=np.float32)
 

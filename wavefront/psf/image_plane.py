@@ -91,17 +91,17 @@ class RenderedStars:
     ----------
     image : ndarray, shape [n_star, ny, nx]
         Fraction of the light that reaches the focal plane in each pixel, float64; 0 where no light does.
-    throughput : ndarray, shape [n_star, n_wave]
+    lit_fraction : ndarray, shape [n_star, n_wave]
         Lit fraction of the pupil.
-    reference : ndarray, shape [n_star, 3]
+    reference_point : ndarray, shape [n_star, 3]
         Point of the CCD at the star's place on the stamp, telescope frame [m].
     offset : ndarray, shape [n_star, 2]
         Place (x, y) of the reference point from the centre of the middle pixel [pixels].
     """
 
     image: np.ndarray
-    throughput: np.ndarray
-    reference: np.ndarray
+    lit_fraction: np.ndarray
+    reference_point: np.ndarray
     offset: np.ndarray
 
 

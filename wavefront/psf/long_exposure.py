@@ -239,9 +239,9 @@ class LongExposureEngine:
             offsets = offsets - recenter(stamps)
             stamps = self._sample(spectrum, offsets)
         inner, outer = self._pupil.radius[[0, -1]]
-        throughput = area / (math.pi * (outer**2 - inner**2))
+        lit_fraction = area / (math.pi * (outer**2 - inner**2))
         return RenderedStars(
-            stamps, np.repeat(throughput[:, None], len(self._wavelengths), axis=1), optics.reference, offsets
+            stamps, np.repeat(lit_fraction[:, None], len(self._wavelengths), axis=1), optics.reference, offsets
         )
 
     def _transform(self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from .long_exposure import LongExposureEngine
 from .wave import WavePsfEngine
 
 ENGINES = ("fast", "wave", "long_exposure")
-#: Kinds of screens that an engine keeps of an atmosphere, as its ``kept_screens`` names them.
+#: Kinds of screens that an engine keeps of an atmosphere, as its ``screens`` names them.
 SCREENS = {"fast": ("slopes",), "wave": ("low", "high"), "long_exposure": ()}
 #: Value of :attr:`Psfs.flags` for a star none of whose light reaches the focal plane; its image is zero.
 DARK = 1
@@ -41,12 +41,12 @@ class Psfs:
         Field angles [rad].
     wavelengths : ndarray, shape [n_wave]
         Vacuum wavelengths [m].
-    reference : ndarray, shape [n_star, 3]
+    reference_point : ndarray, shape [n_star, 3]
         Where the chief ray of the middle wavelength meets the CCD, telescope frame [m]: the centre of pixel
         ``[size // 2, size // 2]`` plus the star's offset.
     offset : ndarray, shape [n_star, 2]
         Place (x, y) of that point from the centre of the middle pixel [pixels].
-    throughput : ndarray, shape [n_star, n_wave]
+    lit_fraction : ndarray, shape [n_star, n_wave]
         Lit fraction of the annular pupil.
     inside : ndarray, shape [n_star]
         Fraction of the light that falls on the stamp.
@@ -58,9 +58,9 @@ class Psfs:
     pixel_scale: float
     fields: np.ndarray
     wavelengths: np.ndarray
-    reference: np.ndarray
+    reference_point: np.ndarray
     offset: np.ndarray
-    throughput: np.ndarray
+    lit_fraction: np.ndarray
     inside: np.ndarray
     flags: np.ndarray
 
@@ -74,7 +74,6 @@ def make_psfs(
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
     engine: str = "fast",
-    seed: int = 0,
     stamp_size: int = 31,
     pixel_size: Any = 10e-6,
     diffusion: Any = 4e-6,
@@ -112,9 +111,6 @@ def make_psfs(
     engine : {"fast", "wave", "long_exposure"}
         Geometric optics with filters, Fourier optics (the truth, slow), or the mean over all turbulence (quickest, best
         with many stars a call; it needs an atmosphere, of which it takes the Fried parameter and the outer scale only).
-    seed : int
-        Accepted so that a call reads alike for every engine. None of these draws a random number: those of the
-        exposure hang on the atmosphere's own seed.
     stamp_size : int
         Pixels on a side of a stamp.
     pixel_size : float or Quantity
@@ -142,7 +138,7 @@ def make_psfs(
     threads : int, optional
         Number of threads; all processors by default.
     progress : callable, optional
-        Called with the number of stars done, after each batch.
+        Called after each batch with the number of its stars.
 
     Returns
     -------
@@ -191,26 +187,30 @@ def make_psfs(
     pixel_scale = plane.pixel_size / maker.focal_length
     seen: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
     image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
-    throughput = np.empty((len(angles), len(lengths)))
-    reference, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
+    lit_fraction = np.empty((len(angles), len(lengths)))
+    reference_point, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
     for first in range(0, len(angles), maker.batch):
         part = slice(first, min(first + maker.batch, len(angles)))
         stars = maker.render(angles[part], places[part], seen)
         inside[part] = stars.image.sum(axis=(1, 2))
         image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
-        throughput[part], reference[part], offset[part] = stars.throughput, stars.reference, stars.offset
+        lit_fraction[part], reference_point[part], offset[part] = (
+            stars.lit_fraction,
+            stars.reference_point,
+            stars.offset,
+        )
         if progress is not None:
-            progress(part.stop)
+            progress(part.stop - first)
     return Psfs(
         image=image,
         pixel_scale=pixel_scale,
         fields=angles,
         wavelengths=lengths,
-        reference=reference,
+        reference_point=reference_point,
         offset=offset,
-        throughput=throughput,
+        lit_fraction=lit_fraction,
         inside=inside,
-        flags=np.where(throughput.any(axis=1), 0, DARK),
+        flags=np.where(lit_fraction.any(axis=1), 0, DARK),
     )
 
 

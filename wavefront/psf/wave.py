@@ -151,7 +151,7 @@ class WavePsfEngine:
             self._sides, self._steps = np.ones(2, dtype=np.int64), np.ones(2)
         else:
             self._screens = [
-                atmosphere.kept_screens(scale, self._threads).reshape(atmosphere.layer_count, -1)
+                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1)
                 for scale in ("low", "high")
             ]
             self._sides = np.array([atmosphere.screen_size, atmosphere.fine_size])
@@ -204,8 +204,8 @@ class WavePsfEngine:
             offset = offset - recenter(image[None])[0]
             image = self._sample(spectra, optics.jacobian[0], offset)
         area = 0.25 * math.pi * self._telescope.pupil_diameter**2 * (1.0 - self._telescope.pupil_obscuration**2)
-        throughput = optics.lit[0].sum(axis=1) * self._lattice.spacing**2 / area
-        return RenderedStars(image[None], throughput[None], optics.reference, offset[None])
+        lit_fraction = optics.lit[0].sum(axis=1) * self._lattice.spacing**2 / area
+        return RenderedStars(image[None], lit_fraction[None], optics.reference, offset[None])
 
     def _expose(self, field: np.ndarray, optics: PupilOptics) -> np.ndarray:
         """Return the squared field on the focal plane, averaged over time, shape [n_wave, size, size].

@@ -40,7 +40,7 @@ def test_default_atmosphere_of_the_site():
 def test_layers_at_other_altitudes_share_their_screens():
     air = small_atmosphere()
     lifted = air.at_altitudes([200.0, *air.altitudes[1:]])
-    assert lifted.kept_screens("slopes") is air.kept_screens("slopes")
+    assert lifted.screens("slopes") is air.screens("slopes")
     direction = np.array([0.01, 0.0, -1.0])
     moved = lifted.pupil_centers(direction) - air.pupil_centers(direction)
     # A layer h away is crossed at -h tan(angle) of the pupil's centre.
@@ -163,38 +163,38 @@ def test_streams_are_separate_and_repeatable():
 )
 def test_screens_are_kept_until_released(kind, size, dtype):
     atmosphere = small_atmosphere()
-    screens = atmosphere.kept_screens(kind)
+    screens = atmosphere.screens(kind)
     assert screens.dtype == dtype
     assert screens.shape == (6, size, size)
-    assert atmosphere.kept_screens(kind) is screens
+    assert atmosphere.screens(kind) is screens
     make = {"slopes": atmosphere.slope_screen, "low": atmosphere.low_screen, "high": atmosphere.high_screen}[kind]
     np.testing.assert_array_equal(screens[4], make(4))
     with pytest.raises(ValueError, match="read-only"):
         screens[0, 0, 0] = 1
     atmosphere.release()
-    anew = atmosphere.kept_screens(kind)
+    anew = atmosphere.screens(kind)
     assert anew is not screens
     np.testing.assert_array_equal(anew, screens)
     with pytest.raises(UnknownNameError, match="unknown kind"):
-        atmosphere.kept_screens("fine")
+        atmosphere.screens("fine")
 
 
 def test_the_same_air_at_other_times():
     air = small_atmosphere(time_step=0.1)
-    part = air.seen_at(air.times[5:8])
+    part = air.at_times(air.times[5:8])
     np.testing.assert_array_equal(part.times, air.times[5:8])
     assert part.exposure == pytest.approx(0.3)
     # Screens made through either are kept for both, whoever comes first, and forgotten for both.
-    assert part.kept_screens("low") is air.kept_screens("low")
-    assert air.kept_screens("slopes") is part.kept_screens("slopes")
-    before = air.kept_screens("low")
+    assert part.screens("low") is air.screens("low")
+    assert air.screens("slopes") is part.screens("slopes")
+    before = air.screens("low")
     part.release()
-    assert air.kept_screens("low") is not before
+    assert air.screens("low") is not before
     # A finer look at the whole of it is what the site gives for that step.
-    fine, anew = air.seen_at((np.arange(40) + 0.5) * 0.05, 2.0), small_atmosphere(time_step=0.05)
+    fine, anew = air.at_times((np.arange(40) + 0.5) * 0.05, 2.0), small_atmosphere(time_step=0.05)
     np.testing.assert_allclose(fine.times, anew.times, rtol=1e-14)
     assert fine.exposure == anew.exposure
-    np.testing.assert_array_equal(fine.kept_screens("slopes"), anew.kept_screens("slopes"))
+    np.testing.assert_array_equal(fine.screens("slopes"), anew.screens("slopes"))
     for times, exposure, text in [
         ([], None, "expected a list of finite times"),
         ([0.1, math.nan], None, "expected a list of finite times"),
@@ -205,7 +205,7 @@ def test_the_same_air_at_other_times():
         ((np.arange(9) + 0.5) * 10.0, 90.0, "screen_length = 81.92: expected more than"),
     ]:
         with pytest.raises(DomainError, match=text):
-            air.seen_at(times, exposure)
+            air.at_times(times, exposure)
 
 
 def test_ground_lift_and_zenith_angle():
@@ -254,13 +254,13 @@ def test_screens_that_do_not_fit_in_memory_are_refused(monkeypatch):
     assert kept < needed < 1.5 * kept
     assert atmosphere.screen_bytes(["low", "high"]) > 2 * kept
     monkeypatch.setattr(memory, "available_bytes", lambda: needed)
-    atmosphere.kept_screens("low")
+    atmosphere.screens("low")
     atmosphere.release()
     monkeypatch.setattr(memory, "available_bytes", lambda: 5_000_000)
     with pytest.raises(DomainError, match=r"screen_size = 512 in 6 layers: needs about .* of memory, 5.0 MB are free"):
-        atmosphere.kept_screens("low")
+        atmosphere.screens("low")
     monkeypatch.setattr(memory, "available_bytes", lambda: None)
-    atmosphere.kept_screens("low")
+    atmosphere.screens("low")
 
 
 def test_quantities_and_sites_are_accepted():

@@ -111,7 +111,7 @@ def test_binning_against_plain_numpy(polynomial_pupil, seed):
     binned = engine._deposit(optics, optics.lit * engine._weights)
 
     cell, n = 5e-6, engine._grid_size
-    counts = atmosphere.kept_screens("slopes")
+    counts = atmosphere.screens("slopes")
     weights = engine._lattice.weights(8.36, 0.612)
     for star, field in enumerate(fields):
         slopes = np.tan(field)
@@ -296,7 +296,7 @@ def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
 def test_no_light_of_a_vignetted_star_is_lost_or_won(lsst_r, n_pupil):
     fields = np.radians([[0.0, 0.0], [1.2, 1.2], [-1.0, 1.4]])
     psfs = make_psfs(lsst_r, fields, ONE_WAVE, n_pupil=n_pupil, stamp_size=41, pixel_size=5e-6, threads=2)
-    assert np.all(psfs.throughput[1:] < 0.96)
+    assert np.all(psfs.lit_fraction[1:] < 0.96)
     # All rays land on the stamp, so what it misses are the wings of the diffraction filter, the same for every star up
     # to the scale of the plate, which changes by less than 1 %.
     assert 0.99 < psfs.inside[0] < 1.0

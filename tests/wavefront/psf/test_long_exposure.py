@@ -17,11 +17,12 @@ from pachon.raytrace.rays import field_direction
 from pachon.wavefront.aberration import ResidualWavefront
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, long_exposure_fwhm, structure_function
+from pachon.wavefront.psf import long_exposure
 from pachon.wavefront.psf.clear_pupil import SpokePupil, clear_edges
 from pachon.wavefront.psf.fast import FastPsfEngine
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.long_exposure import PUPIL_POINTS, LongExposureEngine
-from pachon.wavefront.psf.psf import DARK, long_exposure, make_psfs
+from pachon.wavefront.psf.psf import DARK, make_psfs
 from pachon.wavefront.psf.pupil_lattice import PupilLattice
 from pachon.wavefront.pupil_optics import fields_at, trace_pupils
 
@@ -191,7 +192,7 @@ def test_defocus_and_coma_against_brute_force_over_a_circle(open_pupil, rim):
     jacobian = np.array([[10.3, 0.9], [-0.5, 10.8]])
     telescope = open_pupil(edges=(inner, outer), defocus=1.5e-6, coma=0.6e-6, jacobian=jacobian)
     stars = engine_for(telescope).render(np.array([[0.01, 0.0]]), np.zeros((1, 2)))
-    assert stars.throughput[0, 0] == pytest.approx((outer**2 - inner**2) / (4.18**2 * (1 - 0.612**2)), rel=1e-12)
+    assert stars.lit_fraction[0, 0] == pytest.approx((outer**2 - inner**2) / (4.18**2 * (1 - 0.612**2)), rel=1e-12)
 
     spacing, reach, wavenumber = 0.0125, 60, 2 * np.pi / 620e-9
     line = spacing * (np.arange(-360, 360) + 0.5)
@@ -266,9 +267,9 @@ def test_no_random_numbers_and_no_screens(lsst_r, monkeypatch):
     def refuse(*arguments, **options):
         raise AssertionError("a screen was asked for")
 
-    monkeypatch.setattr(Atmosphere, "kept_screens", refuse)
+    monkeypatch.setattr(Atmosphere, "screens", refuse)
     psfs = [
-        make_psfs(lsst_r, [[0.01, 0.005]], ONE_WAVE, engine="long_exposure", atmosphere=air(seed), seed=seed, threads=1)
+        make_psfs(lsst_r, [[0.01, 0.005]], ONE_WAVE, engine="long_exposure", atmosphere=air(seed), threads=1)
         for seed in (1, 2)
     ]
     np.testing.assert_array_equal(psfs[0].image, psfs[1].image)
@@ -360,10 +361,10 @@ def test_a_vignetted_star(lsst_r):
     field = np.radians([[1.05, 1.4]])
     stars = engine_for(lsst_r).render(field, np.zeros((1, 2)))
     _, area = brute_force(lsst_r, field[0], 620e-9)
-    assert stars.throughput.shape == (1, 1)
+    assert stars.lit_fraction.shape == (1, 1)
     # Sixteen spokes, against a lattice: its rim is cut along its cells.
-    assert stars.throughput[0, 0] == pytest.approx(area / (np.pi * 4.18**2 * (1 - 0.612**2)), abs=1e-3)
-    assert stars.throughput[0, 0] < 0.91
+    assert stars.lit_fraction[0, 0] == pytest.approx(area / (np.pi * 4.18**2 * (1 - 0.612**2)), abs=1e-3)
+    assert stars.lit_fraction[0, 0] < 0.91
 
 
 def test_a_dark_star(lsst_r):
@@ -371,7 +372,7 @@ def test_a_dark_star(lsst_r):
     psfs = make_psfs(
         lsst_r, [[limit, 0.0], [0.0, 0.0]], ONE_WAVE, stamp_size=9, engine="long_exposure", atmosphere=air(), threads=1
     )
-    assert psfs.throughput[0].max() == 0.0
+    assert psfs.lit_fraction[0].max() == 0.0
     assert psfs.flags.tolist() == [DARK, 0]
     assert not psfs.image[0].any()
     assert psfs.image[1].sum() == pytest.approx(1.0, abs=1e-6)
@@ -401,7 +402,7 @@ def test_heights_of_the_ccds(lsst_r):
     # Where the chief ray lands is found to 1e-14 m, on another way: far below single precision.
     np.testing.assert_allclose(flat.image, none.image, atol=1e-7)
     assert np.abs(uneven.image - flat.image).max() > 1e-3 * flat.image.max()
-    assert uneven.throughput.shape == (2, 1)
+    assert uneven.lit_fraction.shape == (2, 1)
 
 
 def test_needs_turbulence(lsst_r):

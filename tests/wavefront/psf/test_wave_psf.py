@@ -77,7 +77,7 @@ def test_perfect_optics_have_the_transfer_function_of_the_annulus(polynomial_pup
     expected = (to_pixels @ spectrum @ to_pixels.T).real * (PLANE.pixel_size * step / (620e-9 * FOCAL_LENGTH)) ** 2
     # The rim of the pupil is cut along grid cells: 2 cm of 836, over some 2000 cells of random error.
     np.testing.assert_allclose(stars.image[0], expected, atol=5e-4 * expected.max())
-    assert stars.throughput[0, 0] == pytest.approx(1.0, abs=1e-3)
+    assert stars.lit_fraction[0, 0] == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("tilt", [(3e-6, 0.0), (0.0, -2e-6)])
