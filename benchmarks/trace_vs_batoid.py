@@ -30,7 +30,7 @@ def with_grid():
     """Return the LSST with 100 nm of ripples on M1, for pachon and for batoid."""
     nodes = np.linspace(-4.3, 4.3, 201)
     values = 1e-7 * np.sin(3 * nodes) * np.cos(2 * nodes)[:, None]
-    telescope = pachon.load_telescope("lsst_v3.3_r").with_figure("M1", GridSag(nodes, nodes, values))
+    telescope = pachon.load_telescope("lsst_v3.3_r").with_deformation("M1", GridSag(nodes, nodes, values))
     optic = batoid.Optic.fromYaml("LSST_r.yaml")
     grid = batoid.Bicubic(nodes, nodes, values)
     return telescope, optic.withSurface("M1", batoid.Sum([optic["M1"].surface, grid]))

@@ -116,7 +116,7 @@ def _workers(
     """Yield what makes workers of the function that computes a point."""
     if sum(option is not None for option in (processes, scheduler, dask_workers)) > 1:
         raise ConfigError("--processes, --scheduler and --workers: expected one of them")
-    from ..core.launch import thread_count
+    from ..core.threads import thread_count
     from ..studies.sweep.workers import DaskWorkers, ProcessWorkers, SerialWorker, dask_client, local_cluster
 
     if scheduler is not None or dask_workers is not None:

@@ -1,4 +1,4 @@
-"""Start Warp quietly and run its kernels over slices, one slice a thread."""
+"""Quiet start of Warp, and launches of its kernels in slices, one per thread."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import os
 import platform
 import sys
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import warp as wp
+
+from .threads import thread_count
 
 wp.config.log_level = wp.LOG_ERROR
 
@@ -35,7 +35,7 @@ _started: list[bool] = []
 def start_warp() -> None:
     """Initialise Warp once, without its banner and its warning that there is no CUDA driver.
 
-    The warning comes from native code, past every Python setting, so standard error is turned away for that moment.
+    The warning comes from native code, past every Python setting, so standard error is redirected for that moment.
     """
     with _start:
         if _started:
@@ -51,45 +51,6 @@ def start_warp() -> None:
             os.close(kept)
             os.close(void)
         _started.append(True)
-
-
-def thread_count(threads: int | None) -> int:
-    """Return the number of threads to use: the given number, or the processors this process may run on."""
-    if threads is not None:
-        return max(1, int(threads))
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@dataclass(frozen=True)
-class KernelPair:
-    """A kernel made twice from one source: for plain telescopes, and for any.
-
-    What a plain telescope does not need would slow it down by merely standing in the loop over its surfaces.
-
-    Attributes
-    ----------
-    plain, special : wp.Kernel
-        The two, each in a module of its own, compiled when it is first needed.
-    """
-
-    plain: wp.Kernel
-    special: wp.Kernel
-
-    def suited(self, surfaces: Any) -> wp.Kernel:
-        """Return the kernel for a telescope's ``PackedSurfaces``."""
-        return self.special if surfaces.special else self.plain
-
-
-def kernel_pair(make: Callable[[bool, wp.Module], wp.Kernel]) -> KernelPair:
-    """Return both kernels of ``make(special, module)``, which puts the kernel that it defines into the module."""
-    made = []
-    for special in (False, True):
-        module = wp.get_module(f"{make.__module__}_{'special' if special else 'plain'}")
-        wp.set_module_options(FORWARD_OPTIONS, module=module)
-        made.append(make(special, module))
-    return KernelPair(*made)
 
 
 def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
@@ -114,7 +75,7 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
 
 
 def launch(
-    kernel: wp.Kernel | KernelPair, count: int, inputs: list[Any], *, threads: int | None = None, device: str = "cpu"
+    kernel: wp.Kernel, count: int, inputs: list[Any], *, threads: int | None = None, device: str = "cpu"
 ) -> None:
     """Run a kernel over ``count`` items, cut into one contiguous slice per thread.
 
@@ -123,8 +84,8 @@ def launch(
 
     Parameters
     ----------
-    kernel : wp.Kernel or KernelPair
-        Kernel whose first argument is ``first``; the second argument of a pair is a ``PackedSurfaces``.
+    kernel : wp.Kernel
+        Kernel whose first argument is ``first``.
     count : int
         Number of items.
     inputs : list
@@ -136,8 +97,6 @@ def launch(
     """
     if count == 0:
         return
-    if isinstance(kernel, KernelPair):
-        kernel = kernel.suited(inputs[0])
     load_kernels(kernel, device)
     slices = min(thread_count(threads), count) if device == "cpu" else 1
     bounds = [count * i // slices for i in range(slices + 1)]

@@ -206,8 +206,15 @@ class Telescope:
         changed = replace(self.surface(name), shape=shape)
         return replace(self, surfaces=tuple(changed if s.name == name else s for s in self.surfaces))
 
-    def with_figure(self, name: str, figure: Shape) -> Telescope:
-        """Return the telescope with a figure, a bending mode or a figure error, added to the sag of one surface.
+    def with_deformation(self, name: str, deformation: Shape) -> Telescope:
+        """Return the telescope with a deformation added to the sag of one surface.
+
+        Parameters
+        ----------
+        name : str
+            Name of the surface.
+        deformation : Shape
+            Sag to add [m], in the surface's own frame: a bending mode or a measured error, for example.
 
         Raises
         ------
@@ -216,7 +223,7 @@ class Telescope:
         """
         shape = self.surface(name).shape
         parts = shape.parts if isinstance(shape, Sum) else (shape,)
-        return self.with_shape(name, Sum((*parts, figure)))
+        return self.with_shape(name, Sum((*parts, deformation)))
 
     def perturbed(
         self,

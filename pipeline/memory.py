@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..core.errors import ConfigError
-from ..core.launch import thread_count
 from ..core.memory import available_bytes, readable
+from ..core.threads import thread_count
 from .experiment import Experiment
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is

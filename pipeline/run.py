@@ -17,8 +17,8 @@ from trimesh.exchange.gltf import export_glb
 
 from ..core.errors import DomainError, PachonError
 from ..core.files import write_bytes, write_ecsv, write_json
-from ..core.launch import thread_count
 from ..core.progress import Reporter
+from ..core.threads import thread_count
 from .ccd_product import product_path, read_product, write_product
 from .config import Configuration
 from .experiment import Experiment, prepare

@@ -9,6 +9,7 @@ import trimesh
 import warp as wp
 
 from ..core.launch import launch, start_warp
+from ..core.warp_arrays import warp_array
 from ..models.surface import Surface
 from .kernels.mesh import first_facet
 
@@ -69,14 +70,15 @@ def land_on_mesh(
     d = direction @ detector.matrix
     start = p - (REACH / np.abs(d[:, 2]))[:, None] * d
 
-    def vectors(values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.vec3, device="cpu")
-
-    facets = wp.array(np.ascontiguousarray(mesh.faces, dtype=np.int32).ravel(), dtype=wp.int32, device="cpu")
-    found = wp.Mesh(points=vectors(mesh.vertices), indices=facets)
+    found = wp.Mesh(points=warp_array(mesh.vertices, wp.vec3), indices=warp_array(mesh.faces.ravel(), wp.int32))
     facet = wp.empty(len(p), dtype=wp.int32, device="cpu")
     reach = float(2 * REACH / np.abs(d[:, 2]).min(initial=1.0))
-    launch(first_facet, len(p), [found.id, vectors(start), vectors(d), reach, facet], threads=threads)
+    launch(
+        first_facet,
+        len(p),
+        [found.id, *(warp_array(a, wp.vec3) for a in (start, d)), reach, facet],
+        threads=threads,
+    )
 
     index = facet.numpy()
     corners = np.asarray(mesh.triangles, dtype=np.float64)[index]

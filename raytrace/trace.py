@@ -10,6 +10,7 @@ import warp as wp
 
 from ..core.errors import ConfigError
 from ..core.launch import launch
+from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .detector import land_on_ccds
@@ -86,7 +87,7 @@ def trace_packets(telescope: Telescope, rays: Rays, every: int, *, threads: int 
     indices = refractive_indices(telescope, rays.wavelength)
 
     def inputs(values: np.ndarray) -> wp.array:
-        return wp.array(to_packets(values), dtype=lanes, device="cpu", copy=False)
+        return warp_array(to_packets(values), lanes)
 
     end = PacketTrace(
         indices,
@@ -98,11 +99,11 @@ def trace_packets(telescope: Telescope, rays: Rays, every: int, *, threads: int 
         wp.empty((every, count), dtype=lane_flags, device="cpu"),
     )
     launch(
-        trace_rays,
+        trace_rays.suited(packed),
         count,
         [
             packed,
-            wp.array(indices[None], dtype=wp.float64, device="cpu"),
+            warp_array(indices[None]),
             end.start,
             end.start_direction,
             inputs(rays.path_length),

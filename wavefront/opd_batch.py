@@ -13,6 +13,7 @@ import warp as wp
 from ..core.errors import DomainError
 from ..core.launch import launch
 from ..core.units import radians
+from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, to_packets
@@ -176,7 +177,7 @@ class _Plan:
         stop = next((i for i, s in enumerate(telescope.surfaces) if s.aperture is not None), None)
         if stop is not None and stop + 1 < len(telescope.surfaces):
             front = PackedSurfaces()
-            for name in ("numbers", "coefficients", "figures", "apertures", "obstructions", "special"):
+            for name in ("numbers", "coefficients", "deformations", "apertures", "obstructions", "special"):
                 setattr(front, name, getattr(whole, name))
             # The kernel goes through as many surfaces as there are rows of kinds.
             front.kinds = whole.kinds[: stop + 1]
@@ -188,18 +189,15 @@ class _Plan:
         return cls(
             telescope,
             stages,
-            wp.array(refractive_indices(telescope, wavelength)[None], dtype=wp.float64, device="cpu"),
-            wp.array(to_packets(np.stack([x[order], y[order]])), dtype=lanes, device="cpu"),
-            wp.array(place.reshape(-1, LANES), dtype=lane_flags, device="cpu"),
+            warp_array(refractive_indices(telescope, wavelength)[None]),
+            warp_array(to_packets(np.stack([x[order], y[order]])), lanes),
+            warp_array(place.reshape(-1, LANES), lane_flags),
             radius,
         )
 
     def trace(self, directions: np.ndarray, sphere: np.ndarray, value: np.ndarray, threads: int | None) -> None:
         """Fill the maps [n_field, n_pupil] of some fields; ``sphere`` holds centres and chief paths [n_field, 4]."""
         telescope, packets = self.telescope, len(self.place)
-
-        def doubles(values: np.ndarray) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=wp.float64, device="cpu", copy=False)
 
         start = np.empty((0, 3))
         if np.isfinite(telescope.object_distance):
@@ -211,23 +209,23 @@ class _Plan:
         for surfaces, filled in zip(self.stages, [value[:0], value][-len(self.stages) :], strict=True):
             work = np.flatnonzero(lit).astype(np.int32)
             launch(
-                trace_opds,
+                trace_opds.suited(surfaces),
                 len(work),
                 [
                     surfaces,
                     self.indices,
-                    wp.array(work, dtype=wp.int32, device="cpu", copy=False),
+                    warp_array(work, wp.int32),
                     self.pupil,
                     self.place,
                     float(telescope.stop_z),
                     float(telescope.launch_distance),
-                    doubles(directions),
-                    doubles(start),
-                    doubles(sphere),
+                    warp_array(directions),
+                    warp_array(start),
+                    warp_array(sphere),
                     self.radius,
                     *nothing,
-                    doubles(filled),
-                    wp.array(lit, dtype=wp.int32, device="cpu", copy=False),
+                    warp_array(filled),
+                    warp_array(lit, wp.int32),
                 ],
                 threads=threads,
             )

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from ..core.launch import FORWARD_OPTIONS, kernel_pair
+from ..core.launch import FORWARD_OPTIONS
+from ..raytrace.kernels.kernel_pair import kernel_pair
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, lanes_sqrt
 from ..raytrace.kernels.pupil import launched
 from ..raytrace.kernels.surface import OK, ONE, ZERO

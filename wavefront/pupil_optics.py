@@ -16,6 +16,7 @@ import warp as wp
 from ..core.errors import DomainError
 from ..core.launch import launch
 from ..core.units import metres, radians
+from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, to_packets
@@ -207,26 +208,24 @@ def trace_pupils(
     count = packet_count(n_pupil)
     bundles = n_star * n_wave
 
-    def doubles(values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=wp.float64, device="cpu")
-
     out_x, out_y, out_path = (wp.empty((bundles, count), dtype=lanes, device="cpu") for _ in range(3))
     nothing = [wp.empty((0, 0, 0), dtype=lanes, device="cpu")] * 2
     nothing += [wp.empty((0, 0), dtype=kind, device="cpu") for kind in (lanes, lane_flags)]
     out_status = wp.empty((bundles, count), dtype=lane_flags, device="cpu")
+    packed = pack_surfaces(telescope)
     launch(
-        trace_pupils_kernel,
+        trace_pupils_kernel.suited(packed),
         bundles * count,
         [
-            pack_surfaces(telescope),
+            packed,
             count,
-            doubles(indices),
-            wp.array(np.tile(np.arange(n_wave, dtype=np.int32), n_star), dtype=wp.int32, device="cpu"),
-            doubles(np.repeat(direction, n_wave, axis=0)),
-            wp.array(to_packets(pupil.T), dtype=lanes, device="cpu"),
+            warp_array(indices),
+            warp_array(np.tile(np.arange(n_wave), n_star), wp.int32),
+            warp_array(np.repeat(direction, n_wave, axis=0)),
+            warp_array(to_packets(pupil.T), lanes),
             float(telescope.stop_z),
             float(telescope.launch_distance),
-            doubles(np.repeat(np.concatenate([reference, normal], axis=1), n_wave, axis=0)),
+            warp_array(np.repeat(np.concatenate([reference, normal], axis=1), n_wave, axis=0)),
             float(radius),
             *nothing,
             out_x,

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ...core.errors import ConfigError, DomainError, PachonError
-from ...core.single_thread import one_blas_thread
+from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ..bundles import field_points, wavelength_points

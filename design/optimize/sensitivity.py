@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import DomainError
-from ...core.single_thread import one_blas_thread
+from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import annular_zernikes
 from ...raytrace.rays import RayStatus

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from ...core.errors import DomainError
-from ...core.launch import thread_count
+from ...core.threads import thread_count
 from ...raytrace.adjoint.gradient import Seeds, position_seeds, sweep
 from ...raytrace.rays import RayStatus, field_direction, parallel_rays
 from .jacobian import ParameterColumns, sphere_seeds

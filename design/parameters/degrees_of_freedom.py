@@ -267,7 +267,7 @@ class DegreesOfFreedom:
                             # A figure of its own on each surface, whatever the surface has already.
                             places[target] = [(s, figure.shape) for s in figure.surfaces]
                             for surface in figure.surfaces:
-                                prepared = prepared.with_figure(surface, figure.shape)
+                                prepared = prepared.with_deformation(surface, figure.shape)
                         found = [f"{s}.{_last(prepared.surface(s).shape, shape, term)}" for s, shape in places[target]]
                     parse_parameters(found, prepared)
                 except PachonError as error:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
-from ...core.single_thread import one_blas_thread
+from ...core.threads import one_blas_thread
 from ...core.units import radians
 
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 
 from ...core.errors import ConfigError, DomainError
-from ...core.single_thread import one_blas_thread
+from ...core.threads import one_blas_thread
 from . import gaussian_process
 from .basis import BASES
 from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms

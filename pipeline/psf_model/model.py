@@ -18,7 +18,7 @@ from astropy.io import fits
 
 from ...core.errors import ConfigError, ProductError
 from ...core.files import read_fits, write_fits
-from ...core.single_thread import one_blas_thread
+from ...core.threads import one_blas_thread
 from . import gaussian_process
 from .file import model_fields, model_hdus
 from .fit import fit_fields, weighted

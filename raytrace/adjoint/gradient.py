@@ -16,6 +16,7 @@ import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
+from ...core.warp_arrays import warp_array
 from ...models.shapes.mesh import MeshSurface
 from ...models.telescope import Telescope
 from ..kernels.packet import LANES, lanes
@@ -281,17 +282,17 @@ def respond(
     -------
     SurfaceResponse
     """
-    telescope, packets = swept.telescope, swept.packets
+    packets, packed = swept.packets, pack_surfaces(swept.telescope)
     outputs, count = len(seeds.path), packets.start.shape[1]
-    rows = columns(telescope) if rows is None else rows
+    rows = columns(swept.telescope) if rows is None else rows
     response = wp.empty((outputs, row_count(rows, polynomials), count), dtype=lanes, device="cpu")
     first = wp.empty((outputs if start else 0, 6, count), dtype=lanes, device="cpu")
     launch(
-        sweep_back,
+        sweep_back.suited(packed),
         outputs * count,
         [
-            pack_surfaces(telescope),
-            wp.array(swept.indices, dtype=wp.float64, device="cpu"),
+            packed,
+            warp_array(swept.indices),
             count,
             packets.start,
             packets.start_direction,
@@ -299,8 +300,8 @@ def respond(
             packets.direction,
             _seed_packets(seeds.position, count),
             _seed_packets(seeds.direction, count),
-            wp.array(seeds.path, dtype=wp.float64, device="cpu"),
-            wp.array(rows, dtype=wp.int32, device="cpu"),
+            warp_array(seeds.path),
+            warp_array(rows, wp.int32),
             *polynomial_tables(rows, polynomials),
             response,
             first,
@@ -328,7 +329,7 @@ def polynomial_tables(rows: np.ndarray, polynomials: Polynomials) -> tuple[wp.ar
         table[j, :3] = degree, rows[surface, SAG], rows[surface, HIT]
         table[j, 3 : 3 + len(own)] = own
     scales = np.array([scale for _, scale, *_ in polynomials], dtype=np.float64)
-    return wp.array(table, dtype=wp.int32, device="cpu"), wp.array(scales, dtype=wp.float64, device="cpu")
+    return warp_array(table, wp.int32), warp_array(scales)
 
 
 def as_rays(values: wp.array, n: int) -> np.ndarray:
@@ -341,4 +342,4 @@ def _seed_packets(values: np.ndarray, count: int) -> wp.array:
     """Return seeds [n_output, 3, n] as packets, the last one filled up with zeros."""
     padded = np.zeros((*values.shape[:2], count * LANES))
     padded[:, :, : values.shape[2]] = values
-    return wp.array(padded.reshape(*values.shape[:2], count, LANES), dtype=lanes, device="cpu", copy=False)
+    return warp_array(padded.reshape(*values.shape[:2], count, LANES), lanes)

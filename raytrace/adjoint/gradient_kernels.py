@@ -23,12 +23,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from ...core.launch import FORWARD_OPTIONS, kernel_pair
+from ...core.launch import FORWARD_OPTIONS
+from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import extra_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
 from ..kernels.trace import (
-    FIGURED,
+    DEFORMED,
     INTERACTION,
     MIRROR,
     PHASE,
@@ -132,8 +133,8 @@ def back_loop(special: bool) -> wp.Function:
 
             sx, sy, sxx, sxy, syy = sag_derivatives(surfaces, s, x, y)
             if wp.static(special):
-                if surfaces.kinds[s, FIGURED] == 1:
-                    zx, zy, zxx, zxy, zyy = extra_derivatives(surfaces.figures, s, x, y)
+                if surfaces.kinds[s, DEFORMED] == 1:
+                    zx, zy, zxx, zxy, zyy = extra_derivatives(surfaces.deformations, s, x, y)
                     sx = sx + zx
                     sy = sy + zy
                     sxx = sxx + zxx

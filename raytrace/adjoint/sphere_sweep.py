@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from ...core.launch import launch, thread_count
+from ...core.launch import launch
+from ...core.threads import thread_count
+from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..kernels.packet import LANES, lane_flags, lanes, to_packets
 from ..pack.surfaces import pack_surfaces
@@ -73,14 +75,14 @@ class SphereSweep:
         self._n_packets = points.shape[1]
         self._inputs = [
             pack_surfaces(telescope),
-            wp.array(indices[None], dtype=wp.float64, device="cpu"),
-            wp.array(indices, dtype=wp.float64, device="cpu"),
-            wp.array(np.column_stack([directions, center.T, path]), dtype=wp.float64, device="cpu"),
-            wp.array(points, dtype=lanes, device="cpu"),
+            warp_array(indices[None]),
+            warp_array(indices),
+            warp_array(np.column_stack([directions, center.T, path])),
+            warp_array(points, lanes),
             float(telescope.stop_z),
             float(telescope.launch_distance),
             float(radius),
-            wp.array(rows, dtype=wp.int32, device="cpu"),
+            warp_array(rows, wp.int32),
             *polynomial_tables(rows, polynomials),
             sphere_row,
             int(lit_only),
@@ -110,7 +112,7 @@ class SphereSweep:
         response = wp.empty((1, self._n_rows, count), dtype=lanes, device="cpu")
         status = wp.empty(count, dtype=lane_flags, device="cpu")
         launch(
-            sweep_sphere,
+            sweep_sphere.suited(self._inputs[0]),
             parts,
             [
                 *self._inputs,

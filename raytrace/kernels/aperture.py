@@ -30,7 +30,7 @@ class PackedApertures:
     """The general apertures of a telescope; see :mod:`pachon.raytrace.pack.apertures`.
 
     ``span`` [surface, 2]: first step of the surface's programme, and the one after its last. ``steps`` [step, 3]: what
-    it does, and for an outline the first of its edges and the one after its last. ``figures`` [step, 6]: centre x, y
+    it does, and for an outline the first of its edges and the one after its last. ``numbers`` [step, 6]: centre x, y
     [m], cosine and sine of the angle, two sizes: the square of the radius; squares of inner and outer radius; halves of
     width and height; where a strip begins, and half its width [m]. ``edges`` [edge, 4]: one end x, y [m], y of the
     other [m], slope dx/dy.
@@ -38,7 +38,7 @@ class PackedApertures:
 
     span: wp.array2d(dtype=wp.int32)
     steps: wp.array2d(dtype=wp.int32)
-    figures: wp.array2d(dtype=wp.float64)
+    numbers: wp.array2d(dtype=wp.float64)
     edges: wp.array2d(dtype=wp.float64)
 
 
@@ -72,10 +72,10 @@ def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes
     stack = lane_flags()
     for step in range(apertures.span[s, 0], apertures.span[s, 1]):
         what = apertures.steps[step, 0]
-        a = apertures.figures[step, 4]
-        b = apertures.figures[step, 5]
-        dx = x - lanes(apertures.figures[step, 0])
-        dy = y - lanes(apertures.figures[step, 1])
+        a = apertures.numbers[step, 4]
+        b = apertures.numbers[step, 5]
+        dx = x - lanes(apertures.numbers[step, 0])
+        dy = y - lanes(apertures.numbers[step, 1])
         inside = lane_flags()
         if what == DISC:
             for i in range(LANES):
@@ -87,8 +87,8 @@ def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes
                 inside[i] = wp.where(r2 >= a, wp.where(r2 < b, 1, 0), 0)
             stack = put(stack, inside)
         elif what == BOX or what == STRIP:
-            cosine = apertures.figures[step, 2]
-            sine = apertures.figures[step, 3]
+            cosine = apertures.numbers[step, 2]
+            sine = apertures.numbers[step, 3]
             along = cosine * dx + sine * dy
             across = cosine * dy - sine * dx
             for i in range(LANES):

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from ...core.launch import FORWARD_OPTIONS, kernel_pair
+from ...core.launch import FORWARD_OPTIONS
+from .kernel_pair import kernel_pair
 from .packet import lane_flags, lanes, lanes_sqrt
 from .surface import ZERO
 from .trace import LOOPS, PackedSurfaces, statuses

@@ -20,7 +20,7 @@ block = wp.types.vector(BLOCK, wp.float64)
 
 #: Newton stops for a lane when its step [m] is below this. The slopes of the last evaluation then hold where the ray
 #: lands, and the step is above what rounding leaves of distances of tens of metres.
-FIGURE_STEP = wp.constant(wp.float64(2.0e-13))
+DEFORMATION_STEP = wp.constant(wp.float64(2.0e-13))
 
 NAN = wp.constant(wp.float64(float("nan")))
 
@@ -35,7 +35,7 @@ GRID_HEAD = wp.constant(4)
 
 
 @wp.struct
-class PackedFigures:
+class PackedDeformations:
     """The figures of a telescope's surfaces; see :mod:`pachon.raytrace.pack.shapes`.
 
     ``span`` [surface, 2]: first part of the surface, and the one after its last. ``parts`` [part, 4]: kind, and what
@@ -232,39 +232,39 @@ def grid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, nx: wp.int32
 
 
 @wp.func
-def extra_sag(figures: PackedFigures, s: wp.int32, x: lanes, y: lanes):
+def extra_sag(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes):
     """Sum of the parts of surface ``s``: sag [m], slopes along x and y, and whether a lane lies beyond a grid."""
     value = lanes(ZERO)
     slope_x = lanes(ZERO)
     slope_y = lanes(ZERO)
     outside = lanes(ZERO)
-    for part in range(figures.span[s, 0], figures.span[s, 1]):
-        kind = figures.parts[part, 0]
-        offset = figures.parts[part, 1]
-        a = figures.parts[part, 2]
-        b = figures.parts[part, 3]
+    for part in range(deformations.span[s, 0], deformations.span[s, 1]):
+        kind = deformations.parts[part, 0]
+        offset = deformations.parts[part, 1]
+        a = deformations.parts[part, 2]
+        b = deformations.parts[part, 3]
         if kind == POLAR:
-            dz, dx, dy = polar_sag(figures.numbers, offset, a, b, x, y)
+            dz, dx, dy = polar_sag(deformations.numbers, offset, a, b, x, y)
             value = value + dz
             slope_x = slope_x + dx
             slope_y = slope_y + dy
         elif kind == ODD:
-            dz, dx, dy = odd_sag(figures.numbers, offset, a, x, y)
+            dz, dx, dy = odd_sag(deformations.numbers, offset, a, x, y)
             value = value + dz
             slope_x = slope_x + dx
             slope_y = slope_y + dy
         elif kind == BICONIC:
-            dz, dx, dy = biconic_sag(figures.numbers, offset, x, y)
+            dz, dx, dy = biconic_sag(deformations.numbers, offset, x, y)
             value = value + dz
             slope_x = slope_x + dx
             slope_y = slope_y + dy
         elif kind == TOROID:
-            dz, dx, dy = toroid_sag(figures.numbers, offset, x, y)
+            dz, dx, dy = toroid_sag(deformations.numbers, offset, x, y)
             value = value + dz
             slope_x = slope_x + dx
             slope_y = slope_y + dy
         elif kind == GRID:
-            dz, dx, dy, beyond = grid_sag(figures.numbers, offset, a, b, x, y)
+            dz, dx, dy, beyond = grid_sag(deformations.numbers, offset, a, b, x, y)
             value = value + dz
             slope_x = slope_x + dx
             slope_y = slope_y + dy
@@ -273,8 +273,8 @@ def extra_sag(figures: PackedFigures, s: wp.int32, x: lanes, y: lanes):
 
 
 @wp.func
-def figured_distance(
-    figures: PackedFigures,
+def deformed_distance(
+    deformations: PackedDeformations,
     c: wp.float64,
     k: wp.float64,
     coefficients: wp.array2d(dtype=wp.float64),
@@ -310,7 +310,7 @@ def figured_distance(
         py = y + wp.cw_mul(t, v)
         r2 = wp.cw_mul(px, px) + wp.cw_mul(py, py)
         outward = wp.cw_mul(px, u) + wp.cw_mul(py, v)
-        value, slope_x, slope_y, outside = extra_sag(figures, s, px, py)
+        value, slope_x, slope_y, outside = extra_sag(deformations, s, px, py)
         b = z + wp.cw_mul(t, w) - value
         along = w - wp.cw_mul(slope_x, u) - wp.cw_mul(slope_y, v)
         if terms > 0:
@@ -332,7 +332,7 @@ def figured_distance(
             sag_y[i] = wp.where(on, slope_y[i], sag_y[i])
             t[i] = wp.where(on, t[i] - step[i], t[i])
             finished = wp.where(outside[i] > ZERO, NAN, t[i])
-            more = wp.abs(step[i]) > FIGURE_STEP
+            more = wp.abs(step[i]) > DEFORMATION_STEP
             # A ray may pass beyond a grid on its way, but not end there. A NaN (a ray that misses) stops too.
             t[i] = wp.where(on, wp.where(more, t[i], finished), t[i])
             running[i] = wp.where(more, running[i], ZERO)

@@ -6,7 +6,7 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from .packet import LANES, lanes, lanes_sqrt
-from .shape import BICONIC, GRID, GRID_HEAD, ODD, POLAR, TOROID, PackedFigures, biconic_sag, toroid_sag
+from .shape import BICONIC, GRID, GRID_HEAD, ODD, POLAR, TOROID, PackedDeformations, biconic_sag, toroid_sag
 from .surface import ONE, TWO, ZERO
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -246,33 +246,33 @@ def grid_derivatives(
 
 
 @wp.func
-def extra_derivatives(figures: PackedFigures, s: wp.int32, x: lanes, y: lanes):
+def extra_derivatives(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes):
     """Sum of the parts of surface ``s``: their slopes along x and y, and second derivatives xx, xy, yy [1/m]."""
     zx = lanes(ZERO)
     zy = lanes(ZERO)
     zxx = lanes(ZERO)
     zxy = lanes(ZERO)
     zyy = lanes(ZERO)
-    for part in range(figures.span[s, 0], figures.span[s, 1]):
-        kind = figures.parts[part, 0]
-        offset = figures.parts[part, 1]
-        n = figures.parts[part, 2]
-        m = figures.parts[part, 3]
+    for part in range(deformations.span[s, 0], deformations.span[s, 1]):
+        kind = deformations.parts[part, 0]
+        offset = deformations.parts[part, 1]
+        n = deformations.parts[part, 2]
+        m = deformations.parts[part, 3]
         a = lanes(ZERO)
         b = lanes(ZERO)
         c = lanes(ZERO)
         d = lanes(ZERO)
         e = lanes(ZERO)
         if kind == POLAR:
-            a, b, c, d, e = polar_derivatives(figures.numbers, offset, n, m, x, y)
+            a, b, c, d, e = polar_derivatives(deformations.numbers, offset, n, m, x, y)
         elif kind == ODD:
-            a, b, c, d, e = odd_derivatives(figures.numbers, offset, n, x, y)
+            a, b, c, d, e = odd_derivatives(deformations.numbers, offset, n, x, y)
         elif kind == BICONIC:
-            a, b, c, d, e = biconic_derivatives(figures.numbers, offset, x, y)
+            a, b, c, d, e = biconic_derivatives(deformations.numbers, offset, x, y)
         elif kind == TOROID:
-            a, b, c, d, e = toroid_derivatives(figures.numbers, offset, x, y)
+            a, b, c, d, e = toroid_derivatives(deformations.numbers, offset, x, y)
         elif kind == GRID:
-            a, b, c, d, e = grid_derivatives(figures.numbers, offset, n, m, x, y)
+            a, b, c, d, e = grid_derivatives(deformations.numbers, offset, n, m, x, y)
         zx = zx + a
         zy = zy + b
         zxx = zxx + c

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from ...core.launch import FORWARD_OPTIONS, kernel_pair
+from ...core.launch import FORWARD_OPTIONS
 from .aperture import PackedApertures, through_aperture
+from .kernel_pair import kernel_pair
 from .mesh import PackedMeshes, mesh_distance
 from .obstruction import PackedObstructions, past_obstructions
 from .packet import LANES, lane_flags, lanes
-from .shape import PackedFigures, figured_distance, through_screen
+from .shape import PackedDeformations, deformed_distance, through_screen
 from .surface import (
     FAR,
     MISSED,
@@ -56,7 +57,7 @@ TERMS = wp.constant(1)
 ROTATED = wp.constant(2)
 STOPPED = wp.constant(3)
 OBSTRUCTED = wp.constant(4)
-FIGURED = wp.constant(5)
+DEFORMED = wp.constant(5)
 KINDS = 6
 
 
@@ -71,7 +72,7 @@ class PackedSurfaces:
     numbers: wp.array2d(dtype=wp.float64)
     kinds: wp.array2d(dtype=wp.int32)
     coefficients: wp.array2d(dtype=wp.float64)
-    figures: PackedFigures
+    deformations: PackedDeformations
     meshes: PackedMeshes
     apertures: PackedApertures
     obstructions: PackedObstructions
@@ -191,16 +192,16 @@ def surface_loop(special: bool) -> wp.Function:
                     status[i] = wp.where(running[i] > ZERO, NOT_CONVERGED, status[i])
             interaction = surfaces.kinds[s, INTERACTION]
             if wp.static(special):
-                figured = surfaces.kinds[s, FIGURED]
+                deformed = surfaces.kinds[s, DEFORMED]
                 part = lanes()
                 part_x = lanes()
                 part_y = lanes()
-                if figured == 2:
+                if deformed == 2:
                     t, part_x, part_y = mesh_distance(surfaces.meshes, s, x, y, z, u, v, w)
-                elif figured == 1:
+                elif deformed == 1:
                     screen = wp.where(interaction == PHASE, 1, 0)
-                    t, part, part_x, part_y, running = figured_distance(
-                        surfaces.figures, c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t, screen
+                    t, part, part_x, part_y, running = deformed_distance(
+                        surfaces.deformations, c, k, surfaces.coefficients, s, terms, x, y, z, u, v, w, t, screen
                     )
                     for i in range(LANES):
                         status[i] = wp.where(running[i] > ZERO, NOT_CONVERGED, status[i])
@@ -249,7 +250,7 @@ def surface_loop(special: bool) -> wp.Function:
                 nx = -wp.cw_mul(bend, x)
                 ny = -wp.cw_mul(bend, y)
                 if wp.static(special):
-                    if figured > 0:
+                    if deformed > 0:
                         b = b - part
                         if terms > 0:
                             bend = lanes(c) + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ...core.errors import PrescriptionError
+from ...core.warp_arrays import warp_array
 from ...models.aperture import (
     Annulus,
     Aperture,
@@ -40,16 +41,16 @@ def depth(aperture: Aperture) -> int:
 
 
 class _Programme:
-    """Steps, figures and edges of several apertures."""
+    """Steps, numbers and edges of several apertures."""
 
     def __init__(self) -> None:
         self.steps: list[tuple[int, int, int]] = []
-        self.figures: list[tuple[float, ...]] = []
+        self.numbers: list[tuple[float, ...]] = []
         self.edges: list[tuple[float, float, float, float]] = []
 
-    def _step(self, what: Any, *figures: float, edges: tuple[int, int] = (0, 0)) -> None:
+    def _step(self, what: Any, *numbers: float, edges: tuple[int, int] = (0, 0)) -> None:
         self.steps.append((int(what), *edges))
-        self.figures.append(figures or (0.0,) * 6)
+        self.numbers.append(numbers or (0.0,) * 6)
 
     def add(self, aperture: Aperture) -> None:
         """Add the steps of an aperture."""
@@ -98,9 +99,8 @@ def pack_apertures(apertures: Sequence[Aperture | None], device: str = "cpu") ->
             programme.add(aperture)
         span.append((first, len(programme.steps)))
     packed = PackedApertures()
-    packed.span = wp.array(np.array(span, dtype=np.int32), dtype=wp.int32, device=device)
-    packed.steps = wp.array(np.array(programme.steps, dtype=np.int32).reshape(-1, 3), dtype=wp.int32, device=device)
-    for name, rows, columns in (("figures", programme.figures, 6), ("edges", programme.edges, 4)):
-        table = np.array(rows, dtype=np.float64).reshape(-1, columns)
-        setattr(packed, name, wp.array(table, dtype=wp.float64, device=device))
+    packed.span = warp_array(span, wp.int32, device=device)
+    packed.steps = warp_array(np.reshape(programme.steps, (-1, 3)), wp.int32, device=device)
+    packed.numbers = warp_array(np.reshape(programme.numbers, (-1, 6)), device=device)
+    packed.edges = warp_array(np.reshape(programme.edges, (-1, 4)), device=device)
     return packed

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...core.warp_arrays import warp_array
 from ...models.shapes.mesh import MeshSurface
 from ...models.surface import Surface
 from ..kernels.mesh import PackedMeshes
@@ -23,8 +24,8 @@ def pack_meshes(surfaces: tuple[Surface, ...], device: str = "cpu") -> Any:
         if not isinstance(shape, MeshSurface):
             continue
         mesh = wp.Mesh(
-            points=wp.array(shape.vertices.astype(np.float32), dtype=wp.vec3, device=device),
-            indices=wp.array(shape.faces.ravel(), dtype=wp.int32, device=device),
+            points=warp_array(shape.vertices, wp.vec3, device=device),
+            indices=warp_array(shape.faces.ravel(), wp.int32, device=device),
         )
         kept.append(mesh)
         ids[row], first[row] = mesh.id, sum(len(f) for f in facets)
@@ -33,10 +34,10 @@ def pack_meshes(surfaces: tuple[Surface, ...], device: str = "cpu") -> Any:
         n = len(shape.faces)
         facets.append(np.concatenate([shape.corners.reshape(n, 9), shape.corner_slopes.reshape(n, 6)], axis=1))
     packed = PackedMeshes()
-    packed.ids = wp.array(ids, dtype=wp.uint64, device=device)
+    packed.ids = warp_array(ids, wp.uint64, device=device)
     # The kernels know meshes by number only: whoever holds the numbers has to keep the meshes.
     packed.ids.kept = kept
-    packed.first_facet = wp.array(first, dtype=wp.int32, device=device)
-    packed.span = wp.array(span, dtype=wp.float64, device=device)
-    packed.facets = wp.array(np.concatenate(facets), dtype=wp.float64, device=device)
+    packed.first_facet = warp_array(first, wp.int32, device=device)
+    packed.span = warp_array(span, device=device)
+    packed.facets = warp_array(np.concatenate(facets), device=device)
     return packed

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...core.warp_arrays import warp_array
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ..kernels.obstruction import PackedObstructions
@@ -42,14 +43,14 @@ def pack_obstructions(telescope: Telescope, device: str = "cpu") -> Any:
         corners = obstruction.triangles.reshape(-1, 3)
         meshes.append(
             wp.Mesh(
-                points=wp.array(corners, dtype=wp.vec3, device=device),
-                indices=wp.array(np.arange(len(corners), dtype=np.int32), dtype=wp.int32, device=device),
+                points=warp_array(corners, wp.vec3, device=device),
+                indices=warp_array(np.arange(len(corners)), wp.int32, device=device),
             )
         )
     packed = PackedObstructions()
-    ids = wp.array(np.array([mesh.id for mesh in meshes], dtype=np.uint64), dtype=wp.uint64, device=device)
+    ids = warp_array([mesh.id for mesh in meshes], wp.uint64, device=device)
     # The kernels know meshes by number only: whoever holds the numbers has to keep the meshes.
     ids.kept = meshes
     packed.meshes = ids
-    packed.blocks = wp.array(blocked_ways(telescope).astype(np.int32), dtype=wp.int32, device=device)
+    packed.blocks = warp_array(blocked_ways(telescope), wp.int32, device=device)
     return packed

@@ -10,12 +10,13 @@ import numpy as np
 import warp as wp
 
 from ...core.errors import PrescriptionError
+from ...core.warp_arrays import warp_array
 from ...models.shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
 from ...models.shapes.grid import GridSag
 from ...models.shapes.mesh import MeshSurface
 from ...models.shapes.polar_polynomial import PolarPolynomial, from_even_powers
 from ...models.shapes.shape import Plane, Rotational, Shape, Sum
-from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, PackedFigures
+from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, PackedDeformations
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ def _flat(shape: Shape) -> Sequence[Shape]:
     return [shape.base, shape] if isinstance(shape, OddAsphere) else [shape]
 
 
-def pack_figures(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
-    """Return the parts of all surfaces as a :class:`PackedFigures` struct on a device.
+def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
+    """Return the parts of all surfaces as a :class:`PackedDeformations` struct on a device.
 
     Raises
     ------
@@ -78,21 +79,21 @@ def pack_figures(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
     offset = 0
     for row, shape in enumerate(shapes):
         span[row, 0] = len(rows)
-        for kind, sizes, figures in _parts(shape.parts):
+        for kind, sizes, own in _parts(shape.parts):
             rows.append([kind, offset, *sizes])
-            numbers.append(figures)
-            offset += len(figures)
+            numbers.append(own)
+            offset += len(own)
         span[row, 1] = len(rows)
-    packed = PackedFigures()
+    packed = PackedDeformations()
     table = np.array(rows, dtype=np.int32).reshape(-1, PART_COLUMNS)
-    packed.span = wp.array(span, dtype=wp.int32, device=device)
-    packed.parts = wp.array(table, dtype=wp.int32, device=device)
-    packed.numbers = wp.array(np.concatenate([np.zeros(0), *numbers]), dtype=wp.float64, device=device)
+    packed.span = warp_array(span, wp.int32, device=device)
+    packed.parts = warp_array(table, wp.int32, device=device)
+    packed.numbers = warp_array(np.concatenate([np.zeros(0), *numbers]), device=device)
     return packed
 
 
 def _parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarray]]:
-    """Return the kind, two whole numbers and the figures of each part; all polynomials make one part."""
+    """Return the kind, two whole numbers and the numbers of each part; all polynomials make one part."""
     found: list[tuple[int, tuple[int, int], np.ndarray]] = []
     polynomial: PolarPolynomial | None = None
 
@@ -120,8 +121,8 @@ def _parts(shapes: Sequence[Shape]) -> list[tuple[int, tuple[int, int], np.ndarr
             found.append((int(TOROID), (0, 0), np.array([cx, cy, (1.0 + shape.conic_y) * cy**2])))
         elif isinstance(shape, GridSag):
             head = [shape.x[0], shape.y[0], *(1.0 / step for step in shape.step)]
-            figures = np.concatenate([head, shape.nodes.ravel()])
-            found.append((int(GRID), (len(shape.x), len(shape.y)), figures))
+            numbers = np.concatenate([head, shape.nodes.ravel()])
+            found.append((int(GRID), (len(shape.x), len(shape.y)), numbers))
         else:
             raise PrescriptionError(f"shape {type(shape).__name__}: expected one that can be part of a sum or a map")
     if polynomial is not None and np.any(polynomial.terms):
@@ -136,11 +137,11 @@ def _conic(shape: Rotational) -> tuple[int, tuple[int, int], np.ndarray]:
 
 def _polar(polynomial: PolarPolynomial) -> tuple[int, tuple[int, int], np.ndarray]:
     degree, order = polynomial.degree, polynomial.order
-    figures: list[float] = []
+    numbers: list[float] = []
     terms = np.zeros((degree + 1, degree // 2 + 1), dtype=np.complex128)
     m_max, k_max = (min(a, b) for a, b in zip(terms.shape, polynomial.terms.shape, strict=True))
     terms[:m_max, :k_max] = polynomial.terms[:m_max, :k_max]
     for m in range(order, -1, -1):
         for k in range((degree - m) // 2, -1, -1):
-            figures += [terms[m, k].real, terms[m, k].imag]
-    return int(POLAR), (degree, order), np.array(figures)
+            numbers += [terms[m, k].real, terms[m, k].imag]
+    return int(POLAR), (degree, order), np.array(numbers)

@@ -9,16 +9,17 @@ import numpy as np
 import warp as wp
 
 from ...core.launch import start_warp
+from ...core.warp_arrays import warp_array
 from ...models.aperture import Annulus, Aperture, Circle, Complement
 from ...models.shapes.mesh import MeshSurface
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ..kernels.surface import FAR
-from ..kernels.trace import FIGURED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
+from ..kernels.trace import DEFORMED, INTERACTION, KINDS, NUMBERS, OBSTRUCTED, PHASE, STOPPED, PackedSurfaces
 from .apertures import pack_apertures
 from .meshes import pack_meshes
 from .obstructions import blocked_ways, pack_obstructions
-from .shapes import pack_figures, split_shape
+from .shapes import pack_deformations, split_shape
 
 
 def clear_ring(aperture: Aperture | None) -> tuple[float, float, float, float] | None:
@@ -64,12 +65,12 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
             2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
         ]
     packed = PackedSurfaces()
-    unusual = kinds[:, FIGURED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
+    unusual = kinds[:, DEFORMED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
     packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
-    packed.numbers = wp.array(numbers, dtype=wp.float64, device=device)
-    packed.kinds = wp.array(kinds, dtype=wp.int32, device=device)
-    packed.coefficients = wp.array(coefficients, dtype=wp.float64, device=device)
-    packed.figures = pack_figures(shapes, device)
+    packed.numbers = warp_array(numbers, device=device)
+    packed.kinds = warp_array(kinds, wp.int32, device=device)
+    packed.coefficients = warp_array(coefficients, device=device)
+    packed.deformations = pack_deformations(shapes, device)
     packed.meshes = pack_meshes(surfaces, device)
     packed.apertures = pack_apertures(general, device)
     packed.obstructions = pack_obstructions(telescope, device)

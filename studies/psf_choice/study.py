@@ -18,7 +18,7 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...core.random_streams import stream
-from ...core.single_thread import one_blas_thread
+from ...core.threads import one_blas_thread
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment, prepare, resolve
 from ...pipeline.measure.correlation import jackknife_error, shear_correlation

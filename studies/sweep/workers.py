@@ -22,7 +22,7 @@ from typing import Any, Protocol
 from uuid import uuid4
 
 from ...core.errors import ConfigError, ProductError
-from ...core.launch import thread_count
+from ...core.threads import thread_count
 from .store import PointResult, SweepPoint
 
 #: Computes one point on so many threads.

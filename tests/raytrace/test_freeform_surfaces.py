@@ -18,9 +18,9 @@ from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere, Sum
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import Telescope
 from pachon.raytrace.kernels.packet import lanes, to_packets
-from pachon.raytrace.kernels.shape import PackedFigures
+from pachon.raytrace.kernels.shape import PackedDeformations
 from pachon.raytrace.kernels.shape_derivatives import extra_derivatives
-from pachon.raytrace.pack.shapes import pack_figures, split_shape
+from pachon.raytrace.pack.shapes import pack_deformations, split_shape
 from pachon.raytrace.rays import Rays, RayStatus
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -206,14 +206,14 @@ def test_rays_beside_a_mesh_miss_it():
 @wp.kernel
 def ask_derivatives(
     first: wp.int32,
-    figures: PackedFigures,
+    deformations: PackedDeformations,
     s: wp.int32,
     x: wp.array(dtype=lanes),
     y: wp.array(dtype=lanes),
     out: wp.array2d(dtype=lanes),
 ):
     p = first + wp.tid()
-    zx, zy, zxx, zxy, zyy = extra_derivatives(figures, s, x[p], y[p])
+    zx, zy, zxx, zxy, zyy = extra_derivatives(deformations, s, x[p], y[p])
     out[0, p] = zx
     out[1, p] = zy
     out[2, p] = zxx
@@ -224,7 +224,7 @@ def ask_derivatives(
 def test_derivatives_in_packets_are_those_of_the_shapes():
     start_warp()
     split = [split_shape(shape) for shape in SHAPES.values()]
-    packed = pack_figures(split)
+    packed = pack_deformations(split)
     x, y = RNG.uniform(-0.7, 0.7, (2, 64))
     places = [wp.array(to_packets(v), dtype=lanes, device="cpu") for v in (x, y)]
     for row, (shape, parts) in enumerate(zip(SHAPES.values(), split, strict=True)):

@@ -44,7 +44,7 @@ def test_the_same_as_field_by_field(lsst_r):
 
 def test_a_disturbed_telescope_and_any_pupil_points(lsst_r, annulus_points):
     tilted = lsst_r.perturbed("Camera", shift=(1e-3, 0, 1e-4), tilt=(1e-3, -2e-3, 0.3))
-    tilted = tilted.with_figure("M1", ZernikeSag((0, 0, 0, 0, 1e-7), 4.18, 2.558))
+    tilted = tilted.with_deformation("M1", ZernikeSag((0, 0, 0, 0, 1e-7), 4.18, 2.558))
     assert_same(tilted, field_disc(3), pupil=annulus_points(70), projection="postel", sphere_radius=3.0)
 
 

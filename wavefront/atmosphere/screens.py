@@ -19,7 +19,7 @@ import numpy as np
 import scipy.fft
 
 from ...core.errors import DomainError, unknown_name
-from ...core.launch import thread_count
+from ...core.threads import thread_count
 from .turbulence import path_spectrum, require_positive
 
 #: How a screen will be read, and so how its modes are amplified to come out right:

@@ -131,7 +131,7 @@ def clear_edges(
     places = wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu")
     surfaces = pack_surfaces(telescope)
     launch(
-        trace_rays,
+        trace_rays.suited(surfaces),
         n_packet,
         [
             surfaces,

@@ -35,7 +35,8 @@ import scipy.fft
 import warp as wp
 
 from ...core.errors import DomainError
-from ...core.launch import launch, thread_count
+from ...core.launch import launch
+from ...core.threads import thread_count
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.rays import field_direction

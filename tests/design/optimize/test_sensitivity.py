@@ -93,7 +93,7 @@ def test_matrix_against_central_differences(lsst_r, result, zernikes, slope, add
 def test_nodes_of_a_grid(lsst_r, pupil, slope):
     """One node of a measured figure: the sag around it alone, against the wavefront itself."""
     axis = np.linspace(-1.8, 1.8, 31)
-    figured = lsst_r.with_figure("M2", GridSag(axis, axis, np.zeros((31, 31))))
+    figured = lsst_r.with_deformation("M2", GridSag(axis, axis, np.zeros((31, 31))))
     address = "M2.node[18,26]"
     field, w = FIELDS[1], lsst_r.default_wavelength
     found = sensitivity(figured, [address, "M2.Z6"], FIELDS[1:2], sampling=pupil).matrix[0]

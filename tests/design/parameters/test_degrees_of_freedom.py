@@ -165,7 +165,7 @@ def test_sensitivity_is_central_differences(lsst_r, maps):
 def test_figures_beside_those_that_a_surface_has(lsst_r, dof, annulus_points):
     """Bending twice is bending by the sum, though the mirror has a Zernike sag, of other rims, already."""
     pupil = annulus_points(60)
-    start = lsst_r.with_figure("M1", ZernikeSag((0, 0, 0, 0, 2e-7, 1e-7), 4.18, 2.558))
+    start = lsst_r.with_deformation("M1", ZernikeSag((0, 0, 0, 0, 2e-7, 1e-7), 4.18, 2.558))
     twice = dof.apply(dof.apply(start, {"M1M3_B2": 0.1, "M2_B4": 0.3}), {"M1M3_B2": 0.2, "M1M3_B9": 0.1})
     once = dof.apply(start, {"M1M3_B2": 0.3, "M1M3_B9": 0.1, "M2_B4": 0.3})
     one, other = (pachon.wavefront_opd(t, FIELD, WAVELENGTH, pupil).value for t in (once, twice))
@@ -187,14 +187,14 @@ def test_the_camera_rotator(lsst_r):
     assert np.abs(on_turned - on_still @ back.T).max() < 1e-13
     # A figure of a lens, and the CCDs, go with it.
     figure = ZernikeSag((0, 0, 0, 0, 3e-7, 0, 1e-7), 0.775)
-    asked = lsst_r.with_figure("L1_entrance", figure).perturbed("Camera", tilt=(0.0, 0.0, angle))
+    asked = lsst_r.with_deformation("L1_entrance", figure).perturbed("Camera", tilt=(0.0, 0.0, angle))
     cos, sin = np.cos(angle), np.sin(angle)
     field = (
         np.arctan(cos * np.tan(FIELD[0]) - sin * np.tan(FIELD[1])),
         np.arctan(sin * np.tan(FIELD[0]) + cos * np.tan(FIELD[1])),
     )
     x, y = np.array(pupil)
-    one = pachon.wavefront_opd(lsst_r.with_figure("L1_entrance", figure), FIELD, WAVELENGTH, pupil)
+    one = pachon.wavefront_opd(lsst_r.with_deformation("L1_entrance", figure), FIELD, WAVELENGTH, pupil)
     other = pachon.wavefront_opd(asked, field, WAVELENGTH, (cos * x - sin * y, sin * x + cos * y))
     assert np.abs(one.value - other.value).max() < 1e-13
     ccds = pachon.FocalPlane.flat("lsst")

@@ -39,7 +39,7 @@ def crooked(lsst_r):
     """An LSST in which nothing is aligned, with a Zernike figure on M3, and a phase screen in front of the filter."""
     moved = bare(lsst_r).perturbed("M2", shift=(1e-3, 2e-3, 1e-4), tilt=(1e-4, 2e-4, 0.01))
     moved = moved.perturbed("Camera", shift=(1e-3, -2e-3, 1e-4), tilt=(1e-4, -2e-4, 0.03))
-    moved = moved.with_figure("M3", ZernikeSag((0.0,) * 6 + (2e-6, -3e-6, 1e-6), 2.508, 0.55))
+    moved = moved.with_deformation("M3", ZernikeSag((0.0,) * 6 + (2e-6, -3e-6, 1e-6), 2.508, 0.55))
     where = moved.surface_names.index("Filter_entrance")
     ahead = moved.surfaces[where]
     screen = Surface(

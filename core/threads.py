@@ -1,7 +1,8 @@
-"""Linear algebra on one thread, so that results do not depend on how many the machine has."""
+"""Numbers of threads, and linear algebra on one thread so that results do not depend on that number."""
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -13,9 +14,18 @@ from threadpoolctl import ThreadpoolController
 _LOCK = threading.RLock()
 
 
+def thread_count(threads: int | None) -> int:
+    """Return the number of threads to use: the given number, or the processors this process may run on."""
+    if threads is not None:
+        return max(1, int(threads))
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @lru_cache(maxsize=1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Return the libraries in memory. To look for them takes a millisecond; new ones come with new modules."""
+    """Return the libraries in memory. Finding them takes a millisecond; new ones come with new modules."""
     return ThreadpoolController()
 
 

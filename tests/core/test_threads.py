@@ -3,7 +3,7 @@ import threading
 import numpy  # noqa: F401  (the BLAS to be held)
 from threadpoolctl import threadpool_info
 
-from pachon.core.single_thread import one_blas_thread
+from pachon.core.threads import one_blas_thread
 
 
 def blas_threads():

@@ -1,0 +1,41 @@
+"""Kernels in two variants, for plain telescopes and for any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+
+
+@dataclass(frozen=True)
+class KernelPair:
+    """A kernel in two variants of one source: for plain telescopes, and for any.
+
+    Code that a plain telescope does not need slows the loop over its surfaces even where it does not run.
+
+    Attributes
+    ----------
+    plain, special : wp.Kernel
+        The two variants, each in a module of its own, compiled at its first use.
+    """
+
+    plain: wp.Kernel
+    special: wp.Kernel
+
+    def suited(self, surfaces: Any) -> wp.Kernel:
+        """Return the variant for a telescope's ``PackedSurfaces``."""
+        return self.special if surfaces.special else self.plain
+
+
+def kernel_pair(make: Callable[[bool, wp.Module], wp.Kernel]) -> KernelPair:
+    """Return both variants of the kernel that ``make(special, module)`` defines in a module."""
+    made = []
+    for special in (False, True):
+        module = wp.get_module(f"{make.__module__}_{'special' if special else 'plain'}")
+        wp.set_module_options(FORWARD_OPTIONS, module=module)
+        made.append(make(special, module))
+    return KernelPair(*made)
