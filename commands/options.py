@@ -130,7 +130,7 @@ def resolved_configuration(config: Path | None, **options: object) -> Configurat
     except PachonError as error:
         if config is None or settings is not base:
             raise
-        raise ConfigError(f"{config}: {error}") from None
+        raise error.within(file=config) from None
 
 
 def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Path] = ()) -> Telescope:

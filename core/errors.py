@@ -1,37 +1,123 @@
-"""Every exception that pachon raises for bad input: one clear line, a subclass of :class:`PachonError`."""
+"""Exceptions for bad input: each a subclass of :class:`PachonError` with a text of one line."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
+from typing import Self
 
 
 class PachonError(Exception):
-    """Base of all errors that a user can cause and mend."""
+    """Base of all errors that a user can cause and mend.
+
+    Its text is ``subject: file, place: problem``, without the parts that are None.
+
+    Parameters
+    ----------
+    problem : str
+        Key, value and expected value.
+    subject : str, optional
+        Object that could not be computed, such as ``"CCD R22_S11"``.
+    file : str or path, optional
+        File with the error.
+    place : str, optional
+        Part of the file, such as ``"line 3, surface 2"``.
+    key : str, optional
+        Key with the error, with dots between sections; it stands in `problem` as well.
+    """
+
+    def __init__(
+        self,
+        problem: str = "",
+        *,
+        subject: str | None = None,
+        file: str | os.PathLike[str] | None = None,
+        place: str | None = None,
+        key: str | None = None,
+    ) -> None:
+        super().__init__(problem)
+        self.problem = problem
+        self.subject = subject
+        self.file = None if file is None else os.fspath(file)
+        self.place = place
+        self.key = key
+
+    def __str__(self) -> str:
+        return self.reason if self.subject is None else f"{self.subject}: {self.reason}"
+
+    @property
+    def reason(self) -> str:
+        """Text of the error without its subject."""
+        where = ", ".join(part for part in (self.file, self.place) if part)
+        return f"{where}: {self.problem}" if where else self.problem
+
+    def within(
+        self,
+        *,
+        subject: str | None = None,
+        file: str | os.PathLike[str] | None = None,
+        place: str | None = None,
+        key: str | None = None,
+    ) -> Self:
+        """Return the same error in a wider context; an error of the same file already has it.
+
+        Parameters
+        ----------
+        subject, file, place : str, optional
+            As above.
+        key : str, optional
+            Section that the key of the error belongs to, or that names the file with the error.
+        """
+        if file is not None and self.file == os.fspath(file):
+            return self
+        if file is None and not key:
+            both = ": ".join(part for part in (subject, self.subject) if part)
+            return type(self)(self.problem, subject=both or None, file=self.file, place=self.place, key=self.key)
+        text, joint = (self.problem, ".") if self.file is None and self.subject is None else (str(self), ": ")
+        keys = key if self.key is None or joint == ": " or not key else f"{key}.{self.key}"
+        problem = f"{key}{joint}{text}" if key else text
+        return type(self)(problem, subject=subject, file=file, place=place, key=keys or self.key)
 
 
 class PrescriptionError(PachonError):
-    """A prescription or site file is malformed."""
+    """Malformed prescription or site file."""
 
 
 class PrescriptionWarning(UserWarning):
-    """Something in a lens file that a lenient reader left out."""
+    """Part of a lens file that is not understood and left out."""
 
 
 class ConfigError(PachonError):
-    """A configuration file or option is malformed."""
+    """Malformed configuration file or option."""
 
 
 class UnknownNameError(PachonError):
-    """A name (model, surface, CCD, site) does not exist."""
+    """Unknown name of a model, surface, CCD or site."""
 
 
 class DomainError(PachonError):
-    """A value lies outside what the model covers."""
+    """Value outside the domain of a model."""
 
 
 class ProductError(PachonError):
-    """A product cannot be read or written."""
+    """Product that cannot be read or written."""
+
+
+@contextmanager
+def error_context(
+    *,
+    subject: str | None = None,
+    file: str | os.PathLike[str] | None = None,
+    place: str | None = None,
+    key: str | None = None,
+) -> Iterator[None]:
+    """Raise errors of the block again within a wider context: see :meth:`PachonError.within`."""
+    try:
+        yield
+    except PachonError as error:
+        raise error.within(subject=subject, file=file, place=place, key=key) from None
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameError:
@@ -40,7 +126,7 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameErr
     Parameters
     ----------
     kind : str
-        What the name should be: ``"model"``, ``"CCD"``, ``"surface"``.
+        Kind of object: ``"model"``, ``"CCD"``, ``"surface"``.
     name : str
         The name given.
     allowed : iterable of str

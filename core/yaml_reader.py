@@ -56,11 +56,11 @@ def read_yaml(path: Path) -> Section:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise PrescriptionError(f"{path}: no such file") from None
+        raise PrescriptionError("no such file", file=path) from None
     except UnicodeDecodeError:
-        raise PrescriptionError(f"{path}: not a UTF-8 text file") from None
+        raise PrescriptionError("not a UTF-8 text file", file=path) from None
     except OSError as error:
-        raise PrescriptionError(f"{path}: cannot be read ({error.strerror})") from None
+        raise PrescriptionError(f"cannot be read ({error.strerror})", file=path) from None
     return parse_yaml(text, str(path))
 
 
@@ -70,12 +70,12 @@ def parse_yaml(text: str, source: str) -> Section:
         content = yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f", line {mark.line + 1}" if mark else ""
-        raise PrescriptionError(f"{source}{where}: not valid YAML: {error.problem or error.context}") from None
+        place = f"line {mark.line + 1}" if mark else None
+        raise PrescriptionError(f"not valid YAML: {error.problem or error.context}", file=source, place=place) from None
     except (yaml.YAMLError, ValueError) as error:
-        raise PrescriptionError(f"{source}: not valid YAML: {' '.join(str(error).split())}") from None
+        raise PrescriptionError(f"not valid YAML: {' '.join(str(error).split())}", file=source) from None
     if not isinstance(content, dict):
-        raise PrescriptionError(f"{source}: expected a mapping of keys to values, not {_shown(content)}")
+        raise PrescriptionError(f"expected a mapping of keys to values, not {_shown(content)}", file=source)
     return Section(content, source, "")
 
 
@@ -134,16 +134,13 @@ class Section:
 
     def error(self, key: str, expected: str) -> PrescriptionError:
         """Return the error for the value of a key."""
-        return PrescriptionError(
-            f"{self.source}: {self._path(key)} = {_shown(self._content.get(key))}: expected {expected}"
-        )
+        path = self._path(key)
+        problem = f"{path} = {_shown(self._content.get(key))}: expected {expected}"
+        return PrescriptionError(problem, file=self.source, key=path)
 
     def placed(self, error: PrescriptionError) -> PrescriptionError:
         """Return an error of the model as one of this section, unless it names the file already."""
-        text = str(error)
-        if text.startswith(self.source):
-            return error
-        return PrescriptionError(f"{self.source}: {self._path(text)}")
+        return error.within(file=self.source, key=self.place)
 
     def allow(self, *keys: str) -> None:
         """Refuse every key that is not among these.
@@ -157,9 +154,9 @@ class Section:
             if key not in keys:
                 near = get_close_matches(key, keys, n=2, cutoff=0.6)
                 hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(keys)}"
-                raise PrescriptionError(
-                    f"{self.source}: unknown key {self._path(key)} = {_shown(self._content[key])}: {hint}"
-                )
+                path = self._path(key)
+                problem = f"unknown key {path} = {_shown(self._content[key])}: {hint}"
+                raise PrescriptionError(problem, file=self.source, key=path)
 
     def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
         """Return a finite number."""
@@ -226,7 +223,7 @@ class Section:
 
     def _required(self, key: str) -> Any:
         if key not in self._content:
-            raise PrescriptionError(f"{self.source}: {self._path(key)} is missing")
+            raise PrescriptionError(f"{self._path(key)} is missing", file=self.source, key=self._path(key))
         return self._content[key]
 
     def _path(self, key: str) -> str:

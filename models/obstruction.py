@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.errors import PrescriptionError
+from ..core.errors import PrescriptionError, error_context
 
 if TYPE_CHECKING:
     import trimesh
@@ -116,21 +116,19 @@ class Obstruction:
 
         path = Path(path)
         if path.suffix.lower() not in MESH_SUFFIXES:
-            raise PrescriptionError(f"{path}: expected a mesh that ends in one of {', '.join(MESH_SUFFIXES)}")
+            raise PrescriptionError(f"expected a mesh that ends in one of {', '.join(MESH_SUFFIXES)}", file=path)
         if not path.is_file():
-            raise PrescriptionError(f"{path}: no such file")
+            raise PrescriptionError("no such file", file=path)
         try:
             # Unprocessed: trimesh would drop what is not finite and join corners.
             scene = trimesh.load_scene(path, process=False)
         except Exception as error:  # trimesh's readers raise whatever their parsers do
             reason = " ".join(str(error).split())[:120]
-            raise PrescriptionError(f"{path}: cannot be read as a mesh ({reason or type(error).__name__})") from None
+            raise PrescriptionError(f"cannot be read as a mesh ({reason or type(error).__name__})", file=path) from None
         if not any(len(getattr(g, "faces", ())) for g in scene.geometry.values()):
-            raise PrescriptionError(f"{path}: expected a mesh with at least one triangle")
-        try:
+            raise PrescriptionError("expected a mesh with at least one triangle", file=path)
+        with error_context(file=path):
             return cls.from_mesh(name or path.stem, scene, scale=scale, before=before)
-        except PrescriptionError as error:
-            raise PrescriptionError(f"{path}: {error}") from None
 
     @property
     def mesh(self) -> trimesh.Trimesh:

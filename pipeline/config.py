@@ -230,7 +230,7 @@ def load_configuration(path: Path) -> Configuration:
     try:
         top = read_yaml(path)
     except PrescriptionError as error:
-        raise ConfigError(str(error)) from None
+        raise ConfigError(error.problem, file=error.file, place=error.place) from None
     content = {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
     return configuration_of(content, str(path))
 
@@ -351,7 +351,7 @@ def first_problem(error: ValidationError, source: str, model: type[BaseModel]) -
         known = _known_keys(model, problem["loc"][:-1])
         near = get_close_matches(str(problem["loc"][-1]), known, n=2, cutoff=0.6)
         hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
-        return ConfigError(f"{source}: unknown key {key} = {_shown(problem['input'])}: {hint}")
+        return ConfigError(f"unknown key {key} = {_shown(problem['input'])}: {hint}", file=source, key=key)
     if kind == "literal_error":
         expected = "one of " + str(context["expected"]).replace(" or ", ", ").replace("'", "")
     elif kind in _LIMITS:
@@ -359,7 +359,7 @@ def first_problem(error: ValidationError, source: str, model: type[BaseModel]) -
         expected = f"a number {word} {context[name]:g}"
     else:
         expected = _EXPECTED.get(kind, problem["msg"])
-    return ConfigError(f"{source}: {key} = {_shown(problem['input'])}: expected {expected}")
+    return ConfigError(f"{key} = {_shown(problem['input'])}: expected {expected}", file=source, key=key)
 
 
 def _dotted(location: tuple[int | str, ...]) -> str:

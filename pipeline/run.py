@@ -175,7 +175,7 @@ def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure, strict:
     except PachonError as error:
         if strict:
             raise
-        return str(error).removeprefix(f"CCD {exposure.name}: ")
+        return error.reason
     config = experiment.config
     cards = [
         ("TELESCOP", experiment.telescope.name, "prescription"),

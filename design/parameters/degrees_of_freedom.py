@@ -271,7 +271,7 @@ class DegreesOfFreedom:
                         found = [f"{s}.{_last(prepared.surface(s).shape, shape, term)}" for s, shape in places[target]]
                     parse_parameters(found, prepared)
                 except PachonError as error:
-                    raise type(error)(f"degree of freedom {freedom.name!r}: {error}") from None
+                    raise error.within(subject=f"degree of freedom {freedom.name!r}") from None
                 for one in found:
                     rows.setdefault(one, np.zeros(len(self)))[column] += weight * size
         return prepared, parse_parameters(rows, prepared), np.array(list(rows.values()))

@@ -61,7 +61,7 @@ def _read(top: Section) -> DegreesOfFreedom:
             freedoms, figures, top.text("name"), top.text("description", ""), top.text("source", "")
         )
     except ConfigError as error:
-        raise PrescriptionError(f"{top.source}: {error}") from None
+        raise PrescriptionError(str(error), file=top.source) from None
 
 
 def _freedom(section: Section) -> Freedom:
@@ -105,4 +105,4 @@ def _figure(name: str, section: Section) -> Figure:
     try:
         return Figure(name, surfaces, GridModes(grids))
     except PachonError as error:
-        raise PrescriptionError(f"{section.source}: {section.place}.grids: {error}") from None
+        raise PrescriptionError(f"{section.place}.grids: {error}", file=section.source) from None

@@ -91,7 +91,7 @@ class GlassCatalogue:
         source = str(path)
         glasses = {g.name: g for g in _read_glasses(records(read_text(Path(path)), source))}
         if not glasses:
-            raise PrescriptionError(f"{source}: expected a glass catalogue, with lines that begin with NM")
+            raise PrescriptionError("expected a glass catalogue, with lines that begin with NM", file=source)
         return cls(glasses, source)
 
     @classmethod
@@ -165,17 +165,14 @@ def _read_glass(lines: list[Record]) -> Glass:
         elif line.keyword not in IGNORED:
             raise line.error(f"CD, TD, LD or one of {', '.join(IGNORED)} in glass {name}")
     if "CD" not in found:
-        raise PrescriptionError(f"{head.where}: glass {name} has no line CD with its coefficients")
+        raise head.problem(f"glass {name} has no line CD with its coefficients")
     limits = found.get("LD")
     low, high = (limits.number(0), limits.number(1)) if limits else DEFAULT_RANGE
     celsius = found["TD"].number(6, 20.0) if "TD" in found else 20.0
     try:
         medium = _medium(head, found["CD"], (low / 1e6, high / 1e6))
     except PrescriptionError as error:
-        text = str(error)
-        raise (
-            error if text.startswith(head.source) else PrescriptionError(f"{head.where}: glass {name}: {text}")
-        ) from None
+        raise (error if error.file else head.problem(f"glass {name}: {error}")) from None
     temperature = celsius + ZERO_CELSIUS
     if not 0 < temperature <= 1000:
         raise found["TD"].error("a temperature above absolute zero and below 700 deg C as word 7")

@@ -15,7 +15,7 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 
-from ...core.errors import PrescriptionError
+from ...core.errors import PrescriptionError, error_context
 from ..shapes.grid import GridSag
 
 
@@ -38,16 +38,13 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
             images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
         reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
-        raise PrescriptionError(f"{path}: cannot be read as FITS ({reason[:120]})") from None
+        raise PrescriptionError(f"cannot be read as FITS ({reason[:120]})", file=path) from None
     if not images:
-        raise PrescriptionError(f"{path}: expected a FITS image of two dimensions")
+        raise PrescriptionError("expected a FITS image of two dimensions", file=path)
     header, data = images[0]
-    try:
-        x, y = _axis(header, 1, data.shape[1], path), _axis(header, 2, data.shape[0], path)
-        return GridSag(x, y, np.asarray(data, dtype=np.float64) * _unit(header, "BUNIT", path))
-    except PrescriptionError as error:
-        text = str(error)
-        raise error if text.startswith(str(path)) else PrescriptionError(f"{path}: {text}") from None
+    with error_context(file=path):
+        x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
+        return GridSag(x, y, np.asarray(data, dtype=np.float64) * _unit(header, "BUNIT"))
 
 
 def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
@@ -72,24 +69,24 @@ def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
         scratch.replace(target)
     except OSError as error:
         scratch.unlink(missing_ok=True)
-        raise PrescriptionError(f"{target}: cannot be written ({error.strerror or error})") from None
+        raise PrescriptionError(f"cannot be written ({error.strerror or error})", file=target) from None
 
 
-def _axis(header: Any, number: int, size: int, path: Path) -> np.ndarray:
+def _axis(header: Any, number: int, size: int) -> np.ndarray:
     keys = [f"CRPIX{number}", f"CRVAL{number}", f"CDELT{number}"]
     for key in keys:
         if key not in header:
-            raise PrescriptionError(f"{path}: {key} is missing: expected the header to say where the nodes are")
+            raise PrescriptionError(f"{key} is missing: expected the header to say where the nodes are")
         if isinstance(header[key], bool) or not isinstance(header[key], (int, float)) or not np.isfinite(header[key]):
-            raise PrescriptionError(f"{path}: {key} = {header[key]!r}: expected a number")
+            raise PrescriptionError(f"{key} = {header[key]!r}: expected a number")
     reference, value, step = (float(header[key]) for key in keys)
-    return (value + (np.arange(1, size + 1) - reference) * step) * _unit(header, f"CUNIT{number}", path)
+    return (value + (np.arange(1, size + 1) - reference) * step) * _unit(header, f"CUNIT{number}")
 
 
-def _unit(header: Any, key: str, path: Path) -> float:
+def _unit(header: Any, key: str) -> float:
     """Return the length in metres of the unit that a card names."""
     text = header.get(key, "m")
     try:
         return float(u.Unit(text).to(u.m))
     except (ValueError, TypeError, u.UnitConversionError):
-        raise PrescriptionError(f"{path}: {key} = {text!r}: expected a unit of length") from None
+        raise PrescriptionError(f"{key} = {text!r}: expected a unit of length") from None

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 import trimesh
 
-from ...core.errors import PrescriptionError, UnknownNameError
+from ...core.errors import PrescriptionError, UnknownNameError, error_context
 from ..obstruction import MESH_SUFFIXES
 from .shape import Shape, Triple, coordinates
 
@@ -82,20 +82,18 @@ class MeshSurface(Shape):
         """
         path = Path(path)
         if path.suffix.lower() not in MESH_SUFFIXES:
-            raise PrescriptionError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
+            raise PrescriptionError(f"expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}", file=path)
         if not path.is_file():
-            raise PrescriptionError(f"{path}: no such file")
+            raise PrescriptionError("no such file", file=path)
         try:
             mesh = trimesh.load(path, force="mesh")
         except Exception as error:
             # trimesh's readers raise whatever their parsing runs into.
-            raise PrescriptionError(f"{path}: cannot be read as a mesh ({type(error).__name__})") from None
+            raise PrescriptionError(f"cannot be read as a mesh ({type(error).__name__})", file=path) from None
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-            raise PrescriptionError(f"{path}: mesh without facets: expected at least one")
-        try:
+            raise PrescriptionError("mesh without facets: expected at least one", file=path)
+        with error_context(file=path):
             return cls.from_mesh(mesh, scale=scale, smooth=smooth)
-        except PrescriptionError as error:
-            raise PrescriptionError(f"{path}: {error}") from None
 
     def _check_manifold(self) -> None:
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)

@@ -138,7 +138,7 @@ def expose_ccd(
         _check_light(observed, "some of its stars")
         return CcdExposure(name, places, truth, observed)
     except PachonError as error:
-        raise type(error)(f"CCD {name}: {error}") from None
+        raise error.within(subject=f"CCD {name}") from None
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
@@ -161,7 +161,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     try:
         return _model(experiment, exposure, noisy)
     except PachonError as error:
-        raise type(error)(f"CCD {exposure.name}: {error}") from None
+        raise error.within(subject=f"CCD {exposure.name}") from None
 
 
 def _model(experiment: Experiment, exposure: CcdExposure, noisy: bool) -> CcdProduct:

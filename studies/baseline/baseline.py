@@ -322,7 +322,7 @@ def _subject(
         try:
             telescope = load_telescope(source)
         except PachonError as error:
-            raise type(error)(f"{path}: model: {error}" if model is None else str(error)) from None
+            raise (error.within(subject="model").within(file=path) if model is None else error) from None
     if configuration is not None:
         return name, telescope, _experiment(configuration, source, telescope)
     if baseline.configuration is None:
@@ -330,7 +330,7 @@ def _subject(
     try:
         return name, telescope, _experiment(path.parent / baseline.configuration, source, telescope)
     except PachonError as error:
-        raise type(error)(f"{path}: configuration: {error}") from None
+        raise error.within(subject="configuration").within(file=path) from None
 
 
 def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experiment:

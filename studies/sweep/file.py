@@ -130,7 +130,7 @@ def _content(path: Path) -> dict[str, Any]:
     try:
         top = read_yaml(path)
     except PrescriptionError as error:
-        raise ConfigError(str(error)) from None
+        raise ConfigError(error.problem, file=error.file, place=error.place) from None
     return {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
 
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ....core.errors import PachonError, PrescriptionError
+from ....core.errors import error_context
 from ...telescope import Telescope
 from ..glass_catalogue import GlassCatalogue
 from ..zemax.file import Block, Findings, ZemaxFile
@@ -50,11 +50,8 @@ def read_codev(
     target = Path(path)
     findings = Findings(lenient)
     catalogues = chosen_catalogues(target, glass_catalogues)
-    try:
+    with error_context(file=target):
         return LensReader(_Translation(target, findings).file(), findings, catalogues).telescope()
-    except PachonError as error:
-        text = str(error)
-        raise error if text.startswith(str(target)) else PrescriptionError(f"{target}: {text}") from None
 
 
 def _commands(path: Path) -> Iterator[Record]:
@@ -91,7 +88,7 @@ class _Translation:
         current = -1
         for command in _commands(self.path):
             if command.keyword in ("SO", "SI") or re.fullmatch(r"S\d*", command.keyword):
-                self.surfaces.append(Block(f"{self.path}, surface {len(self.surfaces)}"))
+                self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
                 self.figures.append({})
                 current = len(self.surfaces) - 1
                 self._start(self._placed(command, current))
@@ -104,7 +101,7 @@ class _Translation:
             else:
                 self._system(command)
         if len(self.surfaces) < 3:
-            raise PrescriptionError(f"{self.path}: {len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
+            raise self.header.problem(f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
         count = len(self.waves)
         line = Record(str(self.path), 1, "", "FTYP", (repr(self.field_type), "0", "0", str(count)), "")
         self.header.lines.append(line)
@@ -148,7 +145,7 @@ class _Translation:
             keyword, self.field_type = FIELDS[key]
             add(keyword, *(repr(command.number(i)) for i in range(len(words))))
         elif key not in IGNORED:
-            self.findings.report(command.where, f"{command.shown}: this command is not understood")
+            self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
     def _start(self, command: Record) -> None:
         """Take what stands on the line that begins a surface: radius or curvature, thickness, glass."""
@@ -195,7 +192,7 @@ class _Translation:
             radius = command.number(1 if obscures else 0)
             block.lines.append(replace(command, keyword="OBSC" if obscures else "CLAP", words=("0", repr(radius))))
         elif key not in IGNORED:
-            self.findings.report(command.where, f"{command.shown}: this command is not understood")
+            self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
     def _blocks(self) -> list[Block]:
         """Return the surfaces, with coordinate breaks between them where they are tilted or decentred."""
@@ -229,7 +226,7 @@ class _Translation:
                 distance = 0.0
             elif moved and figures.get("BEN"):
                 if tilts[2]:
-                    raise PrescriptionError(f"{block.where}: BEN with CDE {figures['CDE']:g}: not understood")
+                    raise block.problem(f"BEN with CDE {figures['CDE']:g}: not understood")
                 after, distance = [self._break(number, [0, 0, *tilts, 0], thickness)], 0.0
             if moved:
                 blocks += [self._break(number, [0.0] * 6, depth), self._break(number, [*shift, *tilts, 0], 0.0)]
@@ -245,7 +242,7 @@ class _Translation:
             ("DISZ", thickness),
             *(("PARM", i, v) for i, v in enumerate(parameters, start=1)),
         ]
-        return Block(self.surfaces[number].where, [self._record(number, *line) for line in lines])
+        return Block(str(self.path), f"surface {number}", [self._record(number, *line) for line in lines])
 
     def _record(self, number: int, keyword: str, *values: object) -> Record:
         words = tuple(repr(v) if isinstance(v, float) else str(v) for v in values)

@@ -36,7 +36,7 @@ IGNORED_SURFACE = frozenset(_SURFACE.split())
 
 @dataclass
 class Findings:
-    """What to do about something that is not understood: an error, or with `lenient` a warning.
+    """Parts of a file that are not understood: an error, or with `lenient` a warning.
 
     Parameters
     ----------
@@ -46,25 +46,24 @@ class Findings:
 
     lenient: bool = False
 
-    def report(self, where: str, message: str, instead: str = "") -> None:
-        """Raise PrescriptionError, or warn.
+    def report(self, error: PrescriptionError, instead: str = "") -> None:
+        """Raise the error, or warn.
 
         Parameters
         ----------
-        where, message : str
-            The place, and what is wrong there.
+        error : PrescriptionError
+            The part of the file, and why it is not understood.
         instead : str
-            What is done about it where it is only a warning.
+            The assumption in its place, for the warning.
 
         Raises
         ------
         PrescriptionError
             Unless lenient.
         """
-        text = f"{where}: {message}"
         if not self.lenient:
-            raise PrescriptionError(text)
-        warnings.warn(f"{text}; {instead}" if instead else text, PrescriptionWarning, stacklevel=2)
+            raise error
+        warnings.warn(f"{error}; {instead}" if instead else str(error), PrescriptionWarning, stacklevel=2)
 
 
 @dataclass
@@ -73,17 +72,24 @@ class Block:
 
     Parameters
     ----------
-    where : str
-        File and surface, for messages.
+    source : str
+        File, for messages.
+    place : str
+        Part of the file, such as ``"surface 3"``; empty for a header.
     lines : list of Record
         Lines in the order of the file.
     used : set of str
         Keywords that have been read.
     """
 
-    where: str
+    source: str
+    place: str = ""
     lines: list[Record] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
+
+    def problem(self, text: str) -> PrescriptionError:
+        """Return an error of this block."""
+        return PrescriptionError(text, file=self.source, place=self.place or None)
 
     def all(self, keyword: str) -> list[Record]:
         """Return every line with a keyword."""
@@ -113,7 +119,7 @@ class Block:
         """Report every keyword that was neither read nor is among those to ignore."""
         for line in self.lines:
             if line.keyword not in self.used and line.keyword not in ignored:
-                findings.report(line.where, f"{line.shown}: this keyword is not understood")
+                findings.report(line.problem(f"{line.shown}: this keyword is not understood"))
 
 
 @dataclass
@@ -156,7 +162,7 @@ def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
         if record.keyword == "SURF":
             if record.integer(0) != len(surfaces):
                 raise record.error(f"surface {len(surfaces)} here")
-            current = Block(f"{source}, surface {len(surfaces)}")
+            current = Block(source, f"surface {len(surfaces)}")
             surfaces.append(current)
         elif surfaces and (record.keyword in TRAILER or (indented and record.line not in indented)):
             # What stands at the margin after the surfaces no longer belongs to one.
@@ -166,15 +172,14 @@ def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
             current.lines.append(record)
     mode = header.text("MODE")
     if mode and mode.upper() != "SEQ":
-        raise PrescriptionError(f"{source}: MODE {mode}: expected SEQ, a sequential lens")
+        raise header.problem(f"MODE {mode}: expected SEQ, a sequential lens")
     if len(surfaces) < 3:
-        raise PrescriptionError(
-            f"{source}: {len(surfaces)} surfaces (SURF): expected an object, an image and one between"
-        )
+        raise header.problem(f"{len(surfaces)} surfaces (SURF): expected an object, an image and one between")
     file = ZemaxFile(path, header, surfaces, trailer)
     if trailer is header:
         file.trailer = Block(source)
     configurations = file.trailer.number("MNUM", 1.0)
     if configurations > 1:
-        findings.report(source, f"MNUM {configurations:.0f}: one configuration is read, the one the file was saved in")
+        text = f"MNUM {configurations:.0f}: one configuration is read, the one the file was saved in"
+        findings.report(header.problem(text))
     return file

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ....core.errors import PachonError, PrescriptionError
+from ....core.errors import PrescriptionError, error_context
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...shapes.shape import Plane
@@ -68,11 +68,8 @@ def read_zemax(
     findings = Findings(lenient)
     file = read_zemax_file(target, findings)
     catalogues = chosen_catalogues(target, glass_catalogues)
-    try:
+    with error_context(file=target):
         return LensReader(file, findings, catalogues).telescope()
-    except PachonError as error:
-        text = str(error)
-        raise error if text.startswith(str(target)) else PrescriptionError(f"{target}: {text}") from None
 
 
 def chosen_catalogues(path: Path, given: Iterable[GlassCatalogue | str | os.PathLike[str]]) -> list[GlassCatalogue]:
@@ -92,7 +89,7 @@ class LensReader:
         self.catalogues = catalogues
         words = file.header.text("UNIT").split() or ["MM"]
         if words[0].upper() not in UNITS:
-            raise PrescriptionError(f"{file.path}: UNIT {words[0]}: expected one of {', '.join(UNITS)}")
+            raise file.header.problem(f"UNIT {words[0]}: expected one of {', '.join(UNITS)}")
         self.unit = UNITS[words[0].upper()]
         self.origin, self.axes = np.zeros(3), np.eye(3)
         self.medium = self.first_medium = self._glass(file.surfaces[0], VACUUM)[1]
@@ -115,7 +112,7 @@ class LensReader:
             self._surface(number, block)
             block.report_rest(IGNORED_SURFACE, findings)
         if self.stop is None:
-            findings.report(str(self.file.path), "no surface is the stop (STOP)", "the first is taken")
+            findings.report(header.problem("no surface is the stop (STOP)"), "the first is taken")
             self.paraxial.mark_stop(0.0, first=True)
         pupil = read_pupil(self.file, self.paraxial, self.unit, waves.primary, self.first_medium, findings)
         header.report_rest(IGNORED_HEADER, findings)
@@ -152,7 +149,8 @@ class LensReader:
     def _check_environment(self) -> None:
         line = self.file.header.last("ENVD")
         if line is not None and line.number(2, 0.0) != 0 and (line.number(0), line.number(1, 1.0)) != (20.0, 1.0):
-            self.findings.report(line.where, f"{line.shown}: indices are not adjusted to temperature and pressure")
+            text = f"{line.shown}: indices are not adjusted to temperature and pressure"
+            self.findings.report(line.problem(text))
 
     def _surface(self, number: int, block: Block) -> None:
         last = number == len(self.file.surfaces) - 1
@@ -160,11 +158,11 @@ class LensReader:
         thickness = block.number("DISZ", 0.0, infinite=True) * self.unit
         if not math.isfinite(thickness):
             if not last:
-                raise PrescriptionError(f"{block.where}: DISZ INFINITY: expected a finite thickness")
+                raise block.problem("DISZ INFINITY: expected a finite thickness")
             thickness = 0.0
         if kind and kind[0].upper() == "COORDBRK":
             if last:
-                raise PrescriptionError(f"{block.where}: TYPE COORDBRK: expected the image as the last surface")
+                raise block.problem("TYPE COORDBRK: expected the image as the last surface")
             self._break(block)
         else:
             self._tilt(block)
@@ -176,7 +174,7 @@ class LensReader:
         values = block.table("PARM")
         for i in sorted(set(values) - {1, 2, 3, 4, 5, 6}):
             if values[i] != 0:
-                self.findings.report(block.where, f"PARM {i} {values[i]:g}: not understood for TYPE COORDBRK")
+                self.findings.report(block.problem(f"PARM {i} {values[i]:g}: not understood for TYPE COORDBRK"))
         block.used |= {"CURV", "CONI", "GLAS", "XDAT"}
         dx, dy, *tilt = (values.get(i, 0.0) for i in range(1, 6))
         self._move(dx, dy, tilt, backwards=values.get(6, 0.0) != 0)
@@ -188,7 +186,8 @@ class LensReader:
             if not any(figures[3:]):
                 continue
             if figures[:3] != [1.0, 0.0, 0.0] or len(figures) < 8:
-                self.findings.report(line.where, f"{line.shown}: only a tilt before the surface (SCBD 1 0 0) is read")
+                text = f"{line.shown}: only a tilt before the surface (SCBD 1 0 0) is read"
+                self.findings.report(line.problem(text))
                 continue
             self._move(figures[3], figures[4], figures[5:8], backwards=False)
 
@@ -206,15 +205,11 @@ class LensReader:
 
     def _acting(self, number: int, block: Block, last: bool) -> None:
         try:
-            shape = read_shape(block, self.unit, self.findings)
-            aperture = read_aperture(block, self.unit, self.findings)
-        except PrescriptionError as error:
-            text = str(error)
-            raise (
-                error if text.startswith(str(self.file.path)) else PrescriptionError(f"{block.where}: {text}")
-            ) from None
+            with error_context(file=block.source, place=block.place):
+                shape = read_shape(block, self.unit, self.findings)
+                aperture = read_aperture(block, self.unit, self.findings)
         except (OverflowError, ZeroDivisionError):
-            raise PrescriptionError(f"{block.where}: the figures of its shape are too large or too small") from None
+            raise block.problem("the parameters of its shape are too large or too small") from None
         mirror, after = self._glass(block, VACUUM)
         if mirror:
             interaction, after = Interaction.MIRROR, self.medium
@@ -257,13 +252,12 @@ class LensReader:
             if name in catalogue and not model:
                 return False, catalogue[name]
         if not model:
-            self.findings.report(
-                line.where, f"{line.shown}: the glass is in no catalogue", "taken as a model glass of its figures"
-            )
+            error = line.problem(f"{line.shown}: the glass is in no catalogue")
+            self.findings.report(error, "taken as a model glass of its indices")
         try:
             return False, replace(model_glass(nd, vd, deviation), name=name)
-        except PrescriptionError as error:
-            raise PrescriptionError(f"{line.where}: {line.shown}: {error}") from None
+        except PrescriptionError as problem:
+            raise line.problem(f"{line.shown}: {problem}") from None
 
     def _turned(self, surface: Surface, z0: float) -> Surface:
         x, y, z = TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
@@ -276,8 +270,8 @@ class LensReader:
             if not covered:
                 continue
             if not covered[0] <= min(waves) <= max(waves) <= covered[-1]:
-                raise PrescriptionError(
-                    f"{self.file.path}: WAVM {min(waves) * 1e6:g} to {max(waves) * 1e6:g} um: expected "
+                raise self.file.header.problem(
+                    f"WAVM {min(waves) * 1e6:g} to {max(waves) * 1e6:g} um: expected "
                     f"{covered[0] * 1e6:g} to {covered[-1] * 1e6:g} um, which glass {medium.name} covers"
                 )
             low, high = max(low, covered[0]), min(high, covered[-1])

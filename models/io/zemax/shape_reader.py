@@ -62,7 +62,7 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     kind = block.text("TYPE").split()[0].upper() if block.text("TYPE") else "STANDARD"
     kind = "GRID_SAG" if kind == "GRIDSAG" else kind
     if kind not in TYPES:
-        findings.report(block.where, f"TYPE {kind}: expected one of {', '.join(TYPES)}", "taken as STANDARD")
+        findings.report(block.problem(f"TYPE {kind}: expected one of {', '.join(TYPES)}"), "taken as STANDARD")
         block.used |= {"PARM", "XDAT", "GDAT", "GARR"}
         kind = "STANDARD"
     curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)
@@ -90,7 +90,7 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     else:
         parts = [_conic(curvature, conic)]
     for i, value in sorted(parameters.items()):
-        findings.report(block.where, f"PARM {i} {value:g}: not understood for TYPE {kind}")
+        findings.report(block.problem(f"PARM {i} {value:g}: not understood for TYPE {kind}"))
     if kind in ("SZERNSAG", "TOROIDAL", "XPOLYNOM"):
         parts += _expansion(block, kind, unit)
     elif kind == "GRID_SAG":
@@ -98,7 +98,7 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     elif kind != "XASPHERE":
         for i, value in block.table("XDAT").items():
             if value != 0:
-                findings.report(block.where, f"XDAT {i} {value:g}: not understood for TYPE {kind}")
+                findings.report(block.problem(f"XDAT {i} {value:g}: not understood for TYPE {kind}"))
     acting = [part for part in parts if not isinstance(part, Plane)]
     if len(acting) > 1:
         return Sum(tuple(acting))
@@ -231,7 +231,7 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
             found.append(Complement(ring) if keyword == "OBSC" else ring)
     for keyword in ("ELAP", "ELOB", "UDAD", "USAP", "USOB", "UDAP"):
         for line in block.all(keyword):
-            findings.report(line.where, f"{line.shown}: elliptical and user-defined apertures are not read")
+            findings.report(line.problem(f"{line.shown}: elliptical and user-defined apertures are not read"))
             break
     if len(found) > 1:
         raise block.lines[0].error("one aperture in this surface")

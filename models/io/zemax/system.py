@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ....core.errors import PrescriptionError
 from ...media.medium import Medium
 from .file import Block, Findings, ZemaxFile
 
@@ -49,17 +48,17 @@ def read_wavelengths(header: Block) -> Wavelengths:
         numbers = range(1, int(count) + 1) if 1 <= count <= 24 else sorted(table)
         for number in numbers:
             if number not in table:
-                raise PrescriptionError(f"{header.where}: WAVM {number} is missing")
+                raise header.problem(f"WAVM {number} is missing")
         values = [table[number] for number in numbers]
     elif listed is not None:
         values = [listed.number(i) for i in range(len(listed.words))]
     else:
         values = []
     if not values or not all(0 < v < 1e4 for v in values):
-        raise PrescriptionError(f"{header.where}: WAVM {values}: expected at least one positive wavelength in um")
+        raise header.problem(f"WAVM {values}: expected at least one positive wavelength in um")
     primary = header.number("PWAV", 1.0)
     if not 1 <= primary <= len(values) or primary != int(primary):
-        raise PrescriptionError(f"{header.where}: PWAV {primary:g}: expected 1 to {len(values)}")
+        raise header.problem(f"PWAV {primary:g}: expected 1 to {len(values)}")
     metres = tuple(v / 1e6 for v in values)
     return Wavelengths(metres, metres[int(primary) - 1])
 
@@ -144,14 +143,14 @@ def read_pupil(
     PrescriptionError
         If the pupil is at infinity or has no size or, unless lenient, the aperture is given twice.
     """
-    header, source = file.header, str(file.path)
+    header = file.header
     # The first surface is where the walk begins: what lies between it and a break in front does not count.
     heights, end_slope = surfaces.trace(1.0, 0.0, wavelength)
     across, _ = surfaces.trace(0.0, 1.0, wavelength)
     scale, offset = float(heights[surfaces.stop]), float(across[surfaces.stop])
     # The entrance pupil is the image of the stop by what lies in front of it; 1e-9 of its own size is no image at all.
     if abs(scale) < 1e-9 * max(1.0, abs(offset)):
-        raise PrescriptionError(f"{source}: the stop makes an entrance pupil at infinity (telecentric): not supported")
+        raise header.problem("the stop makes an entrance pupil at infinity (telecentric): not supported")
     pupil_z = offset / scale
     focal_length = -1.0 / end_slope if end_slope else math.inf
     distance = file.surfaces[0].number("DISZ", math.inf, infinite=True) * unit
@@ -192,14 +191,12 @@ def _pupil_diameter(
         elif math.isfinite(distance) and 0 < value < 1:
             found[keyword] = 2 * abs(distance) * math.tan(math.asin(value))
     if not found:
-        raise PrescriptionError(f"{header.where}: expected the aperture: a line ENPD, FNUM or FLOA")
+        raise header.problem("expected the aperture: a line ENPD, FNUM or FLOA")
     keyword, diameter = next(iter(found.items()))
     if not 0 < diameter < math.inf:
-        raise PrescriptionError(
-            f"{header.where}: {keyword}: expected an entrance pupil of finite size, not {diameter:g} m"
-        )
+        raise header.problem(f"{keyword}: expected an entrance pupil of finite size, not {diameter:g} m")
     if len(found) > 1:
-        findings.report(header.where, f"{' and '.join(found)}: two apertures", f"{keyword} is taken")
+        findings.report(header.problem(f"{' and '.join(found)}: two apertures"), f"{keyword} is taken")
     return diameter
 
 
@@ -216,7 +213,7 @@ def _field_radius(header: Block, unit: float, scale: float, distance: float) -> 
     x, y = (np.array(c + [0.0] * (size - len(c))) for c in columns)
     kind = round(header.number("FTYP", 0.0))
     if not 0 <= kind < len(FIELD_TYPES):
-        raise PrescriptionError(f"{header.where}: FTYP {kind}: expected 0 to {len(FIELD_TYPES) - 1}")
+        raise header.problem(f"FTYP {kind}: expected 0 to {len(FIELD_TYPES) - 1}")
     if kind == 0:
         # As the two angles are given: the square root of the sum of their squares.
         radius = math.radians(float(np.hypot(x, y).max()))
@@ -224,5 +221,5 @@ def _field_radius(header: Block, unit: float, scale: float, distance: float) -> 
         reach = abs(distance) if kind == 1 else abs(scale)
         radius = math.atan(float(np.hypot(x, y).max()) * unit / reach) if 0 < reach < math.inf else 0.0
     if not radius < math.radians(89.0):
-        raise PrescriptionError(f"{header.where}: XFLN, YFLN: expected fields within 89 degrees of the axis")
+        raise header.problem("XFLN, YFLN: expected fields within 89 degrees of the axis")
     return max(radius, LEAST_FIELD)

@@ -20,19 +20,19 @@ def read_text(path: Path) -> str:
     try:
         raw = path.read_bytes()
     except FileNotFoundError:
-        raise PrescriptionError(f"{path}: no such file") from None
+        raise PrescriptionError("no such file", file=path) from None
     except OSError as error:
-        raise PrescriptionError(f"{path}: cannot be read ({error.strerror})") from None
+        raise PrescriptionError(f"cannot be read ({error.strerror})", file=path) from None
     wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = raw.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
         if wide:
-            raise PrescriptionError(f"{path}: not a UTF-16 text file, although it begins like one") from None
+            raise PrescriptionError("not a UTF-16 text file, although it begins like one", file=path) from None
         # Every byte is a character of ISO 8859-1.
         text = raw.decode("iso-8859-1")
     if "\0" in text:
-        raise PrescriptionError(f"{path}: not a text file")
+        raise PrescriptionError("not a text file", file=path)
     return text
 
 
@@ -64,13 +64,13 @@ class Record:
     text: str
 
     def error(self, expected: str) -> PrescriptionError:
-        """Return the error for this line."""
-        return PrescriptionError(f"{self.where}: {self.shown}: expected {expected}")
+        """Return the error of a line with other than the expected words."""
+        return self.problem(f"{self.shown}: expected {expected}")
 
-    @property
-    def where(self) -> str:
-        """File, line and part of it."""
-        return f"{self.source}, line {self.line}" + (f", {self.place}" if self.place else "")
+    def problem(self, text: str) -> PrescriptionError:
+        """Return an error of this line."""
+        place = f"line {self.line}" + (f", {self.place}" if self.place else "")
+        return PrescriptionError(text, file=self.source, place=place)
 
     @property
     def shown(self) -> str:

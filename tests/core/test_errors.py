@@ -1,0 +1,47 @@
+"""Errors carry file, place, key and subject as fields, and keep them when they are raised again in a wider context."""
+
+import pickle
+
+import pytest
+
+from pachon.core.errors import ConfigError, PachonError, PrescriptionError, error_context
+
+
+def test_the_text_has_subject_file_place_and_problem():
+    error = ConfigError("a = 1: expected 2", subject="CCD R22", file="run.yaml", place="line 3", key="a")
+    assert str(error) == "CCD R22: run.yaml, line 3: a = 1: expected 2"
+    assert error.reason == "run.yaml, line 3: a = 1: expected 2"
+    assert str(PachonError("alone")) == "alone"
+
+
+def test_a_section_goes_in_front_of_the_key():
+    error = PrescriptionError("radius = 0: expected more", key="radius").within(file="tel.yaml", key="surfaces[M1]")
+    assert str(error) == "tel.yaml: surfaces[M1].radius = 0: expected more"
+    assert (type(error), error.file, error.key) == (PrescriptionError, "tel.yaml", "surfaces[M1].radius")
+    assert error.within(file="tel.yaml", key="surfaces") is error
+
+
+def test_an_error_of_another_file_is_told_by_the_key_that_names_it():
+    error = PrescriptionError("no such file", file="grid.fits").within(file="tel.yaml", key="surfaces[M1]")
+    assert str(error) == "tel.yaml: surfaces[M1]: grid.fits: no such file"
+    assert (error.file, error.key) == ("tel.yaml", "surfaces[M1]")
+
+
+def test_a_subject_stands_first_and_can_be_left_out():
+    error = ConfigError("no light", file="run.yaml").within(subject="CCD R22")
+    assert str(error) == "CCD R22: run.yaml: no light"
+    assert error.reason == "run.yaml: no light"
+    assert str(error.within(file="sweep.yaml")) == "sweep.yaml: CCD R22: run.yaml: no light"
+
+
+def test_a_block_raises_in_its_context():
+    with (
+        pytest.raises(ConfigError, match=r"^a\.yaml, surface 2: k = 1$"),
+        error_context(file="a.yaml", place="surface 2"),
+    ):
+        raise ConfigError("k = 1")
+
+
+def test_fields_survive_a_process():
+    error = pickle.loads(pickle.dumps(ConfigError("k = 1", file="a.yaml", key="k")))
+    assert (str(error), error.file, error.key) == ("a.yaml: k = 1", "a.yaml", "k")
