@@ -25,7 +25,8 @@ from pachon.pipeline.ccd_product import product_path, write_product
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import prepare, resolve
 from pachon.pipeline.run_folder import stamp_of
-from pachon.pipeline.simulate.ccd_exposure import expose_ccd, model_ccd
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd
+from pachon.pipeline.simulate.ccd_model import model_ccd
 
 LAYERS = {
     n: {"altitudes": a, "weights": w, "wind_speeds": s}

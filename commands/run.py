@@ -64,7 +64,8 @@ def run_command(
     - `pachon run --all --out full --resume`: go on where a run was stopped
     """
     from ..core.files import json_text
-    from ..pipeline.run import left_out_line, run
+    from ..pipeline.run import run
+    from ..pipeline.simulate.ccd_loop import left_out_line
 
     names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
     resolved = resolved_configuration(

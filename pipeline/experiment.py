@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.errors import ConfigError, PachonError
+from ..core.progress import Reporter
 from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera, load_camera
 from ..models.camera.focal_plane import FocalPlane
@@ -135,16 +137,29 @@ class Experiment:
         """Kinds of screens that the engine keeps of the atmosphere; none where there is none."""
         return () if self.atmosphere is None else SCREENS[self.config.psf.engine]
 
-    def make_screens(self, threads: int | None = None) -> None:
-        """Make all screens that the engine keeps, which the first star would else have to wait for.
+    @contextmanager
+    def screens(self, threads: int | None = None, reporter: Reporter | None = None) -> Iterator[None]:
+        """Make all screens of the atmosphere, and release them at the end of the ``with`` block.
 
         Parameters
         ----------
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
+        reporter : Reporter, optional
+            Progress display; silent by default.
         """
-        for kind in self.screen_kinds:
-            _given(self.atmosphere).screens(kind, threads)
+        if self.atmosphere is None:
+            yield
+            return
+        try:
+            if self.screen_kinds:
+                reporter = Reporter(quiet=True) if reporter is None else reporter
+                with reporter.stage(f"atmosphere: {self.atmosphere.layer_count} screens"):
+                    for kind in self.screen_kinds:
+                        self.atmosphere.screens(kind, threads)
+            yield
+        finally:
+            self.atmosphere.release()
 
     @cached_property
     def field_radius_on_detector(self) -> float:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from ..core.errors import DomainError, PachonError
+from ..core.errors import DomainError
 from ..core.files import write_bytes, write_ecsv, write_json
 from ..core.progress import Reporter
 from ..core.threads import thread_count
@@ -26,7 +26,9 @@ from .measure.summary import correlations, run_figures
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
 from .run_folder import SUMMARY_NAME, claim_folder, finished_ccds, stamp_of
-from .simulate.ccd_exposure import CcdExposure, expose_ccd, model_ccd
+from .simulate.ccd_exposure import CcdExposure
+from .simulate.ccd_loop import simulate_ccds
+from .simulate.ccd_model import model_ccd
 
 _MESH_CELLS = 16
 
@@ -104,7 +106,17 @@ def run(
     missing = tuple(name for name in names if name not in kept)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
-    failed = _compute(experiment, folder, missing, strict, threads, reporter)
+    failed: dict[str, str] = {}
+    if missing:
+        with experiment.screens(threads, reporter):
+            failed = simulate_ccds(
+                experiment,
+                partial(_write_ccd, experiment, folder),
+                missing,
+                strict=strict,
+                threads=threads,
+                reporter=reporter,
+            ).not_modelled
     names = tuple(name for name in names if name not in failed)
     if not names:
         name, reason = next(iter(failed.items()))
@@ -126,56 +138,8 @@ def run(
     return RunResult(folder, report, summary, kept, tuple(n for n in missing if n not in failed), failed)
 
 
-def _compute(
-    experiment: Experiment,
-    folder: Path,
-    names: tuple[str, ...],
-    strict: bool,
-    threads: int | None,
-    reporter: Reporter,
-) -> dict[str, str]:
-    """Compute and write the CCDs that are missing; return those that cannot be modelled, and why not."""
-    failed: dict[str, str] = {}
-    if not names:
-        return failed
-    config = experiment.config
-    if experiment.atmosphere is not None and experiment.screen_kinds:
-        with reporter.stage(f"atmosphere: {experiment.atmosphere.layer_count} screens"):
-            experiment.make_screens(threads)
-    stars = config.stars.truth + config.stars.observed
-    reported = reporter.stage(f"PSFs of {len(names)} CCDs", total=stars * len(names))
-    # Modelling runs on one thread only; it goes on beside the PSFs of the next CCD.
-    with reported as stage, ThreadPoolExecutor(1) as modeller:
-        unfinished: list[tuple[str, Future[str | None]]] = []
-        for i, name in enumerate(names, start=1):
-            exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
-            begun, unfinished = unfinished, [(name, modeller.submit(_finish, experiment, folder, exposure, strict))]
-            if thread_count(threads) == 1 or i == len(names):
-                begun, unfinished = begun + unfinished, []
-            for which, work in begun:
-                reason = work.result()
-                if reason is not None:
-                    failed[which] = reason
-                    reporter.line(left_out_line(which, reason))
-            stage.step(name, i, len(names))
-    if experiment.atmosphere is not None:
-        experiment.atmosphere.release()
-    return failed
-
-
-def left_out_line(name: str, reason: str) -> str:
-    """Return the line that tells of a CCD that is left out."""
-    return f"CCD {name} is left out, it cannot be modelled: {reason}"
-
-
-def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure, strict: bool) -> str | None:
-    """Model one CCD and write its product; return why it cannot be modelled, where that ends no run."""
-    try:
-        product = model_ccd(experiment, exposure)
-    except PachonError as error:
-        if strict:
-            raise
-        return error.reason
+def _write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
+    """Model one CCD and write its product."""
     config = experiment.config
     cards = [
         ("TELESCOP", experiment.telescope.name, "prescription"),
@@ -185,8 +149,7 @@ def _finish(experiment: Experiment, folder: Path, exposure: CcdExposure, strict:
         ("ATMOSPH", config.atmosphere.enabled, "whether there is an atmosphere"),
         ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
     ]
-    write_product(folder, product, stamp_of(experiment), cards)
-    return None
+    write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), cards)
 
 
 def _origin(experiment: Experiment) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""One CCD, from its stars to its PSF model: what of a run can be done on its own, whatever the other CCDs are."""
+"""Noise-free PSFs of the stars of one CCD, through optics, CCD heights and atmosphere."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.errors import DomainError, PachonError
+from ...core.errors import DomainError
 from ...models.camera.focal_plane import FocalPlane
 from ...models.ideal_telescope import without_aberration
 from ...models.telescope import Telescope
@@ -16,14 +16,9 @@ from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.psf.image_plane import focal_length
 from ...wavefront.psf.psf import make_psfs
 from ...wavefront.pupil_optics import fields_at, trace_pupils
-from ..ccd_product import CcdProduct, ObservedStars, TruthStars
-from ..experiment import Experiment, truth_components
-from ..measure.shapes import Shapes, fwhm, measure_shapes
-from ..psf_model.checks import snr_weights
-from ..psf_model.model import CLIP_SIGMA, PsfModel
-from ..psf_model.polynomial import term_count
-from .ccd_observation import observe_ccd
-from .photometry import ARCSEC, limiting_magnitude, signal_to_noise
+from ..experiment import Experiment
+from ..measure.shapes import measure_shapes
+from .photometry import ARCSEC, limiting_magnitude
 from .star_field import StarField, make_star_field
 
 #: An observed star is drawn on a stamp so many pixels larger than the one kept: room to shift it onto a pixel's centre.
@@ -85,7 +80,7 @@ class CcdExposure:
 
 def truth_places(experiment: Experiment, name: str) -> np.ndarray:
     """Return the places of a CCD where a run has noise-free PSFs [m], shape [n, 2]; they depend on the seed alone."""
-    return _star_field(experiment, name, _PROVISIONAL_FWHM).truth
+    return ccd_stars(experiment, name, _PROVISIONAL_FWHM).truth
 
 
 def expose_places(experiment: Experiment, positions: np.ndarray, threads: int | None = None) -> Exposed:
@@ -109,7 +104,7 @@ def _check_light(exposed: Exposed, whose: str) -> None:
 
 
 def expose_ccd(
-    experiment: Experiment, name: str, *, threads: int | None = None, advance: Callable[[int], None] | None = None
+    experiment: Experiment, name: str, *, threads: int | None = None, progress: Callable[[int], None] | None = None
 ) -> CcdExposure:
     """Make the PSFs of the stars of one CCD: nearly all of the work, on all threads.
 
@@ -121,124 +116,25 @@ def expose_ccd(
         Name of the CCD.
     threads : int, optional
         Number of threads; no byte depends on it.
-    advance : callable, optional
-        Called with a number of PSFs after so many have been made.
+    progress : callable, optional
+        Called with the number of PSFs made since the last call.
 
     Raises
     ------
     PachonError
-        If a stage fails: one line that starts with the name of the CCD.
+        If a stage fails.
     """
-    try:
-        places = _star_field(experiment, name, _PROVISIONAL_FWHM)
-        truth = _truth(experiment, places.truth, threads, advance)
-        pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
-        size = experiment.stamp_size + _SHIFT_ROOM
-        observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, advance, size=size)
-        _check_light(observed, "some of its stars")
-        return CcdExposure(name, places, truth, observed)
-    except PachonError as error:
-        raise error.within(subject=f"CCD {name}") from None
-
-
-def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
-    """Look at the stars of one CCD through noise, and model the PSF from what was seen.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Telescope, focal plane, atmosphere and settings.
-    exposure : CcdExposure
-        The stars.
-    noisy : bool
-        Without noise, what stands out is the PSF: no pixel is rejected, as for the truth.
-
-    Raises
-    ------
-    PachonError
-        If a stage fails: one line that starts with the name of the CCD.
-    """
-    try:
-        return _model(experiment, exposure, noisy)
-    except PachonError as error:
-        raise error.within(subject=f"CCD {exposure.name}") from None
-
-
-def _model(experiment: Experiment, exposure: CcdExposure, noisy: bool) -> CcdProduct:
-    config = experiment.config
-    name, places, truth, observed = exposure.name, exposure.places, exposure.truth, exposure.observed
-    bounds = _bounds(experiment, name)
-    truth_images = truth.image.astype(np.float64)
-    truth_shapes = measure_shapes(truth_images, truth.pixel_scale, experiment.weight_fwhm)
-    # Places do not depend on the limits of magnitude, which in turn need to know how much light the stars lose.
-    width = effective_fwhm(truth.image, truth.pixel_scale)
-    stars = _star_field(experiment, name, width, least_light=float(observed.light.min()))
-    electrons = stars.electrons * observed.light
-    snr = signal_to_noise(
-        stars.magnitude - 2.5 * np.log10(observed.light), stars.band, config.atmosphere.exposure_s, width
-    )
-    seen = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
-    fit, used = config.reconstruction, seen.used
-    least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
-    seen.require(max(least, term_count(fit.order or 0)))
-    model = PsfModel.fit(
-        seen.images[used],
-        stars.observed[used],
-        basis=fit.basis,
-        interpolation=fit.interpolation,
-        weights=snr_weights(fit.weights, snr[used]),
-        n_components=fit.components,
-        order=fit.order,
-        extent=bounds,
-        clip_sigma=CLIP_SIGMA if noisy else None,
-    )
-    # Noise-free stars have no outliers: what stands out there is the PSF.
-    truth_model = PsfModel.fit(
-        truth_images,
-        places.truth,
-        n_components=truth_components(config),
-        order=fit.truth_order,
-        extent=bounds,
-        clip_sigma=None,
-    )
-
-    def shapes_of(images: np.ndarray) -> Shapes:
-        return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
-
-    at_truth, at_stars = shapes_of(model.at(places.truth)), shapes_of(model.at(stars.observed))
-    left_out = shapes_of(model.leave_one_out())
-    left_out_e1, left_out_e2 = np.full((2, len(used)), np.nan)
-    left_out_e1[used], left_out_e2[used] = left_out.e1, left_out.e2
-    return CcdProduct(
-        name=name,
-        center=_center(experiment, name),
-        pixel_scale=truth.pixel_scale,
-        noise=seen.noise,
-        truth=TruthStars(
-            **_positions(places.truth, truth.fields),
-            **_shapes(truth_shapes, at_truth),
-            fwhm=fwhm(truth.image, truth.pixel_scale),
-        ),
-        observed=ObservedStars(
-            **_positions(stars.observed, observed.fields),
-            **_shapes(seen.shapes, at_stars),
-            magnitude=stars.magnitude,
-            electrons=electrons,
-            snr=snr,
-            defects=seen.defects,
-            used=used,
-            left_out_e1=left_out_e1,
-            left_out_e2=left_out_e2,
-        ),
-        truth_images=truth_images.astype(np.float32),
-        observed_images=seen.images.astype(np.float32),
-        model=model,
-        truth_model=truth_model,
-    )
+    places = ccd_stars(experiment, name, _PROVISIONAL_FWHM)
+    truth = _truth(experiment, places.truth, threads, progress)
+    pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
+    size = experiment.stamp_size + _SHIFT_ROOM
+    observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, progress, size=size)
+    _check_light(observed, "some of its stars")
+    return CcdExposure(name, places, truth, observed)
 
 
 def _truth(
-    experiment: Experiment, positions: np.ndarray, threads: int | None, advance: Callable[[int], None] | None
+    experiment: Experiment, positions: np.ndarray, threads: int | None, progress: Callable[[int], None] | None
 ) -> Exposed:
     """Make noise-free PSFs whose centroid is the centre of a pixel.
 
@@ -251,17 +147,7 @@ def _truth(
         return np.nan_to_num(np.stack([moved.x, moved.y], axis=1))
 
     nothing = np.zeros_like(positions)
-    return _expose(experiment, positions, nothing, threads, advance, size=experiment.stamp_size, recenter=seen_at)
-
-
-def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
-    """Return the FWHM of the Gaussian with as many noise-equivalent pixels as the median star [rad].
-
-    The noise-equivalent number of pixels of an image P of unit sum is 1/sum(P^2), and 2.266 FWHM^2 pixels that of a
-    Gaussian (SMTN-002).
-    """
-    pixels = 1.0 / np.median((images**2).sum(axis=(1, 2)))
-    return float(np.sqrt(pixels / 2.266) * pixel_scale)
+    return _expose(experiment, positions, nothing, threads, progress, size=experiment.stamp_size, recenter=seen_at)
 
 
 def _expose(
@@ -269,7 +155,7 @@ def _expose(
     positions: np.ndarray,
     offsets: np.ndarray,
     threads: int | None,
-    advance: Callable[[int], None] | None,
+    progress: Callable[[int], None] | None,
     *,
     size: int,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
@@ -295,7 +181,7 @@ def _expose(
         dispersion=experiment.dispersion,
         n_pupil=config.psf.n_pupil,
         threads=threads,
-        progress=advance,
+        progress=progress,
     )
     return Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
 
@@ -320,21 +206,15 @@ def _seen_through(experiment: Experiment) -> _Seen:
     return _Seen(plain, None, None, float(there / here))
 
 
-def _center(experiment: Experiment, name: str) -> tuple[float, float]:
-    """Return the centre of a CCD [m]."""
-    x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
-    return float(x), float(y)
-
-
 def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, float]:
     """Return the edges (xmin, xmax, ymin, ymax) of a CCD [m], less the rim that no star comes into."""
     camera = experiment.camera
-    x, y = _center(experiment, name)
+    x, y = map(float, camera.centers[camera.ccd_index(name)])
     half = camera.half_size - _RIM * camera.pixel_size
     return x - half, x + half, y - half, y + half
 
 
-def _star_field(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
+def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
     """Draw the stars of one CCD, the faintest still of the wanted S/N where the least light arrives."""
     config = experiment.config
     band, exposure = config.band or "r", config.atmosphere.exposure_s
@@ -351,19 +231,3 @@ def _star_field(experiment: Experiment, name: str, width: float, least_light: fl
         margin=_MARGIN,
         pixel_size=experiment.camera.pixel_size,
     )
-
-
-def _positions(positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
-    return {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
-
-
-def _shapes(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:
-    return {
-        "e1": measured.e1,
-        "e2": measured.e2,
-        "size": measured.size,
-        "flags": measured.flags,
-        "model_e1": model.e1,
-        "model_e2": model.e2,
-        "model_size": model.size,
-    }

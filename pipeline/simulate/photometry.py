@@ -167,6 +167,16 @@ def effective_pixels(fwhm: Any, pixel_scale: Any = PIXEL_SCALE) -> float:
     return float(2.266 * (fwhm / pixel) ** 2)
 
 
+def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
+    """Return the FWHM of the Gaussian with as many noise-equivalent pixels as the median star [rad].
+
+    The noise-equivalent number of pixels of an image P of unit sum is 1/sum(P^2), and 2.266 FWHM^2 pixels that of a
+    Gaussian (SMTN-002).
+    """
+    pixels = 1.0 / np.median((images**2).sum(axis=(1, 2)))
+    return float(np.sqrt(pixels / 2.266) * pixel_scale)
+
+
 def signal_to_noise(
     magnitude: Any,
     band: str | Band,

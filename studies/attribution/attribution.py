@@ -43,7 +43,9 @@ from ...pipeline.measure.summary import (
 )
 from ...pipeline.memory import check_memory
 from ...pipeline.run_folder import CONFIG_NAME, stamp_of
-from ...pipeline.simulate.ccd_exposure import expose_ccd, model_ccd
+from ...pipeline.simulate.ccd_exposure import CcdExposure
+from ...pipeline.simulate.ccd_loop import simulate_ccds
+from ...pipeline.simulate.ccd_model import model_ccd
 from .plots import attribution_figure
 
 FULL, NOISE, OPTICS = "full", "noise", "optics"
@@ -154,15 +156,14 @@ def attribute(
     check_memory(full, threads)
     correlated, figures = {}, {}
     cases = [FULL, *(c for c in chosen if c != NOISE)]
-    for case in cases:
-        experiment = full if case == FULL else _without(full, case)
-        products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
-        for name, found in ((case, products), (NOISE, noiseless)):
-            if found:
-                correlated[name] = correlations(found, KINDS)
-                figures[name] = _figures(found, correlated[name])
-    if full.atmosphere is not None:
-        full.atmosphere.release()
+    with full.screens(threads, reporter):
+        for case in cases:
+            experiment = full if case == FULL else _without(full, case)
+            products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
+            for name, found in ((case, products), (NOISE, noiseless)):
+                if found:
+                    correlated[name] = correlations(found, KINDS)
+                    figures[name] = _figures(found, correlated[name])
     order = (FULL, *chosen)
     for name in chosen:
         figures[name] |= _changes(figures[FULL], figures[name], correlated[FULL], correlated[name])
@@ -244,19 +245,14 @@ def _products(
     experiment: Experiment, case: str, noiseless: bool, threads: int | None, reporter: Reporter
 ) -> tuple[list[CcdProduct], list[CcdProduct]]:
     """Return the products of all CCDs, and those of the same stars without noise where wanted."""
-    config = experiment.config
-    experiment.make_screens(threads)
-    names = config.ccds or ()
-    stars = config.stars.truth + config.stars.observed
+    noisy_or_not = (True, False) if noiseless else (True,)
+
+    def model(exposure: CcdExposure) -> list[CcdProduct]:
+        return [_without_images(model_ccd(experiment, exposure, noisy=noisy)) for noisy in noisy_or_not]
+
     title = "everything on" if case == FULL else f"{case} off"
-    seen, unseen = [], []
-    with reporter.stage(title, total=stars * len(names)) as stage:
-        for name in names:
-            exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
-            seen.append(_without_images(model_ccd(experiment, exposure)))
-            if noiseless:
-                unseen.append(_without_images(model_ccd(experiment, exposure, noisy=False)))
-    return seen, unseen
+    models = simulate_ccds(experiment, model, title=title, threads=threads, reporter=reporter).results.values()
+    return [m[0] for m in models], [m[1] for m in models if noiseless]
 
 
 def _without_images(product: CcdProduct) -> CcdProduct:

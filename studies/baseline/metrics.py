@@ -24,7 +24,8 @@ from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.measure.summary import ccd_figures
-from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places, model_ccd
+from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places
+from ...pipeline.simulate.ccd_model import model_ccd
 from ...pipeline.simulate.photometry import ARCSEC
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.pupil_optics import fields_at, trace_pupils

@@ -28,10 +28,12 @@ from ...pipeline.memory import check_memory
 from ...pipeline.psf_model.checks import snr_weights
 from ...pipeline.psf_model.model import CLIP_SIGMA, PsfModel
 from ...pipeline.psf_model.polynomial import Extent, design_matrix
-from ...pipeline.simulate.ccd_exposure import CcdExposure, effective_fwhm, expose_ccd
+from ...pipeline.simulate.ccd_exposure import CcdExposure
+from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_observation import Observation, observe_ccd
 from ...pipeline.simulate.photometry import (
     ARCSEC,
+    effective_fwhm,
     instrument_noise,
     limiting_magnitude,
     signal_to_noise,
@@ -216,18 +218,14 @@ def _free_numbers(case: Case) -> int:
 
 def _simulate(experiment: Experiment, threads: int | None, reporter: Reporter) -> list[StudyCcd]:
     """Make the noise-free stars of all CCDs."""
-    config = experiment.config
-    names = config.ccds or ()
-    experiment.make_screens(threads)
-    result = []
-    with reporter.stage("stars", total=(config.stars.truth + config.stars.observed) * len(names)) as stage:
-        for name in names:
-            exposure = expose_ccd(experiment, name, threads=threads, advance=stage.advance)
-            truth = measure_shapes(exposure.truth.image, exposure.truth.pixel_scale, experiment.weight_fwhm)
-            result.append(StudyCcd(exposure, truth, _look_at(experiment, exposure, exposure.observed.image)))
-    if experiment.atmosphere is not None:
-        experiment.atmosphere.release()
-    return result
+
+    def measured(exposure: CcdExposure) -> StudyCcd:
+        truth = measure_shapes(exposure.truth.image, exposure.truth.pixel_scale, experiment.weight_fwhm)
+        return StudyCcd(exposure, truth, _look_at(experiment, exposure, exposure.observed.image))
+
+    with experiment.screens(threads, reporter):
+        simulated = simulate_ccds(experiment, measured, title="stars", threads=threads, reporter=reporter)
+    return list(simulated.results.values())
 
 
 def _look_at(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) -> Observation:

@@ -29,13 +29,12 @@ from ...pipeline.measure.summary import (
 from ...pipeline.psf_model.polynomial import design_matrix
 from ...pipeline.simulate.ccd_exposure import (
     Exposed,
-    effective_fwhm,
     expose_ccd,
     expose_places,
-    model_ccd,
     truth_places,
 )
-from ...pipeline.simulate.photometry import ARCSEC
+from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.simulate.photometry import ARCSEC, effective_fwhm
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.zernike import fit_zernikes
 

@@ -17,7 +17,8 @@ from pachon.pipeline.experiment import prepare, resolve
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.measure.summary import separation_bins
 from pachon.pipeline.run import run
-from pachon.pipeline.simulate import ccd_exposure as ccd_stage
+from pachon.pipeline.simulate import ccd_exposure, ccd_loop
+from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.photometry import electrons
 
 CCDS = ("R22_S11", "R24_S12")
@@ -73,8 +74,8 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
         (copied / name).unlink()
     (copied / ".ccd_R24_S12.fits.partial").write_bytes(b"SIMPLE")
     done = []
-    real = run_module.expose_ccd
-    monkeypatch.setattr(run_module, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))
+    real = ccd_loop.expose_ccd
+    monkeypatch.setattr(ccd_loop, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))
     result = run(tiny(), copied, resume=True)
     assert done == ["R24_S12"]
     assert result.kept == ("R22_S11",)
@@ -104,18 +105,18 @@ def test_a_damaged_product_is_computed_again(finished_run, copied, tiny, no_repo
 
 
 def test_an_interrupted_run_keeps_the_ccds_that_were_finished(finished_run, tmp_path, monkeypatch, tiny, no_report):
-    real = run_module.expose_ccd
+    real = ccd_loop.expose_ccd
 
     def interrupted(experiment, name, **options):
         if name == "R24_S12":
             raise KeyboardInterrupt
         return real(experiment, name, **options)
 
-    monkeypatch.setattr(run_module, "expose_ccd", interrupted)
+    monkeypatch.setattr(ccd_loop, "expose_ccd", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(tiny(), tmp_path / "out")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["ccd_R22_S11.fits", "config.yaml"]
-    monkeypatch.setattr(run_module, "expose_ccd", real)
+    monkeypatch.setattr(ccd_loop, "expose_ccd", real)
     assert run(tiny(), tmp_path / "out", resume=True).kept == ("R22_S11",)
     assert contents(tmp_path / "out") == contents(finished_run)
 
@@ -155,7 +156,7 @@ def test_an_error_inside_a_ccd_names_it(tmp_path, monkeypatch, tiny, no_report):
     def fails(*args, **options):
         raise ConfigError("something is off")
 
-    monkeypatch.setattr(ccd_stage, "make_psfs", fails)
+    monkeypatch.setattr(ccd_exposure, "make_psfs", fails)
     with pytest.raises(PachonError, match=r"^CCD R22_S11: something is off$"):
         run(tiny(), tmp_path / "out")
 
@@ -167,7 +168,7 @@ def failing_ccd(monkeypatch):
 
     def fails(experiment, exposure):
         if exposure.name == "R22_S11":
-            raise DomainError(f"CCD {exposure.name}: 3 of 12 stars left (9 neighbour): expected at least 5")
+            raise DomainError("3 of 12 stars left (9 neighbour): expected at least 5")
         return real(experiment, exposure)
 
     monkeypatch.setattr(run_module, "model_ccd", fails)
@@ -198,7 +199,7 @@ def test_a_ccd_that_could_not_be_modelled_is_tried_again(
     finished_run, tmp_path, tiny, no_report, failing_ccd, monkeypatch
 ):
     run(tiny(), tmp_path / "out", threads=1)
-    monkeypatch.setattr(run_module, "model_ccd", ccd_stage.model_ccd)
+    monkeypatch.setattr(run_module, "model_ccd", model_ccd)
     result = run(tiny(), tmp_path / "out", resume=True)
     assert (result.kept, result.computed, result.not_modelled) == (("R24_S12",), ("R22_S11",), {})
     assert contents(tmp_path / "out") == contents(finished_run)
@@ -287,7 +288,7 @@ def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run
 def computed(config):
     """The product of the one CCD of a configuration."""
     experiment = prepare(config)
-    return ccd_stage.model_ccd(experiment, ccd_stage.expose_ccd(experiment, config.ccds[0]))
+    return model_ccd(experiment, ccd_exposure.expose_ccd(experiment, config.ccds[0]))
 
 
 def test_visits_have_the_same_stars_and_other_noise(tiny):

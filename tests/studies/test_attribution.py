@@ -13,7 +13,8 @@ from pachon.pipeline.experiment import prepare, resolve
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.measure.summary import correlations
-from pachon.pipeline.simulate.ccd_exposure import expose_ccd, model_ccd
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd
+from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.photometry import ARCSEC
 from pachon.pipeline.simulate.stamps import center_stamps
 from pachon.studies.attribution.attribution import (

@@ -1,0 +1,105 @@
+"""The loop over the CCDs of an experiment: expose one CCD while the one before is modelled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from ...core.errors import PachonError, ProductError
+from ...core.progress import Reporter
+from ...core.threads import thread_count
+from ..experiment import Experiment
+from .ccd_exposure import CcdExposure, expose_ccd
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class SimulatedCcds(Generic[_T]):
+    """Results of :func:`simulate_ccds`, in the order of the CCDs.
+
+    Attributes
+    ----------
+    results : dict of str to object
+        Result of each CCD.
+    not_modelled : dict of str to str
+        CCDs that cannot be modelled, each with the reason.
+    """
+
+    results: dict[str, _T] = field(default_factory=dict)
+    not_modelled: dict[str, str] = field(default_factory=dict)
+
+
+def simulate_ccds(
+    experiment: Experiment,
+    model: Callable[[CcdExposure], _T],
+    names: Sequence[str] | None = None,
+    *,
+    title: str | None = None,
+    strict: bool = True,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> SimulatedCcds[_T]:
+    """Expose CCDs one after the other, and model each beside the next exposure.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Telescope, focal plane, atmosphere and settings.
+    model : callable
+        Model of one exposure, such as :func:`~pachon.pipeline.simulate.ccd_model.model_ccd` or any reduction of the
+        exposure. It runs on a thread of its own, one CCD at a time, in the order of the CCDs.
+    names : sequence of str, optional
+        CCDs; by default those of the configuration.
+    title : str, optional
+        Title of the progress bar.
+    strict : bool
+        Whether a CCD that cannot be modelled ends the loop, after the models under way; otherwise the CCD is reported
+        and left out.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    PachonError
+        If a CCD cannot be exposed or, with `strict`, modelled: one line that starts with the name of the CCD.
+    ProductError
+        If `model` writes a product and cannot.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    names = (experiment.config.ccds or ()) if names is None else names
+    simulated: SimulatedCcds[_T] = SimulatedCcds()
+    stars = experiment.config.stars.truth + experiment.config.stars.observed
+    overlap = thread_count(threads) > 1
+    bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=stars * len(names))
+    with bar as stage, ThreadPoolExecutor(1) as modeller:
+        pending: list[tuple[str, Future[_T]]] = []
+        for i, name in enumerate(names, start=1):
+            try:
+                exposure = expose_ccd(experiment, name, threads=threads, progress=stage.advance)
+            except PachonError as error:
+                raise error.within(subject=f"CCD {name}") from None
+            due, pending = pending, [(name, modeller.submit(model, exposure))]
+            if not overlap or i == len(names):
+                due, pending = due + pending, []
+            for which, future in due:
+                try:
+                    simulated.results[which] = future.result()
+                except ProductError:
+                    raise
+                except PachonError as error:
+                    if strict:
+                        raise error.within(subject=f"CCD {which}") from None
+                    simulated.not_modelled[which] = error.reason
+                    reporter.line(left_out_line(which, error.reason))
+            stage.step(name, i, len(names))
+    return simulated
+
+
+def left_out_line(name: str, reason: str) -> str:
+    """Return the line that reports a CCD that is left out."""
+    return f"CCD {name} is left out, it cannot be modelled: {reason}"
