@@ -15,7 +15,7 @@ from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, launch_rays
 from ..raytrace.trace import trace
-from .bundles import field_points, wavelength_points
+from ..wavefront.request import field_points, wavelength_points
 
 if TYPE_CHECKING:
     import trimesh

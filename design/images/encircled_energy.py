@@ -12,8 +12,8 @@ from scipy.ndimage import zoom
 from ...core.errors import ConfigError, DomainError
 from ...core.units import metres
 from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import PupilSampling
 from ..metrics.spots import SpotDiagram, spots
-from ..pupil_sampling import PupilSampling
 from .diffraction import DiffractionPsf, fft_psf
 
 if TYPE_CHECKING:

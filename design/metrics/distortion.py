@@ -13,8 +13,9 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError
 from ...models.telescope import Telescope
 from ...raytrace.rays import field_direction
-from ..bundles import RAYS_AT_ONCE, field_points, trace_bundles, wavelength_points
-from ..pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.bundles import RAYS_AT_ONCE, trace_bundles
+from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 from .spots import REFERENCES, spots
 
 if TYPE_CHECKING:

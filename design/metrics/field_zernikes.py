@@ -16,9 +16,10 @@ from ...core.errors import ConfigError, DomainError
 from ...core.units import radians
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import annular_zernikes
+from ...wavefront.bundles import RAYS_AT_ONCE
 from ...wavefront.pupil_optics import trace_pupils
-from ..bundles import RAYS_AT_ONCE, field_points, wavelength_points
-from ..pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
+from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,8 +13,8 @@ from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace
-from ..bundles import field_points, wavelength_points
-from ..pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

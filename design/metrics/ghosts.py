@@ -20,8 +20,9 @@ from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
 from ...raytrace.rays import Rays, RayStatus, launch_rays
 from ...raytrace.trace import trace
-from ..bundles import field_points, trace_bundles, wavelength_points
-from ..pupil_sampling import spiral_annulus
+from ...wavefront.bundles import trace_bundles
+from ...wavefront.pupil_sampling import spiral_annulus
+from ...wavefront.request import field_points, wavelength_points
 from .ghost_paths import GhostPath, fresnel_reflectivity, ghost_pairs, ghost_path
 from .principal_rays import principal_rays
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
-from ..bundles import bundle_blocks, field_points, wavelength_points
-from ..pupil_sampling import spiral_annulus
+from ...wavefront.bundles import bundle_blocks
+from ...wavefront.pupil_sampling import spiral_annulus
+from ...wavefront.request import field_points, wavelength_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.gradient import landing_seeds, sweep
 from ...raytrace.rays import Rays, RayStatus, field_direction, parallel_rays
 from ...raytrace.trace import trace
-from ..pupil_sampling import PupilSampling
+from ...wavefront.pupil_sampling import PupilSampling
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 

@@ -13,9 +13,9 @@ from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
-from ..bundles import field_points, wavelength_points
+from ...wavefront.pupil_sampling import pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 from ..parameters.parameters import Parameter, apply, parse_parameters
-from ..pupil_sampling import pupil_sampling
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
 from .targets import FocalLength, Target
@@ -157,7 +157,7 @@ def optimize(
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
         Wavefronts to be reached [m], in place of none (:func:`wavefronts` gives those of a telescope).
     sampling, count :
-        Points of the pupil, see :func:`~pachon.design.pupil_sampling.pupil_sampling`.
+        Points of the pupil, see :func:`~pachon.wavefront.pupil_sampling.pupil_sampling`.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     tolerance : float
