@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 import logging
-from typing import Any, Literal
-
-import matplotlib
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from .errors import ConfigError
+
+# Matplotlib takes a third of a second to import: only where something is drawn.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: The palette, in the order in which curves of one picture take it; all differ in lightness too.
 GREY, BLUE, RED, ORANGE, PURPLE = "#3a3a3a", "#1f6fbf", "#c8322b", "#e08a00", "#7a4fb5"
@@ -42,11 +42,16 @@ logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 def styled() -> Any:
     """Return the context in which figures are drawn: our style on top of matplotlib's own, not the user's."""
+    import matplotlib
+
     return matplotlib.rc_context({**matplotlib.rcParamsDefault, **_STYLE, "backend": "agg"})
 
 
 def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
     """Return an empty figure of a size in inches that belongs to no window and no global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
@@ -83,6 +88,4 @@ def png_bytes(figure: Figure) -> bytes:
 
 def figure_of(axes: Axes) -> Figure:
     """Return the figure that axes belong to."""
-    figure = axes.get_figure(root=True)
-    assert isinstance(figure, Figure)
-    return figure
+    return cast("Figure", axes.get_figure(root=True))

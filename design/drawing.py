@@ -1,20 +1,19 @@
-"""What the pictures of design studies share: names and colours of fields, panels, scale bars, maps over the field."""
+"""Shared parts of the plots of design studies: field labels and colours, panels, scale bars, maps over the field."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle
-from matplotlib.tri import Triangulation
 
 from ..core.plotting import new_figure
 
-#: Fields that a legend or a row of panels can hold; a figure of more is drawn against the distance from the axis.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Fields that a legend or a row of panels can hold; a plot of more is drawn against the distance from the axis.
 FEW = 12
 
 
@@ -28,12 +27,18 @@ def field_label(field: np.ndarray) -> str:
 
 def field_colors(count: int) -> list[Any]:
     """Return a colour for each field of a list, from dark at the axis to bright at the edge."""
-    return [matplotlib.colormaps["plasma"](0.05 + 0.78 * i / max(count - 1, 1)) for i in range(count)]
+    return _colors("plasma", 0.05, 0.78, count)
 
 
 def wavelength_colors(count: int) -> list[Any]:
     """Return a colour for each wavelength of a list, from blue to red; one alone is blue."""
-    return [matplotlib.colormaps["turbo"](0.12 + 0.76 * i / max(count - 1, 1)) for i in range(count)]
+    return _colors("turbo", 0.12, 0.76, count)
+
+
+def _colors(name: str, first: float, span: float, count: int) -> list[Any]:
+    from matplotlib import colormaps
+
+    return [colormaps[name](first + span * i / max(count - 1, 1)) for i in range(count)]
 
 
 def panel_grid(count: int, width: float, height: float, most: int = 5) -> tuple[Figure, list[Axes]]:
@@ -79,6 +84,8 @@ def second_scale(axes: Axes, factor: float, label: str) -> None:
 
 def draw_circle(axes: Axes, radius: float, color: str = "0.3", style: Any = "-", label: str | None = None) -> None:
     """Draw a circle about the origin."""
+    from matplotlib.patches import Circle
+
     axes.add_patch(Circle((0.0, 0.0), radius, fill=False, edgecolor=color, linewidth=0.8, linestyle=style, label=label))
 
 
@@ -98,6 +105,8 @@ def spread_in_field(fields: np.ndarray) -> bool:
 
 def draw_field_map(axes: Axes, fields: np.ndarray, values: np.ndarray, **style: Any) -> Any:
     """Draw values at field points [rad] as a map in degrees, smooth between the points, and return its colours' key."""
+    from matplotlib.tri import Triangulation
+
     x, y = np.rad2deg(fields).T
     known = np.isfinite(values)
     image = axes.tripcolor(Triangulation(x[known], y[known]), values[known], shading="gouraud", **style)

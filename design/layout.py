@@ -2,55 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
-from ..models.surface import Interaction, Surface
+from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
+from ..models.surface import Interaction
 from ..models.telescope import Telescope
-from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import RayStatus, launch_rays
-from ..raytrace.trace import trace
-from ..wavefront.request import field_points, wavelength_points
+from .bundles import field_points, wavelength_points
+from .drawing import field_label
+from .layout_parts import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
 
 if TYPE_CHECKING:
     import trimesh
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Rays of a field in section, on either side of the axis, and around the pupil in three dimensions.
 _FAN, _SPOKES = 5, 12
-#: Points of a surface in section.
-_POINTS = 241
-#: A medium of at least this index is drawn as glass.
-_GLASS = 1.05
-#: How far a surface without an aperture reaches beyond the light, and light beyond the telescope.
-_BEYOND, _ABOVE = 1.03, 0.08
-#: A baffle that blocks all around is drawn to this many times its clear radius.
-_RIM = 1.12
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A piece of glass between two neighbouring surfaces.
-
-    Attributes
-    ----------
-    name : str
-        What the names of both surfaces have in common, or both names.
-    front, back : str
-        The surfaces, in the order that light meets them.
-    index : float
-        Refractive index of the glass.
-    """
-
-    name: str
-    front: str
-    back: str
-    index: float
+#: How far light is drawn above the telescope.
+_ABOVE = 0.08
+_RAYS = (BLUE, GREY, RED, ORANGE, PURPLE, "#2a9d6f")
+_GLASS, _GLASS_RIM, _MIRROR, _DETECTOR, _BAFFLE = "#bfe3f2", "#3f7d99", "#1a1a1a", "#0b6b3a", "#6b4a2b"
+#: Lenses and detector get a panel of their own where they are less than this part of the whole.
+_SMALL = 0.4
 
 
 @dataclass(frozen=True)
@@ -113,15 +89,42 @@ class Layout:
 
     def plot(self) -> Figure:
         """Draw the section of the telescope with its rays and, where they are small beside it, its lenses."""
-        from .plots.layout import layout_figure
-
-        return layout_figure(self)
+        drawing = _Drawing(self)
+        surfaces = self.telescope.surfaces
+        names = [s.name for s in surfaces if np.isfinite(self.profiles[s.name]).all(axis=1).any()]
+        whole = drawing.box(names)
+        within = {lens.front for lens in self.lenses} | {lens.back for lens in self.lenses}
+        within |= {s.name for s in surfaces if s.interaction == Interaction.DETECTOR}
+        small = drawing.box([n for n in names if n in within]) if within & set(names) else whole
+        zoom = bool(self.lenses) and bool(np.ptp(small, axis=0).max() < _SMALL * np.ptp(whole, axis=0).max())
+        with styled():
+            if zoom:
+                figure = new_figure(12.4, 5.4 if drawing.lying else 6.4)
+                left, right = figure.subplots(1, 2)
+                _draw(right, drawing, small, within & set(names), beams=False)
+                outside = [n for n in names if n not in within]
+                _draw(left, drawing, whole, set(outside), beams=True)
+            else:
+                ratio = np.ptp(whole, axis=0)
+                wide = float(np.clip(5.2 * ratio[0] / max(ratio[1], 1e-12), 6.4, 12.0))
+                figure = new_figure(wide + 1.2, float(np.clip(wide * ratio[1] / ratio[0], 3.0, 7.5)) + 1.6)
+                left = figure.subplots()
+                _draw(left, drawing, whole, set(names), beams=True)
+            handles, labels = left.get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 8))
+            figure.suptitle(
+                f"{self.telescope.name}: section x = 0, rays of {self.wavelength * 1e9:.4g} nm; "
+                f"light comes from {'the left' if drawing.lying else 'above'}",
+                fontsize=11,
+            )
+            return figure
 
     def scene(self) -> trimesh.Scene:
         """Return mirrors, lenses, baffles, obstructions and rays as a scene of meshes [m], y up, for a GLB file."""
-        from .layout_model import layout_scene
+        from .layout_meshes import layout_scene
 
-        return layout_scene(self)
+        size = float(self.size.max())
+        return layout_scene(self.telescope, self.lenses, self.reach, self.fields, self.bundles, size)
 
     def glb(self) -> bytes:
         """Return the scene as a binary glTF file."""
@@ -161,8 +164,8 @@ def layout(
     edge = telescope.field_radius
     points = field_points(telescope, [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None else fields)
     (w,) = wavelength_points(telescope, wavelength)
-    lenses = _lenses(telescope, float(w))
-    reach = _even_edges(telescope, lenses, _reaches(telescope, points, float(w), threads))
+    lenses = find_lenses(telescope, float(w))
+    reach = even_edges(telescope, lenses, drawn_radii(telescope, points, float(w), threads))
     profiles = {s.name: surface_section(s, reach[s.name]) for s in telescope.surfaces}
     heights = np.concatenate([p[:, 2] for p in profiles.values()])
     heights = np.concatenate([heights[np.isfinite(heights)], [o.height for o in telescope.obstructions]])
@@ -189,163 +192,169 @@ def layout(
     )
 
 
-def ray_paths(
-    telescope: Telescope,
-    field: Sequence[float] | np.ndarray,
-    wavelength: float,
-    pupil: tuple[np.ndarray, np.ndarray],
-    top: float,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> np.ndarray:
-    """Return the ways of the rays that arrive, from a height in front of the telescope to the detector.
+class _Drawing:
+    """Coordinates of a drawing: (y, z) upright, or (-z, y) where the telescope is long."""
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    field : (tx, ty)
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
-    pupil : (px, py)
-        Entrance-pupil coordinates [m].
-    top : float
-        Height that the rays come from [m].
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        width, height = layout.size[1:]
+        self.lying = bool(height > 1.6 * width)
 
-    Returns
-    -------
-    ndarray, shape [n_ray, n_surface + 1, 3]
-        Where each starts and where it meets the surfaces [m], telescope frame.
-    """
-    rays = launch_rays(telescope, (field[0], field[1]), wavelength, pupil, projection)
-    met = trace(telescope, rays, "all", threads=threads)
-    back = (top - rays.position[:, 2:]) / rays.direction[:, 2:]
-    points = np.stack([rays.position + back * rays.direction, *(m.position for m in met)], axis=1)
-    return points[met[-1].status == RayStatus.OK]
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        y, z = points[..., 1], points[..., 2]
+        return np.stack([-z, y] if self.lying else [y, z], axis=-1)
+
+    def box(self, names: list[str]) -> np.ndarray:
+        """Return the lowest and the highest corner of some surfaces, shape [2, 2]."""
+        points = np.concatenate([self(self.layout.profiles[name]) for name in names])
+        return np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)])
 
 
-def surface_section(surface: Surface, reach: float) -> np.ndarray:
-    """Return points along a surface in its own section x = 0, cut to its aperture.
+def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, beams: bool) -> None:
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Polygon
 
-    Parameters
-    ----------
-    surface : Surface
-        The surface; of a baffle, what blocks light is returned.
-    reach : float
-        Distance from its z axis to go to [m].
-
-    Returns
-    -------
-    ndarray, shape [n, 3]
-        Points [m], telescope frame, from -y to +y; NaN breaks the line.
-    """
-    blocks = surface.interaction == Interaction.PASS
-
-    def solid(y: np.ndarray) -> np.ndarray:
-        return clear_region(surface.aperture, np.zeros_like(y), y) != blocks
-
-    y = np.linspace(-reach, reach, _POINTS)
-    here = solid(y)
-    # Where it begins and ends is found by halving the step in which it does.
-    ends = np.flatnonzero(here[1:] != here[:-1])
-    low, high = y[ends].copy(), y[ends + 1].copy()
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        same = solid(middle) == here[ends]
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    y = np.concatenate([y, low, high])
-    order = np.argsort(y, kind="stable")
-    y = y[order]
-    keep = np.concatenate([here, here[ends], here[ends + 1]])[order]
-    sag = np.zeros_like(y) if surface.interaction == Interaction.PHASE else surface.shape.sag(np.zeros_like(y), y)
-    local = np.stack([np.zeros_like(y), y, np.where(keep, sag, np.nan)], axis=-1)
-    return surface.to_telescope(local)
-
-
-def clear_region(aperture: Aperture | None, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return True where light passes an aperture, rims included; everywhere if there is none."""
-    if aperture is None:
-        return np.ones(np.broadcast(x, y).shape, dtype=bool)
-    # Rims of circles do not count, and surfaces are drawn just up to them.
-    return aperture.contains((1.0 - 1e-9) * x, (1.0 - 1e-9) * y)
-
-
-def outer_radius(region: Aperture | None) -> float:
-    """Return a distance from the origin beyond which nothing of a region lies [m]; infinite where it has no end."""
-    if isinstance(region, Circle):
-        return region.radius + float(np.hypot(region.x, region.y))
-    if isinstance(region, Annulus):
-        return region.outer + float(np.hypot(region.x, region.y))
-    if isinstance(region, Rectangle):
-        return float(0.5 * np.hypot(region.width, region.height) + np.hypot(region.x, region.y))
-    if isinstance(region, Polygon):
-        return float(np.hypot(*np.array(region.corners).T).max())
-    if isinstance(region, Union):
-        return max(outer_radius(part) for part in region.parts)
-    if isinstance(region, Intersection):
-        return min(outer_radius(part) for part in region.parts)
-    return float("inf")
-
-
-def _even_edges(telescope: Telescope, lenses: tuple[Lens, ...], reach: dict[str, float]) -> dict[str, float]:
-    """Return the reaches with surfaces that have no rim of their own going as far as the other one of their lens."""
-    found = dict(reach)
-    for lens in lenses:
-        both = max(found[lens.front], found[lens.back])
-        for name in (lens.front, lens.back):
-            surface = telescope.surface(name)
-            rim = np.linspace(0.0, both, _POINTS)
-            if surface.aperture is None and np.isfinite(surface.shape.sag(np.zeros_like(rim), rim)).all():
-                found[name] = both
-    return found
-
-
-def _reaches(telescope: Telescope, fields: np.ndarray, wavelength: float, threads: int | None) -> dict[str, float]:
-    """Return how far each surface is drawn: to its rim, or as far as the light of all fields goes."""
-    edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
-    angle = 2.0 * np.pi * np.arange(16) / 16
-    radius = 0.5 * telescope.pupil_diameter
-    lit = np.zeros(len(telescope.surfaces))
-    for field in np.concatenate([edge, fields]):
-        rays = launch_rays(
-            telescope, (field[0], field[1]), wavelength, (radius * np.cos(angle), radius * np.sin(angle))
+    layout = drawing.layout
+    size = np.ptp(box, axis=0)
+    unit, scale = ("m", 1.0) if size.max() >= 1.5 else ("mm", 1e3)
+    margin = 0.06 * size.max()
+    low, high = (box[0] - margin) * scale, (box[1] + margin) * scale
+    for i, (field, fan) in enumerate(zip(layout.fields, layout.fans, strict=True)):
+        color = _RAYS[i % len(_RAYS)]
+        axes.add_collection(
+            LineCollection(list(drawing(fan) * scale), colors=color, linewidths=0.6, alpha=0.8, zorder=1)
         )
-        for k, met in enumerate(trace(telescope, rays, "all", threads=threads)):
-            local = telescope.surfaces[k].to_local(met.position)
-            # Light that is stopped on its way need not be drawn, but it tells where nothing else does.
-            away = np.hypot(local[:, 0], local[:, 1])
-            lit[k] = max(lit[k], float(np.nanmax(away, initial=0.0)) if np.isfinite(away).any() else 0.0)
-    found = {}
-    for surface, light in zip(telescope.surfaces, lit, strict=True):
-        bound = outer_radius(surface.aperture)
-        if surface.interaction == Interaction.PASS:
-            blocked = outer_radius(surface.aperture.part) if isinstance(surface.aperture, Complement) else np.inf
-            bound = blocked if np.isfinite(blocked) else _RIM * (bound if np.isfinite(bound) else light)
-        found[surface.name] = bound if np.isfinite(bound) else _BEYOND * max(light, 1e-3 * radius)
+        axes.plot([], [], color=color, linewidth=1.2, label=_signed_label(field))
+    for lens in layout.lenses:
+        front, back = (drawing(layout.profiles[name]) * scale for name in (lens.front, lens.back))
+        outline = np.concatenate([front[np.isfinite(front).all(axis=1)], back[np.isfinite(back).all(axis=1)][::-1]])
+        if len(outline) > 2:
+            axes.add_patch(
+                Polygon(
+                    outline, closed=True, facecolor=_GLASS, edgecolor=_GLASS_RIM, linewidth=0.9, alpha=0.75, zorder=2
+                )
+            )
+    in_glass = {lens.front for lens in layout.lenses} | {lens.back for lens in layout.lenses}
+    for surface in layout.telescope.surfaces:
+        if surface.interaction == Interaction.REFRACT and surface.name in in_glass:
+            continue
+        if surface.interaction == Interaction.PASS and not beams:
+            # Baffles stand in the light on its way to the mirrors, beside the lenses at most in the drawing.
+            continue
+        color, width = {
+            Interaction.MIRROR: (_MIRROR, 2.2),
+            Interaction.DETECTOR: (_DETECTOR, 2.6),
+            Interaction.PASS: (_BAFFLE, 1.8),
+        }.get(surface.interaction, (_GLASS_RIM, 1.0))
+        points = drawing(layout.profiles[surface.name]) * scale
+        axes.plot(*points.T, color=color, linewidth=width, solid_capstyle="butt", zorder=3)
+    for obstruction in layout.telescope.obstructions:
+        segments = drawing(_cut(obstruction.triangles.astype(np.float64))) * scale
+        axes.add_collection(LineCollection(list(segments), colors=_BAFFLE, linewidths=1.0, zorder=3))
+    if beams:
+        start = np.concatenate([drawing(fan[:, 0]) for fan in layout.fans] or [box]) * scale
+        if len(start):
+            low, high = np.minimum(low, start.min(axis=0)), np.maximum(high, start.max(axis=0))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    along = f"along the axis, away from the sky [{unit}]"
+    axes.set_xlabel(f"−z, {along}" if drawing.lying else f"y [{unit}]")
+    axes.set_ylabel(f"y [{unit}]" if drawing.lying else f"z, towards the sky [{unit}]")
+    axes.grid(True, color="0.94", linewidth=0.6)
+    axes.set_axisbelow(True)
+    _write_names(axes, _labels(drawing, named, scale, (low, high)), drawing.lying)
+
+
+def _labels(
+    drawing: _Drawing, named: set[str], scale: float, limits: tuple[np.ndarray, np.ndarray]
+) -> list[tuple[str, np.ndarray]]:
+    """Return names, each with the rim of what it belongs to; those of the surfaces of a lens are one."""
+    layout = drawing.layout
+    parts: dict[str, list[str]] = {}
+    covered: set[str] = set()
+    for lens in layout.lenses:
+        if {lens.front, lens.back} <= named:
+            # Cemented lenses share a surface, and then each name stands alone.
+            shared = {lens.front, lens.back} & covered
+            parts[lens.name if not shared else lens.back] = [n for n in (lens.front, lens.back) if n not in shared]
+            covered |= {lens.front, lens.back}
+    for surface in layout.telescope.surfaces:
+        if surface.name in named - covered:
+            parts[surface.name] = [surface.name]
+    # Without a word in common the names of both surfaces are written.
+    found = []
+    for name, members in parts.items():
+        points = np.concatenate([drawing(layout.profiles[m]) for m in members]) * scale
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            continue
+        side = 1 if drawing.lying else 0
+        rim = points[points[:, side] >= points[:, side].max() - 1e-6 * scale]
+        place = rim.mean(axis=0)
+        if (place >= limits[0]).all() and (place <= limits[1]).all():
+            found.append((name, place))
     return found
 
 
-def _lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:
-    index = refractive_indices(telescope, wavelength)
-    # Planes inside a lens, such as its stop, do not divide it.
-    acting = [k for k, s in enumerate(telescope.surfaces) if s.interaction in (Interaction.REFRACT, Interaction.MIRROR)]
-    found = []
-    for front, back in pairwise(acting):
-        if index[front + 1] >= _GLASS:
-            names = telescope.surfaces[front].name, telescope.surfaces[back].name
-            found.append(Lens(_common_name(*names), *names, float(index[front + 1])))
-    return tuple(found)
+def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) -> None:
+    """Write names in a column at the right, or a row above where it lies, far enough apart, with lines to surfaces."""
+    if not labels:
+        return
+    side = 0 if lying else 1
+    low, high = axes.get_xlim() if lying else axes.get_ylim()
+    step = (high - low) / (30.0 if not lying else 34.0)
+    labels = sorted(labels, key=lambda item: float(item[1][side]))
+    places = _apart(np.array([item[1][side] for item in labels]), step, low + step, high - step)
+    edge = axes.get_ylim()[1] if lying else axes.get_xlim()[1]
+    for (name, rim), place in zip(labels, places, strict=True):
+        end: Any = (place, edge) if lying else (edge, place)
+        axes.annotate(
+            name,
+            xy=(rim[0], rim[1]),
+            xytext=end,
+            rotation=60 if lying else 0,
+            ha="left",
+            va="bottom" if lying else "center",
+            fontsize=7.5,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": "0.55", "linewidth": 0.5, "shrinkA": 1.0, "shrinkB": 0.0},
+            zorder=4,
+        )
 
 
-def _common_name(first: str, second: str) -> str:
-    """Return what two names begin with, up to a mark between words; both names where that is nothing."""
-    for mark in "_- .":
-        head = first.partition(mark)[0]
-        if mark in first and mark in second and head and head == second.partition(mark)[0]:
-            return head
-    return f"{first}, {second}"
+def _apart(wanted: np.ndarray, step: float, low: float, high: float) -> np.ndarray:
+    """Return ascending places near those wanted, at least a step apart and within bounds where there is room."""
+    step = min(step, (high - low) / max(len(wanted) - 1, 1))
+    places = np.clip(wanted, low, high)
+    # Groups that are too close are spread about their middle, and joined with what they then touch.
+    groups = [[float(p), 1] for p in places]
+    merged = True
+    while merged:
+        merged = False
+        for i in range(len(groups) - 1):
+            (a, n), (b, m) = groups[i], groups[i + 1]
+            if b - a < 0.5 * step * (n + m) - 1e-12:
+                groups[i : i + 2] = [[(a * n + b * m) / (n + m), n + m]]
+                merged = True
+                break
+    found = np.concatenate([c + step * (np.arange(n) - 0.5 * (n - 1)) for c, n in groups])
+    return found + max(low - found[0], 0.0) - max(found[-1] - high, 0.0)
+
+
+def _cut(triangles: np.ndarray) -> np.ndarray:
+    """Return the segments in which triangles [n, 3, 3] cross the plane x = 0, shape [k, 2, 3]."""
+    start, end = triangles, np.roll(triangles, -1, axis=1)
+    before, after = start[..., 0], end[..., 0]
+    crosses = (before < 0) != (after < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.where(crosses, before / (before - after), np.nan)
+    points = start + part[..., None] * (end - start)
+    both = crosses.sum(axis=1) == 2
+    return points[both][crosses[both]].reshape(-1, 2, 3)
+
+
+def _signed_label(field: np.ndarray) -> str:
+    """Return a field as text; on the y axis with its sign, as both sides are drawn."""
+    x, y = np.rad2deg(field)
+    if abs(x) < 1e-9:
+        return "on the axis" if abs(y) < 1e-9 else f"field {y:+.4g}°"
+    return f"field {field_label(field)}"

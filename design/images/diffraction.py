@@ -10,19 +10,18 @@ entrance pupil, as they are traced, and repeats itself nowhere; it is the slower
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from scipy.ndimage import zoom
 
 from ...core.errors import ConfigError, DomainError
 from ...core.units import metres
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling, square_annulus
-from ...wavefront.request import field_points, relative_weights, wavelength_points
+from ..bundles import field_points, wavelength_points
 from ..metrics.principal_rays import principal_rays
-from ..metrics.spots import REFERENCES, spots
+from ..metrics.spots import REFERENCES, checked_weights, spots
+from ..pupil_sampling import PupilSampling, square_annulus
+from .diffraction_psf import DiffractionPsf, pixel_axis
 from .wavelets import (
     WaveletLattice,
     Wavelets,
@@ -31,9 +30,6 @@ from .wavelets import (
     spot_reach,
     traced_wavelets,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Pixels on a side where none are asked for, and pixels across wavelength times focal ratio.
 _PIXELS, _PER_AIRY = 128, 5.0
@@ -45,123 +41,9 @@ _PERIODS = 2.0
 _HUYGENS_ACROSS = 160
 #: Wavelets summed at once: two complex numbers for each and each column of the image.
 _AT_ONCE = 4096
-#: Images are interpolated to so many times as many pixels for their widths.
-_FINER = 4
 #: The peak is looked for at so many places across wavelength times focal ratio, at most so many in all along an axis,
 #: and at finer steps about the highest.
 _PEAK, _MOST_PLACES, _FINE = 3.0, 192, 33
-
-
-@dataclass(frozen=True)
-class DiffractionPsf:
-    """Diffraction images of several field points, all wavelengths together.
-
-    Attributes
-    ----------
-    telescope : str
-        Name of the telescope.
-    method : {"fft", "huygens"}
-        How the images were made.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
-    image : ndarray, shape [n_field, ny, nx]
-        Part of the light of the image that falls on each pixel, sampled at its centre; [y, x], y up. The sum falls
-        short of 1 by what falls beside.
-    pixel : float
-        Distance of pixel centres [m].
-    reference : ndarray, shape [n_field, 2]
-        Detector coordinates [m] of the middle of the images.
-    light : ndarray, shape [n_field]
-        Part of the entrance pupil that is lit, mean over the wavelengths.
-    strehl : ndarray, shape [n_field]
-        Peak of the image over that of the same light with all wavefronts perfect and together.
-    airy_radius : ndarray, shape [n_field]
-        Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m].
-    plate_scale : ndarray, shape [n_field]
-        Angle on the sky over length on the detector [rad/m].
-    pupil_points : int
-        Points across the pupil.
-    """
-
-    telescope: str
-    method: str
-    fields: np.ndarray
-    wavelengths: np.ndarray
-    image: np.ndarray
-    pixel: float
-    reference: np.ndarray
-    light: np.ndarray
-    strehl: np.ndarray
-    airy_radius: np.ndarray
-    plate_scale: np.ndarray
-    pupil_points: int
-
-    @property
-    def axis(self) -> np.ndarray:
-        """Coordinates of pixel centres along either axis from the middle of the image [m]."""
-        return _axis(self.pixel, self.image.shape[-1])
-
-    @property
-    def inside(self) -> np.ndarray:
-        """Part of the light that falls within each image, shape [n_field]."""
-        return self.image.sum(axis=(1, 2))
-
-    @property
-    def centroid(self) -> np.ndarray:
-        """Centroid of each image relative to its middle [m], x and y, shape [n_field, 2]."""
-        return np.stack([self.image.sum(axis=1) @ self.axis, self.image.sum(axis=2) @ self.axis], -1) / self._inside
-
-    @property
-    def rms_radius(self) -> np.ndarray:
-        """Root mean square distance of the light within each image from its centroid [m], shape [n_field].
-
-        The wings of a diffraction image fall off as the cube of the distance, so that it grows with the image.
-        """
-        square = np.add.outer(self.axis**2, self.axis**2)
-        mean = np.einsum("fyx,yx->f", self.image, square) / self.inside
-        return np.sqrt(mean - (self.centroid**2).sum(axis=1))
-
-    @property
-    def fwhm(self) -> np.ndarray:
-        """Diameter of a disc as large as the part of each image above half its peak [m], shape [n_field]."""
-        finer = zoom(self.image, (1, _FINER, _FINER), order=3, mode="nearest", grid_mode=True)
-        above = (finer > 0.5 * finer.max(axis=(1, 2), keepdims=True)).sum(axis=(1, 2))
-        return 2.0 * self.pixel / _FINER * np.sqrt(above / np.pi)
-
-    @property
-    def _inside(self) -> np.ndarray:
-        return self.inside[:, None]
-
-    def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
-        arcsec = np.rad2deg(self.plate_scale) * 3600.0
-        return {
-            "telescope": self.telescope,
-            "method": self.method,
-            "wavelength_nm": self.wavelengths * 1e9,
-            "pupil_points": self.pupil_points,
-            "pixel_um": self.pixel * 1e6,
-            "pixels": self.image.shape[-1],
-            "field_deg": np.rad2deg(self.fields),
-            "reference_mm": self.reference * 1e3,
-            "strehl": self.strehl,
-            "fwhm_um": self.fwhm * 1e6,
-            "fwhm_arcsec": self.fwhm * arcsec,
-            "centroid_um": self.centroid * 1e6,
-            "airy_radius_um": self.airy_radius * 1e6,
-            "airy_radius_arcsec": self.airy_radius * arcsec,
-            "light_inside": self.inside,
-            "lit_fraction": self.light,
-            "plate_scale_arcsec_per_um": arcsec * 1e-6,
-        }
-
-    def plot(self) -> Figure:
-        """Draw each image on a logarithmic scale, and cuts through the first ones."""
-        from ..plots.diffraction import diffraction_figure
-
-        return diffraction_figure(self)
 
 
 def fft_psf(
@@ -345,7 +227,7 @@ class _Plan:
             raise DomainError(f"pixels = {pixels!r}: expected a whole number from 3 to 4096")
         self.telescope, self.pixels = telescope, int(pixels)
         self.fields, self.waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-        self.shares = relative_weights(weights, len(self.waves))
+        self.shares = checked_weights(weights, len(self.waves))
         self.spots = spots(
             telescope, self.fields, self.waves, reference=reference, projection=projection, threads=threads
         )
@@ -377,7 +259,7 @@ class _Plan:
         pupil_points: int,
         advance: Callable[[], None] | None,
     ) -> DiffractionPsf:
-        axis = _axis(self.pixel, self.pixels)
+        axis = pixel_axis(self.pixel, self.pixels)
         images, light, strehl = [], [], []
         for field, center in zip(self.fields, self.spots.reference, strict=True):
             found: list[tuple[float, Wavelets, _Sum]] = []
@@ -414,7 +296,7 @@ class _Plan:
         def irradiance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             return np.asarray(sum(share * at(x, y) for share, _, at in found))
 
-        axis, step = _axis(self.pixel, self.pixels), self.pixel
+        axis, step = pixel_axis(self.pixel, self.pixels), self.pixel
         if step > self.wave_over_range / _PEAK:
             # Pixels too coarse to show it: look at more places.
             half = 0.5 * self.pixel * self.pixels
@@ -423,8 +305,3 @@ class _Plan:
         row, column = np.unravel_index(int(np.argmax(image)), image.shape)
         fine = step * np.linspace(-1.0, 1.0, _FINE)
         return float(irradiance(axis[column] + fine, axis[row] + fine).max())
-
-
-def _axis(pixel: float, pixels: int) -> np.ndarray:
-    # The reference point lies on the middle pixel, as on the stamps of the PSF engines.
-    return (np.arange(pixels) - pixels // 2) * pixel

@@ -10,13 +10,16 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from ...core.errors import ConfigError, DomainError
+from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import metres
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
+from ..drawing import FEW, field_colors, field_label, second_scale
 from ..metrics.spots import SpotDiagram, spots
+from ..pupil_sampling import PupilSampling
 from .diffraction import DiffractionPsf, fft_psf
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: A pixel is cut into so many parts along each axis to find what of it is within a circle.
@@ -85,9 +88,15 @@ class EncircledEnergy:
 
     def plot(self) -> Figure:
         """Draw the curves, and the radii of 50 and 80 % against the field."""
-        from ..plots.encircled_energy import encircled_energy_figure
-
-        return encircled_energy_figure(self)
+        with styled():
+            figure = new_figure(10.0, 4.2)
+            left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
+            _draw_curves(left, self)
+            _draw_shares(right, self)
+            kind = "with diffraction" if self.kind == "diffraction" else "of rays alone"
+            waves = ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths)
+            figure.suptitle(f"{self.telescope}: encircled energy {kind}, {waves} nm", fontsize=11)
+            return figure
 
 
 def encircled_energy(
@@ -287,3 +296,40 @@ def _crossing(fraction: np.ndarray, radius: np.ndarray, share: float) -> float:
         return float(radius[0])
     low, high = fraction[k - 1], fraction[k]
     return float(radius[k - 1] + (share - low) / (high - low) * (radius[k] - radius[k - 1]))
+
+
+def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
+    few = len(result.fields) <= FEW
+    colors = field_colors(len(result.fields))
+    for field, row, color in zip(result.fields, result.fraction, colors, strict=True):
+        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=field_label(field) if few else None)
+    for share in (0.5, 0.8):
+        axes.axhline(share, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
+        axes.annotate(f"{100 * share:.0f} %", (1.0, share), xycoords=("axes fraction", "data"), xytext=(-3, 2),
+                      textcoords="offset points", ha="right", fontsize=7.5, color="0.4")  # fmt: skip
+    # Where the light of every field has come in, the rest is a flat line.
+    full = np.flatnonzero((result.fraction >= 0.985).all(axis=0))
+    edge = result.radius[full[0]] if len(full) else result.radius[-1]
+    axes.set(xlim=(0.0, max(edge, 0.25 * result.radius[-1]) * 1e6), ylim=(0.0, 1.02))
+    axes.set_xlabel("radius about the centroid of the rays [µm]")
+    axes.set_ylabel("share of the light within")
+    axes.grid(True, color="0.92", linewidth=0.6)
+    second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
+    if few:
+        axes.legend(loc="lower right")
+
+
+def _draw_shares(axes: Axes, result: EncircledEnergy) -> None:
+    away = np.rad2deg(np.linalg.norm(result.fields, axis=-1))
+    order = np.argsort(away, kind="stable")
+    scale = np.rad2deg(result.plate_scale) * 3600.0
+    for share, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
+        radius = result.radius_holding(share) * scale
+        axes.plot(
+            away[order], radius[order], "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * share:.0f} %"
+        )
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("distance from the axis [deg]")
+    axes.set_ylabel("radius that holds the share [arcsec]")
+    axes.grid(True, color="0.92", linewidth=0.6)
+    axes.legend(loc="best", ncols=3)

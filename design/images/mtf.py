@@ -19,16 +19,21 @@ import numpy as np
 import scipy.fft
 
 from ...core.errors import DomainError
+from ...core.plotting import BLUE, RED, new_figure, styled
 from ...models.telescope import Telescope
-from ...wavefront.request import field_points, relative_weights, wavelength_points
+from ..bundles import field_points, wavelength_points
+from ..drawing import field_label, second_scale
 from ..metrics.principal_rays import PrincipalRays, principal_rays
-from ..metrics.spots import spots
+from ..metrics.spots import checked_weights, spots
 from .wavelets import lattice_wavelets, range_of_cosines, spot_reach
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _ACROSS = 256
+#: Panels in a row.
+_MOST = 3
 
 
 @dataclass(frozen=True)
@@ -117,9 +122,27 @@ class Mtf:
 
     def plot(self) -> Figure:
         """Draw the contrast against the frequency, with the limit that diffraction sets."""
-        from ..plots.mtf import mtf_figure
-
-        return mtf_figure(self)
+        count = len(self.fields)
+        rows = -(-count // _MOST)
+        columns = -(-count // rows)
+        with styled():
+            figure = new_figure(max(3.5 * columns, 5.5), 2.6 * rows + 1.0)
+            panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+            for axes in panels[count:]:
+                axes.set_axis_off()
+            for i, axes in enumerate(panels[:count]):
+                _draw_field(axes, self, i)
+            for i, axes in enumerate(panels[:count]):
+                if i % columns == 0:
+                    axes.set_ylabel("contrast")
+                if i + columns >= count:
+                    axes.set_xlabel("spatial frequency [cycles/mm]")
+                    axes.tick_params(labelbottom=True)
+            handles, labels = panels[0].get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside lower center", ncols=3 if columns > 1 else 2)
+            waves = ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths)
+            figure.suptitle(f"{self.telescope}: modulation transfer, {waves} nm", fontsize=11)
+            return figure
 
 
 def mtf(
@@ -164,7 +187,7 @@ def mtf(
     if int(pupil_points) != pupil_points or pupil_points < 16:
         raise DomainError(f"pupil_points = {pupil_points!r}: expected a whole number of at least 16")
     points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    shares = relative_weights(wavelength_weights, len(waves))
+    shares = checked_weights(wavelength_weights, len(waves))
     middle = waves[len(waves) // 2]
     principal = principal_rays(telescope, points, middle, projection=projection, threads=threads)
     diagram = spots(
@@ -272,3 +295,29 @@ def _falls_to(row: np.ndarray, frequency: np.ndarray, contrast: float) -> float:
         return float("nan")
     k = int(below[0])
     return float(np.interp(contrast, row[[k, k - 1]], frequency[[k, k - 1]]))
+
+
+def _draw_field(axes: Axes, result: Mtf, i: int) -> None:
+    frequency = result.frequency * 1e-3
+    for name, color, solid, limit, rays in (
+        ("tangential", BLUE, result.tangential, result.tangential_limit, result.geometric_tangential),
+        ("sagittal", RED, result.sagittal, result.sagittal_limit, result.geometric_sagittal),
+    ):
+        axes.plot(frequency, limit[i], color=color, linewidth=0.8, alpha=0.55, label=f"{name}, perfect wavefront")
+        axes.plot(frequency, rays[i], color=color, linewidth=0.8, linestyle=(0, (1, 1.5)), label=f"{name}, rays alone")
+        axes.plot(frequency, solid[i], color=color, linewidth=1.5, label=name)
+    axes.set(xlim=(0.0, frequency[-1]), ylim=(0.0, 1.0))
+    axes.grid(True, color="0.92", linewidth=0.6)
+    half = result.frequency_at(0.5)[i] * 1e-3
+    axes.text(
+        0.97,
+        0.95,
+        f"{field_label(result.fields[i])}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)",
+        transform=axes.transAxes,
+        ha="right",
+        va="top",
+        fontsize=8,
+    )
+    if i < _MOST:
+        arcsec_per_mm = float(np.rad2deg(result.plate_scale[i].mean())) * 3600e-3
+        second_scale(axes, 1.0 / arcsec_per_mm, "cycles per arc second")

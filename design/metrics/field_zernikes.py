@@ -13,18 +13,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError
+from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
 from ...core.units import radians
 from ...models.telescope import Telescope
-from ...models.zernike_polynomials import annular_zernikes
-from ...wavefront.bundles import RAYS_AT_ONCE
+from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
-from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ..bundles import RAYS_AT_ONCE, field_points, wavelength_points
+from ..drawing import FEW, draw_field_map, field_colors, field_label, spread_in_field
+from ..pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 PUPILS = ("full", "lit")
+#: Maps of single terms in one picture.
+_MAPS = 8
 
 
 @dataclass(frozen=True)
@@ -77,9 +81,35 @@ class FieldZernikes:
 
     def plot(self) -> Figure:
         """Draw the terms as bars for each field; for many fields their rms over the field, and maps of the largest."""
-        from ..plots.field_zernikes import field_zernikes_figure
-
-        return field_zernikes_figure(self)
+        j = np.arange(4, self.coefficients.shape[1] + 1)
+        values = self.coefficients[:, 3:] * 1e9
+        with_maps = spread_in_field(self.fields) and len(j) > 0
+        with styled():
+            figure = new_figure(11.0, 8.6 if with_maps else 4.8)
+            title = (
+                f"{self.telescope}: annular Zernikes over the {self.pupil} pupil, obscuration {self.obscuration:g}, "
+                f"{self.wavelength * 1e9:.4g} nm"
+            )
+            figure.suptitle(title, fontsize=11)
+            if with_maps:
+                parts: Any = figure.subfigures(2, 1, height_ratios=(1.0, 1.35))
+                bars = parts[0].subplots()
+                _draw_maps(parts[1], self, j)
+            else:
+                bars = figure.subplots()
+            if len(self.fields) <= FEW:
+                width = 0.85 / len(self.fields)
+                colors = field_colors(len(self.fields))
+                for i, (row, field, color) in enumerate(zip(values, self.fields, colors, strict=True)):
+                    offset = (i - 0.5 * (len(self.fields) - 1)) * width
+                    bars.bar(j + offset, row, width, color=color, label=field_label(field))
+                bars.set_ylabel("coefficient = rms over the annulus [nm]")
+                bars.legend(loc="best", ncols=2)
+            else:
+                bars.bar(j, np.sqrt((values**2).mean(axis=0)), 0.75, color=BLUE)
+                bars.set_ylabel("rms over the fields [nm]")
+            name_terms(bars, j)
+            return figure
 
 
 @dataclass(frozen=True)
@@ -124,9 +154,36 @@ class DoubleZernikes:
 
     def plot(self) -> Figure:
         """Draw the table of coefficients as a picture, and the sizes of the pupil's terms."""
-        from ..plots.field_zernikes import double_zernikes_figure
+        from matplotlib.colors import SymLogNorm
 
-        return double_zernikes_figure(self)
+        nm = self.coefficients[:, 3:] * 1e9
+        j, k = np.arange(4, nm.shape[1] + 4), np.arange(1, nm.shape[0] + 1)
+        nodes = self.at_nodes
+        with styled():
+            figure = new_figure(11.0, 8.8)
+            table, bars = figure.subplots(2, 1, height_ratios=(1.7, 1.0), sharex=True)
+            largest = max(float(np.abs(nm).max(initial=0.0)), 1e-6)
+            norm = SymLogNorm(largest / 100.0, vmin=-largest, vmax=largest)
+            image = table.imshow(
+                nm, cmap="RdBu_r", norm=norm, aspect="auto", extent=(3.5, j[-1] + 0.5, 0.5, k[-1] + 0.5)
+            )
+            table.set_yticks(k, [term_label(int(n)) for n in k], fontsize=7)
+            table.set_ylabel("Noll index in the field")
+            figure_of(table).colorbar(image, ax=table, fraction=0.03, pad=0.01).set_label("coefficient [nm]")
+            bars.bar(j, np.sqrt((nm**2).sum(axis=0)), 0.75, color=BLUE, label="rms over the field")
+            bars.plot(
+                j, self.residual_rms[3:] * 1e9, "_", color=ORANGE, markersize=9, label="left by the field's terms"
+            )
+            bars.set_ylabel("size of the term [nm]")
+            bars.legend(loc="upper right")
+            name_terms(bars, j)
+            bars.set_xlabel("Noll index in the pupil")
+            figure.suptitle(
+                f"{nodes.telescope}: double Zernikes, pupil ({nodes.pupil}, obscuration {nodes.obscuration:g}) times "
+                f"field (radius {np.rad2deg(self.field_radius):.4g}°), {nodes.wavelength * 1e9:.4g} nm",
+                fontsize=11,
+            )
+            return figure
 
 
 def wavefront_zernikes(
@@ -289,3 +346,34 @@ def _fit(
         coefficients[i], *_ = np.linalg.lstsq(terms[lit] * root[lit, None], value[i, lit] * root[lit], rcond=None)
     rest = np.where(used, value - coefficients @ terms.T, 0.0)
     return coefficients, np.sqrt((rest**2 @ weights) / (used @ weights))
+
+
+def term_label(j: int) -> str:
+    """Return Noll index and name of a term."""
+    return f"{j} {NOLL_NAMES.get(j, '')}".strip()
+
+
+def name_terms(axes: Axes, j: np.ndarray) -> None:
+    """Label an axis of Noll indices."""
+    axes.axhline(0.0, color="0.3", linewidth=0.7)
+    if len(j) <= 45:
+        axes.set_xticks(j, [term_label(int(n)) for n in j], rotation=60, ha="right", rotation_mode="anchor")
+    axes.set_xlabel("Noll index")
+    axes.grid(True, axis="y", color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def _draw_maps(figure: Any, result: FieldZernikes, j: np.ndarray) -> None:
+    sizes = np.sqrt((result.coefficients[:, 3:] ** 2).mean(axis=0))
+    largest = np.sort(j[np.argsort(-sizes, kind="stable")[:_MAPS]])
+    panels = figure.subplots(2, _MAPS // 2, sharex=True, sharey=True).ravel()
+    for axes in panels[len(largest) :]:
+        axes.set_axis_off()
+    for axes, n in zip(panels, largest, strict=False):
+        nm = result.coefficients[:, n - 1] * 1e9
+        edge = max(float(np.abs(nm).max()), 1e-6)
+        image = draw_field_map(axes, result.fields, nm, cmap="RdBu_r", vmin=-edge, vmax=edge)
+        figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
+        axes.set_title(f"{term_label(int(n))} [nm]", fontsize=9)
+    figure.supxlabel("field x [deg]", fontsize=9)
+    figure.supylabel("field y [deg]", fontsize=9)

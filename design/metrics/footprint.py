@@ -9,19 +9,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.plotting import RED, styled
 from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace
-from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ..bundles import field_points, wavelength_points
+from ..drawing import FEW, field_colors, field_label, panel_grid
+from ..pupil_sampling import PupilSampling, pupil_sampling
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Points of an outline, and how far inside the annulus they lie, in units of its radius: a ray through the very rim is
 #: blocked or not by rounding.
 _RIM, _INSIDE = 181, 1e-6
+#: Points across the picture of a clear aperture.
+_ACROSS = 700
 
 
 @dataclass(frozen=True)
@@ -114,9 +119,19 @@ class Footprint:
 
     def plot(self) -> Figure:
         """Draw a panel for each surface: outlines of the footprints over the clear aperture."""
-        from ..plots.footprint import footprint_figure
-
-        return footprint_figure(self)
+        colors = field_colors(len(self.fields))
+        with styled():
+            large = len(self.surfaces) == 1
+            figure, panels = panel_grid(len(self.surfaces), *((6.0, 5.6) if large else (2.9, 3.0)))
+            for axes, footprint in zip(panels, self.surfaces, strict=True):
+                _draw_surface(axes, footprint, colors, [field_label(f) for f in self.fields])
+            panels[0].plot([], [], ".", color=RED, markersize=6.0, label="blocked here first")
+            handles, labels = panels[0].get_legend_handles_labels()
+            if len(self.fields) > FEW:
+                handles, labels = handles[-1:], labels[-1:]
+            figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 7))
+            figure.suptitle(f"{self.telescope}: footprints [mm]", fontsize=11)
+            return figure
 
 
 def footprint(
@@ -186,3 +201,47 @@ def footprint(
             )
         )
     return Footprint(telescope.name, points, float(w), tuple(footprints))
+
+
+def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return middle and half-width [m] of a picture: about the vertex, unless light keeps far away from it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
+    if np.linalg.norm(middle) > 2.0 * half:
+        return middle, 1.15 * half
+    return np.zeros(2), 1.15 * float(np.abs([low, high]).max())
+
+
+def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Any], names: list[str]) -> None:
+    from matplotlib.colors import ListedColormap
+
+    surface = footprint.surface
+    known = footprint.arriving_points().reshape(-1, 2)
+    known = known[np.isfinite(known).all(axis=-1)]
+    if not len(known):
+        axes.set_title(f"{surface.name}: no ray arrives", loc="left")
+        axes.set_axis_off()
+        return
+    middle, half = _frame(known)
+    x, y = (np.linspace(c - half, c + half, _ACROSS) for c in middle)
+    extent = tuple(1e3 * v for v in (x[0], x[-1], y[0], y[-1]))
+    if surface.aperture is not None:
+        clear = np.asarray(surface.aperture.contains(*np.meshgrid(x, y)))
+        axes.imshow(clear, extent=extent, cmap=ListedColormap(["0.8", "1.0"]), vmin=0, vmax=1, aspect="equal")
+    for i, (rims, color, name) in enumerate(zip(footprint.outlines, colors, names, strict=True)):
+        for k, (rim, arriving) in enumerate(zip(rims, footprint.outline_arriving[i], strict=True)):
+            axes.plot(*rim.T * 1e3, color=color, linewidth=0.6, alpha=0.3)
+            lit = np.where(arriving[:, None], rim, np.nan) * 1e3
+            axes.plot(*lit.T, color=color, linewidth=1.2, label=name if k == 0 else None)
+        light = footprint.position[i, footprint.arriving[i]]
+        if len(light) and np.ptp(light, axis=0).max() < 0.02 * half:
+            # A focus would not be seen without.
+            axes.plot(*light.mean(axis=0) * 1e3, ".", color=color, markersize=3.0)
+        blocked = footprint.arriving[i] & ~footprint.passing[i]
+        axes.plot(*footprint.position[i, blocked].T * 1e3, ".", color=RED, markersize=1.6, markeredgewidth=0.0)
+    axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
+    axes.tick_params(labelsize=7)
+    worst = float(footprint.blocked_fraction.max())
+    if worst > 0:
+        axes.set_xlabel(f"blocks up to {100 * worst:.2g} %", fontsize=8, color=RED)
+    axes.set_title(surface.name, loc="left", fontsize=9)

@@ -7,13 +7,17 @@ in the order in which the light meets them this is a telescope like any other, a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...core.errors import DomainError
+from ...core.errors import DomainError, unknown_name
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
+from ...raytrace.pack.surfaces import refractive_indices
+from ...raytrace.rays import Rays, RayStatus
+from ...raytrace.trace import trace
 
 
 @dataclass(frozen=True)
@@ -133,3 +137,79 @@ def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.
     s = (before * cosine - after * within) / (before * cosine + after * within)
     p = (after * cosine - before * within) / (after * cosine + before * within)
     return np.where(square > 0, 0.5 * (s**2 + p**2), 1.0)
+
+
+class Coatings:
+    """Reflectivity of every surface that is no mirror."""
+
+    def __init__(self, telescope: Telescope, given: float | Mapping[str, float] | None, detector: float) -> None:
+        lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT]
+        if isinstance(given, Mapping):
+            for name in given:
+                if name not in lenses:
+                    raise unknown_name(f"lens surface of {telescope.name}", name, lenses)
+            table = {name: float(value) for name, value in given.items()}
+        else:
+            table = {} if given is None else {name: float(given) for name in lenses}
+        last = telescope.surfaces[-1]
+        if last.interaction == Interaction.DETECTOR:
+            table[last.name] = float(detector)
+        for name, value in table.items():
+            if not 0.0 <= value <= 1.0:
+                raise DomainError(f"reflectivity of {name} = {value!r}: expected a number from 0 to 1")
+        self._fixed = {i: table[s.name] for i, s in enumerate(telescope.surfaces) if s.name in table}
+
+    def at(self, place: int, cosine: np.ndarray, before: float, after: float) -> np.ndarray:
+        """Return the reflectivity for light on its way from one index into another."""
+        if place in self._fixed:
+            return np.full_like(cosine, self._fixed[place])
+        return fresnel_reflectivity(cosine, before, after)
+
+
+@dataclass(frozen=True)
+class GhostLight:
+    """Rays of one way on the detector: places and directions in its own frame, and the light they bring."""
+
+    path: GhostPath
+    position: np.ndarray
+    direction: np.ndarray
+    weight: np.ndarray
+
+
+def follow(path: GhostPath, start: Rays, coatings: Coatings, threads: int | None) -> GhostLight:
+    """Trace rays along one way, and what each surface leaves of their light."""
+    telescope = path.telescope
+    met = trace(telescope, start, "all", threads=threads)
+    index = refractive_indices(telescope, start.wavelength)
+    weight = (met[-1].status == RayStatus.OK).astype(np.float64)
+    coming = start.direction
+    for k, (surface, place) in enumerate(zip(telescope.surfaces, path.source, strict=True)):
+        going = met[k].direction
+        if path.reflecting[k]:
+            # A mirror turns a ray by twice the cosine of incidence along the normal.
+            cosine = 0.5 * np.linalg.norm(going - coming, axis=-1)
+            # The medium on the other side is met on the other ways through this surface.
+            weight *= coatings.at(place, cosine, index[k], _other_index(path, k, index))
+        elif surface.interaction == Interaction.REFRACT:
+            normal = index[k + 1] * going - index[k] * coming
+            length = np.linalg.norm(normal, axis=-1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                # Between media of equal index there is no normal to be had, and nothing is reflected.
+                cosine = np.where(length > 1e-12, (coming * normal).sum(axis=-1) / length, 1.0)
+            weight *= 1.0 - coatings.at(place, cosine, index[k], index[k + 1])
+        coming = going
+    detector = telescope.surfaces[-1]
+    lit = weight > 0
+    return GhostLight(
+        path, detector.to_local(met[-1].position[lit])[:, :2], met[-1].direction[lit] @ detector.matrix, weight[lit]
+    )
+
+
+def _other_index(path: GhostPath, k: int, index: np.ndarray) -> float:
+    """Return the index behind a surface that reflects: the way crosses the second one beforehand, the first later."""
+    place = path.source[k]
+    for other, met in enumerate(path.source):
+        if met == place and other != k:
+            # Of the two media there, the other one than that in which the light is reflected.
+            return float(index[other + 1] if other > k else index[other])
+    return float(index[k])

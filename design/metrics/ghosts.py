@@ -14,19 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from ...core.errors import DomainError, unknown_name
-from ...models.surface import Interaction
+from ...core.errors import DomainError
+from ...core.plotting import RED, new_figure, styled
 from ...models.telescope import Telescope
-from ...raytrace.pack.surfaces import refractive_indices
-from ...raytrace.rays import Rays, RayStatus, launch_rays
-from ...raytrace.trace import trace
-from ...wavefront.bundles import trace_bundles
-from ...wavefront.pupil_sampling import spiral_annulus
-from ...wavefront.request import field_points, wavelength_points
-from .ghost_paths import GhostPath, fresnel_reflectivity, ghost_pairs, ghost_path
+from ...raytrace.rays import launch_rays
+from ..bundles import field_points, trace_bundles, wavelength_points
+from ..drawing import draw_circle, field_label
+from ..pupil_sampling import spiral_annulus
+from .ghost_paths import Coatings, GhostLight, GhostPath, follow, ghost_pairs, ghost_path
 from .principal_rays import principal_rays
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _RAYS = 40000
@@ -39,6 +38,8 @@ _MAP = 160
 #: Field of the star where none is given, over the radius of the field of view.
 _FIELD = 0.5
 DETECTOR_REFLECTIVITY = 0.15
+#: Ghosts that are drawn by themselves, and decades of irradiance that the map shows.
+_ALONE, _DECADES = 8, 4.0
 
 
 @dataclass(frozen=True)
@@ -149,9 +150,24 @@ class Ghosts:
 
     def plot(self) -> Figure:
         """Draw the irradiance of all ghosts on the detector, and the brightest of them in order."""
-        from ..plots.ghosts import ghosts_figure
-
-        return ghosts_figure(self)
+        with styled():
+            figure = new_figure(11.6, 5.3)
+            parts: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.12])
+            left, right = parts
+            _draw_map(left.subplots(), self)
+            shown = self.ghosts[:_ALONE]
+            panels = right.subplots(2, _ALONE // 2, squeeze=False).ravel()
+            for axes in panels[len(shown) :]:
+                axes.set_axis_off()
+            for axes, ghost, magnitude in zip(panels, shown, self.magnitudes, strict=False):
+                _draw_ghost(axes, ghost, float(magnitude))
+            right.suptitle("the brightest: reflected at, and then at", fontsize=9.5)
+            figure.suptitle(
+                f"{self.telescope}: ghosts of a star at {field_label(self.field)}, {self.wavelength * 1e9:.4g} nm, "
+                f"{100 * self.flux:.2g} % of its light (detector reflects {100 * self.detector_reflectivity:.3g} %)",
+                fontsize=11,
+            )
+            return figure
 
 
 def ghosts(
@@ -201,7 +217,7 @@ def ghosts(
         raise DomainError(f"rays = {rays!r}: expected a whole number of at least 400")
     (point,) = field_points(telescope, [0.0, _FIELD * telescope.field_radius] if field is None else [field])
     (w,) = wavelength_points(telescope, wavelength)
-    coatings = _Coatings(telescope, reflectivity, detector_reflectivity)
+    coatings = Coatings(telescope, reflectivity, detector_reflectivity)
     pairs = ghost_pairs(telescope)
     if not pairs:
         raise DomainError(
@@ -210,7 +226,7 @@ def ghosts(
     pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, int(rays)).points
     start = launch_rays(telescope, (point[0], point[1]), w, (pupil[:, 0], pupil[:, 1]), projection)
     nothing = GhostPath("", "", telescope, tuple(range(len(telescope.surfaces))), (False,) * len(telescope.surfaces))
-    image = _follow(nothing, start, coatings, threads)
+    image = follow(nothing, start, coatings, threads)
     if not image.weight.sum() > 0:
         raise DomainError(
             f"field = ({_degrees(point)}) deg: the star does not reach the detector; expected a lit pupil"
@@ -219,7 +235,7 @@ def ghosts(
     star = np.average(image.position, axis=0, weights=image.weight)
     landings = []
     for first, second in pairs:
-        landings.append(_follow(ghost_path(telescope, first, second), start, coatings, threads))
+        landings.append(follow(ghost_path(telescope, first, second), start, coatings, threads))
         if advance is not None:
             advance()
     rim = trace_bundles(
@@ -254,83 +270,7 @@ def ghosts(
     )
 
 
-class _Coatings:
-    """Reflectivity of every surface that is no mirror."""
-
-    def __init__(self, telescope: Telescope, given: float | Mapping[str, float] | None, detector: float) -> None:
-        lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT]
-        if isinstance(given, Mapping):
-            for name in given:
-                if name not in lenses:
-                    raise unknown_name(f"lens surface of {telescope.name}", name, lenses)
-            table = {name: float(value) for name, value in given.items()}
-        else:
-            table = {} if given is None else {name: float(given) for name in lenses}
-        last = telescope.surfaces[-1]
-        if last.interaction == Interaction.DETECTOR:
-            table[last.name] = float(detector)
-        for name, value in table.items():
-            if not 0.0 <= value <= 1.0:
-                raise DomainError(f"reflectivity of {name} = {value!r}: expected a number from 0 to 1")
-        self._fixed = {i: table[s.name] for i, s in enumerate(telescope.surfaces) if s.name in table}
-
-    def at(self, place: int, cosine: np.ndarray, before: float, after: float) -> np.ndarray:
-        """Return the reflectivity for light on its way from one index into another."""
-        if place in self._fixed:
-            return np.full_like(cosine, self._fixed[place])
-        return fresnel_reflectivity(cosine, before, after)
-
-
-@dataclass(frozen=True)
-class _Landing:
-    """Rays of one way on the detector: places and directions in its own frame, and the light they bring."""
-
-    path: GhostPath
-    position: np.ndarray
-    direction: np.ndarray
-    weight: np.ndarray
-
-
-def _follow(path: GhostPath, start: Rays, coatings: _Coatings, threads: int | None) -> _Landing:
-    """Trace rays along one way, and what each surface leaves of their light."""
-    telescope = path.telescope
-    met = trace(telescope, start, "all", threads=threads)
-    index = refractive_indices(telescope, start.wavelength)
-    weight = (met[-1].status == RayStatus.OK).astype(np.float64)
-    coming = start.direction
-    for k, (surface, place) in enumerate(zip(telescope.surfaces, path.source, strict=True)):
-        going = met[k].direction
-        if path.reflecting[k]:
-            # A mirror turns a ray by twice the cosine of incidence along the normal.
-            cosine = 0.5 * np.linalg.norm(going - coming, axis=-1)
-            # The medium on the other side is met on the other ways through this surface.
-            weight *= coatings.at(place, cosine, index[k], _other_index(path, k, index))
-        elif surface.interaction == Interaction.REFRACT:
-            normal = index[k + 1] * going - index[k] * coming
-            length = np.linalg.norm(normal, axis=-1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                # Between media of equal index there is no normal to be had, and nothing is reflected.
-                cosine = np.where(length > 1e-12, (coming * normal).sum(axis=-1) / length, 1.0)
-            weight *= 1.0 - coatings.at(place, cosine, index[k], index[k + 1])
-        coming = going
-    detector = telescope.surfaces[-1]
-    lit = weight > 0
-    return _Landing(
-        path, detector.to_local(met[-1].position[lit])[:, :2], met[-1].direction[lit] @ detector.matrix, weight[lit]
-    )
-
-
-def _other_index(path: GhostPath, k: int, index: np.ndarray) -> float:
-    """Return the index behind a surface that reflects: the way crosses the second one beforehand, the first later."""
-    place = path.source[k]
-    for other, met in enumerate(path.source):
-        if met == place and other != k:
-            # Of the two media there, the other one than that in which the light is reflected.
-            return float(index[other + 1] if other > k else index[other])
-    return float(index[k])
-
-
-def _measure(landing: _Landing, direct: float) -> Ghost:
+def _measure(landing: GhostLight, direct: float) -> Ghost:
     # Rays that graze the detector may land anywhere: what counts is where most of the light is.
     around = np.median(landing.position, axis=0)
     core = _within(landing.position - around, landing.weight, _CORE)
@@ -366,7 +306,7 @@ def _within(off: np.ndarray, weight: np.ndarray, share: float) -> np.ndarray:
     return distance <= distance[order][np.searchsorted(held, share * held[-1])]
 
 
-def _irradiance(landing: _Landing, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _irradiance(landing: GhostLight, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the light per area in cells of given edges, [y, x]."""
     light, _, _ = np.histogram2d(landing.position[:, 1], landing.position[:, 0], bins=[y, x], weights=landing.weight)
     return light / np.outer(np.diff(y), np.diff(x))
@@ -374,3 +314,47 @@ def _irradiance(landing: _Landing, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _degrees(field: np.ndarray) -> str:
     return "{:.6g}, {:.6g}".format(*np.rad2deg(field))
+
+
+def _draw_map(axes: Axes, result: Ghosts) -> None:
+    from matplotlib.colors import LogNorm
+
+    light = result.irradiance * 1e-6
+    edges = result.edges * 1e3
+    top = float(light.max())
+    if top > 0:
+        shown: Any = axes.pcolormesh(
+            edges, edges, np.maximum(light, 1e-300), norm=LogNorm(top * 10.0**-_DECADES, top), cmap="magma"
+        )
+        axes.set_facecolor("black")
+        key = axes.figure.colorbar(shown, ax=axes, shrink=0.82, pad=0.02)
+        key.set_label("part of the star's light per mm²")
+    axes.plot(*(result.star * 1e3), "+", color="white", markersize=9.0, markeredgewidth=1.2)
+    axes.annotate(
+        "star",
+        (result.star[0] * 1e3, result.star[1] * 1e3),
+        xytext=(6, 5),
+        textcoords="offset points",
+        color="white",
+        fontsize=8,
+    )
+    draw_circle(axes, result.image_radius * 1e3, color="0.75", style=(0, (4, 3)))
+    axes.set(aspect="equal", xlim=(edges[0], edges[-1]), ylim=(edges[0], edges[-1]))
+    axes.set(xlabel="detector x [mm]", ylabel="detector y [mm]")
+
+
+def _draw_ghost(axes: Axes, ghost: Ghost, magnitude: float) -> None:
+    light = np.where(ghost.irradiance > 0, ghost.irradiance, np.nan) * 1e-6
+    x, y = ghost.edges * 1e3
+    axes.pcolormesh(x, y, light, cmap="magma", vmin=0.0)
+    axes.set_facecolor("black")
+    axes.set_aspect("equal")
+    axes.set(xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set_color("0.8")
+    axes.set_title(f"{ghost.first}\n{ghost.second}", fontsize=8, color=RED)
+    axes.set_xlabel(
+        f"⌀ {ghost.diameter * 1e3:.3g} mm\nflux {ghost.flux:.2g}\n"
+        f"peak {ghost.peak * 1e-6:.2g}/mm²\n{magnitude:.1f} mag/arcsec²",
+        fontsize=7.5,
+    )

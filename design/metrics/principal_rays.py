@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.plotting import BLUE, GREY, ORANGE, new_figure, styled
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace
-from ...wavefront.bundles import trace_bundles
 from ...wavefront.pupil_optics import JACOBIAN_STEP
-from ...wavefront.pupil_sampling import pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ..bundles import field_points, trace_bundles, wavelength_points
+from ..pupil_sampling import pupil_sampling
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,9 +109,34 @@ class PrincipalRays:
 
     def plot(self) -> Figure:
         """Draw focal ratio, plate scale, exit pupil and incidence against the distance from the axis."""
-        from ..plots.principal_rays import principal_rays_figure
-
-        return principal_rays_figure(self)
+        radius = np.rad2deg(np.linalg.norm(self.fields, axis=-1))
+        order = np.argsort(radius, kind="stable")
+        scale = np.rad2deg(self.plate_scale) * 3600e-6
+        pairs = [
+            ("working focal ratio", self.f_number),
+            ('plate scale ["/µm]', scale),
+            ("exit pupil, from the detector [m]", self.exit_pupil_distance),
+            ("diameter of the exit pupil [m]", self.exit_pupil_diameter),
+        ]
+        with styled():
+            figure = new_figure(11.0, 6.4)
+            panels = figure.subplots(2, 3, sharex=True).ravel()
+            for axes, (label, values) in zip(panels, pairs, strict=False):
+                axes.plot(radius[order], values[order, 0], ".-", color=BLUE, label="tangential")
+                axes.plot(radius[order], values[order, 1], ".-", color=ORANGE, label="sagittal")
+                axes.set_ylabel(label)
+            panels[0].legend(loc="best")
+            panels[4].plot(radius[order], np.rad2deg(self.chief_angle[order]), ".-", color=GREY)
+            panels[4].set_ylabel("incidence of the chief ray [deg]")
+            panels[5].set_axis_off()
+            for axes in panels[:5]:
+                axes.grid(True, color="0.92", linewidth=0.6)
+                axes.ticklabel_format(useOffset=False)
+            for axes in panels[2:5]:
+                axes.set_xlabel("distance from the axis [deg]")
+                axes.tick_params(labelbottom=True)
+            figure.suptitle(f"{self.telescope}: chief and marginal rays, {self.wavelength * 1e9:.4g} nm", fontsize=11)
+            return figure
 
 
 def principal_rays(

@@ -6,18 +6,32 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
+from ...core.plotting import BLUE, RED, styled
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling
-from ...wavefront.request import Request
+from ..bundles import field_points, trace_bundles, wavelength_points
+from ..drawing import (
+    bare_frame,
+    draw_circle,
+    draw_scale_bar,
+    field_label,
+    panel_grid,
+    round_length,
+    wavelength_colors,
+)
+from ..pupil_sampling import PupilSampling, pupil_sampling
 from .principal_rays import principal_rays
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 REFERENCES = ("centroid", "chief")
+#: The frame reaches no farther than so many times the radius of 80 % of the rays: stray rays would hide the spots.
+_FARTHEST = 5.0
+#: Dots in one panel beyond which every second, third... ray is left out of the picture.
+_DOTS = 6000
 
 
 @dataclass(frozen=True)
@@ -124,9 +138,24 @@ class SpotDiagram:
 
     def plot(self) -> Figure:
         """Draw a panel for each field, all on one scale, with the Airy disc and a scale bar."""
-        from ..plots.spots import spots_figure
-
-        return spots_figure(self)
+        share = self.radius_holding(0.8)
+        light = np.nanmax(self.geometric_radius, initial=0.0), _FARTHEST * np.nanmax(share, initial=0.0)
+        half = 1.08e6 * max(float(min(light)), float(np.nanmax(self.airy_radius, initial=1e-9)))
+        with styled():
+            figure, panels = panel_grid(len(self.fields), 2.5, 3.0)
+            for i, axes in enumerate(panels):
+                _draw_spot(axes, self, i, half, share[i])
+            bar = round_length(0.7 * half)
+            arcsec = bar * 1e-6 * float(np.rad2deg(self.plate_scale[0])) * 3600.0
+            draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcsec:.3g}"')
+            handles, labels = panels[0].get_legend_handles_labels()
+            legend = figure.legend(
+                handles, labels, loc="outside lower center", ncols=min(len(labels), 7), markerscale=3.0
+            )
+            for handle in filter(None, legend.legend_handles):
+                handle.set_alpha(1.0)
+            figure.suptitle(f"{self.telescope}: spots about the centroid", fontsize=11)
+            return figure
 
     def _mean(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted mean of values [n_field, n_wave, n_pupil, 2] over the rays of each field."""
@@ -140,12 +169,11 @@ class SpotDiagram:
 
 def spots(
     telescope: Telescope,
-    fields: ArrayLike | None = None,
-    wavelengths: ArrayLike | None = None,
+    fields: Any = None,
+    wavelengths: Any = None,
     *,
-    wavelength_weights: ArrayLike | None = None,
+    wavelength_weights: Any = None,
     sampling: str | PupilSampling = "gauss",
-    n_pupil: int | None = None,
     reference: str = "centroid",
     projection: str = "zemax",
     threads: int | None = None,
@@ -156,10 +184,20 @@ def spots(
     ----------
     telescope : Telescope
         The telescope.
-    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
-        As in :meth:`pachon.Request.of`.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; five from the axis to the edge by default.
+    wavelengths : array_like or Quantity, shape [n_wave], optional
+        Vacuum wavelengths [m]; the telescope's own by default.
+    wavelength_weights : array_like, shape [n_wave], optional
+        Relative amounts of light; equal by default.
+    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+        Points of the pupil.
     reference : {"centroid", "chief"}
-        Origin of the displacements: the centroid, or the chief ray of the middle wavelength.
+        What the displacements start from: the centroid, or the chief ray of the middle wavelength.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
 
     Raises
     ------
@@ -170,29 +208,23 @@ def spots(
     """
     if reference not in REFERENCES:
         raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
-    request = Request.of(
-        telescope,
-        fields,
-        wavelengths,
-        wavelength_weights=wavelength_weights,
-        sampling=sampling,
-        n_pupil=n_pupil,
-        projection=projection,
-        threads=threads,
-    )
-    bundles = [request.bundles(float(w)) for w in request.wavelengths]
-    principal = principal_rays(telescope, request.fields, request.middle, projection=projection, threads=threads)
-    chief = bundles[len(bundles) // 2].chief_landing()
+    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+    shares = checked_weights(wavelength_weights, len(waves))
+    pupil = pupil_sampling(telescope, sampling)
+    middle = len(waves) // 2
+    bundles = [trace_bundles(telescope, points, float(w), pupil.points, projection, threads) for w in waves]
+    principal = principal_rays(telescope, points, waves[middle], projection=projection, threads=threads)
+    chief = bundles[middle].chief_landing()
     lit = np.stack([b.lit for b in bundles], axis=1)
     diagram = SpotDiagram(
         telescope=telescope.name,
-        fields=request.fields,
-        wavelengths=request.wavelengths,
+        fields=points,
+        wavelengths=waves,
         displacement=np.stack([b.landing() for b in bundles], axis=1) - chief[:, None, None],
-        weight=np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0),
+        weight=np.where(lit, shares[:, None] * pupil.weights, 0.0),
         reference=chief,
         plate_scale=principal.mean_plate_scale,
-        airy_radius=1.22 * request.middle * principal.mean_f_number,
+        airy_radius=1.22 * waves[middle] * principal.mean_f_number,
     )
     if reference == "chief":
         return diagram
@@ -206,3 +238,42 @@ def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) ->
     held = np.add.reduceat(weights, starts)
     middle = (np.cumsum(held) - 0.5 * held) / held.sum()
     return float(np.interp(share, middle, values[starts]))
+
+
+def checked_weights(weights: Any, count: int) -> np.ndarray:
+    """Return relative weights of so many wavelengths, of sum 1; equal where none are given.
+
+    Raises
+    ------
+    DomainError
+        If there are more or fewer, or one is negative, or all are zero.
+    """
+    values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
+        raise DomainError(f"wavelength_weights = {weights!r}: expected {count} numbers, none negative, not all zero")
+    return values / values.sum()
+
+
+def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, share: float) -> None:
+    centered = (spots.displacement[i] - spots.centroid[i]) * 1e6
+    names = [f"{w * 1e9:.4g} nm" for w in spots.wavelengths]
+    colors = wavelength_colors(len(names)) if len(names) > 1 else [BLUE]
+    step = -(-spots.weight[i].size // _DOTS)
+    for xy, weight, name, color in zip(centered, spots.weight[i], names, colors, strict=True):
+        lit = np.flatnonzero(weight > 0)[::step]
+        axes.plot(*xy[lit].T, ".", markersize=1.6, markeredgewidth=0.0, color=color, alpha=0.7, label=name)
+    draw_circle(axes, spots.airy_radius[i] * 1e6, color="black", style="-", label="Airy disc")
+    draw_circle(axes, share * 1e6, color=RED, style=(0, (4, 2)), label="80 % of the rays")
+    bare_frame(axes, half)
+    scale = float(np.rad2deg(spots.plate_scale[i])) * 3600.0
+    rms = spots.rms_radius[i]
+    text = f'rms {rms * 1e6:.3g} µm = {rms * scale:.3g}"\n80 % {share * 1e6:.3g} µm = {share * scale:.3g}"'
+    if not np.isfinite(rms):
+        text = "no light arrives"
+    elif spots.lit_fraction[i] < 0.995:
+        text += f"\nlit {100 * spots.lit_fraction[i]:.1f} % of the pupil"
+    beyond = float(spots.weight[i][np.abs(centered).max(axis=-1) > half].sum())
+    if beyond > 0:
+        text += f"\n{100 * beyond / spots.lit_fraction[i]:.2g} % of the rays beyond the frame"
+    axes.set_title(field_label(spots.fields[i]), fontsize=9.5)
+    axes.set_xlabel(text, fontsize=7.5)

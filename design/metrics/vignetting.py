@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.plotting import BLUE, figure_of, new_figure, styled
 from ...models.telescope import Telescope
-from ...wavefront.bundles import bundle_blocks
-from ...wavefront.pupil_sampling import spiral_annulus
-from ...wavefront.request import field_points, wavelength_points
+from ..bundles import bundle_blocks, field_points, wavelength_points
+from ..drawing import draw_field_map, spread_in_field
+from ..pupil_sampling import spiral_annulus
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Rings and spokes of field points where none are given.
@@ -71,9 +73,19 @@ class Vignetting:
 
     def plot(self) -> Figure:
         """Draw the light relative to the axis against the distance from it and, where fields suffice, as a map."""
-        from ..plots.vignetting import vignetting_figure
-
-        return vignetting_figure(self)
+        with_map = spread_in_field(self.fields)
+        with styled():
+            figure = new_figure(11.0 if with_map else 6.5, 4.6)
+            panels = figure.subplots(1, 2 if with_map else 1, squeeze=False)[0]
+            _draw_profile(panels[0], self)
+            if with_map:
+                _draw_map(panels[1], self)
+            figure.suptitle(
+                f"{self.telescope}: vignetting at {self.wavelength * 1e9:.4g} nm; "
+                f"on the axis {100 * self.axis_fraction:.1f} % of the annular pupil is lit",
+                fontsize=11,
+            )
+            return figure
 
 
 def vignetting(
@@ -144,3 +156,37 @@ def field_disc(telescope: Telescope, rings: int = _RINGS, spokes: int = _SPOKES)
     angle = 2.0 * np.pi * np.arange(spokes) / spokes
     disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(-1, 2)
     return np.concatenate([np.zeros((1, 2)), disc])
+
+
+def _draw_profile(axes: Axes, result: Vignetting) -> None:
+    radius = np.rad2deg(np.linalg.norm(result.fields, axis=-1))
+    percent = 100.0 * result.relative
+    axes.errorbar(
+        radius,
+        percent,
+        100.0 * result.error / result.axis_fraction,
+        fmt=".",
+        color=BLUE,
+        ecolor="0.6",
+        elinewidth=0.7,
+        markersize=3.5,
+        label="field points, with their errors",
+    )
+    rounded = np.round(radius, 6)
+    rings = np.unique(rounded)
+    if len(rings) < len(radius):
+        axes.plot(rings, [percent[rounded == r].mean() for r in rings], color=BLUE, linewidth=1.3, label="mean")
+    axes.axhline(100.0, color="0.6", linewidth=0.7)
+    axes.set_xlim(left=0.0)
+    axes.set_ylim(top=max(101.0, float(percent.max()) + 1.0))
+    axes.set_xlabel("distance from the axis [deg]")
+    axes.set_ylabel("light relative to the axis [%]")
+    axes.grid(True, color="0.92", linewidth=0.6)
+    axes.legend(loc="lower left")
+
+
+def _draw_map(axes: Axes, result: Vignetting) -> None:
+    image = draw_field_map(axes, result.fields, 100.0 * result.relative, cmap="viridis")
+    axes.set_xlabel("field x [deg]")
+    axes.set_ylabel("field y [deg]")
+    figure_of(axes).colorbar(image, ax=axes, fraction=0.046, pad=0.02).set_label("light relative to the axis [%]")

@@ -16,9 +16,13 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.gradient import landing_seeds, sweep
 from ...raytrace.rays import Rays, RayStatus, field_direction, parallel_rays
 from ...raytrace.trace import trace
-from ...wavefront.pupil_sampling import PupilSampling
+from ..bundles import field_points, wavelength_points
+from ..pupil_sampling import PupilSampling, pupil_sampling
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
+
+#: Points along the radius of the pupil by default.
+_RINGS = 6
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,32 @@ class Beams:
                 raise DomainError(f"field = ({x:.6g}, {y:.6g}) deg: no ray reaches the image of {telescope.name}")
             found.append(lit / total * self.field_weights[:, None])
         return np.array(found) * self.wavelength_weights[:, None, None]
+
+
+def beams(
+    telescope: Telescope,
+    fields: Any = None,
+    wavelengths: Any = None,
+    field_weights: Any = None,
+    wavelength_weights: Any = None,
+    sampling: Any = "gauss",
+    count: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Beams:
+    """Return the rays of a merit; parameters are those of :func:`~.optimize.optimize`."""
+    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+    pupil = pupil_sampling(telescope, sampling, _RINGS if count is None and sampling == "gauss" else count)
+    by_field = _weights(field_weights, len(points), "field")
+    by_wavelength = _weights(wavelength_weights, len(waves), "wavelength")
+    return Beams(points, waves, pupil, by_field, by_wavelength, projection, threads)
+
+
+def _weights(given: Any, count: int, name: str) -> np.ndarray:
+    weights = np.ones(count) if given is None else np.asarray(given, dtype=np.float64)
+    if weights.shape != (count,) or not np.isfinite(weights).all() or (weights < 0).any() or not weights.any():
+        raise DomainError(f"{name}_weights: expected {count} numbers, none negative and not all zero")
+    return weights / weights.sum()
 
 
 class Merit(Protocol):

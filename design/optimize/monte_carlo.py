@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError, PachonError
+from ...core.plotting import BLUE, GREY, RED, new_figure, styled
 from ...models.telescope import Telescope
 from ..parameters.degrees_of_freedom import DegreesOfFreedom
 from ..parameters.tolerances import Tolerance, draw
 from .jacobian import ParameterColumns
-from .merit import Beams, Merit, SpotMerit, WavefrontMerit
-from .optimize import NO_EFFECT, beams
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit, beams
+from .optimize import NO_EFFECT
 from .sensitivity import field_rings
 
 if TYPE_CHECKING:
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 MERITS: dict[str, Callable[[Telescope, Beams], Merit]] = {"wavefront": WavefrontMerit, "spots": SpotMerit}
 _SHARES = (50, 80, 90, 95)
+#: So many tolerances are drawn, the largest contributions first.
+_BARS = 20
+_TITLES = {"wavefront": "rms wavefront", "spots": "rms spot radius"}
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,38 @@ class MonteCarlo:
 
     def plot(self) -> Figure:
         """Draw how the merit is distributed, and what each tolerance contributes."""
-        from ..plots.monte_carlo import monte_carlo_figure
-
-        return monte_carlo_figure(self)
+        finite = np.sort(self.merit[np.isfinite(self.merit)])
+        highest = float(finite.max(initial=self.nominal))
+        unit, scale = ("nm", 1e9) if highest < 1e-6 else ("µm", 1e6)
+        shown = np.argsort(self.contribution)[::-1][:_BARS]
+        with styled():
+            figure = new_figure(9.0, max(3.4, 1.2 + 0.19 * len(shown)))
+            left, right = figure.subplots(1, 2)
+            share = 100.0 * np.arange(1, len(finite) + 1) / len(self.merit)
+            left.step(finite * scale, share, where="post", color=BLUE)
+            left.axvline(self.nominal * scale, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
+            for percent in (50, 95):
+                value = self.at_most(percent / 100.0) * scale
+                if np.isfinite(value):
+                    left.plot(value, percent, "o", color=RED, markersize=4.0)
+                    left.annotate(
+                        f"{percent} %: {value:.4g}", (value, percent), (6, -3), textcoords="offset points", va="top"
+                    )
+            left.set(
+                xlabel=f"{_TITLES[self.merit_name]} [{unit}]", ylabel="telescopes at most there [%]", ylim=(0, 103)
+            )
+            left.margins(x=0.12)
+            left.legend(loc="lower right")
+            left.set_title(f"{len(self.merit)} draws, {self.method}")
+            right.barh(np.arange(len(shown)), self.contribution[shown] * scale, color=BLUE, height=0.7)
+            right.set_yticks(np.arange(len(shown)), [self.tolerances[i].name for i in shown])
+            right.invert_yaxis()
+            right.set_xlabel(f"contribution, added in squares [{unit}]")
+            compensated = f", compensated by {', '.join(self.compensators)}" if self.compensators else ""
+            more = f" (largest {_BARS} of {len(self.contribution)})" if len(self.contribution) > _BARS else ""
+            right.set_title(f"each tolerance alone{more}")
+            figure.suptitle(f"{self.telescope}: within tolerances{compensated}", fontsize=11)
+            return figure
 
 
 def monte_carlo(

@@ -10,22 +10,19 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ...core.errors import ConfigError, DomainError, PachonError
+from ...core.plotting import BLUE, GREY, new_figure, styled
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
-from ...wavefront.pupil_sampling import pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
 from ..parameters.parameters import Parameter, apply, parse_parameters
 from .jacobian import ParameterColumns
-from .merit import Beams, Merit, SpotMerit, WavefrontMerit
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit, beams
 from .targets import FocalLength, Target
 from .wavefront_derivatives import WavefrontBlock
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Points along the radius of the pupil by default.
-_RINGS = 6
 #: A variable whose effect is below this fraction of what single surfaces do to single rays has none: it is rounding.
 NO_EFFECT = 1e-11
 #: Effect of the longest first step, in units of the merit at the start.
@@ -101,9 +98,24 @@ class Optimum:
 
     def plot(self) -> Figure:
         """Draw the merit step by step, and how much each variable's change did."""
-        from ..plots.sensitivity import optimum_figure
+        from matplotlib.ticker import MaxNLocator
 
-        return optimum_figure(self)
+        with styled():
+            names = [p.address for p in self.variables]
+            figure = new_figure(8.4, max(3.2, 1.4 + 0.24 * len(names)))
+            steps, bars = figure.subplots(1, 2)
+            steps.semilogy(range(len(self.history)), self.history * 1e6, "o-", color=BLUE, markersize=4)
+            steps.xaxis.set_major_locator(MaxNLocator(integer=True))
+            steps.grid(True, which="major", linewidth=0.3)
+            steps.set_xlabel("step")
+            steps.set_ylabel(f"rms of {self.merit_name} [µm]")
+            places = np.arange(len(names))
+            bars.barh(places, np.abs(self.changes) * self.effect * 1e6, color=GREY, height=0.7)
+            bars.set_yticks(places, names)
+            bars.invert_yaxis()
+            bars.set_xlabel("change of each times its effect, rms [µm]")
+            steps.set_title(self.telescope.name)
+            return figure
 
 
 @one_blas_thread()
@@ -157,7 +169,7 @@ def optimize(
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
         Wavefronts to be reached [m], in place of none (:func:`wavefronts` gives those of a telescope).
     sampling, count :
-        Points of the pupil, see :func:`~pachon.wavefront.pupil_sampling.pupil_sampling`.
+        Points of the pupil, see :func:`~pachon.design.pupil_sampling.pupil_sampling`.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     tolerance : float
@@ -230,25 +242,6 @@ def optimize(
         collinear=collinear,
         message=str(done.message),
     )
-
-
-def beams(
-    telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
-    field_weights: Any = None,
-    wavelength_weights: Any = None,
-    sampling: Any = "gauss",
-    count: int | None = None,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> Beams:
-    """Return the rays of a merit; parameters are those of :func:`optimize`."""
-    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    pupil = pupil_sampling(telescope, sampling, _RINGS if count is None and sampling == "gauss" else count)
-    by_field = _weights(field_weights, len(points), "field")
-    by_wavelength = _weights(wavelength_weights, len(waves), "wavelength")
-    return Beams(points, waves, pupil, by_field, by_wavelength, projection, threads)
 
 
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
@@ -332,13 +325,6 @@ def _merit(name: str, telescope: Telescope, rays: Beams, reference: str, goal: A
     if goal is not None:
         raise ConfigError("goal is given: expected merit = 'wavefront' with it")
     return SpotMerit(telescope, rays, reference)
-
-
-def _weights(given: Any, count: int, name: str) -> np.ndarray:
-    weights = np.ones(count) if given is None else np.asarray(given, dtype=np.float64)
-    if weights.shape != (count,) or not np.isfinite(weights).all() or (weights < 0).any() or not weights.any():
-        raise DomainError(f"{name}_weights: expected {count} numbers, none negative and not all zero")
-    return weights / weights.sum()
 
 
 def _bounds(

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.plotting import BLUE, new_figure, styled
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import annular_zernikes
 from ...raytrace.rays import RayStatus
-from ...wavefront.pupil_sampling import pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ..bundles import field_points, wavelength_points
 from ..parameters.parameters import Parameter, parse_parameters
+from ..pupil_sampling import pupil_sampling
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
@@ -101,9 +102,33 @@ class Sensitivity:
 
     def plot(self) -> Figure:
         """Draw the matrix, and the singular values of the degrees of freedom."""
-        from ..plots.sensitivity import sensitivity_figure
+        from matplotlib.ticker import MaxNLocator
 
-        return sensitivity_figure(self)
+        first = min(4, self.matrix.shape[1])
+        size = np.sqrt((self.matrix[:, first - 1 :] ** 2).mean(axis=0))
+        largest = size.max(axis=0)
+        with styled():
+            names = [p.address for p in self.parameters]
+            figure = new_figure(min(14.0, 4.5 + 0.22 * len(names)), 4.6)
+            axes, modes = figure.subplots(1, 2, width_ratios=[2.2, 1.0])
+            shown = np.log10(np.maximum(size / np.where(largest > 0, largest, 1.0), 1e-4))
+            last = self.matrix.shape[1]
+            box = (-0.5, len(names) - 0.5, first - 0.5, last + 0.5)
+            image = axes.imshow(shown, extent=box, cmap="viridis", aspect="auto", vmin=-4.0, vmax=0.0)
+            bar = figure.colorbar(image, ax=axes, label="of the largest term of each", ticks=range(-4, 1))
+            bar.ax.set_yticklabels([f"$10^{{{k}}}$" if k else "1" for k in range(-4, 1)])
+            axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8 if len(names) <= 24 else 5)
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.set_ylabel("Noll index")
+            axes.set_title(f"{self.telescope}, {self.wavelength * 1e9:g} nm: rms over {len(self.fields)} fields")
+            values, _ = self.modes()
+            modes.semilogy(np.arange(1, len(values) + 1), values, "o-", color=BLUE, markersize=3.5, linewidth=0.9)
+            modes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            modes.grid(True, which="major", linewidth=0.3)
+            modes.set_xlabel("mode")
+            modes.set_ylabel("singular value, each parameter scaled to 1")
+            modes.set_title("what can be told apart")
+            return figure
 
 
 def field_rings(telescope: Telescope) -> np.ndarray:

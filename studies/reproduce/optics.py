@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...design.images.encircled_energy import energy_curve
-from ...design.layout import outer_radius, ray_paths, surface_section
+from ...design.layout_parts import outer_radius, ray_paths, surface_section
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS

@@ -9,8 +9,9 @@ import trimesh
 
 import pachon
 from pachon.core.plotting import png_bytes
-from pachon.design.layout import layout, outer_radius, surface_section
-from pachon.design.layout_model import surface_mesh, tubes
+from pachon.design.layout import layout
+from pachon.design.layout_meshes import surface_mesh, tubes
+from pachon.design.layout_parts import outer_radius, surface_section
 from pachon.models.aperture import Complement, Intersection, Polygon, Rectangle, Union, Vane
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction

@@ -9,7 +9,8 @@ from trimesh.visual.material import PBRMaterial
 
 from ..models.aperture import Annulus, Circle
 from ..models.surface import Interaction, Surface
-from .layout import Layout, clear_region
+from ..models.telescope import Telescope
+from .layout_parts import Lens, clear_region
 
 #: Points of a surface along the radius and around.
 _RINGS, _SPOKES = 24, 120
@@ -34,11 +35,21 @@ _RAY_COLORS = (
 _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
 
-def layout_scene(layout: Layout) -> trimesh.Scene:
-    """Return a telescope as a scene of named meshes [m]; y points to the sky, as viewers of glTF have it up."""
+def layout_scene(
+    telescope: Telescope,
+    lenses: tuple[Lens, ...],
+    reach: dict[str, float],
+    fields: np.ndarray,
+    bundles: tuple[np.ndarray, ...],
+    size: float,
+) -> trimesh.Scene:
+    """Return a telescope as a scene of named meshes [m]; y points to the sky, as viewers of glTF have it up.
+
+    Parameters are the attributes of :class:`~.layout.Layout`; `size` is its largest extent [m].
+    """
     scene = trimesh.Scene()
-    glass = {name for lens in layout.lenses for name in (lens.front, lens.back)}
-    surfaces = {s.name: s for s in layout.telescope.surfaces}
+    glass = {name for lens in lenses for name in (lens.front, lens.back)}
+    surfaces = {s.name: s for s in telescope.surfaces}
 
     def add(name: str, mesh: trimesh.Trimesh, look: tuple[tuple[float, float, float, float], float, float]) -> None:
         if len(mesh.faces):
@@ -55,9 +66,9 @@ def layout_scene(layout: Layout) -> trimesh.Scene:
             )
             scene.add_geometry(mesh, node_name=name, geom_name=name, transform=_UPRIGHT)
 
-    for lens in layout.lenses:
-        faces = [surface_mesh(surfaces[name], layout.reach[name]) for name in (lens.front, lens.back)]
-        edge = _wall(*(_rim(surfaces[name], layout.reach[name]) for name in (lens.front, lens.back)))
+    for lens in lenses:
+        faces = [surface_mesh(surfaces[name], reach[name]) for name in (lens.front, lens.back)]
+        edge = _wall(*(_rim(surfaces[name], reach[name]) for name in (lens.front, lens.back)))
         mirrors = [n for n in (lens.front, lens.back) if surfaces[n].interaction == Interaction.MIRROR]
         whole = trimesh.util.concatenate([*faces, edge])
         assert isinstance(whole, trimesh.Trimesh)
@@ -69,13 +80,13 @@ def layout_scene(layout: Layout) -> trimesh.Scene:
         look = {Interaction.MIRROR: "mirror", Interaction.DETECTOR: "detector", Interaction.PASS: "baffle"}
         add(
             _unused(scene, name),
-            surface_mesh(surface, layout.reach[name]),
+            surface_mesh(surface, reach[name]),
             _LOOKS[look.get(surface.interaction, "glass")],
         )
-    for obstruction in layout.telescope.obstructions:
+    for obstruction in telescope.obstructions:
         add(_unused(scene, obstruction.name), obstruction.mesh, _LOOKS["baffle"])
-    radius = 0.5 * _RAY * float(layout.size.max())
-    for i, (field, bundle) in enumerate(zip(layout.fields, layout.bundles, strict=True)):
+    radius = 0.5 * _RAY * size
+    for i, (field, bundle) in enumerate(zip(fields, bundles, strict=True)):
         x, y = np.rad2deg(field)
         mesh = tubes(bundle, radius)
         add(_unused(scene, f"rays {x:+.4g} {y:+.4g} deg"), mesh, (_RAY_COLORS[i % len(_RAY_COLORS)], 0.0, 0.8))

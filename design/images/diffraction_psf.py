@@ -1,0 +1,213 @@
+"""Diffraction images of several field points, their sizes and their plot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.ndimage import zoom
+
+from ...core.plotting import new_figure, styled
+from ..drawing import draw_circle, draw_scale_bar, field_colors, field_label, round_length
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Images are interpolated to so many times as many pixels for their widths.
+_FINER = 4
+#: Decades below the brightest pixel that the plot shows.
+_DECADES = 4.0
+#: Panels in a row; cuts are drawn of one row.
+_MOST = 5
+
+
+@dataclass(frozen=True)
+class DiffractionPsf:
+    """Diffraction images of several field points, all wavelengths together.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    method : {"fft", "huygens"}
+        How the images were made.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    image : ndarray, shape [n_field, ny, nx]
+        Part of the light of the image that falls on each pixel, sampled at its centre; [y, x], y up. The sum falls
+        short of 1 by what falls beside.
+    pixel : float
+        Distance of pixel centres [m].
+    reference : ndarray, shape [n_field, 2]
+        Detector coordinates [m] of the middle of the images.
+    light : ndarray, shape [n_field]
+        Part of the entrance pupil that is lit, mean over the wavelengths.
+    strehl : ndarray, shape [n_field]
+        Peak of the image over that of the same light with all wavefronts perfect and together.
+    airy_radius : ndarray, shape [n_field]
+        Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m].
+    plate_scale : ndarray, shape [n_field]
+        Angle on the sky over length on the detector [rad/m].
+    pupil_points : int
+        Points across the pupil.
+    """
+
+    telescope: str
+    method: str
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    image: np.ndarray
+    pixel: float
+    reference: np.ndarray
+    light: np.ndarray
+    strehl: np.ndarray
+    airy_radius: np.ndarray
+    plate_scale: np.ndarray
+    pupil_points: int
+
+    @property
+    def axis(self) -> np.ndarray:
+        """Coordinates of pixel centres along either axis from the middle of the image [m]."""
+        return pixel_axis(self.pixel, self.image.shape[-1])
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Part of the light that falls within each image, shape [n_field]."""
+        return self.image.sum(axis=(1, 2))
+
+    @property
+    def centroid(self) -> np.ndarray:
+        """Centroid of each image relative to its middle [m], x and y, shape [n_field, 2]."""
+        return np.stack([self.image.sum(axis=1) @ self.axis, self.image.sum(axis=2) @ self.axis], -1) / self._inside
+
+    @property
+    def rms_radius(self) -> np.ndarray:
+        """Root mean square distance of the light within each image from its centroid [m], shape [n_field].
+
+        The wings of a diffraction image fall off as the cube of the distance, so that it grows with the image.
+        """
+        square = np.add.outer(self.axis**2, self.axis**2)
+        mean = np.einsum("fyx,yx->f", self.image, square) / self.inside
+        return np.sqrt(mean - (self.centroid**2).sum(axis=1))
+
+    @property
+    def fwhm(self) -> np.ndarray:
+        """Diameter of a disc as large as the part of each image above half its peak [m], shape [n_field]."""
+        finer = zoom(self.image, (1, _FINER, _FINER), order=3, mode="nearest", grid_mode=True)
+        above = (finer > 0.5 * finer.max(axis=(1, 2), keepdims=True)).sum(axis=(1, 2))
+        return 2.0 * self.pixel / _FINER * np.sqrt(above / np.pi)
+
+    @property
+    def _inside(self) -> np.ndarray:
+        return self.inside[:, None]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures by name, units in the names; lists run over the fields."""
+        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        return {
+            "telescope": self.telescope,
+            "method": self.method,
+            "wavelength_nm": self.wavelengths * 1e9,
+            "pupil_points": self.pupil_points,
+            "pixel_um": self.pixel * 1e6,
+            "pixels": self.image.shape[-1],
+            "field_deg": np.rad2deg(self.fields),
+            "reference_mm": self.reference * 1e3,
+            "strehl": self.strehl,
+            "fwhm_um": self.fwhm * 1e6,
+            "fwhm_arcsec": self.fwhm * arcsec,
+            "centroid_um": self.centroid * 1e6,
+            "airy_radius_um": self.airy_radius * 1e6,
+            "airy_radius_arcsec": self.airy_radius * arcsec,
+            "light_inside": self.inside,
+            "lit_fraction": self.light,
+            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+        }
+
+    def plot(self) -> Figure:
+        """Draw each image on a logarithmic scale, and cuts through the first ones."""
+        count = len(self.fields)
+        rows = -(-count // _MOST)
+        columns = -(-count // rows)
+        with styled():
+            figure = new_figure(max(2.3 * columns + 0.9, 6.4), 2.95 * rows + 2.9)
+            parts: Any = figure.subfigures(2, 1, height_ratios=[2.8 * rows + 0.4, 2.6])
+            above, below = parts
+            panels = above.subplots(rows, columns, squeeze=False).ravel()
+            for axes in panels[count:]:
+                axes.set_axis_off()
+            image: Any = None
+            for i, axes in enumerate(panels[:count]):
+                image = _draw_image(axes, self, i)
+            half = 0.5e6 * self.pixel * self.image.shape[-1]
+            bar = round_length(0.6 * half)
+            draw_scale_bar(panels[0], bar, f'{bar:g} µm = {_arcsec(self, 0) * bar * 1e-6:.3g}"')
+            _whiten(panels[0])
+            key = above.colorbar(image, ax=list(panels), shrink=0.85, pad=0.015, aspect=30)
+            key.set_label("light over that of\nthe brightest pixel")
+            waves = ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths)
+            way = "Fourier sum" if self.method == "fft" else "Huygens' wavelets"
+            figure.suptitle(f"{self.telescope}: diffraction images, {waves} nm ({way})", fontsize=11)
+            _draw_cuts(below.subplots(1, 2, sharey=True), self)
+            return figure
+
+
+def pixel_axis(pixel: float, pixels: int) -> np.ndarray:
+    """Return coordinates of pixel centres from the middle of the image [m], shape [pixels]."""
+    # The reference point lies on the middle pixel, as on the stamps of the PSF engines.
+    return (np.arange(pixels) - pixels // 2) * pixel
+
+
+def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
+    from matplotlib.colors import LogNorm
+
+    image = psf.image[i] / psf.image[i].max()
+    low, high = (psf.axis[k] * 1e6 + s * 0.5e6 * psf.pixel for k, s in ((0, -1.0), (-1, 1.0)))
+    shown = axes.imshow(
+        np.maximum(image, 10.0**-_DECADES),
+        extent=(low, high, low, high),
+        cmap="inferno",
+        norm=LogNorm(10.0**-_DECADES, 1.0),
+    )
+    draw_circle(axes, psf.airy_radius[i] * 1e6, color="white", style=(0, (3, 2)))
+    axes.set(xticks=[], yticks=[])
+    axes.set_title(field_label(psf.fields[i]), fontsize=9.5)
+    fwhm = psf.fwhm[i]
+    lit = "" if psf.light[i] > 0.995 else f"lit {100 * psf.light[i]:.1f} % of the pupil"
+    axes.set_xlabel(
+        f'Strehl {psf.strehl[i]:.3g}\nFWHM {fwhm * 1e6:.3g} µm = {fwhm * _arcsec(psf, i):.2g}"\n{lit}', fontsize=7.5
+    )
+    return shown
+
+
+def _draw_cuts(panels: Any, psf: DiffractionPsf) -> None:
+    colors = field_colors(min(len(psf.fields), _MOST))
+    for axes, name in zip(panels, "xy", strict=True):
+        for i, color in enumerate(colors):
+            density = psf.image[i] / psf.pixel**2 * 1e-12
+            row, column = np.unravel_index(int(np.argmax(density)), density.shape)
+            cut = density[row] if name == "x" else density[:, column]
+            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=field_label(psf.fields[i]))
+        axes.set_xlabel(f"{name} on the detector from the middle of the image [µm]")
+        axes.set_xlim(psf.axis[0] * 1e6, psf.axis[-1] * 1e6)
+        axes.set_ylim(bottom=0.0)
+        axes.grid(True, color="0.92", linewidth=0.6)
+    panels[0].set_ylabel("part of the light per µm²\n(through the brightest pixel)")
+    panels[1].legend(loc="upper right")
+
+
+def _whiten(axes: Axes) -> None:
+    """Make the scale bar and its label readable on a dark image."""
+    for line in axes.lines:
+        line.set_color("white")
+    for text in axes.texts:
+        text.set_color("white")
+
+
+def _arcsec(psf: DiffractionPsf, i: int) -> float:
+    """Return arc seconds per metre on the detector."""
+    return float(np.rad2deg(psf.plate_scale[i])) * 3600.0

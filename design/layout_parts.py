@@ -1,0 +1,208 @@
+"""Sections of surfaces, pieces of glass and paths of rays: the parts that a layout is drawn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ..models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
+from ..models.surface import Interaction, Surface
+from ..models.telescope import Telescope
+from ..raytrace.pack.surfaces import refractive_indices
+from ..raytrace.rays import RayStatus, launch_rays
+from ..raytrace.trace import trace
+
+#: Points of a surface in section.
+_POINTS = 241
+#: A medium of at least this index is drawn as glass.
+_GLASS = 1.05
+#: How far a surface without an aperture reaches beyond the light.
+_BEYOND = 1.03
+#: A baffle that blocks all around is drawn to this many times its clear radius.
+_RIM = 1.12
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A piece of glass between two neighbouring surfaces.
+
+    Attributes
+    ----------
+    name : str
+        What the names of both surfaces have in common, or both names.
+    front, back : str
+        The surfaces, in the order that light meets them.
+    index : float
+        Refractive index of the glass.
+    """
+
+    name: str
+    front: str
+    back: str
+    index: float
+
+
+def ray_paths(
+    telescope: Telescope,
+    field: Sequence[float] | np.ndarray,
+    wavelength: float,
+    pupil: tuple[np.ndarray, np.ndarray],
+    top: float,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> np.ndarray:
+    """Return the ways of the rays that arrive, from a height in front of the telescope to the detector.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    field : (tx, ty)
+        Field angles [rad].
+    wavelength : float
+        Vacuum wavelength [m].
+    pupil : (px, py)
+        Entrance-pupil coordinates [m].
+    top : float
+        Height that the rays come from [m].
+    projection : str
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Returns
+    -------
+    ndarray, shape [n_ray, n_surface + 1, 3]
+        Where each starts and where it meets the surfaces [m], telescope frame.
+    """
+    rays = launch_rays(telescope, (field[0], field[1]), wavelength, pupil, projection)
+    met = trace(telescope, rays, "all", threads=threads)
+    back = (top - rays.position[:, 2:]) / rays.direction[:, 2:]
+    points = np.stack([rays.position + back * rays.direction, *(m.position for m in met)], axis=1)
+    return points[met[-1].status == RayStatus.OK]
+
+
+def surface_section(surface: Surface, reach: float) -> np.ndarray:
+    """Return points along a surface in its own section x = 0, cut to its aperture.
+
+    Parameters
+    ----------
+    surface : Surface
+        The surface; of a baffle, what blocks light is returned.
+    reach : float
+        Distance from its z axis to go to [m].
+
+    Returns
+    -------
+    ndarray, shape [n, 3]
+        Points [m], telescope frame, from -y to +y; NaN breaks the line.
+    """
+    blocks = surface.interaction == Interaction.PASS
+
+    def solid(y: np.ndarray) -> np.ndarray:
+        return clear_region(surface.aperture, np.zeros_like(y), y) != blocks
+
+    y = np.linspace(-reach, reach, _POINTS)
+    here = solid(y)
+    # Where it begins and ends is found by halving the step in which it does.
+    ends = np.flatnonzero(here[1:] != here[:-1])
+    low, high = y[ends].copy(), y[ends + 1].copy()
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        same = solid(middle) == here[ends]
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    y = np.concatenate([y, low, high])
+    order = np.argsort(y, kind="stable")
+    y = y[order]
+    keep = np.concatenate([here, here[ends], here[ends + 1]])[order]
+    sag = np.zeros_like(y) if surface.interaction == Interaction.PHASE else surface.shape.sag(np.zeros_like(y), y)
+    local = np.stack([np.zeros_like(y), y, np.where(keep, sag, np.nan)], axis=-1)
+    return surface.to_telescope(local)
+
+
+def clear_region(aperture: Aperture | None, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return True where light passes an aperture, rims included; everywhere if there is none."""
+    if aperture is None:
+        return np.ones(np.broadcast(x, y).shape, dtype=bool)
+    # Rims of circles do not count, and surfaces are drawn just up to them.
+    return aperture.contains((1.0 - 1e-9) * x, (1.0 - 1e-9) * y)
+
+
+def outer_radius(region: Aperture | None) -> float:
+    """Return a distance from the origin beyond which nothing of a region lies [m]; infinite where it has no end."""
+    if isinstance(region, Circle):
+        return region.radius + float(np.hypot(region.x, region.y))
+    if isinstance(region, Annulus):
+        return region.outer + float(np.hypot(region.x, region.y))
+    if isinstance(region, Rectangle):
+        return float(0.5 * np.hypot(region.width, region.height) + np.hypot(region.x, region.y))
+    if isinstance(region, Polygon):
+        return float(np.hypot(*np.array(region.corners).T).max())
+    if isinstance(region, Union):
+        return max(outer_radius(part) for part in region.parts)
+    if isinstance(region, Intersection):
+        return min(outer_radius(part) for part in region.parts)
+    return float("inf")
+
+
+def even_edges(telescope: Telescope, lenses: tuple[Lens, ...], reach: dict[str, float]) -> dict[str, float]:
+    """Return the reaches with surfaces that have no rim of their own going as far as the other one of their lens."""
+    found = dict(reach)
+    for lens in lenses:
+        both = max(found[lens.front], found[lens.back])
+        for name in (lens.front, lens.back):
+            surface = telescope.surface(name)
+            rim = np.linspace(0.0, both, _POINTS)
+            if surface.aperture is None and np.isfinite(surface.shape.sag(np.zeros_like(rim), rim)).all():
+                found[name] = both
+    return found
+
+
+def drawn_radii(telescope: Telescope, fields: np.ndarray, wavelength: float, threads: int | None) -> dict[str, float]:
+    """Return how far each surface is drawn: to its rim, or as far as the light of all fields goes."""
+    edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
+    angle = 2.0 * np.pi * np.arange(16) / 16
+    radius = 0.5 * telescope.pupil_diameter
+    lit = np.zeros(len(telescope.surfaces))
+    for field in np.concatenate([edge, fields]):
+        rays = launch_rays(
+            telescope, (field[0], field[1]), wavelength, (radius * np.cos(angle), radius * np.sin(angle))
+        )
+        for k, met in enumerate(trace(telescope, rays, "all", threads=threads)):
+            local = telescope.surfaces[k].to_local(met.position)
+            # Light that is stopped on its way need not be drawn, but it tells where nothing else does.
+            away = np.hypot(local[:, 0], local[:, 1])
+            lit[k] = max(lit[k], float(np.nanmax(away, initial=0.0)) if np.isfinite(away).any() else 0.0)
+    found = {}
+    for surface, light in zip(telescope.surfaces, lit, strict=True):
+        bound = outer_radius(surface.aperture)
+        if surface.interaction == Interaction.PASS:
+            blocked = outer_radius(surface.aperture.part) if isinstance(surface.aperture, Complement) else np.inf
+            bound = blocked if np.isfinite(blocked) else _RIM * (bound if np.isfinite(bound) else light)
+        found[surface.name] = bound if np.isfinite(bound) else _BEYOND * max(light, 1e-3 * radius)
+    return found
+
+
+def find_lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:
+    """Return the pieces of glass between neighbouring surfaces."""
+    index = refractive_indices(telescope, wavelength)
+    # Planes inside a lens, such as its stop, do not divide it.
+    acting = [k for k, s in enumerate(telescope.surfaces) if s.interaction in (Interaction.REFRACT, Interaction.MIRROR)]
+    found = []
+    for front, back in pairwise(acting):
+        if index[front + 1] >= _GLASS:
+            names = telescope.surfaces[front].name, telescope.surfaces[back].name
+            found.append(Lens(_common_name(*names), *names, float(index[front + 1])))
+    return tuple(found)
+
+
+def _common_name(first: str, second: str) -> str:
+    """Return what two names begin with, up to a mark between words; both names where that is nothing."""
+    for mark in "_- .":
+        head = first.partition(mark)[0]
+        if mark in first and mark in second and head and head == second.partition(mark)[0]:
+            return head
+    return f"{first}, {second}"
