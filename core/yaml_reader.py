@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from .errors import PrescriptionError
+from .errors import PachonError, PrescriptionError
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -35,48 +35,45 @@ def _mapping_without_repeats(loader: _StrictLoader, node: yaml.MappingNode) -> d
 _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping_without_repeats)
 
 
-def read_yaml(path: Path) -> Section:
+def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> dict[str, Any]:
     """Return the top level of a YAML file.
 
     Parameters
     ----------
     path : Path
         File to read, UTF-8.
-
-    Returns
-    -------
-    Section
-        Its top-level mapping.
+    error : type
+        Class of the error.
 
     Raises
     ------
-    PrescriptionError
+    PachonError
         If the file cannot be read, is not YAML, or is not a mapping.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise PrescriptionError("no such file", file=path) from None
+        raise error("no such file", file=path) from None
     except UnicodeDecodeError:
-        raise PrescriptionError("not a UTF-8 text file", file=path) from None
-    except OSError as error:
-        raise PrescriptionError(f"cannot be read ({error.strerror})", file=path) from None
-    return parse_yaml(text, str(path))
-
-
-def parse_yaml(text: str, source: str) -> Section:
-    """Return the top level of YAML text; `source` names it in error messages."""
+        raise error("not a UTF-8 text file", file=path) from None
+    except OSError as problem:
+        raise error(f"cannot be read ({problem.strerror})", file=path) from None
     try:
         content = yaml.load(text, Loader=_StrictLoader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
+    except yaml.MarkedYAMLError as problem:
+        mark = problem.problem_mark or problem.context_mark
         place = f"line {mark.line + 1}" if mark else None
-        raise PrescriptionError(f"not valid YAML: {error.problem or error.context}", file=source, place=place) from None
-    except (yaml.YAMLError, ValueError) as error:
-        raise PrescriptionError(f"not valid YAML: {' '.join(str(error).split())}", file=source) from None
+        raise error(f"not valid YAML: {problem.problem or problem.context}", file=path, place=place) from None
+    except (yaml.YAMLError, ValueError) as problem:
+        raise error(f"not valid YAML: {' '.join(str(problem).split())}", file=path) from None
     if not isinstance(content, dict):
-        raise PrescriptionError(f"expected a mapping of keys to values, not {_shown(content)}", file=source)
-    return Section(content, source, "")
+        raise error(f"expected a mapping of keys to values, not {_shown(content)}", file=path)
+    return content
+
+
+def read_yaml(path: Path) -> Section:
+    """Return the top level of a YAML file."""
+    return Section(read_mapping(path), str(path), "")
 
 
 def as_number(value: Any) -> float | None:

@@ -8,38 +8,29 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, Field
 
-from ..core.errors import ConfigError, PachonError, PrescriptionError
-from ..core.yaml_reader import as_number, read_yaml
+from ..core.errors import ConfigError
+from ..core.schema import (
+    Count,
+    Fraction,
+    NotNegative,
+    Positive,
+    Real,
+    Section,
+    Switch,
+    Whole,
+    plain_number,
+    shown,
+    validated,
+)
+from ..core.yaml_reader import read_mapping
 
-
-def plain_number(value: Any) -> Any:
-    """Return a number that YAML took for text as a number, and anything else as it is."""
-    # YAML 1.1 reads 1e-9, without a point, as text; whoever wrote it means a number.
-    number = as_number(value) if isinstance(value, str) else None
-    return value if number is None else number
-
-
-Real = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False, gt=0)]
-NotNegative = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False, ge=0)]
-Count = Annotated[int, Field(strict=True, ge=1)]
-Whole = Annotated[int, Field(strict=True, ge=0)]
-Fraction = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=1)]
-Switch = Annotated[bool, Field(strict=True)]
 BandName = Literal["u", "g", "r", "i", "z", "y"]
-
-
-class Section(BaseModel):
-    """Part of a file in which every key is known, and nothing changes once it is read."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class StarsConfig(Section):
@@ -204,19 +195,7 @@ def configuration_of(content: dict[str, Any], source: str) -> Configuration:
     """
     if isinstance(content.get("ccds"), str):
         content = {**content, "ccds": [content["ccds"]]}
-    return _validated(content, source)
-
-
-def known_keys(model: type[BaseModel] = Configuration) -> tuple[str, ...]:
-    """Return all keys of a configuration, with dots between sections."""
-    keys: list[str] = []
-    for name, field in model.model_fields.items():
-        section = field.annotation
-        if isinstance(section, type) and issubclass(section, BaseModel):
-            keys += [f"{field.alias or name}.{key}" for key in known_keys(section)]
-        else:
-            keys.append(field.alias or name)
-    return tuple(keys)
+    return validated(Configuration, content, source)
 
 
 def load_configuration(path: Path) -> Configuration:
@@ -227,12 +206,7 @@ def load_configuration(path: Path) -> Configuration:
     ConfigError
         If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    try:
-        top = read_yaml(path)
-    except PrescriptionError as error:
-        raise ConfigError(error.problem, file=error.file, place=error.place) from None
-    content = {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
-    return configuration_of(content, str(path))
+    return configuration_of(read_mapping(path, ConfigError), str(path))
 
 
 def with_options(config: Configuration, **options: Any) -> Configuration:
@@ -255,14 +229,14 @@ def with_options(config: Configuration, **options: Any) -> Configuration:
         for section in sections:
             target = target[section]
         target[key] = value
-    return _validated(content, "command line")
+    return validated(Configuration, content, "command line")
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Return one ``key: old -> new`` for each key in which two resolved configurations differ."""
     before, after = dict(_flat(old)), dict(_flat(new))
     keys = [*before, *(k for k in after if k not in before)]
-    return [f"{k}: {_shown(before.get(k))} -> {_shown(after.get(k))}" for k in keys if before.get(k) != after.get(k)]
+    return [f"{k}: {shown(before.get(k))} -> {shown(after.get(k))}" for k in keys if before.get(k) != after.get(k)]
 
 
 def digest(content: Any) -> str:
@@ -310,73 +284,3 @@ def _flat(content: dict[str, Any], place: str = "") -> Iterator[tuple[str, Any]]
             yield from _flat(value, f"{place}{key}.")
         else:
             yield f"{place}{key}", value
-
-
-def _shown(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _validated(content: dict[str, Any], source: str) -> Configuration:
-    try:
-        return Configuration.model_validate(content)
-    except ValidationError as error:
-        raise first_problem(error, source, Configuration) from None
-
-
-_EXPECTED = {
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "float_type": "a number",
-    "finite_number": "a finite number",
-    "bool_type": "true or false",
-    "string_type": "a text",
-    "tuple_type": "a list",
-    "model_type": "a mapping of keys to values",
-    "model_attributes_type": "a mapping of keys to values",
-    "none_required": "nothing",
-}
-_LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
-
-
-def first_problem(error: ValidationError, source: str, model: type[BaseModel]) -> PachonError:
-    """Return the first problem of a file of that model as one line: file, key, value, what was expected."""
-    # A misspelt key is the likelier cause of what else is wrong, so it goes first.
-    problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
-    problem = problems[0]
-    # Members of an optional type are no keys of the file.
-    key = _dotted(problem["loc"])
-    kind, context = problem["type"], problem.get("ctx", {})
-    if kind == "extra_forbidden":
-        known = _known_keys(model, problem["loc"][:-1])
-        near = get_close_matches(str(problem["loc"][-1]), known, n=2, cutoff=0.6)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(known)}"
-        return ConfigError(f"unknown key {key} = {_shown(problem['input'])}: {hint}", file=source, key=key)
-    if kind == "literal_error":
-        expected = "one of " + str(context["expected"]).replace(" or ", ", ").replace("'", "")
-    elif kind in _LIMITS:
-        name, word = _LIMITS[kind]
-        expected = f"a number {word} {context[name]:g}"
-    else:
-        expected = _EXPECTED.get(kind, problem["msg"])
-    return ConfigError(f"{key} = {_shown(problem['input'])}: expected {expected}", file=source, key=key)
-
-
-def _dotted(location: tuple[int | str, ...]) -> str:
-    parts: list[str] = []
-    for part in location:
-        if isinstance(part, int):
-            parts[-1] += f"[{part}]"
-        else:
-            parts.append(part)
-    return ".".join(parts)
-
-
-def _known_keys(model: Any, location: tuple[int | str, ...]) -> list[str]:
-    for part in location:
-        if not hasattr(model, "model_fields"):
-            # A mapping of names to sections: all of one kind.
-            model = get_args(model)[-1]
-            continue
-        model = model.model_fields[part].annotation
-    return [field.alias or name for name, field in model.model_fields.items()]

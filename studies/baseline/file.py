@@ -11,22 +11,18 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from ...core.errors import ConfigError
 from ...core.files import write_bytes
-from ...pipeline.config import Positive, Real, first_problem
+from ...core.schema import Positive, Real, Section, validated
 
 FORMAT = "pachon baseline"
 #: Version of the format; it is counted up when an older pachon could not read the file, or would read it wrongly.
 VERSION = 1
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class BaselineFigure(_Section):
+class BaselineFigure(Section):
     """One figure that is to stay as it is."""
 
     value: Real = Field(description="the figure")
@@ -36,7 +32,7 @@ class BaselineFigure(_Section):
     checked_against: str | None = Field(None, description="independent source that has the same figure, and how near")
 
 
-class BaselinePlan(_Section):
+class BaselinePlan(Section):
     """Where the figures are taken."""
 
     fields_deg: Annotated[tuple[tuple[Real, Real], ...], Field(min_length=1)] = Field(
@@ -49,7 +45,7 @@ class BaselinePlan(_Section):
     ccds: tuple[str, ...] = Field((), description="CCDs at whose centres the PSF is taken; the first is modelled")
 
 
-class Baseline(_Section):
+class Baseline(Section):
     """Figures of a telescope, and what they were computed from."""
 
     format: Literal["pachon baseline"] = Field("pachon baseline", description="what the file is")
@@ -90,10 +86,7 @@ def read_baseline(path: Path) -> Baseline:
             f"{path}: version = {content.get('version')!r}: expected {VERSION}; "
             f"the file was written by pachon {content.get('pachon')}"
         )
-    try:
-        baseline = Baseline.model_validate(content)
-    except ValidationError as error:
-        raise first_problem(error, str(path), Baseline) from None
+    baseline = validated(Baseline, content, str(path))
     for name, figure in baseline.figures.items():
         if figure.reason not in baseline.reasons:
             known = ", ".join(baseline.reasons)

@@ -22,11 +22,12 @@ import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field
 
-from ...core.errors import ConfigError, PrescriptionError
-from ...core.yaml_reader import read_yaml
-from ...pipeline.config import Real, Section, digest, first_problem, plain_number
+from ...core.errors import ConfigError
+from ...core.schema import Count, Real, Section, Whole, plain_number, validated
+from ...core.yaml_reader import read_mapping
+from ...pipeline.config import digest
 
 #: Folder of the sweeps that come along.
 EXAMPLES = Path(__file__).parent / "examples"
@@ -54,12 +55,10 @@ class Design(Section):
     kind: Literal["one_at_a_time", "grid", "monte_carlo", "latin_hypercube", "sobol", "table"] = Field(
         "one_at_a_time", description="how points are chosen"
     )
-    points: Annotated[int, Field(strict=True, ge=1)] = Field(
-        5, description="points of a random design, or along each range of a grid or one at a time"
-    )
-    seed: Annotated[int, Field(strict=True, ge=0)] = Field(1, description="seed of a random design")
+    points: Count = Field(5, description="points of a random design, or along each range of a grid or one at a time")
+    seed: Whole = Field(1, description="seed of a random design")
     file: str | None = Field(None, description="ECSV table of the points, a column a parameter, for kind table")
-    replicas: Annotated[int, Field(strict=True, ge=1)] = Field(
+    replicas: Count = Field(
         1, description="times each point is computed, each time with another seed of heights, turbulence and stars"
     )
 
@@ -97,9 +96,9 @@ def load_sweep(path: Path) -> SweepFile:
     ConfigError
         If the file cannot be read, is not YAML, or a key or value is not as expected: one line.
     """
-    content = _content(path)
+    content = read_mapping(path, ConfigError)
     if isinstance(content.get("base"), str):
-        content["base"] = _content(path.parent / content["base"])
+        content["base"] = read_mapping(path.parent / content["base"], ConfigError)
     folder = path.parent
     content["design"] = _with_path(content.get("design", {}), "file", folder)
     base = _with_path(content.get("base", {}), "telescope", folder)
@@ -118,20 +117,9 @@ def _with_path(section: Any, key: str, folder: Path) -> Any:
 
 def read_sweep(content: dict[str, Any], source: str) -> SweepFile:
     """Return the sweep that plain mappings describe; `source` names them in error messages."""
-    try:
-        sweep = SweepFile.model_validate(content)
-    except ValidationError as error:
-        raise first_problem(error, source, SweepFile) from None
+    sweep = validated(SweepFile, content, source)
     _check(sweep, source)
     return sweep
-
-
-def _content(path: Path) -> dict[str, Any]:
-    try:
-        top = read_yaml(path)
-    except PrescriptionError as error:
-        raise ConfigError(error.problem, file=error.file, place=error.place) from None
-    return {key: top.value(key) for key in top.keys()}  # noqa: SIM118 - a Section is no mapping
 
 
 def _check(sweep: SweepFile, source: str) -> None:

@@ -21,9 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, PachonError, unknown_name
+from ...core.schema import known_keys
 from ...design.parameters.changes import parse_change
 from ...models.camera.camera import Camera, load_camera
-from ...pipeline.config import Configuration, configuration_of, known_keys
+from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.experiment import Experiment, prepare, resolve
 from .compensation import compensated
 from .file import SweepFile
@@ -75,7 +76,7 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
         raise ConfigError(f"base = {sweep.base!r}: expected the content of the file; see load_sweep")
     content = deepcopy(sweep.base)
     content["seed"] = seed
-    keys = known_keys()
+    keys = known_keys(Configuration)
     sections = {key.partition(".")[0] for key in keys if "." in key}
     for name, value in parameters.items():
         if name in keys:

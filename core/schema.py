@@ -1,0 +1,225 @@
+"""Validation of files by pydantic: strict sections, checked values, and errors of one line.
+
+A file is a tree of :class:`Section`. :func:`validated` reports the first problem with file, path of keys, value and
+expected value. Nothing here is imported with ``import pachon``: pydantic takes longer than all else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from .errors import ConfigError, PachonError
+from .yaml_reader import as_number
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def plain_number(value: Any) -> Any:
+    """Return text that is a number as the number, and other values unchanged."""
+    # YAML 1.1 reads 1e-9, without a point, as text.
+    number = as_number(value) if isinstance(value, str) else None
+    return value if number is None else number
+
+
+Real = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False, gt=0)]
+NotNegative = Annotated[float, BeforeValidator(plain_number), Field(strict=True, allow_inf_nan=False, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Whole = Annotated[int, Field(strict=True, ge=0)]
+Fraction = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=1)]
+Switch = Annotated[bool, Field(strict=True)]
+
+
+class Section(BaseModel):
+    """Immutable mapping of a file; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _only_known_keys(cls, content: Any) -> Any:
+        if isinstance(content, dict):
+            known = cls.keys()
+            for key in content:
+                if key not in known:
+                    raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
+        return content
+
+    @classmethod
+    def keys(cls) -> list[str]:
+        """Return the keys of the section as they stand in a file."""
+        return [field.alias or name for name, field in cls.model_fields.items()]
+
+
+def validated(
+    model: type[Model],
+    content: Any,
+    source: str,
+    error: type[PachonError] = ConfigError,
+    context: Any = None,
+) -> Model:
+    """Return the model of plain mappings, lists and values.
+
+    Parameters
+    ----------
+    model : type
+        Class of the file.
+    content : dict
+        Content of the file.
+    source : str
+        Name of the file, for messages.
+    error : type
+        Class of the error.
+    context : object, optional
+        Context of the validators, such as the units of the file.
+
+    Raises
+    ------
+    PachonError
+        If a key is unknown or missing, or a value is not as expected: the first problem, in one line.
+    """
+    try:
+        return model.model_validate(content, context=context)
+    except ValidationError as problems:
+        raise _first_problem(problems, content, source, error) from None
+
+
+def expected(text: str, key: str = "") -> PydanticCustomError:
+    """Return the error of a validator for a value that is not as expected.
+
+    Parameters
+    ----------
+    text : str
+        Expected value.
+    key : str
+        Key of the value, where the validator is that of a section.
+    """
+    return PydanticCustomError("expected", "expected", {"expected": text, "key": key})
+
+
+def checked(convert: Callable[[Any], Any], text: str) -> BeforeValidator:
+    """Return a validator that converts a value; where the conversion gives None, the value is not as expected."""
+
+    def convert_or_raise(value: Any) -> Any:
+        found = convert(value)
+        if found is None:
+            raise expected(text)
+        return found
+
+    return BeforeValidator(convert_or_raise)
+
+
+def nearest(name: object, known: Iterable[str], n: int = 2) -> str:
+    """Return the known names nearest to a name, as "did you mean"; empty where none is near."""
+    near = get_close_matches(str(name), list(known), n=n, cutoff=0.6)
+    return f"did you mean {' or '.join(near)}?" if near else ""
+
+
+def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
+    """Return all keys of a model, with dots between sections."""
+    keys: list[str] = []
+    for name, field in model.model_fields.items():
+        section = field.annotation
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            keys += [f"{field.alias or name}.{key}" for key in known_keys(section)]
+        else:
+            keys.append(field.alias or name)
+    return tuple(keys)
+
+
+def shown(value: Any) -> str:
+    """Return a value as JSON, cut short."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+_EXPECTED = {
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "string_type": "a text",
+    "tuple_type": "a list",
+    "dict_type": "a mapping of keys to values",
+    "model_type": "a mapping of keys to values",
+    "model_attributes_type": "a mapping of keys to values",
+    "none_required": "nothing",
+}
+_LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
+
+
+def _first_problem(problems: ValidationError, content: Any, source: str, error: type[PachonError]) -> PachonError:
+    # A misspelt key is the likelier cause of the other problems, so it goes first.
+    problem = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
+    kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
+    path = dotted([*problem["loc"], *filter(None, [limits.get("key")])], content)
+    if kind == "unknown_key":
+        key, known = limits["key"], limits["known"]
+        hint = nearest(key, known) or f"expected one of {', '.join(known)}"
+        return error(f"unknown key {path} = {_as_in(error, value[key])}: {hint}", file=source, key=path)
+    if limits.get("key"):
+        kind, value = ("expected", value[limits["key"]]) if limits["key"] in value else ("missing", None)
+    if kind == "missing":
+        return error(f"{path} is missing", file=source, key=path)
+    if kind == "expected":
+        text = limits["expected"]
+    elif kind == "literal_error":
+        choices = str(limits["expected"]).replace(" or ", ", ").replace("'", "")
+        near = nearest(value, choices.split(", "), n=1)
+        text = f"one of {choices}" + (f" ({near})" if near else "")
+    elif kind in _LIMITS:
+        name, word = _LIMITS[kind]
+        text = f"a number {word} {limits[name]:g}"
+    else:
+        text = _EXPECTED.get(kind, problem["msg"])
+    return error(f"{path} = {_as_in(error, value)}: expected {text}", file=source, key=path)
+
+
+def _as_in(error: type[PachonError], value: Any) -> str:
+    """Return a value cut short: as JSON in configurations, else as Python has it."""
+    if error is ConfigError:
+        return shown(value)
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+#: Keys that tell the entries of a list apart in messages.
+_LABELS = ("name", "altitude", "shape")
+
+
+def dotted(location: Iterable[int | str], content: Any) -> str:
+    """Return a location as a path of keys: ``surfaces[M1].radius``.
+
+    Parameters
+    ----------
+    location : iterable of int or str
+        Keys and indices; tags of unions stand in angle brackets, and are no keys of the file.
+    content : object
+        Content of the file, for the names of entries.
+    """
+    path = ""
+    for part in location:
+        if isinstance(part, str) and part.startswith("<"):
+            continue
+        inner = _item(content, part)
+        if isinstance(part, int):
+            labels = [inner[key] for key in _LABELS if key in inner] if isinstance(inner, Mapping) else []
+            path += f"[{labels[0] if labels else part}]"
+        else:
+            path += f".{part}" if path else part
+        content = inner
+    return path
+
+
+def _item(content: Any, part: int | str) -> Any:
+    try:
+        return content[part]
+    except (KeyError, IndexError, TypeError):
+        return None
