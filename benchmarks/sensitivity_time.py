@@ -16,8 +16,8 @@ import numpy as np
 import pachon
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
 from pachon.design.parameters.parameters import apply, with_figures
-from pachon.design.pupil_sampling import pupil_sampling
 from pachon.raytrace.rays import field_direction, parallel_rays
+from pachon.wavefront.pupil_sampling import pupil_sampling
 from pachon.wavefront.zernike import annular_zernikes
 
 THREADS = int(sys.argv[1]) if len(sys.argv) > 1 else 1

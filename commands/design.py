@@ -64,7 +64,7 @@ def spots_command(
     - `pachon spots my_telescope.yaml --field-deg 0 --field-deg 0.3,0.4 --wavelength-nm 656.3 --json`
     """
     from ..design.metrics.spots import spots
-    from ..design.pupil_sampling import pupil_sampling
+    from ..wavefront.pupil_sampling import pupil_sampling
 
     picture_kind(picture)
     telescope = load_model(model, lenient)

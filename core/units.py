@@ -33,3 +33,9 @@ def radians(value: Any, name: str) -> np.ndarray:
 def metres(value: Any, name: str) -> np.ndarray:
     """Return a length in metres as a float64 array; plain numbers are metres already."""
     return _si(value, u.m, name)
+
+
+def field_label(field: np.ndarray) -> str:
+    """Return a field point [rad] as error messages name it, in degrees."""
+    x, y = np.rad2deg(field)
+    return f"field = ({x:.6g}, {y:.6g}) deg"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FEW = 12
 
 
-def field_label(field: np.ndarray) -> str:
+def field_text(field: np.ndarray) -> str:
     """Return a field point [rad] as text in degrees: one number where it lies on the +y axis, else both."""
     x, y = np.rad2deg(field)
     if abs(x) < 1e-9 and y > -1e-9:

@@ -10,8 +10,8 @@ import numpy as np
 from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
 from ..models.surface import Interaction
 from ..models.telescope import Telescope
-from .bundles import field_points, wavelength_points
-from .drawing import field_label
+from ..wavefront.request import field_points, wavelength_points
+from .drawing import field_text
 from .layout_parts import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
 
 if TYPE_CHECKING:
@@ -357,4 +357,4 @@ def _signed_label(field: np.ndarray) -> str:
     x, y = np.rad2deg(field)
     if abs(x) < 1e-9:
         return "on the axis" if abs(y) < 1e-9 else f"field {y:+.4g}°"
-    return f"field {field_label(field)}"
+    return f"field {field_text(field)}"

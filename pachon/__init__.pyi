@@ -1,5 +1,4 @@
 from .core.errors import PachonError as PachonError
-from .design.bundles import field_points as field_points
 from .design.images.diffraction import fft_psf as fft_psf
 from .design.images.diffraction import huygens_psf as huygens_psf
 from .design.images.encircled_energy import encircled_energy as encircled_energy
@@ -22,7 +21,6 @@ from .design.parameters.degrees_of_freedom import DegreesOfFreedom as DegreesOfF
 from .design.parameters.degrees_of_freedom_file import load_degrees_of_freedom as load_degrees_of_freedom
 from .design.parameters.thermal import thermal as thermal
 from .design.parameters.tolerances import Tolerance as Tolerance
-from .design.pupil_sampling import pupil_sampling as pupil_sampling
 from .models.camera.camera import lsst_camera as lsst_camera
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
@@ -51,6 +49,10 @@ from .wavefront.opd import wavefront_opd as wavefront_opd
 from .wavefront.opd_batch import wavefront_opds as wavefront_opds
 from .wavefront.psf.psf import make_psfs as make_psfs
 from .wavefront.pupil_optics import fields_at as fields_at
+from .wavefront.pupil_sampling import PupilSampling as PupilSampling
+from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling
+from .wavefront.request import Request as Request
+from .wavefront.request import field_points as field_points
 from .wavefront.zernike import fit_zernikes as fit_zernikes
 
 __version__: str

@@ -15,7 +15,7 @@ import warp as wp
 
 from ..core.errors import DomainError
 from ..core.launch import launch
-from ..core.units import metres, radians
+from ..core.units import field_label, metres, radians
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
@@ -184,13 +184,13 @@ def trace_pupils(
     reference = np.array(chief.position)
     if not np.isfinite(reference).all():
         bad = int(np.flatnonzero(~np.isfinite(reference).all(axis=1))[0])
-        raise DomainError(f"{_named(fields[bad])}: the chief ray does not reach the detector")
+        raise DomainError(f"{field_label(fields[bad])}: the chief ray does not reach the detector")
     normal = np.zeros((n_star, 3))
     normal[:, 2] = 1.0
     if focal_plane is not None:
         if chief.ccd.min(initial=0) < 0:
             bad = int(np.flatnonzero(chief.ccd < 0)[0])
-            raise DomainError(f"{_named(fields[bad])}: the star lands between the CCDs")
+            raise DomainError(f"{field_label(fields[bad])}: the star lands between the CCDs")
         on_detector = telescope.surfaces[-1].to_local(reference)
         offset = on_detector[:, :2] - focal_plane.camera.centers[chief.ccd]
         normal[:, :2] = -focal_plane.surfaces.gradient(chief.ccd, offset[:, 0], offset[:, 1])
@@ -264,12 +264,6 @@ def trace_pupils(
         fields=fields,
         wavelengths=wavelengths,
     )
-
-
-def _named(field: np.ndarray) -> str:
-    """Return a field in degrees, as messages name a star."""
-    x, y = np.rad2deg(field)
-    return f"field = ({x:.6g}, {y:.6g}) deg"
 
 
 def _jacobians(telescope: Telescope, direction: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.errors import DomainError
+from ..core.units import field_label
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
@@ -68,22 +69,17 @@ def reference_spheres(
     lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
     if lost.any():
         raise DomainError(
-            f"{_named(fields[lost][0])}: the chief ray does not reach the image; wavefront_opd can do without it, with "
-            "reference='mean'"
+            f"{field_label(fields[lost][0])}: the chief ray does not reach the image; "
+            "wavefront_opd can do without it, with reference='mean'"
         )
     if end.ccd is not None and (end.ccd < 0).any():
         raise DomainError(
-            f"{_named(fields[end.ccd < 0][0])}: the chief ray lands between the CCDs; expected a point on a CCD"
+            f"{field_label(fields[end.ccd < 0][0])}: the chief ray lands between the CCDs; expected a point on a CCD"
         )
     center = np.array(end.position)
     index = refractive_indices(telescope, wavelength)[-2]
     path = end.path_length + index * distance_to_sphere(end.position, end.direction, center, radius)
     return ReferenceSpheres(center, path)
-
-
-def _named(field: np.ndarray) -> str:
-    x, y = np.rad2deg(field)
-    return f"field = ({x:.6g}, {y:.6g}) deg"
 
 
 def distance_to_sphere(position: np.ndarray, direction: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:

@@ -17,10 +17,10 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError
 from ...core.units import metres
 from ...models.telescope import Telescope
-from ..bundles import field_points, wavelength_points
+from ...wavefront.pupil_sampling import PupilSampling, square_annulus
+from ...wavefront.request import field_points, relative_weights, wavelength_points
 from ..metrics.principal_rays import principal_rays
-from ..metrics.spots import REFERENCES, checked_weights, spots
-from ..pupil_sampling import PupilSampling, square_annulus
+from ..metrics.spots import REFERENCES, spots
 from .diffraction_psf import DiffractionPsf, pixel_axis
 from .wavelets import (
     WaveletLattice,
@@ -227,7 +227,7 @@ class _Plan:
             raise DomainError(f"pixels = {pixels!r}: expected a whole number from 3 to 4096")
         self.telescope, self.pixels = telescope, int(pixels)
         self.fields, self.waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-        self.shares = checked_weights(weights, len(self.waves))
+        self.shares = relative_weights(weights, len(self.waves))
         self.spots = spots(
             telescope, self.fields, self.waves, reference=reference, projection=projection, threads=threads
         )

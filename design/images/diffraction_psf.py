@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from ...core.plotting import new_figure, styled
-from ..drawing import draw_circle, draw_scale_bar, field_colors, field_label, round_length
+from ..drawing import draw_circle, draw_scale_bar, field_colors, field_text, round_length
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -175,7 +175,7 @@ def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
     )
     draw_circle(axes, psf.airy_radius[i] * 1e6, color="white", style=(0, (3, 2)))
     axes.set(xticks=[], yticks=[])
-    axes.set_title(field_label(psf.fields[i]), fontsize=9.5)
+    axes.set_title(field_text(psf.fields[i]), fontsize=9.5)
     fwhm = psf.fwhm[i]
     lit = "" if psf.light[i] > 0.995 else f"lit {100 * psf.light[i]:.1f} % of the pupil"
     axes.set_xlabel(
@@ -191,7 +191,7 @@ def _draw_cuts(panels: Any, psf: DiffractionPsf) -> None:
             density = psf.image[i] / psf.pixel**2 * 1e-12
             row, column = np.unravel_index(int(np.argmax(density)), density.shape)
             cut = density[row] if name == "x" else density[:, column]
-            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=field_label(psf.fields[i]))
+            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=field_text(psf.fields[i]))
         axes.set_xlabel(f"{name} on the detector from the middle of the image [µm]")
         axes.set_xlim(psf.axis[0] * 1e6, psf.axis[-1] * 1e6)
         axes.set_ylim(bottom=0.0)

@@ -13,9 +13,9 @@ from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import metres
 from ...models.telescope import Telescope
-from ..drawing import FEW, field_colors, field_label, second_scale
+from ...wavefront.pupil_sampling import PupilSampling
+from ..drawing import FEW, field_colors, field_text, second_scale
 from ..metrics.spots import SpotDiagram, spots
-from ..pupil_sampling import PupilSampling
 from .diffraction import DiffractionPsf, fft_psf
 
 if TYPE_CHECKING:
@@ -302,7 +302,7 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
     few = len(result.fields) <= FEW
     colors = field_colors(len(result.fields))
     for field, row, color in zip(result.fields, result.fraction, colors, strict=True):
-        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=field_label(field) if few else None)
+        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=field_text(field) if few else None)
     for share in (0.5, 0.8):
         axes.axhline(share, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
         axes.annotate(f"{100 * share:.0f} %", (1.0, share), xycoords=("axes fraction", "data"), xytext=(-3, 2),

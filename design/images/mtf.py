@@ -21,10 +21,10 @@ import scipy.fft
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, new_figure, styled
 from ...models.telescope import Telescope
-from ..bundles import field_points, wavelength_points
-from ..drawing import field_label, second_scale
+from ...wavefront.request import field_points, relative_weights, wavelength_points
+from ..drawing import field_text, second_scale
 from ..metrics.principal_rays import PrincipalRays, principal_rays
-from ..metrics.spots import checked_weights, spots
+from ..metrics.spots import spots
 from .wavelets import lattice_wavelets, range_of_cosines, spot_reach
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def mtf(
     if int(pupil_points) != pupil_points or pupil_points < 16:
         raise DomainError(f"pupil_points = {pupil_points!r}: expected a whole number of at least 16")
     points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    shares = checked_weights(wavelength_weights, len(waves))
+    shares = relative_weights(wavelength_weights, len(waves))
     middle = waves[len(waves) // 2]
     principal = principal_rays(telescope, points, middle, projection=projection, threads=threads)
     diagram = spots(
@@ -312,7 +312,7 @@ def _draw_field(axes: Axes, result: Mtf, i: int) -> None:
     axes.text(
         0.97,
         0.95,
-        f"{field_label(result.fields[i])}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)",
+        f"{field_text(result.fields[i])}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)",
         transform=axes.transAxes,
         ha="right",
         va="top",

@@ -26,10 +26,10 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
-from ..bundles import Bundles, trace_bundles
+from ...wavefront.bundles import Bundles, trace_bundles
+from ...wavefront.pupil_sampling import PupilSampling, ring_annulus
 from ..metrics.principal_rays import PrincipalRays
 from ..metrics.spots import SpotDiagram
-from ..pupil_sampling import PupilSampling, ring_annulus
 
 #: Degree of the polynomials that the search for aimed rays starts from; they give the Jacobian too.
 _DEGREE = 7

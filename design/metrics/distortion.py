@@ -14,8 +14,9 @@ from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...models.telescope import Telescope
 from ...raytrace.rays import field_direction
-from ..bundles import RAYS_AT_ONCE, field_points, trace_bundles, wavelength_points
-from ..pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.bundles import RAYS_AT_ONCE, trace_bundles
+from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 from .spots import REFERENCES, spots
 
 if TYPE_CHECKING:

@@ -17,10 +17,11 @@ from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
 from ...core.units import radians
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
+from ...wavefront.bundles import RAYS_AT_ONCE
 from ...wavefront.pupil_optics import trace_pupils
-from ..bundles import RAYS_AT_ONCE, field_points, wavelength_points
-from ..drawing import FEW, draw_field_map, field_colors, field_label, spread_in_field
-from ..pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
+from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
+from ..drawing import FEW, draw_field_map, field_colors, field_text, spread_in_field
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,7 +103,7 @@ class FieldZernikes:
                 colors = field_colors(len(self.fields))
                 for i, (row, field, color) in enumerate(zip(values, self.fields, colors, strict=True)):
                     offset = (i - 0.5 * (len(self.fields) - 1)) * width
-                    bars.bar(j + offset, row, width, color=color, label=field_label(field))
+                    bars.bar(j + offset, row, width, color=color, label=field_text(field))
                 bars.set_ylabel("coefficient = rms over the annulus [nm]")
                 bars.legend(loc="best", ncols=2)
             else:

@@ -14,9 +14,9 @@ from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace
-from ..bundles import field_points, wavelength_points
-from ..drawing import FEW, field_colors, field_label, panel_grid
-from ..pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
+from ..drawing import FEW, field_colors, field_text, panel_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,7 +124,7 @@ class Footprint:
             large = len(self.surfaces) == 1
             figure, panels = panel_grid(len(self.surfaces), *((6.0, 5.6) if large else (2.9, 3.0)))
             for axes, footprint in zip(panels, self.surfaces, strict=True):
-                _draw_surface(axes, footprint, colors, [field_label(f) for f in self.fields])
+                _draw_surface(axes, footprint, colors, [field_text(f) for f in self.fields])
             panels[0].plot([], [], ".", color=RED, markersize=6.0, label="blocked here first")
             handles, labels = panels[0].get_legend_handles_labels()
             if len(self.fields) > FEW:

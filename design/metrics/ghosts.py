@@ -18,9 +18,10 @@ from ...core.errors import DomainError
 from ...core.plotting import RED, new_figure, styled
 from ...models.telescope import Telescope
 from ...raytrace.rays import launch_rays
-from ..bundles import field_points, trace_bundles, wavelength_points
-from ..drawing import draw_circle, field_label
-from ..pupil_sampling import spiral_annulus
+from ...wavefront.bundles import trace_bundles
+from ...wavefront.pupil_sampling import spiral_annulus
+from ...wavefront.request import field_points, wavelength_points
+from ..drawing import draw_circle, field_text
 from .ghost_paths import Coatings, GhostLight, GhostPath, follow, ghost_pairs, ghost_path
 from .principal_rays import principal_rays
 
@@ -163,7 +164,7 @@ class Ghosts:
                 _draw_ghost(axes, ghost, float(magnitude))
             right.suptitle("the brightest: reflected at, and then at", fontsize=9.5)
             figure.suptitle(
-                f"{self.telescope}: ghosts of a star at {field_label(self.field)}, {self.wavelength * 1e9:.4g} nm, "
+                f"{self.telescope}: ghosts of a star at {field_text(self.field)}, {self.wavelength * 1e9:.4g} nm, "
                 f"{100 * self.flux:.2g} % of its light (detector reflects {100 * self.detector_reflectivity:.3g} %)",
                 fontsize=11,
             )

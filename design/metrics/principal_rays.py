@@ -17,9 +17,10 @@ from ...core.plotting import BLUE, GREY, ORANGE, new_figure, styled
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace
+from ...wavefront.bundles import trace_bundles
 from ...wavefront.pupil_optics import JACOBIAN_STEP
-from ..bundles import field_points, trace_bundles, wavelength_points
-from ..pupil_sampling import pupil_sampling
+from ...wavefront.pupil_sampling import pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,21 +6,22 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, RED, styled
 from ...models.telescope import Telescope
-from ..bundles import field_points, trace_bundles, wavelength_points
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
 from ..drawing import (
     bare_frame,
     draw_circle,
     draw_scale_bar,
-    field_label,
+    field_text,
     panel_grid,
     round_length,
     wavelength_colors,
 )
-from ..pupil_sampling import PupilSampling, pupil_sampling
 from .principal_rays import principal_rays
 
 if TYPE_CHECKING:
@@ -169,11 +170,12 @@ class SpotDiagram:
 
 def spots(
     telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
     *,
-    wavelength_weights: Any = None,
+    wavelength_weights: ArrayLike | None = None,
     sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     reference: str = "centroid",
     projection: str = "zemax",
     threads: int | None = None,
@@ -184,20 +186,10 @@ def spots(
     ----------
     telescope : Telescope
         The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelengths : array_like or Quantity, shape [n_wave], optional
-        Vacuum wavelengths [m]; the telescope's own by default.
-    wavelength_weights : array_like, shape [n_wave], optional
-        Relative amounts of light; equal by default.
-    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Points of the pupil.
+    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`.
     reference : {"centroid", "chief"}
-        What the displacements start from: the centroid, or the chief ray of the middle wavelength.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+        Origin of the displacements: the centroid, or the chief ray of the middle wavelength.
 
     Raises
     ------
@@ -208,23 +200,29 @@ def spots(
     """
     if reference not in REFERENCES:
         raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
-    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    shares = checked_weights(wavelength_weights, len(waves))
-    pupil = pupil_sampling(telescope, sampling)
-    middle = len(waves) // 2
-    bundles = [trace_bundles(telescope, points, float(w), pupil.points, projection, threads) for w in waves]
-    principal = principal_rays(telescope, points, waves[middle], projection=projection, threads=threads)
-    chief = bundles[middle].chief_landing()
+    request = Request.of(
+        telescope,
+        fields,
+        wavelengths,
+        wavelength_weights=wavelength_weights,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+    )
+    bundles = [request.bundles(float(w)) for w in request.wavelengths]
+    principal = principal_rays(telescope, request.fields, request.middle, projection=projection, threads=threads)
+    chief = bundles[len(bundles) // 2].chief_landing()
     lit = np.stack([b.lit for b in bundles], axis=1)
     diagram = SpotDiagram(
         telescope=telescope.name,
-        fields=points,
-        wavelengths=waves,
+        fields=request.fields,
+        wavelengths=request.wavelengths,
         displacement=np.stack([b.landing() for b in bundles], axis=1) - chief[:, None, None],
-        weight=np.where(lit, shares[:, None] * pupil.weights, 0.0),
+        weight=np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0),
         reference=chief,
         plate_scale=principal.mean_plate_scale,
-        airy_radius=1.22 * waves[middle] * principal.mean_f_number,
+        airy_radius=1.22 * request.middle * principal.mean_f_number,
     )
     if reference == "chief":
         return diagram
@@ -238,20 +236,6 @@ def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) ->
     held = np.add.reduceat(weights, starts)
     middle = (np.cumsum(held) - 0.5 * held) / held.sum()
     return float(np.interp(share, middle, values[starts]))
-
-
-def checked_weights(weights: Any, count: int) -> np.ndarray:
-    """Return relative weights of so many wavelengths, of sum 1; equal where none are given.
-
-    Raises
-    ------
-    DomainError
-        If there are more or fewer, or one is negative, or all are zero.
-    """
-    values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
-    if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
-        raise DomainError(f"wavelength_weights = {weights!r}: expected {count} numbers, none negative, not all zero")
-    return values / values.sum()
 
 
 def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, share: float) -> None:
@@ -275,5 +259,5 @@ def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, share: float
     beyond = float(spots.weight[i][np.abs(centered).max(axis=-1) > half].sum())
     if beyond > 0:
         text += f"\n{100 * beyond / spots.lit_fraction[i]:.2g} % of the rays beyond the frame"
-    axes.set_title(field_label(spots.fields[i]), fontsize=9.5)
+    axes.set_title(field_text(spots.fields[i]), fontsize=9.5)
     axes.set_xlabel(text, fontsize=7.5)

@@ -11,16 +11,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.plotting import new_figure, styled
-from ...core.units import metres
+from ...core.units import field_label, metres
 from ...models.telescope import Telescope
-from ..bundles import Bundles, field_points, trace_bundles, wavelength_points
-from ..drawing import FEW, field_colors, field_label
-from ..pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.bundles import Bundles
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
+from ..drawing import FEW, field_colors, field_text
 from .principal_rays import principal_rays
-from .spots import checked_weights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -116,12 +117,13 @@ class ThroughFocus:
 
 def through_focus(
     telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
-    defocus: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
+    defocus: ArrayLike | None = None,
     *,
-    wavelength_weights: Any = None,
+    wavelength_weights: ArrayLike | None = None,
     sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> ThroughFocus:
@@ -131,50 +133,47 @@ def through_focus(
     ----------
     telescope : Telescope
         The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelengths : array_like or Quantity, shape [n_wave], optional
-        Vacuum wavelengths [m]; the telescope's own by default.
+    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`.
     defocus : array_like or Quantity, shape [n_height], optional
         Heights of the detector above its place [m], ascending; by default about the common best focus, as far as the
         spots grow to about three times their size.
-    wavelength_weights : array_like, shape [n_wave], optional
-        Relative amounts of light; equal by default.
-    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Points of the pupil.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
 
     Raises
     ------
     DomainError
         If fields, wavelengths or heights are out of range, or a field gets no light.
     """
-    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    shares = checked_weights(wavelength_weights, len(waves))
-    pupil = pupil_sampling(telescope, sampling)
-    bundles = [trace_bundles(telescope, points, float(w), pupil.points, projection, threads) for w in waves]
-    square = _mean_squares(bundles, shares, pupil.weights, points)
+    request = Request.of(
+        telescope,
+        fields,
+        wavelengths,
+        wavelength_weights=wavelength_weights,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+    )
+    bundles = [request.bundles(float(w)) for w in request.wavelengths]
+    square = _mean_squares(request, bundles)
     best = -square[:, 1] / (2.0 * square[:, 2])
     total = square.sum(axis=0)
     common = float(-total[1] / (2.0 * total[2]))
     smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
     if defocus is None:
-        principal = principal_rays(telescope, points, waves[len(waves) // 2], projection=projection, threads=threads)
-        blur = max(float(smallest.max()), float((waves.mean() * principal.mean_f_number).max()))
+        principal = principal_rays(telescope, request.fields, request.middle, projection=projection, threads=threads)
+        blur = max(float(smallest.max()), float((request.wavelengths.mean() * principal.mean_f_number).max()))
         reach = float(np.abs(best - common).max()) + 3.0 * blur / float(np.sqrt(square[:, 2].min()))
         heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
     else:
         heights = np.atleast_1d(metres(defocus, "defocus"))
         if heights.ndim != 1 or not (np.isfinite(heights).all() and (np.diff(heights) > 0).all() and len(heights)):
             raise DomainError(f"defocus = {defocus!r}: expected ascending heights of the detector in metres")
-    wavefront, strehl = _wavefronts(telescope, bundles, shares, pupil, heights)
+    wavefront, strehl = _wavefronts(request, bundles, heights)
     return ThroughFocus(
         telescope=telescope.name,
-        fields=points,
-        wavelengths=waves,
+        fields=request.fields,
+        wavelengths=request.wavelengths,
         defocus=heights,
         rms_radius=np.sqrt(np.maximum(np.polynomial.polynomial.polyval(heights, square.T), 0.0)),
         rms_wavefront=wavefront,
@@ -186,14 +185,13 @@ def through_focus(
     )
 
 
-def _mean_squares(bundles: list[Bundles], shares: np.ndarray, weights: np.ndarray, fields: np.ndarray) -> np.ndarray:
+def _mean_squares(request: Request, bundles: list[Bundles]) -> np.ndarray:
     """Return the mean square radius of each field as a parabola in the height, coefficients [n_field, 3]."""
     lit = np.stack([b.lit for b in bundles], axis=1)
-    weight = np.where(lit, shares[:, None] * weights, 0.0)
+    weight = np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0)
     light = weight.sum(axis=(1, 2))
     if not (light > 0).all():
-        dark = np.rad2deg(fields[~(light > 0)][0])
-        raise DomainError(f"field = ({dark[0]:.6g}, {dark[1]:.6g}) deg: no light reaches the detector")
+        raise DomainError(f"{field_label(request.fields[~(light > 0)][0])}: no light reaches the detector")
     weight /= light[:, None, None]
     start = np.stack([b.landing() for b in bundles], axis=1)
     slope = np.stack([b.direction[..., :2] / b.direction[..., 2:] for b in bundles], axis=1)
@@ -210,21 +208,20 @@ def _mean_squares(bundles: list[Bundles], shares: np.ndarray, weights: np.ndarra
     return np.stack([mean(start, start), 2.0 * mean(start, slope), mean(slope, slope)], axis=-1)
 
 
-def _wavefronts(
-    telescope: Telescope, bundles: list[Bundles], shares: np.ndarray, pupil: PupilSampling, heights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rms wavefront [m] and Strehl ratio, shape [n_field, n_height] each."""
-    plane = np.stack([np.ones(len(pupil)), *(pupil.points.T / (0.5 * telescope.pupil_diameter))], axis=-1)
+    radius, weights = request.telescope.reference_sphere_radius, request.pupil.weights
+    plane = np.stack([np.ones(len(weights)), *request.unit_pupil.T], axis=-1)
     square, strehl = np.zeros((2, len(bundles[0].chief_path), len(heights)))
-    for bundle, share in zip(bundles, shares, strict=True):
+    for bundle, share in zip(bundles, request.weights, strict=True):
         for i, lit in enumerate(bundle.lit):
             if not lit.any():
                 continue
-            weight = pupil.weights[lit] / pupil.weights[lit].sum()
+            weight = weights[lit] / weights[lit].sum()
             # Weighted least squares by one factorisation serves all heights.
             basis = np.linalg.qr(plane[lit] * np.sqrt(weight)[:, None])[0]
             for k, height in enumerate(heights):
-                value = bundle.one(i).opd(telescope.reference_sphere_radius, float(height))[0, lit]
+                value = bundle.one(i).opd(radius, float(height))[0, lit]
                 scaled = value * np.sqrt(weight)
                 rest = scaled - basis @ (basis.T @ scaled)
                 square[i, k] += share * (rest**2).sum()
@@ -248,7 +245,7 @@ def _draw_curves(axes: Axes, result: ThroughFocus, values: np.ndarray, best: np.
     for row, field, color, height in zip(
         values, result.fields, field_colors(len(result.fields)), best * 1e6, strict=True
     ):
-        axes.plot(heights, row, color=color, linewidth=1.4, label=field_label(field) if few else None)
+        axes.plot(heights, row, color=color, linewidth=1.4, label=field_text(field) if few else None)
         if heights[0] <= height <= heights[-1]:
             axes.plot(height, np.interp(height, heights, row), "o", color=color, markersize=4.0)
     axes.axvline(0.0, color="0.6", linewidth=0.7)

@@ -11,9 +11,10 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_of, new_figure, styled
 from ...models.telescope import Telescope
-from ..bundles import bundle_blocks, field_points, wavelength_points
+from ...wavefront.bundles import bundle_blocks
+from ...wavefront.pupil_sampling import spiral_annulus
+from ...wavefront.request import field_points, wavelength_points
 from ..drawing import draw_field_map, spread_in_field
-from ..pupil_sampling import spiral_annulus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

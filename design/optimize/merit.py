@@ -16,8 +16,8 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.gradient import landing_seeds, sweep
 from ...raytrace.rays import Rays, RayStatus, field_direction, parallel_rays
 from ...raytrace.trace import trace
-from ..bundles import field_points, wavelength_points
-from ..pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 

@@ -169,7 +169,7 @@ def optimize(
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
         Wavefronts to be reached [m], in place of none (:func:`wavefronts` gives those of a telescope).
     sampling, count :
-        Points of the pupil, see :func:`~pachon.design.pupil_sampling.pupil_sampling`.
+        Points of the pupil, see :func:`~pachon.wavefront.pupil_sampling.pupil_sampling`.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     tolerance : float

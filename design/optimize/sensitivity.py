@@ -14,9 +14,9 @@ from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import annular_zernikes
 from ...raytrace.rays import RayStatus
-from ..bundles import field_points, wavelength_points
+from ...wavefront.pupil_sampling import pupil_sampling
+from ...wavefront.request import field_points, wavelength_points
 from ..parameters.parameters import Parameter, parse_parameters
-from ..pupil_sampling import pupil_sampling
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 

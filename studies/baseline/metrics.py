@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError, PachonError
-from ...design.bundles import trace_bundles
 from ...design.images.encircled_energy import encircled_energy
 from ...design.metrics.distortion import distortion
 from ...design.metrics.field_zernikes import wavefront_zernikes
@@ -27,6 +26,7 @@ from ...pipeline.measure.summary import ccd_figures
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...pipeline.simulate.photometry import ARCSEC
+from ...wavefront.bundles import trace_bundles
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.pupil_optics import fields_at, trace_pupils
 from .file import BaselinePlan

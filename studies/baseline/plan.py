@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
-from ...design.bundles import field_points, wavelength_points
 from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
+from ...wavefront.request import field_points, wavelength_points
 from .file import BaselinePlan
 
 #: Fields of a plan, in units of the field's radius; no symmetry of the telescope leaves all of them as they are.

@@ -7,7 +7,7 @@ import pachon
 from pachon.design.images.diffraction import fft_psf, huygens_psf
 from pachon.design.images.encircled_energy import encircled_energy
 from pachon.design.metrics.ghost_paths import ghost_pairs, ghost_path
-from pachon.design.pupil_sampling import PupilSampling
+from pachon.wavefront.pupil_sampling import PupilSampling
 
 batoid = pytest.importorskip("batoid")
 

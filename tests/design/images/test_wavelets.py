@@ -10,7 +10,7 @@ from pachon.design.images.mtf import mtf
 from pachon.design.images.wavelets import lattice_wavelets, spot_reach, traced_wavelets
 from pachon.design.metrics.spots import spots
 from pachon.design.metrics.vignetting import vignetting
-from pachon.design.pupil_sampling import gauss_annulus, square_annulus
+from pachon.wavefront.pupil_sampling import gauss_annulus, square_annulus
 
 
 @pytest.mark.parametrize("angle", [(0.0, 0.0), (0.0, 1.75), (-0.9, 1.1)])

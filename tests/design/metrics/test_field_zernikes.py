@@ -5,11 +5,11 @@ from pachon.core.errors import ConfigError, DomainError
 from pachon.core.plotting import png_bytes
 from pachon.design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
 from pachon.design.metrics.vignetting import field_disc
-from pachon.design.pupil_sampling import PupilSampling
 from pachon.models.aperture import Circle
 from pachon.models.first_order import seidel_sums
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.wavefront.opd import wavefront_opd
+from pachon.wavefront.pupil_sampling import PupilSampling
 
 
 def test_coma_and_astigmatism_of_a_slow_paraboloid_are_seidels(paraboloid):

@@ -7,9 +7,9 @@ from scipy.integrate import quad
 from pachon.core.errors import DomainError
 from pachon.core.plotting import png_bytes
 from pachon.design.metrics.principal_rays import MARGINAL, principal_rays
-from pachon.design.pupil_sampling import gauss_annulus
 from pachon.models.first_order import first_order
 from pachon.models.io.prescription import load_telescope
+from pachon.wavefront.pupil_sampling import gauss_annulus
 
 LENS = Path(__file__).parents[2] / "data" / "zmx" / "lens_thorlabs_iso_8859_1.zmx"
 

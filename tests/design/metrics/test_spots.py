@@ -8,12 +8,13 @@ from scipy.integrate import quad
 import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.core.plotting import png_bytes
-from pachon.design.bundles import RAYS_AT_ONCE, bundle_blocks, field_points, trace_bundles
 from pachon.design.metrics.field_zernikes import wavefront_zernikes
 from pachon.design.metrics.spots import spots
-from pachon.design.pupil_sampling import PupilSampling
 from pachon.models.aperture import Circle
 from pachon.models.surface import Conic
+from pachon.wavefront.bundles import RAYS_AT_ONCE, bundle_blocks, trace_bundles
+from pachon.wavefront.pupil_sampling import PupilSampling
+from pachon.wavefront.request import field_points
 
 
 def test_a_paraboloid_is_perfect_on_its_axis(paraboloid):

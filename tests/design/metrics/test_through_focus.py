@@ -5,8 +5,8 @@ from pachon.core.errors import DomainError
 from pachon.core.plotting import png_bytes
 from pachon.design.metrics.spots import spots
 from pachon.design.metrics.through_focus import through_focus
-from pachon.design.pupil_sampling import pupil_sampling
 from pachon.wavefront.opd import wavefront_opd
+from pachon.wavefront.pupil_sampling import pupil_sampling
 
 
 def test_a_displaced_detector_is_found_again(paraboloid):

@@ -5,8 +5,8 @@ from pachon.core.errors import DomainError, UnknownNameError
 from pachon.core.plotting import png_bytes
 from pachon.design.metrics.footprint import footprint
 from pachon.design.metrics.vignetting import field_disc, vignetting
-from pachon.design.pupil_sampling import spiral_annulus
 from pachon.models.aperture import Circle
+from pachon.wavefront.pupil_sampling import spiral_annulus
 
 
 def lens(radius, distance):

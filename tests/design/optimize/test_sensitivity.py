@@ -10,11 +10,11 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
 from pachon.design.parameters.parameters import apply, with_figures
-from pachon.design.pupil_sampling import pupil_sampling
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.pupil_sampling import pupil_sampling
 from pachon.wavefront.zernike import fit_zernikes
 
 FIELDS = np.deg2rad([[0.0, 0.0], [0.5, 1.0], [-1.2, 1.2]])

@@ -1,15 +1,13 @@
-"""Points of an annulus with weights: the entrance pupil, or a field of view, as sums see it.
+"""Points of an annulus with weights: quadrature over the entrance pupil or over a field of view.
 
-A mean over the pupil is a sum over points with weights. Gauss quadrature is exact for polynomials and so the choice
-for every figure of an unvignetted pupil; where an edge cuts through the pupil all kinds of sampling converge as their
-points grow in number. Rings of equal width with weights that know the obscuration, a spiral without any symmetry, and a
-square lattice are the others.
+A mean over the pupil is a weighted sum over points. Gauss quadrature is exact for polynomials and is the default; the
+others are rings of equal width, a spiral without symmetry, and a square lattice. Where an edge vignettes the pupil, all
+of them converge with the number of points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -17,13 +15,13 @@ from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 
 KINDS = ("gauss", "rings", "spiral", "square")
-#: Points along the radius (gauss, rings), in all (spiral) or along the diameter (square), unless others are asked for.
+#: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
 _DEFAULT_COUNT = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
 
 
 @dataclass(frozen=True)
 class PupilSampling:
-    """Points of an annulus and what each contributes to a mean.
+    """Points of an annulus and their weights in a mean.
 
     Attributes
     ----------
@@ -54,13 +52,13 @@ class PupilSampling:
 def gauss_annulus(radius: float, obscuration: float, rings: int, spokes: int) -> PupilSampling:
     """Return Gauss quadrature on an annulus: Gauss-Legendre in the square of the radius, equal angles.
 
-    The mean of ``x^a y^b`` comes out exactly for ``a + b < min(4 rings, spokes)``, and so for twice the degree of a
-    wavefront of degree 8 from 5 rings and 17 spokes on (Forbes 1988, J. Opt. Soc. Am. A 5, 1943).
+    The mean of ``x^a y^b`` comes out exactly for ``a + b < min(4 rings, spokes)``: 5 rings and 17 spokes integrate the
+    square of a wavefront of degree 8 (Forbes 1988, J. Opt. Soc. Am. A 5, 1943).
 
     Parameters
     ----------
     radius : float
-        Outer radius [m], or whatever the points are to be in.
+        Outer radius, in the unit of the points.
     obscuration : float
         Inner over outer radius.
     rings, spokes : int
@@ -75,10 +73,10 @@ def gauss_annulus(radius: float, obscuration: float, rings: int, spokes: int) ->
 
 
 def ring_annulus(radius: float, obscuration: float, rings: int) -> PupilSampling:
-    """Return rings of equal width with about square cells, as spot diagrams are drawn with (Zemax: hexapolar).
+    """Return rings of equal width with about square cells, the hexapolar sampling of Zemax.
 
-    A point stands at the root mean square radius of its ring, so that quadratic functions are averaged exactly; beyond
-    these the error falls as the square of the number of rings.
+    Points lie at the root mean square radius of their ring, so quadratic functions are averaged exactly. For others
+    the error falls as the inverse square of the number of rings.
 
     Parameters
     ----------
@@ -103,9 +101,9 @@ def ring_annulus(radius: float, obscuration: float, rings: int) -> PupilSampling
 
 
 def spiral_annulus(radius: float, obscuration: float, count: int) -> PupilSampling:
-    """Return points of equal weight on a spiral of the golden angle, each with as much area as any other.
+    """Return points of equal weight on a spiral of the golden angle, at equal areas.
 
-    The pattern has no symmetry, so that an edge across the pupil cuts off about the right number of points wherever it
+    The pattern has no symmetry, so an edge across the pupil cuts off about the right number of points wherever it
     lies (Vogel 1979, Mathematical Biosciences 44, 179).
 
     Parameters
@@ -146,7 +144,9 @@ def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampl
     return PupilSampling(points, np.ones(len(points)))
 
 
-def pupil_sampling(telescope: Telescope, sampling: Any = "gauss", count: int | None = None) -> PupilSampling:
+def pupil_sampling(
+    telescope: Telescope, sampling: str | PupilSampling = "gauss", n_pupil: int | None = None
+) -> PupilSampling:
     """Return points of a telescope's entrance pupil.
 
     Parameters
@@ -154,8 +154,8 @@ def pupil_sampling(telescope: Telescope, sampling: Any = "gauss", count: int | N
     telescope : Telescope
         The telescope.
     sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        How to choose the points; a sampling is returned as it is.
-    count : int, optional
+        Kind of sampling; a :class:`PupilSampling` is returned unchanged.
+    n_pupil : int, optional
         Points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
 
     Raises
@@ -163,14 +163,14 @@ def pupil_sampling(telescope: Telescope, sampling: Any = "gauss", count: int | N
     ConfigError
         If the kind is unknown.
     DomainError
-        If the count is not a whole number of at least 1.
+        If ``n_pupil`` is not a whole number of at least 1.
     """
     if isinstance(sampling, PupilSampling):
         return sampling
     if sampling not in KINDS:
         raise ConfigError(f"sampling = {sampling!r}: expected one of {', '.join(KINDS)}")
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    n = _DEFAULT_COUNT[sampling] if count is None else count
+    n = _DEFAULT_COUNT[sampling] if n_pupil is None else n_pupil
     if sampling == "gauss":
         return gauss_annulus(radius, obscuration, n, 4 * n)
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ..core.errors import DomainError
-from ..core.units import metres, radians
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, field_direction, launch_bundles
 from ..raytrace.trace import trace
-from ..wavefront.reference_sphere import distance_to_sphere
+from .reference_sphere import distance_to_sphere
 
-#: Rays traced at once where a figure reduces them: 15 doubles each, so some 60 MB.
+#: Rays in one block of :func:`bundle_blocks`: 15 doubles each, so some 60 MB.
 RAYS_AT_ONCE = 1 << 19
-#: Distances from the axis at which figures are given where no field is asked for, in units of the field's radius; for
-#: the LSST they are 0, 0.5, 1, 1.5 and 1.75 degrees.
-_RADII = np.array([0.0, 2.0, 4.0, 6.0, 7.0]) / 7.0
 
 
 @dataclass(frozen=True)
@@ -107,39 +101,6 @@ class Bundles:
 
 def _at_height(position: np.ndarray, direction: np.ndarray, height: float) -> np.ndarray:
     return position[..., :2] + height * direction[..., :2] / direction[..., 2:]
-
-
-def field_points(telescope: Telescope, fields: Any = None) -> np.ndarray:
-    """Return field angles [rad], shape [n, 2], that the telescope covers.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n, 2] or [2], optional
-        Field angles [rad]; five points from the axis to the edge of the field along +y where not given.
-
-    Raises
-    ------
-    DomainError
-        If the shape is another, or a point lies outside what the telescope covers.
-    """
-    if fields is None:
-        fields = np.stack([np.zeros(len(_RADII)), _RADII * telescope.field_radius], axis=-1)
-    points = np.atleast_2d(radians(fields, "fields"))
-    if points.ndim != 2 or points.shape[1] != 2 or not len(points):
-        raise DomainError(f"fields of shape {points.shape}: expected field angles x, y, shape [n, 2]")
-    telescope.check_field(points[:, 0], points[:, 1])
-    return points
-
-
-def wavelength_points(telescope: Telescope, wavelengths: Any = None) -> np.ndarray:
-    """Return wavelengths [m], shape [n], that the telescope covers; its default where none is given."""
-    values = np.atleast_1d(metres(telescope.default_wavelength if wavelengths is None else wavelengths, "wavelengths"))
-    if values.ndim != 1 or not len(values):
-        raise DomainError(f"wavelengths of shape {values.shape}: expected one wavelength or a list")
-    telescope.check_wavelength(values)
-    return values
 
 
 def trace_bundles(

@@ -3,7 +3,7 @@ import pytest
 from scipy.integrate import quad
 
 from pachon.core.errors import ConfigError, DomainError
-from pachon.design.pupil_sampling import (
+from pachon.wavefront.pupil_sampling import (
     PupilSampling,
     gauss_annulus,
     pupil_sampling,
@@ -56,10 +56,10 @@ def test_spiral_and_square_fill_the_annulus_evenly(obscuration):
             assert sample.weights @ (x**a * y**b) == pytest.approx(mean_power(a, b, 1.0, obscuration), abs=4e-3)
 
 
-def test_a_sampling_of_ones_own_is_normalised_and_kept(paraboloid):
+def test_a_sampling_of_ones_own_is_normalised_and_kept(lsst_r):
     own = PupilSampling([[0.0, 0.01], [0.02, 0.0]], [1.0, 3.0])
     assert own.weights.tolist() == [0.25, 0.75]
-    assert pupil_sampling(paraboloid(), own) is own
+    assert pupil_sampling(lsst_r, own) is own
 
 
 def test_the_default_fills_the_telescopes_pupil(lsst_r):

@@ -1,0 +1,198 @@
+"""Rays of a calculation: field points, wavelengths and pupil points, validated once for all functions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.errors import DomainError
+from ..core.units import metres, radians
+from ..models.telescope import Telescope
+from ..raytrace.rays import Rays, field_direction, launch_bundles
+from .bundles import Bundles, bundle_blocks, trace_bundles
+from .pupil_sampling import PupilSampling, pupil_sampling
+
+#: Radii of the default field points over the radius of the field; for the LSST 0, 0.5, 1, 1.5 and 1.75 degrees.
+_RADII = np.array([0.0, 2.0, 4.0, 6.0, 7.0]) / 7.0
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """Rays of a calculation: all field points at all wavelengths through all pupil points.
+
+    :meth:`of` makes one from the arguments that many functions share; they are documented there.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : ndarray, shape [n_field, 2]
+        Field angles [rad].
+    wavelengths : ndarray, shape [n_wave]
+        Vacuum wavelengths [m].
+    weights : ndarray, shape [n_wave]
+        Relative amounts of light of the wavelengths; they sum to 1.
+    pupil : PupilSampling
+        Points of the entrance pupil.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int or None
+        Number of threads; None for all processors.
+    """
+
+    telescope: Telescope
+    fields: np.ndarray
+    wavelengths: np.ndarray
+    weights: np.ndarray
+    pupil: PupilSampling
+    projection: str
+    threads: int | None
+
+    @classmethod
+    def of(
+        cls,
+        telescope: Telescope,
+        fields: ArrayLike | None = None,
+        wavelengths: ArrayLike | None = None,
+        *,
+        wavelength_weights: ArrayLike | None = None,
+        sampling: str | PupilSampling = "gauss",
+        n_pupil: int | None = None,
+        projection: str = "zemax",
+        threads: int | None = None,
+    ) -> Request:
+        """Validate a request and fill in its defaults.
+
+        Parameters
+        ----------
+        telescope : Telescope
+            The telescope.
+        fields : array_like or Quantity, shape [n_field, 2] or [2], optional
+            Field angles [rad]: slopes of the light's own travel, in the stated projection. Five points from the axis
+            to the edge of the field along +y by default.
+        wavelengths : array_like or Quantity, shape [n_wave] or scalar, optional
+            Vacuum wavelengths [m]; the telescope's own by default.
+        wavelength_weights : array_like, shape [n_wave], optional
+            Relative amounts of light in front of the telescope; equal by default.
+        sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
+            Points of the entrance pupil, see :func:`~pachon.pupil_sampling`.
+        n_pupil : int, optional
+            Points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
+        projection : {"zemax", "gnomonic", "postel"}
+            Meaning of the field angles, see :func:`~pachon.raytrace.rays.field_direction`.
+        threads : int, optional
+            Number of threads; all processors by default. Results do not depend on it.
+
+        Raises
+        ------
+        ConfigError
+            If the sampling or the projection is unknown.
+        DomainError
+            If an array has another shape, a field point or wavelength lies outside what the telescope covers, or a
+            weight is negative.
+        """
+        points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+        weights = relative_weights(wavelength_weights, len(waves))
+        pupil = pupil_sampling(telescope, sampling, n_pupil)
+        request = cls(telescope, points, waves, weights, pupil, projection, threads)
+        _ = request.directions  # an unknown projection is an error of the request, not of its first use
+        return request
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """Unit vectors in which the light of each field point travels, telescope frame, shape [n_field, 3]."""
+        return field_direction(self.fields[:, 0], self.fields[:, 1], self.projection)
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Slopes (vx, vy) / abs(vz) of the light of each field point, shape [n_field, 2]."""
+        return self.directions[:, :2] / -self.directions[:, 2:]
+
+    @property
+    def middle(self) -> float:
+        """Wavelength in the middle of the list [m], to which reference points belong."""
+        return float(self.wavelengths[len(self.wavelengths) // 2])
+
+    @property
+    def wavelength(self) -> float:
+        """The only wavelength [m].
+
+        Raises
+        ------
+        DomainError
+            If there are several.
+        """
+        if len(self.wavelengths) != 1:
+            raise DomainError(f"wavelength: {len(self.wavelengths)} wavelengths are given; expected one")
+        return float(self.wavelengths[0])
+
+    @property
+    def unit_pupil(self) -> np.ndarray:
+        """Pupil points in units of the radius of the entrance pupil, shape [n_pupil, 2]."""
+        return self.pupil.points / (0.5 * self.telescope.pupil_diameter)
+
+    def launch(self, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
+        """Return the rays of one wavelength [m], field by field; through other pupil points [m] if these are given."""
+        points = self.pupil.points if pupil is None else pupil
+        return launch_bundles(self.telescope, self.directions, wavelength, points)
+
+    def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
+        """Trace the rays of one wavelength [m] to the detector; through other pupil points [m] if these are given."""
+        points = self.pupil.points if pupil is None else pupil
+        return trace_bundles(self.telescope, self.fields, wavelength, points, self.projection, self.threads)
+
+    def blocks(self, wavelength: float) -> Iterator[tuple[slice, Bundles]]:
+        """Trace the rays of one wavelength [m], a block of field points at a time: see :func:`bundle_blocks`."""
+        points = self.pupil.points
+        return bundle_blocks(self.telescope, self.fields, wavelength, points, self.projection, self.threads)
+
+
+def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.ndarray:
+    """Return field angles [rad], shape [n, 2], that the telescope covers.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    fields : array_like or Quantity, shape [n, 2] or [2], optional
+        Field angles [rad]; five points from the axis to the edge of the field along +y by default.
+
+    Raises
+    ------
+    DomainError
+        If the shape is another, or a point lies outside what the telescope covers.
+    """
+    if fields is None:
+        fields = np.stack([np.zeros(len(_RADII)), _RADII * telescope.field_radius], axis=-1)
+    points = np.atleast_2d(radians(fields, "fields"))
+    if points.ndim != 2 or points.shape[1] != 2 or not len(points):
+        raise DomainError(f"fields of shape {points.shape}: expected field angles x, y, shape [n, 2]")
+    telescope.check_field(points[:, 0], points[:, 1])
+    return points
+
+
+def wavelength_points(telescope: Telescope, wavelengths: ArrayLike | None = None) -> np.ndarray:
+    """Return wavelengths [m], shape [n], that the telescope covers; its default where none is given."""
+    values = np.atleast_1d(metres(telescope.default_wavelength if wavelengths is None else wavelengths, "wavelengths"))
+    if values.ndim != 1 or not len(values):
+        raise DomainError(f"wavelengths of shape {values.shape}: expected one wavelength or a list")
+    telescope.check_wavelength(values)
+    return values
+
+
+def relative_weights(weights: ArrayLike | None, count: int, name: str = "wavelength_weights") -> np.ndarray:
+    """Return so many weights of sum 1, equal where none are given.
+
+    Raises
+    ------
+    DomainError
+        If there are more or fewer, or one is negative, or all are zero.
+    """
+    values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
+        raise DomainError(f"{name} = {weights!r}: expected {count} numbers, none negative, not all zero")
+    return values / values.sum()
