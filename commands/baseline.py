@@ -1,4 +1,4 @@
-"""The commands ``pachon baseline`` and ``pachon check``; :mod:`~pachon.commands.cli` registers them."""
+"""The commands ``pachon baseline save``, ``baseline update`` and ``check``."""
 
 from __future__ import annotations
 
@@ -8,26 +8,34 @@ from typing import Annotated
 import typer
 
 from ..core.errors import ConfigError
-from .options import (
-    FieldsDeg,
-    Json,
-    Quiet,
-    Threads,
-    WavelengthsNm,
-    field_list,
-    interruptible,
-    name_list,
-)
+from .inputs import interruptible
+from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
 
-_VERBS = ("save", "update")
+app = typer.Typer()
+baseline_app = typer.Typer()
+app.add_typer(baseline_app, name="baseline")
 
 
-def baseline_command(
-    verb: Annotated[str, typer.Argument(metavar="save | update", help="Make a baseline, or accept changed figures.")],
-    subject: Annotated[
-        str, typer.Argument(metavar="MODEL | FILE", help="To save: bundled model, or path of a prescription.")
-    ],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Baseline to write, NAME.baseline.json.")] = None,
+@baseline_app.callback()
+def baseline_group() -> None:
+    """Store the metrics of a telescope, for `pachon check` to compare with.
+
+    Wavefront, landing points, Zernikes, spots, encircled energy, distortion and vignetting; with a configuration also
+    the height of every CCD and its effect on the wavefront, PSFs, and the residuals of a PSF model. Each has a
+    tolerance with its reason, and a line of its own in the file.
+
+    **Examples**
+
+    - `pachon baseline save lsst_v3.3_r -o lsst.baseline.json`
+    - `pachon baseline save telescope.yaml -o telescope.baseline.json --config run.yaml`
+    - `pachon baseline update telescope.baseline.json`: new values where out of tolerance, all else stays
+    """
+
+
+@baseline_app.command("save")
+def baseline_save(
+    model: Model,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Baseline to write, NAME.baseline.json.")],
     config: Annotated[
         Path | None,
         typer.Option(metavar="RUN.yaml", help="Run configuration: adds CCD heights, PSFs and a reconstruction."),
@@ -41,27 +49,12 @@ def baseline_command(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Store the figures of a telescope, for `pachon check` to compare with.
-
-    Wavefront, landing points, Zernikes, spots, encircled energy, distortion and vignetting; with a configuration also
-    the height of every CCD and what it does to the wavefront, PSFs, and what a PSF model leaves. Each has a tolerance,
-    and the reason for it; one stands on each line.
+    """Compute the metrics of a telescope, and write them with their tolerances.
 
     **Examples**
 
-    - `pachon baseline save lsst_v3.3_r -o lsst.baseline.json`
-
-    - `pachon baseline save telescope.yaml -o telescope.baseline.json --config run.yaml`
-
-    - `pachon baseline update telescope.baseline.json`: new values for what is out of tolerance, all else stays
+    - `pachon baseline save telescope.yaml -o telescope.baseline.json --config run.yaml --ccds R22_S11,R02_S01`
     """
-    if verb not in _VERBS:
-        raise ConfigError(f"pachon baseline {verb}: expected save MODEL -o FILE, or update FILE")
-    if verb == "update":
-        _update(Path(subject), threads, as_json, quiet)
-        return
-    if out is None:
-        raise ConfigError("pachon baseline save: expected -o FILE, the baseline to write")
     from ..core.files import json_text
     from ..studies.baseline.baseline import make_baseline
     from ..studies.baseline.file import write_baseline
@@ -71,7 +64,7 @@ def baseline_command(
         count = len(OPTICS) + (0 if config is None else len(CAMERA))
         with reporter.stage("baseline", count) as stage:
             baseline, left_out = make_baseline(
-                subject,
+                model,
                 out.parent,
                 config,
                 fields=field_list(field_deg),
@@ -82,14 +75,26 @@ def baseline_command(
             )
     write_baseline(out, baseline)
     for kind, why in left_out.items():
-        typer.echo(f"pachon: warning: no figures of kind {kind}: {why}", err=True)
+        typer.echo(f"pachon: warning: no metrics of kind {kind}: {why}", err=True)
     if as_json:
         print(json_text({"baseline": str(out), "figures": len(baseline.figures), "left_out": left_out}))
     elif not quiet:
-        print(f"{out}: {len(baseline.figures)} figures of {baseline.model}")
+        print(f"{out}: {len(baseline.figures)} metrics of {baseline.model}")
 
 
-def _update(path: Path, threads: int | None, as_json: bool, quiet: bool) -> None:
+@baseline_app.command("update")
+def baseline_update(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="Baseline to update.")],
+    threads: Threads = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Accept changed metrics: new values for those out of tolerance, all else stays.
+
+    **Examples**
+
+    - `pachon baseline update telescope.baseline.json`
+    """
     from ..core.files import json_text
     from ..studies.baseline.baseline import updated_baseline
     from ..studies.baseline.file import write_baseline
@@ -100,12 +105,13 @@ def _update(path: Path, threads: int | None, as_json: bool, quiet: bool) -> None
     if as_json:
         print(json_text({"baseline": str(path), "updated": [d.name for d in check.out]}))
     elif not quiet:
-        print(f"{path}: {len(check.out)} of {len(check.deviations)} figures updated")
+        print(f"{path}: {len(check.out)} of {len(check.deviations)} metrics updated")
 
 
+@app.command("check")
 def check_command(
     files: Annotated[
-        list[Path] | None, typer.Argument(metavar="[FILE]...", help="Baselines; those that come along by default.")
+        list[Path] | None, typer.Argument(metavar="[FILE]...", help="Baselines; the bundled ones by default.")
     ] = None,
     model: Annotated[
         str | None, typer.Option(help="Telescope in place of the baseline's own: bundled, or a path.")
@@ -113,22 +119,20 @@ def check_command(
     config: Annotated[
         Path | None, typer.Option(metavar="RUN.yaml", help="Run configuration in place of the baseline's own.")
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Show all figures, not the worst alone.")] = False,
+    everything: Annotated[bool, typer.Option("--all", help="Show all metrics, not the worst alone.")] = False,
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compute the figures of baselines anew, and say which have moved by more than their tolerances.
+    """Compute the metrics of baselines again, and list those that have moved by more than their tolerances.
 
-    Worst first. Exit status 1 when a figure is out of tolerance. Without a file, the LSST's own baselines are checked,
-    whose figures agree with Zemax, batoid and GalSim as far as those have them.
+    Worst first. Exit status 1 when a metric is out of tolerance. Without a file, the bundled baselines of the LSST are
+    checked, whose metrics agree with Zemax, batoid and GalSim as far as those have them.
 
     **Examples**
 
-    - `pachon check`: is this pachon the one that was verified?
-
+    - `pachon check`: does this installation agree with the one that was verified?
     - `pachon check telescope.baseline.json`: after a change of the prescription, in CI
-
     - `pachon check telescope.baseline.json --model as_built.yaml --json`
     """
     from ..core.files import json_text
@@ -150,6 +154,3 @@ def check_command(
             print(check.text(everything))
     if not passed:
         raise typer.Exit(1)
-
-
-COMMANDS = {"baseline": baseline_command, "check": check_command}

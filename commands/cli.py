@@ -1,9 +1,10 @@
-"""The command line, ``pachon run | reproduce | diagnose | attribute | study | opd | info``, and its groups of commands.
+"""The command line, ``pachon``: its commands, exit statuses and errors.
 
-A group is a file ``command_<subject>.py`` whose ``COMMANDS`` maps names to functions. What is slow to import, which is
-all that computes, is imported inside those functions: ``pachon --help`` is to be quick.
+Every file of commands has an ``app`` that this one adds to its own. Modules that compute are slow to import;
+commands import them inside their functions, so that ``pachon --help`` is quick.
 
-Exit status 0: done; 2: bad input or a file that cannot be written, one line on standard error; 130: interrupted.
+Exit status 0: done; 1: a check failed; 2: bad input or a file that cannot be written, one line on standard error;
+130: interrupted.
 """
 
 from __future__ import annotations
@@ -17,36 +18,10 @@ from typing import Annotated, Any
 import typer
 
 from ..core.errors import PachonError
-from . import baseline as command_baseline
-from . import design as command_design
-from . import design_images as command_design_images
-from . import diagnostics as command_diagnostics
-from . import field as command_field
-from . import lens as command_lens
-from . import models as command_models
-from . import reproduce as command_reproduce
-from . import run as command_run
-from . import sensitivity as command_sensitivity
-from . import study as command_study
-from . import sweep as command_sweep
-from .options import InterruptedRunError
+from . import baseline, design, diagnostics, reproduce, run, study, sweep, telescope
+from .inputs import InterruptedRunError
 
-#: The groups of commands, in the order of the help.
-_GROUPS = (
-    command_run,
-    command_reproduce,
-    command_diagnostics,
-    command_study,
-    command_sweep,
-    command_baseline,
-    command_design,
-    command_field,
-    command_design_images,
-    command_models,
-    command_lens,
-    command_sensitivity,
-)
-# Both live in typer or in click, as the version of typer has it; this way the right ones are caught.
+# The error of bad arguments is a class of typer or of click, depending on the version of typer.
 _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
@@ -80,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _UsageError as error:
         return _fail(error.format_message())
     except BrokenPipeError:
-        # Whoever read our output has gone; Python would complain once more when it closes the stream.
+        # The reader of our output has gone; Python would complain once more when it closes the stream.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except PachonError as error:
@@ -113,9 +88,9 @@ def _common(
     del show_version
 
 
-for _group in _GROUPS:
-    for _name, _command in _group.COMMANDS.items():
-        app.command(_name)(_command)
+# In the order of the help.
+for _group in (run, reproduce, diagnostics, study, sweep, baseline, design, telescope):
+    app.add_typer(_group.app)
 
 
 if __name__ == "__main__":

@@ -1,73 +1,58 @@
-"""The commands ``pachon diagnose`` and ``pachon attribute``; :mod:`~pachon.commands.cli` registers them."""
+"""The commands ``pachon diagnose`` and ``pachon attribute``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from .options import (
-    Ccds,
-    Config,
-    Json,
-    ObservedStars,
-    Quiet,
-    Raft,
-    Threads,
-    TruthStars,
-    interruptible,
-    name_list,
-    one_name_list,
-    resolved_configuration,
-    show_table,
-    wide_console,
-)
+from .inputs import interruptible, resolved_configuration
+from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, name_list, one_name_list
+from .tables import Rows, wide_console
+
+app = typer.Typer()
 
 
+@app.command("diagnose")
 def diagnose_command(
     folder: Annotated[Path, typer.Argument(metavar="RUN_FOLDER", help="Folder of a run, finished or not.")],
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to; by default diagnostics, in that of the run.")
     ] = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="End where a CCD has no product that can be read, and do not leave it out.")
+        bool,
+        typer.Option("--strict", help="End at the first CCD without a readable product, in place of leaving it out."),
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Look at the residuals of a run: ellipticity and size of each CCD, correlations, rho statistics, with jackknife.
+    """Measure the residuals of a run: ellipticity and size of each CCD, correlations, rho statistics, with jackknife.
 
-    Residuals at the stars, which flatter the model, at stars left out of the fit, and where no star is, side by side.
-    Tables (ECSV), pictures and all figures (diagnostics.json) go into one folder.
+    Side by side: residuals at the stars of the fit, which are too small, leave-one-out residuals, and residuals at
+    holdout positions. Tables (ECSV), plots and all metrics (diagnostics.json) go into one folder.
 
     **Examples**
 
     - `pachon diagnose pachon_run`
-
-    - `pachon diagnose pachon_run --out looked_at`
-
-    - `pachon diagnose pachon_run --json`: all figures on standard output
+    - `pachon diagnose pachon_run --out residuals`
+    - `pachon diagnose pachon_run --json`: all metrics on standard output
     """
     from ..core.files import json_text
     from ..pipeline.measure.diagnostics import diagnose
+    from ..pipeline.report.tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
 
     result = diagnose(folder, out, strict=strict)
     if as_json:
         print(json_text(result.as_dict()))
         return
-    _show_diagnostics(result)
-
-
-def _show_diagnostics(result: Any) -> None:
-    from ..pipeline.report.tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
-
-    show_table(DIAGNOSTICS_COLUMNS, diagnostics_rows(result.overall), DIAGNOSTICS_CAPTION)
+    Rows(DIAGNOSTICS_COLUMNS, diagnostics_rows(result.overall), DIAGNOSTICS_CAPTION).show()
     if result.missing:
         reason = next(iter(result.missing.values()))
         wide_console().print(f"{len(result.missing)} CCDs are left out; the first: {reason}", style="bold")
     print(f"diagnostics: {result.folder.resolve()}")
 
 
+@app.command("attribute")
 def attribute_command(
     config: Config = None,
     ccds: Ccds = None,
@@ -80,7 +65,7 @@ def attribute_command(
         ),
     ] = None,
     average: Annotated[
-        bool, typer.Option("--average", help="The mean over all turbulence: quick, and leaves optics and heights.")
+        bool, typer.Option("--average", help="Average over all turbulence: quick; optics and heights remain.")
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("pachon_attribution"),
     truth_stars: TruthStars = None,
@@ -89,18 +74,18 @@ def attribute_command(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Find what each cause does: the same stars with everything, and once more with each cause switched off.
+    """Attribute ellipticity to its causes: the same stars with all causes, and once more without each of them.
 
-    As long as a run for each cause. Heights, turbulence and positions of the stars stay as they were, so a difference
-    is the doing of the cause. Tables (ECSV), a picture and all figures (attribution.json) go into one folder.
+    Each cause takes as long as a run. Heights, turbulence and positions of the stars stay the same, so a difference
+    is due to the cause. Tables (ECSV), a plot and all metrics (attribution.json) go into one folder.
 
     **Examples**
 
     - `pachon attribute --raft R22 --average`: seconds
-
     - `pachon attribute pachon_run/config.yaml --causes ccd,potato_chip,atmosphere --truth-stars 200`
     """
     from ..core.files import json_text, make_folder
+    from ..pipeline.report.tables import ATTRIBUTION_CAPTION, ATTRIBUTION_COLUMNS, attribution_rows
     from ..studies.attribution.attribution import attribute, checked_causes, write_attribution
 
     names = one_name_list(ccds=ccds, raft=raft)
@@ -117,14 +102,5 @@ def attribute_command(
         print(json_text(result.figures))
         return
     if not quiet:
-        _show_attribution(result.figures)
+        Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.figures), ATTRIBUTION_CAPTION).show()
     print(f"attribution: {out.resolve()}")
-
-
-def _show_attribution(figures: dict[str, dict[str, float]]) -> None:
-    from ..pipeline.report.tables import ATTRIBUTION_CAPTION, ATTRIBUTION_COLUMNS, attribution_rows
-
-    show_table(ATTRIBUTION_COLUMNS, attribution_rows(figures), ATTRIBUTION_CAPTION)
-
-
-COMMANDS = {"diagnose": diagnose_command, "attribute": attribute_command}

@@ -1,4 +1,4 @@
-"""The command ``pachon reproduce``; :mod:`~pachon.commands.cli` registers it."""
+"""The command ``pachon reproduce``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from .options import Json, Quiet, Threads, interruptible, wide_console
+from .inputs import interruptible
+from .options import Json, Quiet, Threads
+from .tables import wide_console
+
+app = typer.Typer()
 
 
+@app.command("reproduce")
 def reproduce_command(
     figures: Annotated[
         list[str] | None, typer.Argument(metavar="fig1 ... fig14 | table1 | all", help="Figures; all by default.")
@@ -22,23 +27,21 @@ def reproduce_command(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Make figures of Jee & Tyson (2011) again, those that need no galaxies: what the paper says, what comes out here.
+    """Reproduce the figures of Jee & Tyson (2011) that need no galaxies, with the paper's values beside ours.
 
-    Each gives pictures (PNG), the numbers behind them (ECSV or FITS) and a verdict; `all` writes summary.json too.
+    Each gives plots (PNG), their data (ECSV or FITS) and a verdict; `all` writes summary.json too.
     Figures 9 and 11 to 14 show one run of the pipeline, in the sub-folder run: it is kept, and used again.
 
     **Examples**
 
     - `pachon reproduce`: all of them, small
-
     - `pachon reproduce fig3 table1 --out figures`
-
     - `pachon reproduce all --scale paper --out paper_figures`
     """
     from ..core.files import json_text
     from ..studies.reproduce.reproduce import reproduce_at
 
-    with interruptible(quiet, f"what was finished is in {out}, and is used by the next call") as reporter:
+    with interruptible(quiet, f"finished parts are in {out}, and are used by the next call") as reporter:
         summary = reproduce_at(figures or ("all",), scale, out, seed=seed, threads=threads, reporter=reporter)
     if as_json:
         print(json_text(summary))
@@ -55,6 +58,3 @@ def _show_reproduced(summary: dict[str, Any], folder: Path) -> None:
         table.add_row(name, figure["paper"], figure["here"], f"{figure['verdict']}: {figure['why']}")
     wide_console().print(table, markup=False, highlight=False)
     print(f"figures: {folder.resolve()}")
-
-
-COMMANDS = {"reproduce": reproduce_command}

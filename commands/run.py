@@ -1,4 +1,4 @@
-"""The command ``pachon run``; :mod:`~pachon.commands.cli` registers it."""
+"""The command ``pachon run``."""
 
 from __future__ import annotations
 
@@ -7,24 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from .options import (
-    Ccds,
-    Config,
-    Json,
-    ObservedStars,
-    Quiet,
-    Raft,
-    Threads,
-    TruthStars,
-    interruptible,
-    one_name_list,
-    resolved_configuration,
-    wide_console,
-)
+from .inputs import interruptible, resolved_configuration
+from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
+from .tables import Rows, plain_table, wide_console
+
+app = typer.Typer()
 
 
+@app.command("run")
 def run_command(
     config: Config = None,
     ccds: Ccds = None,
@@ -54,13 +45,9 @@ def run_command(
     **Examples**
 
     - `pachon run`: the default, a few minutes on two cores
-
     - `pachon run --raft R22 --out central_raft --seed 7`
-
     - `pachon run --ccds R22_S11,R24_S12 --truth-stars 400`
-
     - `pachon run pachon_run/config.yaml --out again`: the same bytes
-
     - `pachon run --all --out full --resume`: go on where a run was stopped
     """
     from ..core.files import json_text
@@ -73,7 +60,7 @@ def run_command(
     )
     with interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter:
         result = run(resolved, out, resume=resume, strict=strict, threads=threads, reporter=reporter)
-    if quiet:  # the reporter has said nothing
+    if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
             print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)
     if as_json:
@@ -86,26 +73,16 @@ def _show_run(result: Any, seconds: float) -> None:
     from ..pipeline.report.tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
     console = wide_console()
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    for what, value in headline(result.summary):
-        table.add_row(what, value)
+    headlines = plain_table(show_header=False)
+    for name, value in headline(result.summary):
+        headlines.add_row(name, value)
     rows = per_ccd(result.summary)
     if len(rows) <= 21:
-        each = Table(box=None, header_style="bold", padding=(0, 1, 0, 0))
-        for name, unit in PER_CCD_COLUMNS:
-            each.add_column(
-                f"{name} [{unit}]".replace("[", "\\[") if unit else name, justify="right" if unit else "left"
-            )
-        for row in rows:
-            each.add_row(*row)
-        console.print(each)
-        console.print(PER_CCD_CAPTION, style="dim", width=100)
+        headings = [f"{name} [{unit}]" if unit else name for name, unit in PER_CCD_COLUMNS]
+        Rows(headings, rows, PER_CCD_CAPTION, left=sum(not unit for _, unit in PER_CCD_COLUMNS)).show()
         console.print()
-    console.print(table)
+    console.print(headlines)
     console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
     if result.not_modelled:
         console.print(f"left out, not to be modelled: {', '.join(result.not_modelled)}", style="bold")
     print(f"report: {result.report.resolve()}")
-
-
-COMMANDS = {"run": run_command}

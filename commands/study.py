@@ -1,4 +1,4 @@
-"""The command ``pachon study``; :mod:`~pachon.commands.cli` registers it."""
+"""The command ``pachon study``."""
 
 from __future__ import annotations
 
@@ -8,38 +8,32 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from ..core.errors import ConfigError
-from .options import (
-    Config,
-    Json,
-    Quiet,
-    Threads,
-    TruthStars,
-    interruptible,
-    name_list,
-    one_name_list,
-    resolved_configuration,
-    show_table,
-    wide_console,
-)
+from .inputs import interruptible, resolved_configuration
+from .options import Config, Json, Quiet, Threads, TruthStars, name_list, one_name_list
+from .tables import Rows, wide_console
 
 if TYPE_CHECKING:
     from ..studies.psf_choice.study import Study
 
+app = typer.Typer()
+
 _Number = TypeVar("_Number", int, float)
 _COLUMNS = {
     "rms_e_at_stars": "at stars: rms e",
-    "rms_e_away": "no star: rms e",
+    "rms_e_away": "holdout: rms e",
     "rms_size_away": "rms size",
     "mean_e_away": "mean e of a CCD",
     "xi_plus_away_long": "ξ+ beyond 10'",
 }
 _CAPTION = (
-    "Residuals of the base, of what is recommended, and of the best order of each number of stars. Rms of one "
-    "component of e: observed - model at the stars, which flatters; truth - model where no star is. There, too: rms of "
-    "the relative size, rms over CCDs of their mean of e, and mean ξ+ from 10' to 3 deg."
+    "Residuals of the base, of the recommended model, and of the best order of each number of stars. Rms of one "
+    "component of e: observed - model at the stars of the fit, which is too small; noise-free - model at holdout "
+    "positions. Also at holdout positions: rms of the relative size, rms over CCDs of the mean e, and mean ξ+ from 10' "
+    "to 3 deg."
 )
 
 
+@app.command("study")
 def study_command(
     config: Config = None,
     ccds: Annotated[
@@ -56,16 +50,15 @@ def study_command(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Find how to model the PSF: how many stars, which order, how many components, basis, interpolation, S/N.
+    """Choose a PSF model: number of stars, order, number of components, basis, interpolation, S/N.
 
     Stars are simulated once, observed through several draws of noise and modelled in some 350 ways about that of the
-    configuration; each is held against the truth where no star is. Some minutes. Table (ECSV), pictures and all
-    figures (study.json) go into one folder.
+    configuration; each is compared with the noise-free PSFs at holdout positions. Some minutes. Table (ECSV), plots
+    and all metrics (study.json) go into one folder.
 
     **Examples**
 
     - `pachon study`: forty stars of S/N 30 and more on nine CCDs across the field
-
     - `pachon study my_config.yaml --ccds R22_S11,R24_S11 -o small_study --stars 20,40 --orders 1,2,3 --draws 2`
     """
     from ..core.files import json_text, make_folder
@@ -83,7 +76,7 @@ def study_command(
         snrs=_numbers(snr, "--snr", float),
         draws=draws,
     )
-    study_configuration(resolved, plan)  # refuses what cannot be, before anything is written
+    study_configuration(resolved, plan)  # raises for a bad plan, before anything is written
     make_folder(out)
     with interruptible(quiet) as reporter:
         result = study(resolved, plan, threads=threads, reporter=reporter)
@@ -105,7 +98,7 @@ def _show(result: Study) -> None:
     for case in dict.fromkeys(cases):
         if (found := result.figures.get(case)) is not None:
             rows.append((f"{case.stars} stars, {case}", *(f"{found[key]:.1e}" for key in _COLUMNS)))
-    show_table(("model", *_COLUMNS.values()), rows, _CAPTION)
+    Rows(("model", *_COLUMNS.values()), rows, _CAPTION).show()
     if result.problems:
         console.print(f"{len(result.problems)} ways could not be fitted, such as {_example(result)}", style="dim")
     if chosen is None:
@@ -113,8 +106,8 @@ def _show(result: Study) -> None:
         return
     error = result.figures[chosen]["error_rms_e_away"]
     console.print(
-        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e where no "
-        f"star is {result.figures[chosen]['rms_e_away']:.2e} ± {error:.0e}",
+        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e at holdout "
+        f"positions {result.figures[chosen]['rms_e_away']:.2e} ± {error:.0e}",
         highlight=False,
     )
 
@@ -130,6 +123,3 @@ def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]
     except ValueError:
         expected = "whole numbers" if kind is int else "numbers"
         raise ConfigError(f"{option} = {text!r}: expected {expected} separated by commas, such as 20,40") from None
-
-
-COMMANDS = {"study": study_command}

@@ -1,4 +1,4 @@
-"""The command ``pachon sweep`` with its status, export and report; :mod:`~pachon.commands.cli` registers it."""
+"""The commands ``pachon sweep``, ``sweep status``, ``sweep export`` and ``sweep report``."""
 
 from __future__ import annotations
 
@@ -10,26 +10,47 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..core.errors import ConfigError
-from .options import Json, Quiet, Threads, interruptible, show_table
+from .default_group import DefaultGroup
+from .inputs import interruptible
+from .options import Json, Quiet, Threads
+from .tables import Rows
 
 if TYPE_CHECKING:
     from ..core.progress import Reporter
     from ..studies.sweep.workers import Measure, Workers
 
-_VERBS = ("status", "export", "report")
+app = typer.Typer()
+sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
+app.add_typer(sweep_app, name="sweep")
+
+Store = Annotated[Path, typer.Argument(metavar="STORE", help="Store of a sweep, SWEEP.sweep.")]
 
 
-def sweep_command(
-    what: Annotated[
-        str | None,
-        typer.Argument(metavar="SWEEP.yaml | status | export | report", help="Sweep to run, or what to do."),
-    ] = None,
-    store: Annotated[Path | None, typer.Argument(metavar="[STORE]", help="Store of a sweep, after a verb.")] = None,
+@sweep_app.callback()
+def sweep_group() -> None:
+    """Vary heights, optics, atmosphere or settings, measure each point, and rank what matters.
+
+    One SQLite file holds all points; the report, `report.html` in a folder beside it, has the tornado chart, curves,
+    error budget and allowances. The same points give the same metrics on any machine.
+
+    **Examples**
+
+    - `pachon sweep --example table1_small`: the height budget of Jee & Tyson (2011), Table 1, in minutes
+    - `pachon sweep heights.yaml -o heights.sweep`, and after an interruption `--resume`
+    - `pachon sweep heights.yaml --scheduler tcp://login1:8786`: on a Dask cluster
+    - `pachon sweep status heights.sweep`
+    - `pachon sweep export heights.sweep -o heights.ecsv`, or .csv, .fits, .parquet
+    - `pachon sweep report heights.sweep`
+    """
+
+
+@sweep_app.command("run")
+def sweep_run(
+    sweep: Annotated[Path | None, typer.Argument(metavar="[SWEEP.yaml]", help="Sweep to run.")] = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Store to write (SWEEP.sweep), table of an export, or folder of a report."),
+        Path | None, typer.Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Compute only what the store does not hold yet.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Compute only the points that are missing.")] = False,
     processes: Annotated[
         int | None, typer.Option(min=1, help="Processes of this machine; one for each processor by default.")
     ] = None,
@@ -45,50 +66,31 @@ def sweep_command(
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
-) -> None:
-    """Vary heights, optics, atmosphere or settings, measure each point, and say what matters.
-
-    One SQLite file holds all points; the report, `report.html` in a folder beside it, has the tornado chart, curves,
-    error budget and allowances. The same points give the same figures whoever computes them.
+) -> None:  # fmt: skip
+    """Run a sweep and write its report; the word `run` may be left out.
 
     **Examples**
 
-    - `pachon sweep --example table1_small`: the height budget of Jee & Tyson (2011), Table 1, in minutes
-
-    - `pachon sweep heights.yaml -o heights.sweep`, and after an interruption `--resume`
-
-    - `pachon sweep heights.yaml --scheduler tcp://login1:8786`: on a Dask cluster
-
-    - `pachon sweep status heights.sweep`
-
-    - `pachon sweep export heights.sweep -o heights.ecsv`, or .csv, .fits, .parquet
-
-    - `pachon sweep report heights.sweep`
+    - `pachon sweep heights.yaml --processes 4`
+    - `pachon sweep heights.yaml --resume`
     """
-    if what in _VERBS:
-        if store is None:
-            raise ConfigError(f"pachon sweep {what}: expected the store of a sweep after it")
-        {"status": _status, "export": _export, "report": _report}[what](store, out, as_json)
-        return
-    if store is not None:
-        raise ConfigError(f"{what} {store}: expected one sweep file, or one of {', '.join(_VERBS)} and a store")
-    if (what is None) == (example is None):
+    if (sweep is None) == (example is None):
         raise ConfigError("pachon sweep: expected a sweep file, or --example NAME")
-    path = _example(example) if example else Path(what or "")
-    sweep_store = out or path.with_suffix(".sweep")
-    resumed = f"go on with: pachon sweep {path} -o {sweep_store} --resume"
+    path = sweep or _example(example or "")
+    store = out or path.with_suffix(".sweep")
+    resumed = f"go on with: pachon sweep {path} -o {store} --resume"
     with (
         interruptible(quiet, resumed) as reporter,
         _workers(processes, scheduler, workers, threads, reporter) as maker,
     ):
-        figures = _run(path, sweep_store, resume, maker, reporter)
-    _show(figures, as_json, quiet)
+        outcome = _run(path, store, resume, maker, reporter)
+    _show(outcome, as_json, quiet)
 
 
 def _run(
     path: Path, store: Path, resume: bool, maker: Callable[[Measure], Workers], reporter: Reporter
 ) -> dict[str, Any]:
-    """Compute what is missing, draw the report, and return what is shown in the end."""
+    """Compute the points that are missing, write the report, and return the counts."""
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
     from ..studies.sweep.store import SweepStore
@@ -99,21 +101,15 @@ def _run(
     if outcome.failed < outcome.points:
         with reporter.stage("report"), SweepStore(store) as opened:
             report = str(write_report(opened, _report_folder(store)))
-    return {
-        "store": str(store),
-        "points": outcome.points,
-        "kept": outcome.kept,
-        "computed": outcome.computed,
-        "failed": outcome.failed,
-        "report": report,
-    }
+    counts = {key: getattr(outcome, key) for key in ("points", "kept", "computed", "failed")}
+    return {"store": str(store), **counts, "report": report}
 
 
 @contextmanager
 def _workers(
     processes: int | None, scheduler: str | None, dask_workers: int | None, threads: int | None, reporter: Reporter
 ) -> Iterator[Callable[[Measure], Workers]]:
-    """Yield what makes workers of the function that computes a point."""
+    """Yield the function that makes workers of the function that computes a point."""
     if sum(option is not None for option in (processes, scheduler, dask_workers)) > 1:
         raise ConfigError("--processes, --scheduler and --workers: expected one of them")
     from ..core.threads import thread_count
@@ -121,18 +117,13 @@ def _workers(
 
     if scheduler is not None or dask_workers is not None:
         with local_cluster(dask_workers, reporter.line) if scheduler is None else dask_client(scheduler) as client:
-
-            def on_cluster(measure: Measure) -> Workers:
-                return DaskWorkers(measure, client)
-
-            yield on_cluster
+            yield lambda measure: DaskWorkers(measure, client)
         return
     count = thread_count(threads) if processes is None else processes
-
-    def on_this_machine(measure: Measure) -> Workers:
-        return SerialWorker(measure, threads) if count == 1 else ProcessWorkers(measure, count, threads)
-
-    yield on_this_machine
+    if count == 1:
+        yield lambda measure: SerialWorker(measure, threads)
+    else:
+        yield lambda measure: ProcessWorkers(measure, count, threads)
 
 
 def _example(name: str) -> Path:
@@ -150,17 +141,24 @@ def _example(name: str) -> Path:
     return path
 
 
-def _status(path: Path, out: Path | None, as_json: bool) -> None:
+@sweep_app.command("status")
+def sweep_status(store: Store, as_json: Json = False) -> None:
+    """Count the points of a store: computed, failed and missing.
+
+    **Examples**
+
+    - `pachon sweep status heights.sweep`
+    """
     from ..studies.sweep.store import SweepStore
 
-    with SweepStore(path) as store:
-        results = store.results()
-        count = len(store.points())
-        sweep = store.sweep
+    with SweepStore(store) as opened:
+        results = opened.results()
+        count = len(opened.points())
+        sweep = opened.sweep
     problems = [r for r in results if r.problem is not None]
-    figures = {
+    status = {
         "sweep": sweep.name,
-        "pachon": store.about["pachon"],
+        "pachon": opened.about["pachon"],
         "design": sweep.design.kind,
         "points": count,
         "computed": len(results) - len(problems),
@@ -169,49 +167,70 @@ def _status(path: Path, out: Path | None, as_json: bool) -> None:
         "seconds_a_point": sum(r.seconds for r in results) / len(results) if results else None,
         "workers": len({r.worker for r in results}),
     }
-    _show(figures, as_json, False)
+    _show(status, as_json)
     if problems and not as_json:
-        show_table(["point", "problem"], [[str(r.number), r.problem or ""] for r in problems[:20]], left=2)
+        Rows(["point", "problem"], [[str(r.number), r.problem or ""] for r in problems[:20]], left=2).show()
 
 
-def _export(path: Path, out: Path | None, as_json: bool) -> None:
+@sweep_app.command("export")
+def sweep_export(
+    store: Store,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Table to write, .ecsv, .csv, .fits or .parquet.")
+    ] = None,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Write the points of a store as a table; of a damaged store those that can still be read.
+
+    **Examples**
+
+    - `pachon sweep export heights.sweep`: heights.ecsv
+    - `pachon sweep export heights.sweep -o heights.parquet`
+    """
     from ..core.errors import ProductError
     from ..studies.sweep.store import SweepStore
     from ..studies.sweep.table import export_table, salvage
 
-    target = out or path.with_suffix(".ecsv")
+    target = out or store.with_suffix(".ecsv")
+    damaged = {}
     try:
-        with SweepStore(path) as store:
-            count = export_table(store, target)
+        with SweepStore(store) as opened:
+            count = export_table(opened, target)
     except ProductError as error:
         if "damaged" not in str(error):
             raise
-        count = salvage(path, target)
-        _show({"table": str(target), "points": count, "damaged": str(error)}, as_json, False)
-        return
-    _show({"table": str(target), "points": count}, as_json, False)
+        count, damaged = salvage(store, target), {"damaged": str(error)}
+    _show({"table": str(target), "points": count, **damaged}, as_json)
 
 
-def _report(path: Path, out: Path | None, as_json: bool) -> None:
+@sweep_app.command("report")
+def sweep_report(
+    store: Store,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to; beside the store.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the report of a store: tornado chart, curves, error budget and allowances.
+
+    **Examples**
+
+    - `pachon sweep report heights.sweep -o heights_report`
+    """
     from ..studies.sweep.report import write_report
     from ..studies.sweep.store import SweepStore
 
-    with SweepStore(path) as store:
-        report = write_report(store, out or _report_folder(path))
-    _show({"report": str(report)}, as_json, False)
+    with SweepStore(store) as opened:
+        report = write_report(opened, out or _report_folder(store))
+    _show({"report": str(report)}, as_json)
 
 
 def _report_folder(store: Path) -> Path:
     return store.with_name(f"{store.stem}_report")
 
 
-def _show(figures: dict[str, Any], as_json: bool, quiet: bool) -> None:
+def _show(values: dict[str, Any], as_json: bool, quiet: bool = False) -> None:
     from ..core.files import json_text
 
     if as_json:
-        print(json_text(figures))
+        print(json_text(values))
     elif not quiet:
-        show_table(["", ""], [[k.replace("_", " "), "" if v is None else f"{v}"] for k, v in figures.items()], left=2)
-
-
-COMMANDS = {"sweep": sweep_command}
+        Rows(["", ""], [[k.replace("_", " "), "" if v is None else f"{v}"] for k, v in values.items()], left=2).show()

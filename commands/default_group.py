@@ -1,0 +1,38 @@
+"""A group of commands of which one needs no name."""
+
+from __future__ import annotations
+
+from copy import copy
+from difflib import get_close_matches
+from typing import Any
+
+from typer.core import TyperGroup
+
+
+class DefaultGroup(TyperGroup):
+    """A group whose first command may be left out: ``pachon sweep FILE`` is ``pachon sweep run FILE``.
+
+    The help of the group shows the options of that command too.
+    """
+
+    @property
+    def default(self) -> str:
+        """Name of the command that may be left out."""
+        return next(iter(self.commands))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the name of the default command before arguments that do not begin with that of another one."""
+        first = args[0] if args else ""
+        if first not in (*self.commands, "--help") and not self._mistyped(first):
+            args = [self.default, *args]
+        return super().parse_args(ctx, args)
+
+    def _mistyped(self, word: str) -> bool:
+        return not word.startswith("-") and bool(get_close_matches(word, list(self.commands), cutoff=0.6))
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of the group, with the options of the default command."""
+        # The group itself does not parse these.
+        shown = copy(self)
+        shown.params = list(self.commands[self.default].params)
+        super(DefaultGroup, shown).format_help(ctx, formatter)

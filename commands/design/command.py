@@ -1,0 +1,195 @@
+"""Builder of design commands: the options that all of them have, the way in, and the way out.
+
+A command is one function that takes the shared options as a :class:`Given`, has the command's own options as further
+parameters, and returns a result with ``summary()`` and ``plot()``. Its name and docstring are those of the command;
+:func:`design_command` adds the shared options, and the columns of the table.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import typer
+
+from .. import options
+from ..inputs import interruptible, load_model
+from ..tables import Column, Rows
+
+if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    from ...models.telescope import Telescope
+
+app = typer.Typer()
+
+
+class Study(Protocol):
+    """The result of a design command."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the metrics by name, units in the names."""
+
+    def plot(self) -> Figure:
+        """Draw the picture."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A result with more to show than its command's table.
+
+    Attributes
+    ----------
+    result : Study
+        Metrics and picture.
+    table : callable, optional
+        Function from the result to a table, in place of the command's columns.
+    stem : str, optional
+        Name of the picture without its end; by default those of command and telescope.
+    notes : sequence of str
+        Lines below the table.
+    """
+
+    result: Study
+    table: Callable[[Any], Rows] | None = None
+    stem: str | None = None
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Given:
+    """The options that design commands share; files are read when they are first used."""
+
+    model: str
+    field_deg: Sequence[str] | str | None = None
+    wavelength_nm: Any = None
+    across_band: int | None = None
+    projection: str = "zemax"
+    lenient: bool = False
+    threads: int | None = None
+
+    @cached_property
+    def telescope(self) -> Telescope:
+        """The telescope."""
+        return load_model(self.model, self.lenient)
+
+    @cached_property
+    def fields(self) -> np.ndarray | None:
+        """Field angles [rad], shape [n, 2]; None where none are given."""
+        return options.field_list([self.field_deg] if isinstance(self.field_deg, str) else self.field_deg)
+
+    @cached_property
+    def wavelength(self) -> float | None:
+        """The one wavelength [m]; None where none is given."""
+        return None if self.wavelength_nm is None else self.wavelength_nm * 1e-9
+
+    @cached_property
+    def wavelengths(self) -> np.ndarray | None:
+        """The wavelengths [m]; None where none are given."""
+        return options.wavelength_list(self.telescope, self.wavelength_nm, self.across_band)
+
+    @property
+    def how(self) -> dict[str, Any]:
+        """Projection and threads, as keyword arguments."""
+        return {"projection": self.projection, "threads": self.threads}
+
+    @property
+    def images(self) -> int:
+        """The number of images, over fields and wavelengths; five fields by default."""
+        count = 5 if self.fields is None else len(self.fields)
+        return count if self.wavelengths is None else count * len(self.wavelengths)
+
+    @contextmanager
+    def stage(self, title: str, total: int | None) -> Iterator[Callable[[int], None]]:
+        """Show progress, and yield the callback that takes the number of items done since the last call."""
+        with interruptible(False) as reporter, reporter.stage(title, total) as stage:
+            yield stage.advance
+
+
+def design_command(
+    *columns: Column,
+    caption: str | Callable[[dict[str, Any]], str] = "",
+    left: int = 1,
+    band: bool = False,
+    picture: Any = options.Picture,
+) -> Callable[[Callable[..., Study | Outcome]], Callable[..., Study | Outcome]]:
+    """Make a command of a function, and add it to :data:`app`.
+
+    Parameters
+    ----------
+    *columns : Column
+        Columns of the table.
+    caption : str or callable
+        Text below the table; fields in braces are those of the summary. Or a function of the summary.
+    left : int
+        Number of columns of names.
+    band : bool
+        Take several wavelengths or the pass band, not one wavelength.
+    picture : annotated type
+        The option that names the picture.
+    """
+
+    def rows(result: Study) -> Rows:
+        summary = result.summary()
+        cells = [column.texts(result, summary) for column in columns]
+        text = caption.format_map(summary) if isinstance(caption, str) else caption(summary)
+        return Rows([column.heading for column in columns], [*zip(*cells, strict=True)], text, left)
+
+    def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
+        name = compute.__name__
+        first: dict[str, tuple[Any, Any]] = {"model": (options.Model, inspect.Parameter.empty)}
+        first["field_deg"] = (options.FieldsDeg, None)
+        first["wavelength_nm"] = (options.WavelengthsNm if band else options.WavelengthNm, None)
+        if band:
+            first["across_band"] = (options.AcrossBand, None)
+        _, *given = inspect.signature(compute, eval_str=True).parameters.values()
+        own = {p.name: (p.annotation, p.default) for p in given}
+        last = {
+            "projection": (options.Projection, "zemax"),
+            "lenient": (options.Lenient, False),
+            "picture": (picture, None),
+            "threads": (options.Threads, None),
+            "as_json": (options.Json, False),
+        }
+
+        def command(picture: Path | None, as_json: bool, **values: Any) -> None:
+            kind = options.picture_kind(picture)
+            shared = Given(**{f.name: values[f.name] for f in fields(Given) if f.name in values})
+            found = compute(shared, **{key: values[key] for key in own})
+            outcome = found if isinstance(found, Outcome) else Outcome(found)
+            path = picture or Path(f"{outcome.stem or f'{name}_{shared.telescope.name}'}.png")
+            _deliver(outcome, outcome.table or rows, path, kind, as_json)
+
+        # Keyword-only, so that an option without a default may follow one that has a default.
+        parameters = [
+            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+            for key, (annotation, default) in {**first, **own, **last}.items()
+        ]
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        command.__doc__ = inspect.getdoc(compute)
+        app.command(name)(command)
+        return compute
+
+    return build
+
+
+def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: str, as_json: bool) -> None:
+    """Save the picture, and print the metrics as JSON or as a table."""
+    from ...core.files import json_text, write_bytes
+    from ...core.plotting import picture_bytes
+
+    write_bytes(path, picture_bytes(outcome.result.plot(), kind))
+    if as_json:
+        print(json_text({**outcome.result.summary(), "picture": str(path)}))
+        return
+    table(outcome.result).show()
+    for note in outcome.notes:
+        print(note)
+    print(f"picture: {path.resolve()}")

@@ -1,0 +1,157 @@
+"""Commands on the field of view and the apertures: ``distortion``, ``vignetting``, ``footprint`` and ``draw``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ...core.errors import ConfigError
+from ..tables import Column, Rows, number_texts
+from .command import Given, Outcome, design_command
+
+#: Number of rays that takes longer than two seconds to trace.
+_MANY_RAYS = 10_000_000
+
+
+@design_command()
+def distortion(
+    given: Given,
+    centroid: Annotated[bool, typer.Option("--centroid", help="Centroids of the light, not chief rays.")] = False,
+) -> Outcome:
+    """Compare where stars land with a scaled picture of the sky, r = f tan(theta).
+
+    In percent against the scale that fits best over the field, and against that at the axis, as lens designers do.
+
+    **Examples**
+
+    - `pachon distortion lsst_v3.3_r`: a lattice over the field of view
+    - `pachon distortion lsst_v3.3_r --centroid --json`
+    """
+    from ...design.metrics.distortion import distortion as compute
+
+    reference = "centroid" if centroid else "chief"
+    where = given.telescope, given.fields, given.wavelength
+    return Outcome(compute(*where, reference=reference, **given.how), _distortion_rows)
+
+
+def _distortion_rows(result: Any) -> Rows:
+    s = result.summary()
+    rows = [
+        ("focal length that fits best", f"{s['focal_length_m']:.6f} m"),
+        ("focal length at the axis", f"{s['axis_focal_length_m']:.6f} m"),
+        ("largest distortion against the best scale", f"{s['largest_percent']:.4f} %"),
+        ("largest distortion against the axis's scale", f"{s['largest_percent_of_axis_scale']:.4f} %"),
+        ("largest shift from the best picture", f"{s['largest_shift_um']:.3f} µm"),
+        ("rms shift", f"{s['rms_shift_um']:.3f} µm"),
+    ]
+    return Rows(("metric", "value"), rows, f"{s['telescope']}, {s['wavelength_nm']:g} nm, {len(result.fields)} fields")
+
+
+@design_command()
+def vignetting(
+    given: Given,
+    rays: Annotated[int, typer.Option(min=16, max=10**7, help="Rays of each field.")] = 16384,
+) -> Outcome:
+    """Find how much of the pupil is lit against field, with an error, as profile and map.
+
+    **Examples**
+
+    - `pachon vignetting lsst_v3.3_r`: rings over the field of view
+    - `pachon vignetting lsst_v3.3_r --field-deg 1.2 --field-deg 1.75 --rays 1000000 --json`
+    """
+    from ...design.metrics.vignetting import field_disc
+    from ...design.metrics.vignetting import vignetting as compute
+
+    fields: Any = field_disc(given.telescope) if given.fields is None else given.fields
+    where = given.telescope, fields, given.wavelength
+    if rays * (len(fields) + 1) < _MANY_RAYS:
+        return Outcome(compute(*where, rays=rays, **given.how), _vignetting_rows)
+    with given.stage("vignetting", len(fields) + 1) as progress:
+        return Outcome(compute(*where, rays=rays, progress=progress, **given.how), _vignetting_rows)
+
+
+def _vignetting_rows(result: Any) -> Rows:
+    """Light at each distance from the axis."""
+    import numpy as np
+
+    radius = np.rad2deg(np.linalg.norm(result.fields, axis=-1)).round(6)
+    rows = []
+    for r in np.unique(radius):
+        ring = radius == r
+        light, error = 100.0 * result.relative[ring], 100.0 * result.error[ring].max() / result.axis_fraction
+        rows.append((f"{r:g}", f"{light.mean():.2f}", f"{light.min():.2f}", f"{light.max():.2f}", f"{error:.2f}"))
+    headings = ("distance from the axis [deg]", "light [%]", "least", "most", "error of one field")
+    caption = f"Relative to the axis, where {100 * result.axis_fraction:.2f} % of the annular pupil is lit."
+    return Rows(headings, rows, caption)
+
+
+@design_command()
+def footprint(
+    given: Given,
+    surface: Annotated[
+        list[str] | None, typer.Option(help="Name of a surface, once for each; all of them by default.")
+    ] = None,
+) -> Outcome:
+    """Draw the footprints of beams on surfaces, over the clear apertures, and the light that each surface blocks.
+
+    **Examples**
+
+    - `pachon footprint lsst_v3.3_r`: a panel for each surface
+    - `pachon footprint lsst_v3.3_r --surface M2 --surface Filter_entrance --field-deg 0 --field-deg 1.75`
+    """
+    from ...design.metrics.footprint import footprint as compute
+
+    where = given.telescope, surface or None, given.fields, given.wavelength
+    return Outcome(compute(*where, **given.how), _footprint_rows)
+
+
+def _footprint_rows(result: Any) -> Rows:
+    import numpy as np
+
+    rows = []
+    for s in result.surfaces:
+        blocked = number_texts(100.0 * s.blocked_fraction, ".2f")
+        rows.append((s.surface.name, f"{np.nanmax(s.largest_radius, initial=0.0) * 1e3:.2f}", *blocked))
+    fields = [f"{text}°" for text in number_texts(result.summary()["field_deg"], ".4g")]
+    caption = (
+        "Reaches to: largest distance from the vertex of light that arrives. Then, field by field, the part of the "
+        "pupil [%] that the surface is the first to block."
+    )
+    return Rows(("surface", "reaches to [mm]", *fields), rows, caption)
+
+
+@design_command(
+    Column("surface", "surface"),
+    Column("kind", "interaction"),
+    Column("vertex [mm]", "vertex_m", ".6g", 1e3),
+    Column("drawn to [mm]", "drawn_radius_m", ".4g", 1e3),
+    left=2,
+)
+def draw(
+    given: Given,
+    glb: Annotated[
+        Path | None, typer.Option(help="Write the telescope and its rays in three dimensions, .glb.")
+    ] = None,
+) -> Outcome:  # fmt: skip
+    """Draw a telescope: its section with rays of some fields, and a model in three dimensions.
+
+    Surfaces are cut to their apertures; those without one go as far as the light of the field of view does.
+
+    **Examples**
+
+    - `pachon draw lsst_v3.3_r`
+    - `pachon draw lsst_v3.3_r_obstructed -o lsst.pdf --glb lsst.glb`
+    - `pachon draw my_lens.zmx --field-deg 0 --field-deg 10`
+    """
+    from ...core.files import write_bytes
+    from ...design.layout import layout
+
+    if glb is None:
+        return Outcome(layout(given.telescope, given.fields, given.wavelength, **given.how))
+    if glb.suffix.lower() != ".glb":
+        raise ConfigError(f"--glb = {str(glb)!r}: expected a name that ends in .glb")
+    result = layout(given.telescope, given.fields, given.wavelength, **given.how)
+    write_bytes(glb, result.glb())
+    return Outcome(result, notes=[f"model: {glb.resolve()}"])

@@ -1,0 +1,201 @@
+"""Commands that make images of stars: ``psf``, ``ee``, ``mtf`` and ``ghosts``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ...core.errors import ConfigError
+from ..tables import FIELD, Column
+from .command import Given, Outcome, Study, design_command
+
+PupilPoints = Annotated[
+    int | None, typer.Option(min=16, max=4096, help="Lattice points across the pupil; enough of them by default.")
+]
+
+
+@design_command(
+    FIELD,
+    Column("Strehl", "strehl", ".4f"),
+    Column("FWHM [µm]", "fwhm_um", ".3f"),
+    Column("FWHM [arcsec]", "fwhm_arcsec", ".4f"),
+    Column("Airy [µm]", "airy_radius_um", ".3f"),
+    Column("inside [%]", "light_inside", ".2f", 100.0),
+    Column("lit [%]", "lit_fraction", ".2f", 100.0),
+    caption=lambda s: (
+        f"{s['pixels']} x {s['pixels']} pixels of {s['pixel_um']:.4g} µm; inside: of the light, within the "
+        f"{s['pixels'] * s['pixel_um']:.4g} µm of the image; lit: of the annular pupil. {s['pupil_points']} points "
+        "across the pupil."
+    ),
+    band=True,
+)
+def psf(
+    given: Given,
+    huygens: Annotated[bool, typer.Option("--huygens", help="Sum the wave of every ray at every pixel.")] = False,
+    pixel_um: Annotated[float | None, typer.Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
+    pixels: Annotated[int, typer.Option(min=16, max=4096, help="Pixels on a side.")] = 128,
+    pupil_points: PupilPoints = None,
+    fits: Annotated[Path | None, typer.Option(help="FITS file to write the images to, [field, y, x].")] = None,
+) -> Study:
+    """Make diffraction images of the telescope alone: Strehl ratio, FWHM, and the images themselves.
+
+    By a Fourier sum over directions at the image, exact off the axis too; or by Huygens' wavelets.
+
+    **Examples**
+
+    - `pachon psf lsst_v3.3_i`: five fields from the axis to the edge
+    - `pachon psf lsst_v3.3_i --across-band 5 --field-deg 1.4 --fits psf.fits`
+    - `pachon psf paul_baker --field-deg 0 --huygens --json`
+    """
+    from ...core.files import image_hdu, write_fits
+    from ...design.images.diffraction import fft_psf, huygens_psf
+
+    if huygens and pupil_points is not None:
+        raise ConfigError("--huygens and --pupil-points: expected one of them")
+    how: dict[str, Any] = dict(pixel=None if pixel_um is None else pixel_um * 1e-6, pixels=pixels, **given.how)
+    where = given.telescope, given.fields, given.wavelengths
+    with given.stage("diffraction images", given.images) as progress:
+        if huygens:
+            result = huygens_psf(*where, advance=progress, **how)
+        else:
+            result = fft_psf(*where, pupil_points=pupil_points, advance=progress, **how)
+    if fits is not None:
+        cards = [
+            ("MODEL", result.telescope, "telescope"),
+            ("METHOD", result.method, "fft or huygens"),
+            ("PIXEL", result.pixel * 1e6, "[um] distance of pixel centres"),
+        ]
+        write_fits(fits, [image_hdu("PSF", result.image, "part of the light in each pixel")], None, cards)
+    return result
+
+
+@design_command(
+    FIELD,
+    *(
+        Column(f"{fraction} % [{unit}]", f"ee{fraction}_radius_{key}", form)
+        for fraction in (50, 80, 90)
+        for unit, key, form in (("µm", "um", ".3f"), ("arcsec", "arcsec", ".4f"))
+    ),
+    caption="Radii about the centroid of the rays.",
+    band=True,
+)
+def ee(
+    given: Given,
+    geometric: Annotated[bool, typer.Option("--geometric", help="Of rays alone, without diffraction.")] = False,
+    pixels: Annotated[int, typer.Option(min=16, max=4096, help="Pixels of the images, on a side.")] = 256,
+    pupil_points: PupilPoints = None,
+) -> Study:
+    """Measure the encircled energy: radii that hold 50, 80 and 90 % of a star's light, in µm and arc seconds.
+
+    With diffraction, about the centroid of the rays.
+
+    **Examples**
+
+    - `pachon ee lsst_v3.3_i`
+    - `pachon ee lsst_v3.3_i --wavelength-nm 750 --field-deg 0 --field-deg 1 --field-deg 1.4 --field-deg 1.75`
+    - `pachon ee my_lens.zmx --geometric --across-band 5 --json`
+    """
+    from ...design.images.encircled_energy import encircled_energy
+
+    kind, total = ("geometric", None) if geometric else ("diffraction", given.images)
+    where = given.telescope, given.fields, given.wavelengths
+    with given.stage("encircled energy", total) as progress:
+        how = dict(pixels=pixels, pupil_points=pupil_points, **given.how)
+        return encircled_energy(*where, kind=kind, advance=progress, **how)
+
+
+@design_command(
+    FIELD,
+    Column("50 % [cycles/mm]", "half_contrast_cycles_per_mm", ".2f"),
+    Column("50 % [cycles/arcsec]", "half_contrast_cycles_per_arcsec", ".3f"),
+    Column("cut-off [cycles/mm]", "cutoff_cycles_per_mm", ".1f"),
+    Column("f/", "f_number", ".4f"),
+    caption="Pairs: tangential, sagittal. 50 %: where the contrast first falls to a half.",
+    band=True,
+)
+def mtf(
+    given: Given,
+    pupil_points: Annotated[int, typer.Option(min=16, max=4096, help="Lattice points across the pupil.")] = 256,
+) -> Study:
+    """Draw the modulation transfer, tangential and sagittal, beside that of a perfect wavefront and of rays alone.
+
+    **Examples**
+
+    - `pachon mtf lsst_v3.3_r`
+    - `pachon mtf my_lens.zmx --across-band 5 --field-deg 0 --field-deg 10 -o mtf.pdf`
+    """
+    from ...design.images.mtf import mtf as compute
+
+    where = given.telescope, given.fields, given.wavelengths
+    with given.stage("modulation transfer", given.images) as progress:
+        return compute(*where, pupil_points=pupil_points, advance=progress, **given.how)
+
+
+@design_command(
+    Column("reflected at", "first"),
+    Column("and then at", "second"),
+    Column("light", "flux", ".3e"),
+    Column("peak [1/mm²]", "peak_per_mm2", ".2e"),
+    Column("peak [mag/arcsec²]", "peak_magnitudes_per_arcsec2", ".2f"),
+    Column("diameter [mm]", "diameter_mm", ".2f"),
+    Column("at [mm]", "centroid_mm", ".1f"),
+    Column("focus [mm]", "focus_mm", ".2f"),
+    caption=lambda s: (
+        "Light and peak over the light of the star's own image; magnitudes below the star's own. Focus: height "
+        f"above the detector. All ghosts together hold {100 * s['total_flux']:.3g} % of the star's light."
+    ),
+    left=2,
+)
+def ghosts(
+    given: Given,
+    field_deg: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y | R",
+            help="Field angle of the star [deg], or its distance from the axis along +y; half-way by default.",
+        ),
+    ] = None,
+    reflectivity: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="R | NAME=R", help="Of the lens surfaces, one for all or by name; by default that of bare glass."
+        ),
+    ] = None,
+    detector_reflectivity: Annotated[float, typer.Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
+    rays: Annotated[int, typer.Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
+) -> Outcome:
+    """Trace every ghost that two reflections make: its light, irradiance, size and focus, the brightest first.
+
+    **Examples**
+
+    - `pachon ghosts lsst_v3.3_r`
+    - `pachon ghosts lsst_v3.3_r --field-deg 1.2 --reflectivity 0.01 --detector-reflectivity 0.3`
+    - `pachon ghosts lsst_v3.3_r --reflectivity Filter_exit=0.005 --reflectivity Filter_entrance=0.005 --json`
+    """
+    from ...design.metrics.ghost_paths import ghost_pairs
+    from ...design.metrics.ghosts import ghosts as compute
+
+    how: dict[str, Any] = dict(reflectivity=_reflectivities(reflectivity or []), **given.how)
+    field = None if given.fields is None else given.fields[0]
+    with given.stage("ghosts", max(len(ghost_pairs(given.telescope)), 1)) as progress:
+        how |= dict(detector_reflectivity=detector_reflectivity, rays=rays, advance=progress)
+        return Outcome(compute(given.telescope, field, given.wavelength, **how))
+
+
+def _reflectivities(texts: list[str]) -> float | dict[str, float] | None:
+    """Return the reflectivities: None where there are none, one number for all, or numbers by name."""
+    found: dict[str, float] = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            raise ConfigError(f"--reflectivity = {text!r}: expected a number, or NAME=number") from None
+        if not name:
+            if len(texts) > 1:
+                raise ConfigError(f"--reflectivity = {text!r}: expected one number alone, or NAME=number for each")
+            return number
+        found[name] = number
+    return found or None

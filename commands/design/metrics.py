@@ -1,0 +1,183 @@
+"""Commands on rays and wavefronts of field points: ``spots``, ``focus``, ``zernikes`` and ``rays``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from ...core.errors import ConfigError
+from ..tables import FIELD, Column, Rows, number_texts
+from .command import Given, Outcome, Study, design_command
+
+
+@design_command(
+    FIELD,
+    Column("rms [µm]", "rms_radius_um", ".3f"),
+    Column("rms [arcsec]", "rms_radius_arcsec", ".4f"),
+    Column("80 % [µm]", "radius_80_percent_um", ".3f"),
+    Column("80 % [arcsec]", "radius_80_percent_arcsec", ".4f"),
+    Column("largest [µm]", "geometric_radius_um", ".3f"),
+    Column("Airy [µm]", "airy_radius_um", ".3f"),
+    Column("lit [%]", "lit_fraction", ".2f", 100.0),
+    caption="Radii about the centroid; lit: of the annular pupil.",
+    band=True,
+)
+def spots(
+    given: Given,
+    sampling: Annotated[str, typer.Option(help="Sampling of the pupil: gauss, rings, spiral or square.")] = "gauss",
+    rays: Annotated[
+        int | None,
+        typer.Option(min=1, help="Rays along the radius (gauss, rings), in all (spiral), across (square)."),
+    ] = None,
+) -> Study:
+    """Draw and measure spot diagrams: rms radius, radius of 80 % of the rays, in micrometres and arc seconds.
+
+    Sizes are about the centroid of all wavelengths together. Diffraction is left out; the Airy disc is drawn.
+
+    **Examples**
+
+    - `pachon spots lsst_v3.3_r`: five fields from the axis to the edge
+    - `pachon spots lsst_v3.3_r --across-band 5 -o spots.pdf`: the whole band in colours
+    - `pachon spots my_telescope.yaml --field-deg 0 --field-deg 0.3,0.4 --wavelength-nm 656.3 --json`
+    """
+    from ...design.metrics.spots import spots as compute
+    from ...design.pupil_sampling import pupil_sampling
+
+    where = given.telescope, given.fields, given.wavelengths
+    return compute(*where, sampling=pupil_sampling(given.telescope, sampling, rays), **given.how)
+
+
+@design_command(
+    FIELD,
+    Column("best for the spot [µm]", "best_focus_spot_um", "+.3f"),
+    Column("smallest rms [µm]", "smallest_rms_radius_um", ".3f"),
+    Column("best for the wavefront [µm]", "best_focus_wavefront_um", "+.3f"),
+    Column("smallest rms [nm]", lambda result: result.rms_wavefront.min(axis=1), ".2f", 1e9),
+    Column("largest Strehl", lambda result: result.strehl.max(axis=1), ".4f"),
+    caption="The spots of all fields together are smallest at {best_focus_common_um:+.3f} µm.",
+    band=True,
+)
+def focus(
+    given: Given,
+    range_um: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Heights of the detector [um]; by default until spots are three times "
+                     "their smallest."),
+    ] = None,
+    steps: Annotated[int, typer.Option(min=3, max=10000, help="Heights in that range.")] = 61,
+) -> Study:  # fmt: skip
+    """Move the detector through focus: spots, wavefront and Strehl ratio against its height, and the best focus.
+
+    Heights are those of the detector above its place along its own z axis.
+
+    **Examples**
+
+    - `pachon focus lsst_v3.3_r`
+    - `pachon focus paul_baker --range-um -500 200 --field-deg 0 --field-deg 0.5`
+    """
+    import numpy as np
+
+    from ...design.metrics.through_focus import through_focus
+
+    if range_um is not None and not range_um[0] < range_um[1]:
+        raise ConfigError(f"--range-um = {range_um[0]:g} {range_um[1]:g}: expected the lower height first")
+    heights = None if range_um is None else np.linspace(*range_um, steps) * 1e-6
+    return through_focus(given.telescope, given.fields, given.wavelengths, heights, **given.how)
+
+
+@design_command()
+def zernikes(
+    given: Given,
+    jmax: Annotated[int, typer.Option(min=4, max=500, help="Highest Noll index in the pupil.")] = 28,
+    pupil: Annotated[
+        str, typer.Option(help="full: the whole annulus, orthogonal; lit: where light passes.")
+    ] = "full",
+    over_field: Annotated[bool, typer.Option("--map", help="Maps over the field of view.")] = False,
+    double: Annotated[
+        int | None, typer.Option(min=1, max=200, metavar="KMAX", help="Double Zernikes, so many terms in the field.")
+    ] = None,
+) -> Outcome:  # fmt: skip
+    """Fit annular Zernikes (Noll, in nm) to the wavefronts of field points, or over the whole field of view.
+
+    **Examples**
+
+    - `pachon zernikes lsst_v3.3_r`: five fields from the axis to the edge
+    - `pachon zernikes lsst_v3.3_r --map`: each term over the field
+    - `pachon zernikes lsst_v3.3_r --double 22 --json`: Zernikes of the field times those of the pupil
+    """
+    from ...design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
+    from ...design.metrics.vignetting import field_disc
+
+    if sum((bool(given.field_deg), over_field, double is not None)) > 1:
+        raise ConfigError("--field-deg, --map and --double: expected one of them")
+    telescope = given.telescope
+    how = dict(jmax=jmax, pupil=pupil, **given.how)
+    if double is not None:
+        terms = double_zernikes(telescope, given.wavelength, kmax=double, **how)
+        return Outcome(terms, _double_rows, stem=f"double_zernikes_{telescope.name}")
+    fields = field_disc(telescope) if over_field else given.fields
+    return Outcome(wavefront_zernikes(telescope, fields, given.wavelength, **how), _map_rows if over_field else _rows)
+
+
+def _rows(result: Any) -> Rows:
+    """Every term at every field."""
+    summary = result.summary()
+    return _terms(summary, [f"{field}°" for field in number_texts(summary["field_deg"], ".4g")], summary["zernike_nm"])
+
+
+def _map_rows(result: Any) -> Rows:
+    """Statistics of every term over the field."""
+    import numpy as np
+
+    nm = result.summary()["zernike_nm"]
+    values = [nm.mean(axis=0), np.sqrt((nm**2).mean(axis=0)), nm.min(axis=0), nm.max(axis=0)]
+    return _terms(result.summary(), ["mean", "rms", "least", "largest"], values)
+
+
+def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
+    from ...models.zernike_polynomials import NOLL_NAMES
+
+    names = [f"{j} {NOLL_NAMES.get(j, '')}".strip() for j in range(1, len(columns[0]) + 1)]
+    cells = [number_texts(values, ".2f") for values in columns]
+    caption = "{telescope}, {wavelength_nm:g} nm; {pupil} pupil, obscuration {obscuration:g}; nm".format_map(summary)
+    return Rows(["term", *headings], [*zip(names, *cells, strict=True)], caption)
+
+
+def _double_rows(result: Any) -> Rows:
+    """The sixteen largest terms from defocus on."""
+    import numpy as np
+
+    summary = result.summary()
+    nm = summary["double_zernike_nm"][:, 3:]
+    order = np.argsort(-np.abs(nm), axis=None, kind="stable")[:16]
+    rows = [
+        (f"{k + 1}", f"{j + 4}", f"{nm[k, j]:.3f}") for k, j in zip(*np.unravel_index(order, nm.shape), strict=True)
+    ]
+    caption = f"The largest from defocus on; rms of all {summary['rms_without_tilt_nm']:.2f} nm over pupil and field."
+    return Rows(("field k", "pupil j", "coefficient [nm]"), rows, caption, left=0)
+
+
+@design_command(
+    FIELD,
+    Column("chief ray at [mm]", "chief_landing_mm", ".4f"),
+    Column("incidence [deg]", "chief_incidence_deg", ".4f"),
+    Column("f/", "f_number", ".4f"),
+    Column("[arcsec/µm]", "plate_scale_arcsec_per_um", ".6f"),
+    Column("exit pupil at [mm]", "exit_pupil_distance_m", ".3f", 1e3),
+    Column("its diameter [mm]", "exit_pupil_diameter_m", ".3f", 1e3),
+    caption="Pairs: tangential, sagittal. The exit pupil is at that distance from the detector, along the light.",
+)
+def rays(given: Given) -> Study:
+    """Trace chief and marginal rays: focal ratio, plate scale, exit pupil, incidence on the detector, field by field.
+
+    Tangential is the direction of the field point seen from the axis, sagittal is across it.
+
+    **Examples**
+
+    - `pachon rays lsst_v3.3_r`
+    - `pachon rays paul_baker --field-deg 0.3,0.4 --json`
+    """
+    from ...design.metrics.principal_rays import principal_rays
+
+    return principal_rays(given.telescope, given.fields, given.wavelength, **given.how)

@@ -1,0 +1,100 @@
+"""The way in: telescopes and configurations from files and options, and the interrupt of long commands."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from ..core.errors import PachonError
+
+if TYPE_CHECKING:
+    from ..core.progress import Reporter
+    from ..models.telescope import Telescope
+    from ..pipeline.config import Configuration
+
+
+class InterruptedRunError(Exception):
+    """A command ended by Ctrl-C; the text names the place of the finished parts."""
+
+
+@contextmanager
+def interruptible(quiet: bool, finished: str = "") -> Iterator[Reporter]:
+    """Yield the reporter of a long command, which Ctrl-C ends with one line.
+
+    Parameters
+    ----------
+    quiet : bool
+        Print nothing at all.
+    finished : str
+        Place of the finished parts, if a later call can use them.
+
+    Raises
+    ------
+    InterruptedRunError
+        If Ctrl-C was pressed.
+    """
+    from ..core.interrupt import remembered_interrupts
+    from ..core.progress import Reporter
+
+    try:
+        with remembered_interrupts() as check:
+            yield Reporter(quiet, check)
+    except KeyboardInterrupt:
+        raise InterruptedRunError(f"interrupted; {finished}" if finished else "interrupted") from None
+
+
+def resolved_configuration(config: Path | None, **options: object) -> Configuration:
+    """Return the configuration of a file and of the options of the command line, every default filled in.
+
+    Parameters
+    ----------
+    config : Path, optional
+        Configuration file; without one all has its default.
+    **options : object
+        Values by dotted key, as :func:`~pachon.pipeline.config.with_options` takes them; None where not given.
+
+    Raises
+    ------
+    PachonError
+        If something in the file or the options is wrong. The line names the file where no option was given: then
+        it alone can be at fault.
+    """
+    from ..pipeline.config import Configuration, load_configuration, with_options
+    from ..pipeline.experiment import resolve
+
+    base = Configuration() if config is None else load_configuration(config)
+    settings = with_options(base, **options)
+    try:
+        return resolve(settings, None if config is None else config.parent)
+    except PachonError as error:
+        if config is None or settings is not base:
+            raise
+        raise error.within(file=config) from None
+
+
+def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Path] = ()) -> Telescope:
+    """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each.
+
+    Parameters
+    ----------
+    model : str
+        Bundled model, or path of a prescription.
+    lenient : bool
+        Of a Zemax or CODE V file: go on where something is not understood.
+    glass_catalogues : sequence of Path
+        Glass catalogues (.agf) to look glasses up in first.
+    """
+    from ..core.errors import PrescriptionWarning
+    from ..models.io.prescription import load_telescope
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", PrescriptionWarning)
+        telescope = load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues)
+    for warning in caught:
+        typer.echo(f"pachon: warning: {warning.message}", err=True)
+    return telescope

@@ -1,0 +1,97 @@
+"""Tables on the terminal: numbers as text, columns by key of a summary, and a console that cuts nothing short."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+
+class Column(NamedTuple):
+    """A column of numbers or names.
+
+    Attributes
+    ----------
+    heading : str
+        Heading, with the unit in brackets.
+    values : str or callable
+        Key of the result's summary, or a function from the result to one value per row.
+    form : str
+        Format of the numbers; of pairs that of each.
+    scale : float
+        Factor from the value to the unit of the heading.
+    """
+
+    heading: str
+    values: str | Callable[[Any], Any]
+    form: str = ""
+    scale: float = 1.0
+
+    def texts(self, result: Any, summary: dict[str, Any]) -> list[str]:
+        """Return the cells of the column."""
+        values = summary[self.values] if isinstance(self.values, str) else self.values(result)
+        return number_texts(values if self.scale == 1.0 else self.scale * values, self.form)
+
+
+#: Field angles, the first column of most tables.
+FIELD = Column("field [deg]", "field_deg", ".4g")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A table as text.
+
+    Attributes
+    ----------
+    headings : sequence of str
+        Headings of the columns.
+    rows : sequence of sequences of str
+        Cells, row by row.
+    caption : str
+        Meaning of the columns, printed below.
+    left : int
+        Number of columns that are aligned on the left, as names are; the others hold numbers.
+    """
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    left: int = 1
+
+    def show(self) -> None:
+        """Print the table."""
+        console = wide_console()
+        table = plain_table()
+        for i, name in enumerate(self.headings):
+            table.add_column(name.replace("[", "\\["), justify="left" if i < self.left else "right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*row)
+        console.print(table)
+        if self.caption:
+            console.print(self.caption, style="dim", width=100)
+
+
+def number_texts(values: Iterable[Any], form: str) -> list[str]:
+    """Return numbers in a format, pairs with a comma; what rounds to zero has no minus sign, and text stays as it is."""
+    return [
+        v if isinstance(v, str) else ", ".join(number_texts(v, form)) if hasattr(v, "__len__") else _number(v, form)
+        for v in values
+    ]
+
+
+def _number(value: float, form: str) -> str:
+    text = format(value, form)
+    return format(0.0, form) if float(text) == 0.0 else text
+
+
+def wide_console() -> Console:
+    """Return a console that cuts no table short: a narrow terminal wraps its lines itself."""
+    return Console(width=max(Console().width, 132))
+
+
+def plain_table(**options: Any) -> Table:
+    """Return an empty table without lines."""
+    return Table(box=None, header_style="bold", padding=(0, 2, 0, 0), **options)

@@ -1,0 +1,88 @@
+"""The commands ``pachon info`` and ``pachon convert``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .inputs import load_model
+from .options import Json, Lenient, Model
+from .tables import Rows, plain_table, wide_console
+
+app = typer.Typer()
+
+
+@app.command("info")
+def info_command(
+    model: Annotated[str | None, typer.Argument(help="Bundled model, or path of a prescription.")] = None,
+    lenient: Lenient = False,
+    as_json: Json = False,
+) -> None:
+    """Show the lens table and the first-order properties of a telescope; without a model, list the bundled ones.
+
+    Radii and z are in the telescope frame: origin at the vertex of the primary, +z towards the sky, a positive radius
+    has its centre on the +z side.
+
+    **Examples**
+
+    - `pachon info`
+    - `pachon info lsst_v3.3_r`
+    - `pachon info my_telescope.yaml --json`
+    """
+    from ..core.files import json_text
+    from ..pipeline.report.info import SURFACE_COLUMNS, describe, figure_rows, list_models, surface_rows
+
+    console = wide_console()
+    if model is None:
+        models = list_models()
+        if as_json:
+            print(json_text({"models": models}))
+            return
+        table = plain_table()
+        table.add_column("model", no_wrap=True)
+        table.add_column("description")
+        for entry in models:
+            table.add_row(entry["name"], entry["description"])
+        console.print(table)
+        return
+    description = describe(load_model(model, lenient))
+    if as_json:
+        print(json_text(description))
+        return
+    console.print(f"{description['name']}: {description['description']}", highlight=False)
+    console.print(f"source: {description['source']}\n", highlight=False)
+    Rows(SURFACE_COLUMNS, surface_rows(description), left=2).show()
+    console.print()
+    properties = plain_table(show_header=False)
+    for name, value in figure_rows(description):
+        properties.add_row(name, value)
+    console.print(properties)
+
+
+@app.command("convert")
+def convert_command(
+    model: Model,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .yaml (ours) or .zmx (Zemax).")],
+    glass_catalogue: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE.agf", help="Glass catalogue to look glasses up in; once for each."),
+    ] = None,
+    lenient: Lenient = False,
+) -> None:
+    """Write a telescope in another format: a Zemax or CODE V file as ours, or any model as a Zemax file.
+
+    Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside it.
+
+    **Examples**
+
+    - `pachon convert lens.zmx lens.yaml`
+    - `pachon convert lens.zmx lens.yaml --glass-catalogue schott.agf --lenient`
+    - `pachon convert lsst_v3.3_r lsst.zmx`
+    """
+    from ..models.io.prescription import save_telescope
+
+    telescope = load_model(model, lenient, glass_catalogue or ())
+    save_telescope(telescope, out)
+    print(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")
