@@ -22,7 +22,7 @@ def diagnose_command(
     ] = None,
     strict: Annotated[
         bool,
-        typer.Option("--strict", help="End at the first CCD without a readable product, in place of leaving it out."),
+        typer.Option("--strict", help="End at the first CCD without a readable product; do not leave it out."),
     ] = False,
     as_json: Json = False,
 ) -> None:

@@ -106,8 +106,8 @@ def _show(result: Study) -> None:
         return
     error = result.figures[chosen]["error_rms_e_away"]
     console.print(
-        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e at holdout "
-        f"positions {result.figures[chosen]['rms_e_away']:.2e} ± {error:.0e}",
+        f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e at "
+        f"holdout positions {result.figures[chosen]['rms_e_away']:.2e} ± {error:.0e}",
         highlight=False,
     )
 

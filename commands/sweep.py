@@ -46,7 +46,7 @@ def sweep_group() -> None:
 
 @sweep_app.command("run")
 def sweep_run(
-    sweep: Annotated[Path | None, typer.Argument(metavar="[SWEEP.yaml]", help="Sweep to run.")] = None,
+    sweep: Annotated[Path | None, typer.Argument(metavar="SWEEP.yaml", help="Sweep to run.")] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")
     ] = None,

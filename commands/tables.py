@@ -75,7 +75,7 @@ class Rows:
 
 
 def number_texts(values: Iterable[Any], form: str) -> list[str]:
-    """Return numbers in a format, pairs with a comma; what rounds to zero has no minus sign, and text stays as it is."""
+    """Return numbers in a format, pairs with a comma, zeros without a minus sign; text stays as it is."""
     return [
         v if isinstance(v, str) else ", ".join(number_texts(v, form)) if hasattr(v, "__len__") else _number(v, form)
         for v in values

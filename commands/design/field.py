@@ -73,7 +73,7 @@ def vignetting(
 
 
 def _vignetting_rows(result: Any) -> Rows:
-    """Light at each distance from the axis."""
+    """Return the light at each distance from the axis."""
     import numpy as np
 
     radius = np.rad2deg(np.linalg.norm(result.fields, axis=-1)).round(6)

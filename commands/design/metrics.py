@@ -42,10 +42,9 @@ def spots(
     - `pachon spots my_telescope.yaml --field-deg 0 --field-deg 0.3,0.4 --wavelength-nm 656.3 --json`
     """
     from ...design.metrics.spots import spots as compute
-    from ...design.pupil_sampling import pupil_sampling
 
     where = given.telescope, given.fields, given.wavelengths
-    return compute(*where, sampling=pupil_sampling(given.telescope, sampling, rays), **given.how)
+    return compute(*where, sampling=sampling, n_pupil=rays, **given.how)
 
 
 @design_command(
@@ -121,13 +120,13 @@ def zernikes(
 
 
 def _rows(result: Any) -> Rows:
-    """Every term at every field."""
+    """Return every term at every field."""
     summary = result.summary()
     return _terms(summary, [f"{field}°" for field in number_texts(summary["field_deg"], ".4g")], summary["zernike_nm"])
 
 
 def _map_rows(result: Any) -> Rows:
-    """Statistics of every term over the field."""
+    """Return statistics of every term over the field."""
     import numpy as np
 
     nm = result.summary()["zernike_nm"]
@@ -145,15 +144,13 @@ def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
 
 
 def _double_rows(result: Any) -> Rows:
-    """The sixteen largest terms from defocus on."""
+    """Return the sixteen largest terms from defocus on."""
     import numpy as np
 
     summary = result.summary()
     nm = summary["double_zernike_nm"][:, 3:]
-    order = np.argsort(-np.abs(nm), axis=None, kind="stable")[:16]
-    rows = [
-        (f"{k + 1}", f"{j + 4}", f"{nm[k, j]:.3f}") for k, j in zip(*np.unravel_index(order, nm.shape), strict=True)
-    ]
+    order = np.unravel_index(np.argsort(-np.abs(nm), axis=None, kind="stable")[:16], nm.shape)
+    rows = [(f"{k + 1}", f"{j + 4}", f"{nm[k, j]:.3f}") for k, j in zip(*order, strict=True)]
     caption = f"The largest from defocus on; rms of all {summary['rms_without_tilt_nm']:.2f} nm over pupil and field."
     return Rows(("field k", "pupil j", "coefficient [nm]"), rows, caption, left=0)
 
