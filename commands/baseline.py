@@ -58,7 +58,8 @@ def baseline_save(
     from ..core.files import json_text
     from ..studies.baseline.baseline import make_baseline
     from ..studies.baseline.file import write_baseline
-    from ..studies.baseline.metrics import CAMERA, OPTICS
+    from ..studies.metrics.camera import CAMERA
+    from ..studies.metrics.optics import OPTICS
 
     with interruptible(quiet or as_json) as reporter:
         count = len(OPTICS) + (0 if config is None else len(CAMERA))
@@ -71,7 +72,7 @@ def baseline_save(
                 wavelengths=[nm / 1e9 for nm in wavelength_nm] if wavelength_nm else None,
                 ccds=None if ccds is None else name_list(ccds, "--ccds"),
                 threads=threads,
-                advance=stage.advance,
+                progress=stage.advance,
             )
     write_baseline(out, baseline)
     for kind, why in left_out.items():
@@ -100,7 +101,7 @@ def baseline_update(
     from ..studies.baseline.file import write_baseline
 
     with interruptible(quiet or as_json) as reporter, reporter.stage(str(path)) as stage:
-        baseline, check = updated_baseline(path, threads=threads, advance=stage.advance)
+        baseline, check = updated_baseline(path, threads=threads, progress=stage.advance)
     write_baseline(path, baseline)
     if as_json:
         print(json_text({"baseline": str(path), "updated": [d.name for d in check.out]}))
@@ -137,7 +138,8 @@ def check_command(
     """
     from ..core.files import json_text
     from ..studies.baseline.baseline import bundled_baselines, check_baseline
-    from ..studies.baseline.metrics import CAMERA, OPTICS
+    from ..studies.metrics.camera import CAMERA
+    from ..studies.metrics.optics import OPTICS
 
     if not files and (model is not None or config is not None):
         raise ConfigError("pachon check: expected a FILE with --model or --config")
@@ -145,7 +147,7 @@ def check_command(
     with interruptible(quiet or as_json) as reporter:
         for path in files or bundled_baselines():
             with reporter.stage(path.name, len(OPTICS) + len(CAMERA)) as stage:
-                checks.append(check_baseline(path, model, config, threads=threads, advance=stage.advance))
+                checks.append(check_baseline(path, model, config, threads=threads, progress=stage.advance))
     passed = all(check.passed for check in checks)
     if as_json:
         print(json_text({"passed": passed, "baselines": [check.summary() for check in checks]}))

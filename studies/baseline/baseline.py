@@ -1,7 +1,7 @@
-"""Baselines: the figures of a telescope as they were, and whether they still are.
+"""Baselines: stored metrics of a telescope, and the check of their present values.
 
-A design team keeps a baseline in its repository, and its CI says when a prescription, a glass, a configuration or
-pachon itself has changed an answer.
+A design team keeps a baseline in its repository. A check in its CI then fails when a change of a prescription, a glass,
+a configuration or pachon itself changes a metric.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,130 +23,21 @@ from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
 from ...pipeline.experiment import Experiment, prepare, resolve
-from .file import Baseline, BaselineFigure, read_baseline, rounded
-from .metrics import CAMERA, OPTICS, REASONS, Scene, measure
-from .plan import make_plan
+from ..metrics.camera import CAMERA
+from ..metrics.metric import REASONS, Metric, MetricGroup
+from ..metrics.optics import OPTICS
+from ..metrics.plan import make_plan
+from ..metrics.scene import Scene
+from .check import BaselineCheck, Deviation
+from .file import Baseline, BaselineMetric, read_baseline, rounded
 
 #: End of the names of baselines.
 SUFFIX = ".baseline.json"
 _BUNDLED = Path(__file__).parent / "bundled"
-#: Figures of a table that are shown unless all are asked for; fewer where none is out.
-_SHOWN, _SHOWN_PASSED = 20, 3
-_COLUMNS = ("figure", "now", "baseline", "tolerance", "unit", "deviation / tolerance", "checked against")
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """One figure against its baseline.
-
-    Attributes
-    ----------
-    name, unit : str
-        Of the figure.
-    stored, tolerance : float
-        What the baseline has.
-    found : float or None
-        What it is now; None where it cannot be had.
-    checked_against : str or None
-        Independent source of the stored figure.
-    problem : str or None
-        Why it cannot be had.
-    """
-
-    name: str
-    unit: str
-    stored: float
-    tolerance: float
-    found: float | None
-    checked_against: str | None
-    problem: str | None = None
-
-    @property
-    def ratio(self) -> float:
-        """How many tolerances it has moved by; infinite where it cannot be had."""
-        return np.inf if self.found is None else abs(self.found - self.stored) / self.tolerance
-
-    def texts(self) -> list[str]:
-        """Return what a table shows of it."""
-        digits = max(0, 1 - int(np.floor(np.log10(self.tolerance))))
-        found = self.problem or "none" if self.found is None else f"{self.found:.{digits}f}"
-        ratio = f"{self.ratio:.2f}" if self.ratio < 1e4 else f"{self.ratio:.1e}"
-        against = self.checked_against or ""
-        return [self.name, found, f"{self.stored:.{digits}f}", f"{self.tolerance:g}", self.unit, ratio, against]
-
-
-@dataclass(frozen=True)
-class BaselineCheck:
-    """All figures of a baseline against what they are now.
-
-    Attributes
-    ----------
-    path, model : str
-        The baseline, and the telescope that it was checked with.
-    deviations : tuple of Deviation
-        Worst first.
-    notes : tuple of str
-        What else has changed since: version, prescription, configuration.
-    """
-
-    path: str
-    model: str
-    deviations: tuple[Deviation, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def out(self) -> tuple[Deviation, ...]:
-        """Figures beyond their tolerance, worst first."""
-        return tuple(d for d in self.deviations if not d.ratio <= 1.0)
-
-    @property
-    def passed(self) -> bool:
-        """Whether there are none."""
-        return not self.out
-
-    @property
-    def verdict(self) -> str:
-        """One line."""
-        count = len(self.deviations)
-        if self.passed:
-            return f"{self.path}: all {count} figures of {self.model} within their tolerances"
-        return f"{self.path}: {len(self.out)} of {count} figures of {self.model} out of tolerance"
-
-    def summary(self) -> dict[str, Any]:
-        """Return the figures by name; those of the list are in the order worst first."""
-        return {
-            "baseline": self.path,
-            "model": self.model,
-            "passed": self.passed,
-            "figures": len(self.deviations),
-            "out": len(self.out),
-            "notes": list(self.notes),
-            "deviations": [
-                {
-                    "name": d.name,
-                    "unit": d.unit,
-                    "stored": d.stored,
-                    "found": d.found,
-                    "tolerance": d.tolerance,
-                    "deviation_over_tolerance": d.ratio,
-                    "checked_against": d.checked_against,
-                    "problem": d.problem,
-                }
-                for d in self.deviations
-            ],
-        }
-
-    def text(self, everything: bool = False) -> str:
-        """Return the verdict, the notes and the table of the worst figures, or of all."""
-        shown = None if everything else _SHOWN_PASSED if self.passed else _SHOWN
-        rows = [list(_COLUMNS), *(d.texts() for d in self.deviations[:shown])]
-        widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
-        table = ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-        return "\n".join([self.verdict, *self.notes, *table])
 
 
 def bundled_baselines() -> tuple[Path, ...]:
-    """Return the files of the baselines that come with pachon."""
+    """Return the files of the bundled baselines."""
     return tuple(sorted(_BUNDLED.glob(f"*{SUFFIX}")))
 
 
@@ -161,7 +52,7 @@ def make_baseline(
     pupil: Sequence[tuple[float, float]] | None = None,
     checked: Mapping[str, str] | None = None,
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> tuple[Baseline, dict[str, str]]:
     """Compute a baseline.
 
@@ -170,9 +61,9 @@ def make_baseline(
     model : str
         Bundled telescope, or path of its file.
     folder : Path
-        Folder that the baseline will lie in; it names other files from there.
+        Folder of the baseline, from which it names other files.
     configuration : Path, optional
-        Run configuration, for the figures of focal plane, PSF and reconstruction; its telescope gives way to `model`.
+        Run configuration, for the metrics of focal plane, PSF and reconstruction. Its telescope is replaced by `model`.
     fields : ndarray, shape [n, 2], optional
         Field angles [rad]; five over the field of view by default.
     wavelengths : sequence of float, optional
@@ -180,53 +71,51 @@ def make_baseline(
     ccds : sequence of str, optional
         CCDs at whose centres the PSF is taken; the first is modelled. Five of the camera by default.
     pupil : sequence of (x, y), optional
-        Points of the pupil, in units of its radius; four by default.
+        Points of the entrance pupil, in units of its radius; four by default.
     checked : mapping of str to str, optional
-        What figures were checked against, by the start of their names.
+        Independent sources of metrics, by the start of their names.
     threads : int, optional
-        Number of threads; no byte depends on it.
-    advance : callable, optional
-        Called after each kind of figures.
+        Number of threads; results do not depend on it.
+    progress : callable, optional
+        Called with 1 after each group of metrics.
 
     Returns
     -------
     baseline : Baseline
     left_out : dict of str to str
-        Kinds of figures that this telescope does not have, and why.
+        Groups of metrics that cannot be computed for this telescope, and the reason.
 
     Raises
     ------
     PachonError
-        If the telescope or the configuration cannot be had, or none of the figures.
+        If the telescope or the configuration cannot be read, or no metric can be computed.
     """
     telescope = load_telescope(model)
     experiment = None if configuration is None else _experiment(configuration, _absolute(model, Path()), telescope)
     plan = make_plan(telescope, experiment, fields, wavelengths, ccds, pupil)
-    scene = Scene(telescope if experiment is None else experiment.telescope, plan, experiment, threads)
-    found, left_out = measure(scene, _kinds(experiment), advance)
+    scene = Scene(telescope if experiment is None else experiment.telescope, experiment, plan, threads)
+    found, left_out = _measured(scene, OPTICS if experiment is None else {**OPTICS, **CAMERA}, progress)
     if not found:
-        raise ConfigError(f"{model}: no figure can be had of it ({next(iter(left_out.values()))})")
+        raise ConfigError(f"{model}: no metric can be computed ({next(iter(left_out.values()))})")
 
-    def against(name: str) -> str | None:
-        return next((text for start, text in (checked or {}).items() if name.startswith(start)), None)
-
-    figures = {
-        name: BaselineFigure(
-            value=rounded(q.value, q.tolerance),
-            unit=q.unit,
-            tolerance=q.tolerance,
-            reason=q.reason,
-            checked_against=against(name),
+    def stored(name: str, value: float, tolerance: float, metric: Metric) -> BaselineMetric:
+        against = next((text for start, text in (checked or {}).items() if name.startswith(start)), None)
+        return BaselineMetric(
+            value=rounded(value, tolerance),
+            unit=metric.unit,
+            tolerance=tolerance,
+            reason=metric.reason,
+            checked_against=against,
         )
-        for name, q in found.items()
-    }
+
+    metrics = {name: stored(name, *each) for name, each in found.items()}
     baseline = Baseline(
         **_stamps(telescope, experiment),
         model=_relative(model, folder, bundled_names()),
         configuration=None if configuration is None else _relative(str(configuration), folder, ()),
         plan=plan,
-        reasons={key: text for key, text in REASONS.items() if any(f.reason == key for f in figures.values())},
-        figures=figures,
+        reasons={key: text for key, text in REASONS.items() if any(m.reason == key for m in metrics.values())},
+        figures=metrics,
     )
     return baseline, left_out
 
@@ -237,9 +126,9 @@ def check_baseline(
     configuration: Path | None = None,
     *,
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> BaselineCheck:
-    """Compute the figures of a baseline anew and compare them.
+    """Compare the metrics of a baseline with their present values.
 
     Parameters
     ----------
@@ -250,9 +139,9 @@ def check_baseline(
     configuration : Path, optional
         Run configuration in place of the baseline's own.
     threads : int, optional
-        Number of threads; no byte depends on it.
-    advance : callable, optional
-        Called after each kind of figures.
+        Number of threads; results do not depend on it.
+    progress : callable, optional
+        Called with 1 after each group of metrics.
 
     Raises
     ------
@@ -261,48 +150,65 @@ def check_baseline(
     """
     baseline = read_baseline(path)
     name, telescope, experiment = _subject(path, baseline, model, configuration)
-    scene = Scene(telescope if experiment is None else experiment.telescope, baseline.plan, experiment, threads)
-    kinds = [k for k in (*OPTICS, *CAMERA) if k in {name.partition(" ")[0] for name in baseline.figures}]
-    found, problems = measure(scene, kinds, advance)
+    scene = Scene(telescope if experiment is None else experiment.telescope, experiment, baseline.plan, threads)
+    stored = {key.partition(" ")[0] for key in baseline.figures}
+    groups = {group: each for group, each in {**OPTICS, **CAMERA}.items() if group in stored}
+    found, problems = _measured(scene, groups, progress)
 
-    def deviation(key: str, figure: BaselineFigure) -> Deviation:
-        kind = key.partition(" ")[0]
-        now = found[key].value if key in found else None
-        problem = None if key in found else problems.get(kind, "no such figure")
-        return Deviation(key, figure.unit, figure.value, figure.tolerance, now, figure.checked_against, problem)
+    def deviation(key: str, metric: BaselineMetric) -> Deviation:
+        now = found[key][0] if key in found else None
+        problem = None if key in found else problems.get(key.partition(" ")[0], "no such metric")
+        return Deviation(key, metric.unit, metric.value, metric.tolerance, now, metric.checked_against, problem)
 
     deviations = sorted((deviation(*item) for item in baseline.figures.items()), key=lambda d: (-d.ratio, d.name))
     return BaselineCheck(str(path), name, tuple(deviations), _notes(baseline, _stamps(telescope, experiment)))
 
 
 def updated_baseline(
-    path: Path, *, threads: int | None = None, advance: Callable[[], None] | None = None
+    path: Path, *, threads: int | None = None, progress: Callable[[int], None] | None = None
 ) -> tuple[Baseline, BaselineCheck]:
-    """Return a baseline with what its figures are now in place of those that are out of tolerance.
+    """Replace the metrics of a baseline that are out of tolerance.
 
-    Its plan, tolerances and reasons stay, as do figures within their tolerances: the file changes where an answer has.
-    A figure that was replaced is no longer checked against anything.
+    Plan, tolerances and reasons stay, as do metrics within their tolerances. Replaced metrics lose their independent
+    source.
 
     Raises
     ------
     PachonError
-        If something cannot be read, or a figure cannot be had any more.
+        If a file cannot be read, or a metric can no longer be computed.
     """
     baseline = read_baseline(path)
-    check = check_baseline(path, threads=threads, advance=advance)
-    figures = dict(baseline.figures)
+    check = check_baseline(path, threads=threads, progress=progress)
+    metrics = dict(baseline.figures)
     for d in check.out:
         if d.found is None:
             raise ConfigError(f"{path}: figures.{d.name}: {d.problem}; remove its line, or save the baseline anew")
-        figures[d.name] = figures[d.name].model_copy(
-            update={"value": rounded(d.found, d.tolerance), "checked_against": None}
-        )
+        update = {"value": rounded(d.found, d.tolerance), "checked_against": None}
+        metrics[d.name] = metrics[d.name].model_copy(update=update)
     _, telescope, experiment = _subject(path, baseline, None, None)
-    return baseline.model_copy(update={**_stamps(telescope, experiment), "figures": figures}), check
+    return baseline.model_copy(update={**_stamps(telescope, experiment), "figures": metrics}), check
+
+
+def _measured(
+    scene: Scene, groups: Mapping[str, MetricGroup], progress: Callable[[int], None] | None
+) -> tuple[dict[str, tuple[float, float, Metric]], dict[str, str]]:
+    """Return finite values, tolerances and metrics by name, and the problems of groups that fail."""
+    found: dict[str, tuple[float, float, Metric]] = {}
+    problems: dict[str, str] = {}
+    for name, group in groups.items():
+        try:
+            values = {key: value for key, value in group.compute(scene).items() if np.isfinite(value)}
+            metrics = {key: group.metric(key) for key in values}
+            found |= {key: (v, metrics[key].tolerance_of(scene, v), metrics[key]) for key, v in values.items()}
+        except PachonError as error:
+            problems[name] = str(error)
+        if progress is not None:
+            progress(1)
+    return found, problems
 
 
 def prescription_hash(telescope: Telescope) -> str:
-    """Return the SHA-256 of a prescription as pachon writes it, whatever file it came from."""
+    """Return the SHA-256 of a prescription as pachon writes it, independent of its file."""
     return hashlib.sha256(telescope_to_yaml(telescope).encode()).hexdigest()
 
 
@@ -334,7 +240,7 @@ def _subject(
 
 
 def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experiment:
-    """Return the experiment of a configuration with this telescope, seen by the engine without luck."""
+    """Return the experiment of a configuration with this telescope and the long-exposure engine."""
     base = load_configuration(configuration)
     engine = "long_exposure" if base.atmosphere.enabled else None
     try:
@@ -345,16 +251,12 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
         raise ConfigError(f"{configuration}: {error}") from None
 
 
-def _kinds(experiment: Experiment | None) -> tuple[str, ...]:
-    return OPTICS if experiment is None else (*OPTICS, *CAMERA)
-
-
 def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, Any]:
-    """Return version and hashes of what figures are computed from."""
+    """Return version and hashes of telescope and configuration."""
     hashed = None
     if experiment is not None:
         content = experiment.config.as_dict()
-        # The telescope has a hash of its own, and a path is another one on another machine.
+        # The telescope has a hash of its own, and paths differ between machines.
         del content["telescope"], content["ccds"]
         content["atmosphere"]["site"] = Path(content["atmosphere"]["site"]).name
         hashed = digest(content)
@@ -366,13 +268,13 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
 
 
 def _notes(baseline: Baseline, now: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a line for each stamp that is another one now."""
+    """Return a line for each stamp that has changed."""
     notes = []
     if now["pachon"] != baseline.pachon:
         notes.append(f"pachon: {baseline.pachon} -> {now['pachon']}")
-    for key, what in (("model_sha256", "prescription"), ("configuration_sha256", "configuration")):
+    for key, name in (("model_sha256", "prescription"), ("configuration_sha256", "configuration")):
         if now[key] != getattr(baseline, key):
-            notes.append(f"the {what} is not the one that the baseline was made from")
+            notes.append(f"the {name} is not the one that the baseline was made from")
     return tuple(notes)
 
 

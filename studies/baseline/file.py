@@ -1,7 +1,7 @@
-"""The file of a baseline: figures of a telescope, each with unit and tolerance, and what they were computed from.
+"""File of a baseline: metrics of a telescope with units and tolerances, and their origin.
 
-One figure stands on one line, in the order of the names, with two digits beyond its tolerance: what a change of the
-design does is read off the difference of two versions of the file.
+Metrics stand one a line in the order of their names, with two digits beyond the tolerance. The difference of two
+versions of the file then shows the effect of a change of the design.
 """
 
 from __future__ import annotations
@@ -16,48 +16,36 @@ from pydantic import Field
 from ...core.errors import ConfigError
 from ...core.files import write_bytes
 from ...core.schema import Positive, Real, Section, validated
+from ..metrics.plan import Plan
 
 FORMAT = "pachon baseline"
-#: Version of the format; it is counted up when an older pachon could not read the file, or would read it wrongly.
+#: Version of the format, raised when an older pachon could not read the file.
 VERSION = 1
 
 
-class BaselineFigure(Section):
-    """One figure that is to stay as it is."""
+class BaselineMetric(Section):
+    """A stored metric."""
 
-    value: Real = Field(description="the figure")
-    unit: str = Field(description="its unit; empty for a pure number")
-    tolerance: Positive = Field(description="how far it may lie from the value, in the same unit")
-    reason: str = Field(description="why so far: a key of reasons")
-    checked_against: str | None = Field(None, description="independent source that has the same figure, and how near")
-
-
-class BaselinePlan(Section):
-    """Where the figures are taken."""
-
-    fields_deg: Annotated[tuple[tuple[Real, Real], ...], Field(min_length=1)] = Field(
-        description="field angles (zemax projection) [deg]"
-    )
-    wavelengths_nm: Annotated[tuple[Positive, ...], Field(min_length=1)] = Field(
-        description="wavelengths [nm]; what takes one alone takes the middle one"
-    )
-    pupil: tuple[tuple[Real, Real], ...] = Field(description="points of the entrance pupil, in units of its radius")
-    ccds: tuple[str, ...] = Field((), description="CCDs at whose centres the PSF is taken; the first is modelled")
+    value: Real = Field(description="value of the metric")
+    unit: str = Field(description="unit; empty for a pure number")
+    tolerance: Positive = Field(description="largest accepted change, in the same unit")
+    reason: str = Field(description="reason of the tolerance: a key of reasons")
+    checked_against: str | None = Field(None, description="independent source of the value, and its agreement")
 
 
 class Baseline(Section):
-    """Figures of a telescope, and what they were computed from."""
+    """Metrics of a telescope, and their origin."""
 
-    format: Literal["pachon baseline"] = Field("pachon baseline", description="what the file is")
+    format: Literal["pachon baseline"] = Field("pachon baseline", description="name of the format")
     version: int = Field(VERSION, description="version of the format")
-    pachon: str = Field(description="version of pachon that the figures come from")
+    pachon: str = Field(description="version of pachon that computed the metrics")
     model: str = Field(description="bundled telescope, or path of its file from the folder of this one")
     model_sha256: str = Field(description="SHA-256 of the prescription as pachon writes it")
     configuration: str | None = Field(None, description="path of the run configuration from the folder of this file")
     configuration_sha256: str | None = Field(None, description="SHA-256 of the configuration with all defaults")
-    plan: BaselinePlan
-    reasons: dict[str, str] = Field(description="what decides the tolerances")
-    figures: Annotated[dict[str, BaselineFigure], Field(min_length=1)] = Field(description="the figures by name")
+    plan: Plan
+    reasons: dict[str, str] = Field(description="reasons of the tolerances")
+    figures: Annotated[dict[str, BaselineMetric], Field(min_length=1)] = Field(description="the metrics by name")
 
 
 def read_baseline(path: Path) -> Baseline:

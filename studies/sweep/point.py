@@ -1,14 +1,14 @@
-"""One point of a sweep: the values of its parameters become a configuration, and that becomes figures.
+"""Points of a sweep: parameter values become a configuration, and that becomes metrics.
 
 A parameter is
 
 - a key of the configuration, with dots between sections: ``band``, ``atmosphere.r0_m``, ``focal_plane.raft_um``;
-- a motion of a raft or CCD: ``R22.dz_um``, ``R22_S11.rx_urad``, ``R22_S11.ry_urad``;
+- a motion of a raft or CCD of the point's camera: ``R22.dz_um``, ``R22_S11.rx_urad``, ``R22_S11.ry_urad``;
 - a value of the prescription with its unit: ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.radius_m``; see
   :mod:`pachon.design.parameters.parameters`.
 
-Random numbers are common to all points of a replica: heights keep their pattern when a term grows, stars their places,
-turbulence and wind theirs, so a difference between two points is the doing of their parameters.
+Random numbers are common to all points of a replica. Heights keep their pattern when a term grows, stars their
+positions, turbulence and wind their course. A difference between two points is then an effect of their parameters.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from __future__ import annotations
 import time
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, PachonError, unknown_name
 from ...core.schema import known_keys
 from ...design.parameters.changes import parse_change
-from ...models.camera.camera import Camera, load_camera
+from ...models.camera.camera import load_camera
+from ...models.io.prescription import load_telescope
 from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.experiment import Experiment, prepare, resolve
+from ..metrics.scene import Scene
+from ..metrics.stars import STARS
 from .compensation import compensated
 from .file import SweepFile
-from .metrics import check_metrics, measure_metrics
 from .store import PointResult, SweepPoint
 from .workers import worker_name
 
@@ -37,7 +38,7 @@ _MOTIONS = ("dz_um", "rx_urad", "ry_urad")
 
 @dataclass(frozen=True)
 class PointMeasurement:
-    """Compute points of a sweep; a picklable function that every worker can be handed.
+    """Compute the metrics of points; a picklable function for every kind of worker.
 
     Parameters
     ----------
@@ -51,17 +52,23 @@ class PointMeasurement:
     folder: str
 
     def __call__(self, point: SweepPoint, threads: int) -> PointResult:
-        """Compute one point; what cannot be computed is a result too, with one line that says why."""
+        """Compute one point; where that fails, the result holds one line with the reason."""
         start = time.perf_counter()
         metrics, problem = None, None
         try:
-            experiment = _with_screens(point_experiment(self.sweep, point, Path(self.folder)))
-            experiment, solved = compensated(experiment, self.sweep.compensators, threads)
-            metrics = measure_metrics(experiment, self.sweep.metrics, threads)
-            metrics |= {f"solved {name}": value for name, value in solved.items()}
+            metrics = self._metrics(point, threads)
         except PachonError as error:
             problem = " ".join(str(error).split())
         return PointResult(point.number, metrics, problem, time.perf_counter() - start, worker_name())
+
+    def _metrics(self, point: SweepPoint, threads: int) -> dict[str, float]:
+        experiment = _with_screens(point_experiment(self.sweep, point, Path(self.folder)))
+        experiment, solved = compensated(experiment, self.sweep.compensators, threads)
+        scene = Scene(experiment.telescope, experiment, threads=threads)
+        metrics: dict[str, float] = {}
+        for name in dict.fromkeys(self.sweep.metrics):
+            metrics |= STARS[name].compute(scene)
+        return metrics | {f"solved {name}": value for name, value in solved.items()}
 
 
 def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int, folder: Path) -> Configuration:
@@ -78,21 +85,29 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
     content["seed"] = seed
     keys = known_keys(Configuration)
     sections = {key.partition(".")[0] for key in keys if "." in key}
+    changes = {}
     for name, value in parameters.items():
+        section, _, quantity = name.partition(".")
         if name in keys:
             # One wavelength is the whole band, and one CCD all there is.
             alone = name in ("wavelengths_nm", "ccds")
             _set(content, name.split("."), [value] if alone else value)
-            continue
-        body, _, quantity = name.partition(".")
-        if body in _bodies():
-            if quantity not in _MOTIONS:
-                raise unknown_name(f"motion of {body}", quantity, _MOTIONS)
-            _set(content, ["focal_plane", "moved", body, quantity], value)
-        elif body in sections or not quantity:
+        elif section in sections or not quantity:
             raise unknown_name("parameter", name, keys)
         else:
+            changes[name] = value
+    config = resolve(configuration_of(content, f"sweep {sweep.name}"), folder)
+    if not changes:
+        return config
+    camera = load_camera(load_telescope(config.telescope or "").camera or "")
+    for name, value in changes.items():
+        body, _, quantity = name.partition(".")
+        if body not in camera.raft_names and body not in camera.ccd_names:
             _set(content, ["changes", name], value)
+        elif quantity in _MOTIONS:
+            _set(content, ["focal_plane", "moved", body, quantity], value)
+        else:
+            raise unknown_name(f"motion of {body}", quantity, _MOTIONS)
     return resolve(configuration_of(content, f"sweep {sweep.name}"), folder)
 
 
@@ -102,14 +117,18 @@ def point_experiment(sweep: SweepFile, point: SweepPoint, folder: Path) -> Exper
 
 
 def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> None:
-    """Check names and values before anything is computed, on the first point and the extremes of each parameter.
+    """Check names and values, on the first point and the extremes of each parameter.
 
     Raises
     ------
     PachonError
         If a parameter, metric or compensator is unknown, or a value not possible: one line.
     """
-    check_metrics(sweep.metrics)
+    if not sweep.metrics:
+        raise ConfigError(f"metrics = []: expected some of {', '.join(STARS)}")
+    for name in sweep.metrics:
+        if name not in STARS:
+            raise unknown_name("metric", name, STARS)
     if not points:
         raise ConfigError(f"sweep {sweep.name}: no points to compute")
     tried: set[int] = {points[0].number}
@@ -128,7 +147,7 @@ _kept: list[Experiment] = []
 
 
 def _with_screens(experiment: Experiment) -> Experiment:
-    """Return the experiment with the screens of the one before, where they are the same: they take seconds to make."""
+    """Return the experiment with the screens of the previous one, where they are the same: they take seconds."""
 
     def air(one: Experiment) -> Any:
         return one.config.seed, one.config.atmosphere, one.config.psf.engine
@@ -142,12 +161,6 @@ def _with_screens(experiment: Experiment) -> Experiment:
             before.atmosphere.release()
     _kept[:] = [experiment]
     return experiment
-
-
-@lru_cache(maxsize=1)
-def _bodies() -> frozenset[str]:
-    camera: Camera = load_camera("lsst")
-    return frozenset((*camera.raft_names, *camera.ccd_names))
 
 
 def _set(content: dict[str, Any], path: list[str], value: Any) -> None:

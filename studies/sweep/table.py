@@ -13,6 +13,7 @@ from astropy.table import Table
 
 from ...core.errors import ConfigError, ProductError
 from ...core.files import described_table, write_bytes
+from ..metrics.stars import STARS
 from .store import SweepStore
 
 #: Formats of an export, by the ending of the file.
@@ -145,7 +146,7 @@ def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
         "seed": (table.seed, "", "seed of its random numbers"),
     }
     columns |= {name: (_plain(values), _unit(name), "parameter") for name, values in table.parameters.items()}
-    columns |= {name: (values, _unit(name), "figure") for name, values in table.metrics.items()}
+    columns |= {name: (values, STARS.unit(name) or _unit(name), "metric") for name, values in table.metrics.items()}
     columns["problem"] = (table.problem, "", "why it could not be computed")
     columns["seconds"] = (table.seconds, "s", "how long it took")
     return described_table(columns, meta)

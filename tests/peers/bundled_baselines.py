@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pachon.studies.baseline.baseline import baseline
+from pachon.studies.baseline import baseline
 from pachon.studies.baseline.file import write_baseline
 
 FOLDER = Path(baseline.__file__).parent / "bundled"

@@ -21,7 +21,9 @@ from pachon.models.io.prescription import DATA, load_telescope, save_telescope
 from pachon.models.shapes.shape import EvenAsphere
 from pachon.studies.baseline.baseline import bundled_baselines, check_baseline, make_baseline
 from pachon.studies.baseline.file import baseline_text, read_baseline, rounded, write_baseline
-from pachon.studies.baseline.metrics import CAMERA, OPTICS
+from pachon.studies.metrics import camera as camera_metrics
+from pachon.studies.metrics.camera import CAMERA
+from pachon.studies.metrics.optics import OPTICS
 from pachon.testing import assert_matches_baseline
 
 ROOT = Path(__file__).parents[2]
@@ -128,7 +130,7 @@ def test_a_radius_off_by_1e_6_is_caught(project, name, change):
     assert {"opd", "landing"} <= kinds_out(check)
     # Not by a hair.
     assert check.deviations[0].ratio > 10
-    with pytest.raises(AssertionError, match=r"figures of lsst_v3\.3_r out of tolerance"):
+    with pytest.raises(AssertionError, match=r"metrics of lsst_v3\.3_r out of tolerance"):
         assert_matches_baseline(telescope, project / "rays.json")
 
 
@@ -205,16 +207,14 @@ def test_a_changed_sign_of_heights_is_caught(project, monkeypatch):
 
 def test_a_changed_sign_where_light_meets_the_heights_is_caught(project, monkeypatch):
     """The heights as such stay as they are; what light sees of them does not."""
-    from pachon.studies.baseline import metrics as baseline_figures
-
-    seen = baseline_figures.trace_pupils
+    seen = camera_metrics.trace_pupils
 
     def wrong(telescope, fields, wavelength, pupil, plane=None, **keywords):
         if plane is not None:
             plane = replace(plane, surfaces=replace(plane.surfaces, polynomial=-plane.surfaces.polynomial))
         return seen(telescope, fields, wavelength, pupil, plane, **keywords)
 
-    monkeypatch.setattr(baseline_figures, "trace_pupils", wrong)
+    monkeypatch.setattr(camera_metrics, "trace_pupils", wrong)
     assert kinds_out(check_baseline(project / "camera.json")) == {"defocus"}
 
 
@@ -269,7 +269,7 @@ def test_another_telescope_is_another(project, capsys):
     assert main(["check", file, "--model", "lsst_v3.3_r", "--quiet"]) == 0
     assert main(["check", file, "--model", "lsst_v3.3_i"]) == 1
     out = capsys.readouterr().out
-    assert "figures of lsst_v3.3_i out of tolerance" in out
+    assert "metrics of lsst_v3.3_i out of tolerance" in out
     # Two notes, and the worst twenty: another band is another configuration too.
     assert len(out.splitlines()) == 4 + 20
 
@@ -284,7 +284,7 @@ def test_a_telescope_alone_and_options(tmp_path, monkeypatch, capsys):
     assert baseline.configuration is None
     assert {n.partition(" ")[0] for n in baseline.figures} == set(OPTICS)
     assert main(["check", "pb.baseline.json"]) == 0
-    assert "figures of paul_baker within their tolerances" in capsys.readouterr().out
+    assert "metrics of paul_baker within their tolerances" in capsys.readouterr().out
 
 
 def test_a_file_beside_the_baselines_folder_is_found(tmp_path, monkeypatch):
@@ -412,7 +412,7 @@ def test_assert_matches_baseline(project):
     with pytest.raises(AssertionError) as caught:
         assert_matches_baseline(moved, path)
     lines = str(caught.value).splitlines()
-    assert lines[2].split()[:3] == ["figure", "now", "baseline"]
+    assert lines[2].split()[:3] == ["metric", "now", "baseline"]
     assert len(lines) == 3 + 20
 
 

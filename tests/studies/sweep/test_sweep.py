@@ -8,13 +8,18 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError
+from pachon.core.errors import ConfigError, PachonError
+from pachon.models.camera.camera import CAMERAS, lsst_camera
+from pachon.models.io.prescription import DATA
+from pachon.studies.metrics.stars import STARS
 from pachon.studies.sweep.file import load_sweep, read_sweep
-from pachon.studies.sweep.metrics import METRICS
+from pachon.studies.sweep.point import point_configuration
 from pachon.studies.sweep.store import SweepStore
 from pachon.studies.sweep.sweep import check_room
 
@@ -208,7 +213,7 @@ def test_bad_sweeps_end_with_one_line_before_anything_is_computed(folder, capsys
 
 
 def test_every_metric_gives_finite_figures(folder):
-    metrics = ", ".join(m for m in METRICS if m != "reconstruction")
+    metrics = ", ".join(m for m in STARS if m != "reconstruction")
     (folder / "small.yaml").write_text(
         SWEEP.replace("fwhm, rms_e", metrics).replace("points: 18", "points: 1").replace("[R23]", "[R23_S11, R23_S12]")
     )
@@ -302,3 +307,29 @@ def test_compensators_are_solved_at_every_point(folder):
     # The camera goes back by what it was moved; the solver stops at 1e-9 of the mean square radius of the spots.
     assert moved["solved Camera.dz_um"] - still["solved Camera.dz_um"] == pytest.approx(-10.0, abs=0.02)
     assert moved["rms_e"] == pytest.approx(still["rms_e"], rel=1e-3)
+
+
+def test_motions_are_those_of_the_points_own_camera(folder, monkeypatch):
+    """A camera of four CCDs named otherwise than the LSST's: its names are motions, the LSST's are none."""
+    lsst = lsst_camera()
+    four = replace(
+        lsst,
+        name="four",
+        ccd_names=("A_1", "A_2", "B_1", "B_2"),
+        raft_names=("A", "B"),
+        raft_index=np.array([0, 0, 1, 1]),
+        centers=lsst.centers[[90, 91, 93, 94]],
+    )
+    monkeypatch.setitem(CAMERAS, "four", lambda: four)
+    text = (DATA / "lsst_v3.3_r.yaml").read_text().replace("camera: lsst", "camera: four")
+    (folder / "four.yaml").write_text(text)
+    base = {"telescope": "four.yaml", "ccds": ["A_1"], "wavelengths_nm": [624]}
+
+    def configuration(parameter):
+        content = {"base": base, "parameters": {parameter: {"values": [5]}}, "design": {"kind": "grid"}}
+        return point_configuration(read_sweep(content, "test"), {parameter: 5}, 1, folder)
+
+    assert configuration("B_2.dz_um").focal_plane.moved["B_2"].dz_um == 5
+    assert configuration("A.rx_urad").focal_plane.moved["A"].rx_urad == 5
+    with pytest.raises(PachonError, match="R22_S11"):
+        configuration("R22_S11.dz_um")

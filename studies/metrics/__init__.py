@@ -1,0 +1,1 @@
+"""Metrics of telescopes, focal planes and PSFs, for baselines and sweeps."""

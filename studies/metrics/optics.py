@@ -1,0 +1,138 @@
+"""Metrics of the optics: wavefront, landing points, spots, encircled energy, distortion and vignetting."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...design.images.encircled_energy import encircled_energy
+from ...design.metrics.field_zernikes import wavefront_zernikes
+from ...design.metrics.spots import spots
+from ...design.metrics.vignetting import vignetting
+from ...wavefront.bundles import trace_bundles
+from ...wavefront.opd import wavefront_opd
+from .metric import Metric, MetricTable
+from .scene import Scene, one_digit
+
+#: Metrics of a telescope alone.
+OPTICS = MetricTable()
+#: Highest Zernike term, Noll.
+_HIGHEST = 15
+#: Pixels on a side of the images for the encircled energy, and points across the pupil. Adaptive numbers would grow
+#: with the spots of a faulty telescope, to minutes of computing.
+_EE_PIXELS, _EE_POINTS = 96, 192
+#: Rays of each field for vignetting.
+_VIGNETTING_RAYS = 4096
+#: Slope over which the scale on the axis is taken [rad].
+_AXIS_SLOPE = 1e-4
+
+
+@OPTICS.group("opd", Metric("opd", "nm", "path"))
+def opd(scene: Scene) -> dict[str, float]:
+    """Return the optical path difference of each field, wavelength and pupil point."""
+    metrics = {}
+    for field, place in zip(scene.fields, scene.plan.fields_deg, strict=True):
+        for wavelength, nm in zip(scene.wavelengths, scene.plan.wavelengths_nm, strict=True):
+            opd = wavefront_opd(scene.telescope, tuple(field), wavelength, tuple(scene.pupil.T), threads=scene.threads)
+            for value, point in zip(opd.value, scene.plan.pupil, strict=True):
+                metrics[f"opd {nm:g} nm field {_pair(place)} pupil {_pair(point)}"] = float(value) * 1e9
+    return metrics
+
+
+@OPTICS.group("landing", Metric("landing", "mm", "path"))
+def landing(scene: Scene) -> dict[str, float]:
+    """Return where rays of the middle wavelength land; pupil point (0, 0) is the chief ray."""
+    bundles = trace_bundles(scene.telescope, scene.fields, scene.middle, scene.pupil, threads=scene.threads)
+    points = np.concatenate([bundles.chief_landing()[:, None], bundles.landing()], axis=1) * 1e3
+    return {
+        f"landing {axis} field {_pair(place)} pupil {_pair(point)}": float(value)
+        for rays, place in zip(points, scene.plan.fields_deg, strict=True)
+        for ray, point in zip(rays, ((0.0, 0.0), *scene.plan.pupil), strict=True)
+        for axis, value in zip("xy", ray, strict=True)
+    }
+
+
+@OPTICS.group("zernike", Metric("zernike", "nm", "path"))
+def zernike(scene: Scene) -> dict[str, float]:
+    """Return annular Zernike terms (Noll) of each field at the middle wavelength."""
+    fit = wavefront_zernikes(scene.telescope, scene.fields, scene.middle, jmax=_HIGHEST, threads=scene.threads)
+    return {
+        f"zernike Z{j} field {_pair(place)}": float(row[j - 1]) * 1e9
+        for row, place in zip(fit.coefficients, scene.plan.fields_deg, strict=True)
+        for j in range(4, _HIGHEST + 1)
+    }
+
+
+@OPTICS.group("spot", Metric("spot", "um", "path"))
+def spot(scene: Scene) -> dict[str, float]:
+    """Return the rms spot radius of each field and wavelength."""
+    metrics = {}
+    for wavelength, nm in zip(scene.wavelengths, scene.plan.wavelengths_nm, strict=True):
+        radii = spots(scene.telescope, scene.fields, wavelength, threads=scene.threads).rms_radius * 1e6
+        for value, place in zip(radii, scene.plan.fields_deg, strict=True):
+            metrics[f"spot rms {nm:g} nm field {_pair(place)}"] = float(value)
+    return metrics
+
+
+@OPTICS.group("ee80", Metric("ee80", "um", "curve", lambda _, value: one_digit(1e-7 * value)))
+def ee80(scene: Scene) -> dict[str, float]:
+    """Return the radius of 80 % of the diffraction image's light at the middle wavelength."""
+    energy = encircled_energy(
+        scene.telescope,
+        scene.fields,
+        scene.middle,
+        pixels=_EE_PIXELS,
+        pupil_points=_EE_POINTS,
+        threads=scene.threads,
+    )
+    radii = energy.radius_holding(0.8) * 1e6
+    return {f"ee80 field {_pair(p)}": float(v) for v, p in zip(radii, scene.plan.fields_deg, strict=True)}
+
+
+def _scale_tolerance(scene: Scene, slope: float) -> float:
+    """Return the change [m] that rounding causes in a focal length measured over a slope [rad]."""
+    return scene.length_tolerance / slope
+
+
+@OPTICS.group(
+    "distortion",
+    Metric(
+        "distortion focal length",
+        "m",
+        "path",
+        lambda scene, _: one_digit(_scale_tolerance(scene, scene.telescope.field_radius)),
+    ),
+    Metric(
+        "distortion axis focal length", "m", "path", lambda scene, _: one_digit(_scale_tolerance(scene, _AXIS_SLOPE))
+    ),
+    Metric(
+        "distortion largest percent of axis scale",
+        "percent",
+        "path",
+        lambda scene, _: one_digit(
+            100.0 * _scale_tolerance(scene, _AXIS_SLOPE) / scene.distortion["axis_focal_length_m"]
+        ),
+    ),
+    Metric("distortion rms shift", "um", "path"),
+)
+def distortion(scene: Scene) -> dict[str, float]:
+    """Return scale and distortion of the chief rays over the field of view."""
+    return {
+        "distortion focal length": scene.distortion["focal_length_m"],
+        "distortion axis focal length": scene.distortion["axis_focal_length_m"],
+        "distortion largest percent of axis scale": scene.distortion["largest_percent_of_axis_scale"],
+        "distortion rms shift": scene.distortion["rms_shift_um"],
+    }
+
+
+@OPTICS.group("vignetting", Metric("vignetting lit fraction", "", "edge", one_digit(1.5 / _VIGNETTING_RAYS)))
+def lit_fraction(scene: Scene) -> dict[str, float]:
+    """Return the fraction of the pupil that lights the detector at the middle wavelength."""
+    found = vignetting(scene.telescope, scene.fields, scene.middle, rays=_VIGNETTING_RAYS, threads=scene.threads)
+    return {
+        f"vignetting lit fraction field {_pair(place)}": float(value)
+        for value, place in zip(found.fraction, scene.plan.fields_deg, strict=True)
+    }
+
+
+def _pair(values: tuple[float, float]) -> str:
+    return f"({values[0]:g}, {values[1]:g})"

@@ -1,0 +1,150 @@
+"""Metrics of the stars of a configuration: widths, ellipticities, correlations, PSF models.
+
+Stars are noise-free, at positions that depend on the seed alone. Only the reconstruction models noisy stars, as a run
+does.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...design.images.encircled_energy import energy_curve
+from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN, correlations, mean_xi_plus, run_figures
+from ...pipeline.psf_model.polynomial import design_matrix
+from ...pipeline.simulate.ccd_loop import simulate_ccds
+from ...pipeline.simulate.ccd_model import model_ccd
+from ...pipeline.simulate.photometry import ARCSEC, effective_fwhm
+from ...wavefront.opd import wavefront_opd
+from ...wavefront.zernike import fit_zernikes
+from .metric import Metric, MetricTable
+from .scene import Scene
+
+#: Metrics of the stars on the CCDs of a configuration.
+STARS = MetricTable()
+#: Rings of field angle of the mean ellipticity [deg].
+_RINGS = ((0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 1.8))
+#: Zernike terms of the wavefront, Noll.
+_ZERNIKES = range(4, 12)
+#: Ranges of separation over which xi+ is averaged [arcmin].
+RANGES = {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, LONGEST_ARCMIN)}
+# CCDs are neighbours where their centres are no farther apart than this, over the side of a CCD.
+_NEIGHBOUR = 1.08
+# Order of the fit of ellipticity within a CCD, for its value at the border.
+_BORDER_ORDER = 2
+
+
+@STARS.group("fwhm", Metric("fwhm_arcsec", "arcsec"))
+def width(scene: Scene) -> dict[str, float]:
+    """Return the effective FWHM of the median star."""
+    return {"fwhm_arcsec": effective_fwhm(scene.stars.image, scene.stars.pixel_scale) / ARCSEC}
+
+
+@STARS.group("rms_e", Metric("rms_e"), Metric("mean_e"))
+def ellipticity(scene: Scene) -> dict[str, float]:
+    """Return the rms of one component of e, and the mean modulus."""
+    e = np.stack([scene.shapes.e1, scene.shapes.e2])
+    return {"rms_e": float(np.sqrt(np.nanmean(e**2))), "mean_e": float(np.nanmean(np.hypot(*e)))}
+
+
+@STARS.group("e_rings", Metric("mean_e"))
+def ellipticity_of_rings(scene: Scene) -> dict[str, float]:
+    """Return the mean modulus of e in rings of field angle."""
+    radius = np.rad2deg(np.hypot(*scene.stars.fields.T))
+    size = np.hypot(scene.shapes.e1, scene.shapes.e2)
+    metrics = {}
+    for low, high in _RINGS:
+        inside = size[(radius >= low) & (radius < high) & np.isfinite(size)]
+        metrics[f"mean_e_{low:g}_to_{high:g}_deg"] = float(inside.mean()) if inside.size else np.nan
+    return metrics
+
+
+@STARS.group("border_jump", Metric("border_jump_e"))
+def border_jump(scene: Scene) -> dict[str, float]:
+    """Return the rms jump of one component of e across borders between neighbouring CCDs."""
+    camera = scene.camera_experiment.camera
+    centers = camera.centers[[camera.ccd_index(name) for name in scene.ccds]]
+    pairs = np.array(sorted(cKDTree(centers).query_pairs(_NEIGHBOUR * camera.ccd_size))).reshape(-1, 2)
+    if not len(pairs):
+        return {"border_jump_e": np.nan}
+    middles = centers[pairs].mean(axis=1)
+    first = np.cumsum([0, *map(len, scene.positions)])
+    # Ellipticity on either side of each border, by a fit within the CCD.
+    sides = np.full((len(pairs), 2, 2), np.nan)
+    for k, positions in enumerate(scene.positions):
+        stars = slice(first[k], first[k + 1])
+        e = np.stack([scene.shapes.e1[stars], scene.shapes.e2[stars]], axis=1)
+        good, borders = np.isfinite(e).all(axis=1), pairs == k
+        (x, y), half = centers[k], camera.half_size
+        extent = (x - half, x + half, y - half, y + half)
+        points = np.concatenate([positions[good], middles[borders.any(axis=1)]])
+        terms = design_matrix(points, extent, _BORDER_ORDER)
+        if good.sum() >= terms.shape[1]:
+            sides[borders] = terms[good.sum() :] @ np.linalg.lstsq(terms[: good.sum()], e[good], rcond=None)[0]
+    jumps = sides[:, 0] - sides[:, 1]
+    return {"border_jump_e": float(np.sqrt(np.nanmean(np.square(jumps))))}
+
+
+@STARS.group("xi_raw", Metric("xi_raw"))
+def correlation(scene: Scene) -> dict[str, float]:
+    """Return the mean of xi+ over short and long separations."""
+    return {f"xi_raw_{name}": mean_xi_plus(scene.correlation, *bounds) for name, bounds in RANGES.items()}
+
+
+@STARS.group("xi_bins", Metric("xi_plus"), Metric("xi_minus"))
+def correlation_bins(scene: Scene) -> dict[str, float]:
+    """Return xi+ and xi- of each bin of separation."""
+    found = scene.correlation
+    plus = {f"xi_plus_{r:.3g}_arcmin": float(v) for r, v in zip(found.r_arcmin, found.xi_plus, strict=True)}
+    minus = {f"xi_minus_{r:.3g}_arcmin": float(v) for r, v in zip(found.r_arcmin, found.xi_minus, strict=True)}
+    return plus | minus
+
+
+@STARS.group("reconstruction", Metric("xi_residual"), Metric("xi_away"), Metric("rms_residual"))
+def reconstruction(scene: Scene) -> dict[str, float]:
+    """Return the residuals of PSF models of noisy stars, and their correlations."""
+    experiment = scene.camera_experiment
+    simulated = simulate_ccds(experiment, partial(model_ccd, experiment), threads=scene.threads)
+    products = list(simulated.results.values())
+    found = correlations(products)
+    together = run_figures(products, found)["all"]
+    metrics = {
+        f"xi_{kind}_{name}": mean_xi_plus(found[kind], *bounds)
+        for kind in ("residual", "away")
+        for name, bounds in RANGES.items()
+    }
+    return metrics | {key: float(together[key]) for key in ("rms_residual_at_stars", "rms_residual_away")}
+
+
+@STARS.group("ee80", Metric("ee80_arcsec", "arcsec"))
+def ee80(scene: Scene) -> dict[str, float]:
+    """Return the radius of 80 % of the light in the stamp of the mean star."""
+    mean = scene.stars.image.astype(np.float64).mean(axis=0)
+    radii, within = energy_curve(mean)
+    radius = float(np.interp(0.8 * mean.sum(), within, radii))
+    return {"ee80_arcsec": radius * scene.stars.pixel_scale / ARCSEC}
+
+
+@STARS.group("throughput", Metric("throughput"))
+def lit_fraction(scene: Scene) -> dict[str, float]:
+    """Return mean and minimum of the lit fraction of the pupil."""
+    light = scene.stars.light
+    return {"throughput_mean": float(light.mean()), "throughput_min": float(light.min())}
+
+
+@STARS.group("zernikes", *(Metric(f"Z{j}_nm", "nm") for j in _ZERNIKES))
+def zernikes(scene: Scene) -> dict[str, float]:
+    """Return the rms of each wavefront term over five fields, to the edge on either axis."""
+    telescope, wavelengths = scene.telescope, scene.camera_experiment.wavelengths
+    angles = telescope.field_radius * np.array([0.0, 0.5, 0.95])
+    fields = {(0.0, 0.0), *((a, 0.0) for a in angles), *((0.0, a) for a in angles)}
+    wavelength = float(wavelengths[len(wavelengths) // 2])
+    found = []
+    for field in sorted(fields):
+        opd = wavefront_opd(telescope, field, wavelength, grid=48, threads=scene.threads)
+        fit = fit_zernikes(opd, 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, jmax=22)
+        found.append(fit.coefficients)
+    rms = np.sqrt(np.mean(np.square(found), axis=0)) * 1e9
+    return {f"Z{j}_nm": float(rms[j - 1]) for j in _ZERNIKES}
