@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import numpy as np
-import warp as wp
 
 from ..core.errors import ConfigError
 from ..core.launch import launch
@@ -14,7 +13,7 @@ from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .detector import land_on_ccds
-from .kernels.packet import lane_flags, lanes, packet_count, to_packets
+from .kernels.packet import lanes, packet_count, ray_packets, to_packets
 from .kernels.trace import trace_rays
 from .pack.surfaces import pack_surfaces, refractive_indices
 from .rays import Rays, RayStatus
@@ -55,66 +54,34 @@ class TraceResult:
 
 @dataclass(frozen=True)
 class PacketTrace:
-    """Packets of rays as the kernels have them, before the first surface and after the last ones.
+    """Packets of rays before the first surface and after the last ones.
 
     Attributes
     ----------
     indices : ndarray, shape [n_surface + 1]
         Refractive index before the first surface and after each.
-    start, start_direction : array of lanes, shape [3, n_packet]
-        Where the rays start [m], and where they go.
-    position, direction : array of lanes, shape [every, 3, n_packet]
-        Rays after each surface kept, telescope frame.
-    path : array of lanes, shape [every, n_packet]
-        Optical path [m].
-    status : array of lane_flags, shape [every, n_packet]
-        A :class:`~pachon.raytrace.rays.RayStatus` each.
+    start : RayPackets
+        Rays before the first surface, as one surface.
+    end : RayPackets
+        Rays after each surface kept.
     """
 
     indices: np.ndarray
-    start: wp.array
-    start_direction: wp.array
-    position: wp.array
-    direction: wp.array
-    path: wp.array
-    status: wp.array
+    start: Any
+    end: Any
 
 
-def trace_packets(telescope: Telescope, rays: Rays, every: int, *, threads: int | None = None) -> PacketTrace:
-    """Trace rays and leave them in packets, the last one filled up; ``every`` surfaces are kept, the last ones."""
+def trace_packets(telescope: Telescope, rays: Rays, n_kept: int, *, threads: int | None = None) -> PacketTrace:
+    """Trace rays in packets, the last one filled up, and keep them at the last ``n_kept`` surfaces."""
     packed = pack_surfaces(telescope)
     count = packet_count(len(rays))
     indices = refractive_indices(telescope, rays.wavelength)
-
-    def inputs(values: np.ndarray) -> wp.array:
-        return warp_array(to_packets(values), lanes)
-
-    end = PacketTrace(
-        indices,
-        inputs(rays.position.T),
-        inputs(rays.direction.T),
-        wp.empty((every, 3, count), dtype=lanes, device="cpu"),
-        wp.empty((every, 3, count), dtype=lanes, device="cpu"),
-        wp.empty((every, count), dtype=lanes, device="cpu"),
-        wp.empty((every, count), dtype=lane_flags, device="cpu"),
-    )
-    launch(
-        trace_rays.suited(packed),
-        count,
-        [
-            packed,
-            warp_array(indices[None]),
-            end.start,
-            end.start_direction,
-            inputs(rays.path_length),
-            end.position,
-            end.direction,
-            end.path,
-            end.status,
-        ],
-        threads=threads,
-    )
-    return end
+    start, end = ray_packets(), ray_packets(n_kept, count)
+    start.position = warp_array(to_packets(rays.position.T[None]), lanes)
+    start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
+    start.path = warp_array(to_packets(rays.path_length[None]), lanes)
+    launch(trace_rays.suited(packed), count, [packed, warp_array(indices[None]), start, end], threads=threads)
+    return PacketTrace(indices, start, end)
 
 
 @overload
@@ -178,7 +145,7 @@ def trace(
         raise ConfigError(f"surfaces = {surfaces!r}: expected 'last' or 'all'")
     n = len(rays)
     every = len(telescope.surfaces) if surfaces == "all" else 1
-    end = trace_packets(telescope, rays, every, threads=threads)
+    end = trace_packets(telescope, rays, every, threads=threads).end
     names = telescope.surface_names if surfaces == "all" else telescope.surface_names[-1:]
     positions = end.position.numpy().reshape(every, 3, -1)[:, :, :n]
     directions = end.direction.numpy().reshape(every, 3, -1)[:, :, :n]

@@ -16,7 +16,7 @@ from ..core.units import radians
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, to_packets
+from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.trace import PackedSurfaces
 from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
 from ..raytrace.rays import check_wavelength, field_direction, object_points
@@ -202,8 +202,6 @@ class _Plan:
         start = np.empty((0, 3))
         if np.isfinite(telescope.object_distance):
             start = object_points(telescope, directions)
-        nothing = [wp.empty((0, 0, 0), dtype=lanes, device="cpu")] * 2
-        nothing += [wp.empty((0, 0), dtype=kind, device="cpu") for kind in (lanes, lane_flags)]
         lit = np.ones(len(directions) * packets, dtype=np.int32)
         # The first stage only tells which packets hold light at all.
         for surfaces, filled in zip(self.stages, [value[:0], value][-len(self.stages) :], strict=True):
@@ -223,7 +221,7 @@ class _Plan:
                     warp_array(start),
                     warp_array(sphere),
                     self.radius,
-                    *nothing,
+                    ray_packets(),
                     warp_array(filled),
                     warp_array(lit, wp.int32),
                 ],

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..core.launch import FORWARD_OPTIONS
 from ..raytrace.kernels.kernel_pair import kernel_pair
-from ..raytrace.kernels.packet import LANES, lane_flags, lanes, lanes_sqrt
+from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes, lanes_sqrt
 from ..raytrace.kernels.pupil import launched
 from ..raytrace.kernels.surface import OK, ONE, ZERO
 from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
@@ -38,10 +38,7 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
         start: wp.array2d(dtype=wp.float64),
         sphere: wp.array2d(dtype=wp.float64),
         radius: wp.float64,
-        no_position: wp.array3d(dtype=lanes),
-        no_direction: wp.array3d(dtype=lanes),
-        no_path: wp.array2d(dtype=lanes),
-        no_status: wp.array2d(dtype=lane_flags),
+        no_rays: RayPackets,
         value: wp.array2d(dtype=wp.float64),
         lit: wp.array(dtype=wp.int32),
     ):
@@ -88,10 +85,7 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
             dw,
             lanes(ZERO),
             p,
-            no_position,
-            no_direction,
-            no_path,
-            no_status,
+            no_rays,
         )
         count = wp.int32(0)
         for i in range(LANES):

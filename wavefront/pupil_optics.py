@@ -19,7 +19,7 @@ from ..core.units import field_label, metres, radians
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, to_packets
+from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
 from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
 from ..raytrace.rays import RayStatus, field_direction, parallel_rays
@@ -209,8 +209,6 @@ def trace_pupils(
     bundles = n_star * n_wave
 
     out_x, out_y, out_path = (wp.empty((bundles, count), dtype=lanes, device="cpu") for _ in range(3))
-    nothing = [wp.empty((0, 0, 0), dtype=lanes, device="cpu")] * 2
-    nothing += [wp.empty((0, 0), dtype=kind, device="cpu") for kind in (lanes, lane_flags)]
     out_status = wp.empty((bundles, count), dtype=lane_flags, device="cpu")
     packed = pack_surfaces(telescope)
     launch(
@@ -227,7 +225,7 @@ def trace_pupils(
             float(telescope.launch_distance),
             warp_array(np.repeat(np.concatenate([reference, normal], axis=1), n_wave, axis=0)),
             float(radius),
-            *nothing,
+            ray_packets(),
             out_x,
             out_y,
             out_path,

@@ -8,8 +8,10 @@ import numpy as np
 
 from ...models.shapes.polar_polynomial import PolarPolynomial
 from ...models.telescope import Telescope
-from ...raytrace.adjoint.gradient import Seeds, SurfaceResponse, Sweep, columns, polynomial_terms, respond
-from ...raytrace.adjoint.sphere_sweep import SPHERE_ROWS, SphereSweep
+from ...raytrace.adjoint.adjoint_matrix import AdjointMatrix, column_table, polynomial_terms
+from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
+from ...raytrace.adjoint.forward_pass import ForwardPass
+from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS, SphereAdjoint
 from ...wavefront.reference_sphere import sphere_distance_derivatives
 from ..parameters.parameters import Parameter, apply, figured_shapes, index_surfaces, twists
 from ..parameters.surface_deformation import figure_polynomial
@@ -26,7 +28,7 @@ class ParameterColumns:
     parameters : tuple of Parameter
         The parameters.
     rows : ndarray of int, shape [n_surface + 1, 13]
-        Table of the columns, for :func:`~pachon.raytrace.adjoint.gradient.respond`.
+        Table of the columns, for :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`.
     polynomials : tuple of (surface, scale, degree, rows)
         Surfaces with figures that are polynomials, for the same.
     figures : tuple of (surface, name)
@@ -54,10 +56,10 @@ class ParameterColumns:
         moved = apply(telescope, dict(zip(parameters, values, strict=True)))
         names = telescope.surface_names
         figured = [(p, names.index(one.target), one) for p, one in enumerate(parameters) if one.kind == "figure"]
-        wanted = {(s, name) for _, s, _ in figured for name in ("sag", "hit")}
-        helpers = columns(telescope, wanted)
+        wanted = {(s, name) for _, s, _ in figured for name in ("sag", "intersection")}
+        helpers = column_table(telescope, wanted)
         count = int(helpers.max()) + 1
-        first = count + SPHERE_ROWS
+        first = count + SPHERE_COLUMNS
 
         # Across a gap a motion counts by what the bodies on both sides do differently.
         ends = np.zeros((len(parameters), 1, 6))
@@ -66,7 +68,7 @@ class ParameterColumns:
         behind = {(s, "index") for run in runs.values() for s in run}
         before = {(s + 1, "index") for run in runs.values() for s in run if s + 1 < len(names)}
         gaps = {(int(g), "gap") for g in np.flatnonzero(motion.any(axis=(0, 2)))}
-        own = columns(telescope, behind | before | gaps, first)
+        own = column_table(telescope, behind | before | gaps, first)
         rows = np.maximum(helpers, own)
 
         # Where rays go, a shape has the figures that are not zero; to be differentiated by, all that are named.
@@ -102,20 +104,20 @@ class ParameterColumns:
         listed = tuple(block[:4] for block in blocks)
         return cls(moved, parameters, rows, listed, tuple((s, name) for _, s, name in figures), count, total[first:])
 
-    def responses(self, swept: Sweep, seeds: Seeds, *, threads: int | None = None) -> np.ndarray:
+    def responses(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return all rows of every output and ray, shape [n_output, n_row, n]; times the weights they are derivatives.
 
         Parameters
         ----------
-        swept : Sweep
+        forward : ForwardPass
             Rays through ``self.telescope``.
-        seeds : Seeds
+        gradient : OutputGradient
             The outputs.
         threads : int, optional
             Number of threads.
         """
-        response = respond(swept, seeds, self.rows, polynomials=self.polynomials, threads=threads)
-        return self._with_figures(response, self.helpers + SPHERE_ROWS)
+        response = backward_pass(forward, gradient, self.rows, polynomials=self.polynomials, threads=threads)
+        return self._with_figures(response, self.helpers + SPHERE_COLUMNS)
 
     def to_spheres(
         self,
@@ -126,12 +128,12 @@ class ParameterColumns:
         path: np.ndarray,
         *,
         lit_only: bool = False,
-    ) -> SphereSweep:
+    ) -> SphereAdjoint:
         """Return the sweep of the rays of field points to their reference spheres, whose rows :meth:`of_path` takes.
 
-        Parameters are those of :class:`~pachon.raytrace.adjoint.sphere_sweep.SphereSweep`.
+        Parameters are those of :class:`~pachon.raytrace.adjoint.sphere_adjoint.SphereAdjoint`.
         """
-        return SphereSweep(
+        return SphereAdjoint(
             self.telescope,
             directions,
             indices,
@@ -145,14 +147,14 @@ class ParameterColumns:
             lit_only=lit_only,
         )
 
-    def of_path(self, response: SurfaceResponse) -> np.ndarray:
+    def of_path(self, response: AdjointMatrix) -> np.ndarray:
         """Return the rows [n_row, n_field, n_pupil] of optical paths to reference spheres.
 
         The first four are the path and its derivatives with respect to the landing point; all others have weights.
         """
         return self._with_figures(response, self.helpers)[0]
 
-    def _with_figures(self, response: SurfaceResponse, first: int) -> np.ndarray:
+    def _with_figures(self, response: AdjointMatrix, first: int) -> np.ndarray:
         """Return the rows from a first one on, those of figures that are no polynomials added."""
         values = response.values[:, first:]
         if not self.figures:
@@ -160,22 +162,24 @@ class ParameterColumns:
         shapes, names = figured_shapes(self.telescope, self.parameters), self.telescope.surface_names
         extra = np.empty((len(values), len(self.figures), *values.shape[2:]))
         for i, (s, name) in enumerate(self.figures):
-            f, fx, fy = shapes[names[s]].sag_derivative(name, *response.hit(s))
+            f, fx, fy = shapes[names[s]].sag_derivative(name, *response.intersection(s))
             sag = response.sag(s)
             extra[:, i] = sag[:, 0] * f + sag[:, 1] * fx + sag[:, 2] * fy
         return np.concatenate([values, extra], axis=1)
 
-    def size_of_terms(self, swept: Sweep, seeds: Seeds, *, threads: int | None = None) -> np.ndarray:
+    def size_of_terms(
+        self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None
+    ) -> np.ndarray:
         """Return how large the terms are that a derivative sums up, rms over rays and outputs, shape [n_parameter].
 
         A derivative far below them is rounding: the terms cancel.
         """
-        terms = np.abs(self.responses(swept, seeds, threads=threads)).transpose(0, 2, 1) @ np.abs(self.weights)
+        terms = np.abs(self.responses(forward, gradient, threads=threads)).transpose(0, 2, 1) @ np.abs(self.weights)
         return np.sqrt(np.mean(terms**2, axis=(0, 1)))
 
-    def derivatives(self, swept: Sweep, seeds: Seeds, *, threads: int | None = None) -> np.ndarray:
+    def derivatives(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return the derivatives of every output and ray with respect to each parameter, [n_output, n, n_parameter]."""
-        return np.matmul(self.responses(swept, seeds, threads=threads).transpose(0, 2, 1), self.weights)
+        return np.matmul(self.responses(forward, gradient, threads=threads).transpose(0, 2, 1), self.weights)
 
 
 def _scale(telescope: Telescope, surface: int) -> float:
@@ -199,12 +203,12 @@ def _polynomial_weights(found: dict[int, PolarPolynomial], n: int, scale: float)
     return degree, weights
 
 
-def sphere_seeds(swept: Sweep, center: np.ndarray, radius: float) -> tuple[Seeds, np.ndarray]:
-    """Return the seeds of the optical path to reference spheres, one output, and that path.
+def sphere_gradient(forward: ForwardPass, center: np.ndarray, radius: float) -> tuple[OutputGradient, np.ndarray]:
+    """Return the gradient of the optical path to reference spheres, one output, and that path.
 
     Parameters
     ----------
-    swept : Sweep
+    forward : ForwardPass
         Rays traced to the image.
     center : ndarray, shape [3, n]
         Centre of the sphere of each ray [m], telescope frame. The derivative of the path with respect to it is the
@@ -214,12 +218,14 @@ def sphere_seeds(swept: Sweep, center: np.ndarray, radius: float) -> tuple[Seeds
 
     Returns
     -------
-    seeds : Seeds
+    gradient : OutputGradient
         One output.
     path : ndarray, shape [n]
         Optical path to the sphere [m].
     """
-    n = swept.indices[-2]
-    distance, by_position, by_direction = sphere_distance_derivatives(swept.position, swept.direction, center, radius)
-    seeds = Seeds(n * by_position[None], n * by_direction[None], np.ones(1), index=distance[None])
-    return seeds, swept.path + n * distance
+    n = forward.indices[-2]
+    distance, by_position, by_direction = sphere_distance_derivatives(
+        forward.position, forward.direction, center, radius
+    )
+    gradient = OutputGradient(n * by_position[None], n * by_direction[None], np.ones(1), index=distance[None])
+    return gradient, forward.path_length + n * distance

@@ -13,7 +13,8 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
-from ...raytrace.adjoint.gradient import landing_seeds, sweep
+from ...raytrace.adjoint.backward_pass import landing_gradient
+from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import Rays, RayStatus, field_direction, parallel_rays
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
@@ -181,8 +182,10 @@ class SpotMerit:
         return reduced[..., 0].ravel(), reduced[..., 1:].reshape(-1, reduced.shape[-1] - 1)
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:  # noqa: D102
-        swept = sweep(columns.telescope, self._beams.rays(columns.telescope, float(self._beams.wavelengths[0])))
-        return columns.size_of_terms(swept, landing_seeds(swept), threads=self._beams.threads)
+        forward = forward_pass(
+            columns.telescope, self._beams.rays(columns.telescope, float(self._beams.wavelengths[0]))
+        )
+        return columns.size_of_terms(forward, landing_gradient(forward), threads=self._beams.threads)
 
     def _chief_rays(self, telescope: Telescope) -> Rays:
         light = field_direction(self._beams.fields[:, 0], self._beams.fields[:, 1], self._beams.projection)
@@ -195,9 +198,9 @@ class SpotMerit:
 
     def _landing(self, columns: ParameterColumns, rays: Rays) -> np.ndarray:
         """Return landing points and, behind them, their derivatives, shape [2, n, 1 + n_parameter]."""
-        swept = sweep(columns.telescope, rays, threads=self._beams.threads)
-        change = columns.derivatives(swept, landing_seeds(swept), threads=self._beams.threads)
-        return np.concatenate([swept.landing[:2, :, None], change], axis=2)
+        forward = forward_pass(columns.telescope, rays, threads=self._beams.threads)
+        change = columns.derivatives(forward, landing_gradient(forward), threads=self._beams.threads)
+        return np.concatenate([forward.landing[:2, :, None], change], axis=2)
 
     def _reduced(self, landing: np.ndarray, chief: np.ndarray | None) -> np.ndarray:
         """Return weighted deviations of [n_wave, 2, n_field * n_pupil, k] from the centroid or the chief ray's."""

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...models.telescope import Telescope
-from ...raytrace.adjoint.gradient import landing_seeds, sweep
+from ...raytrace.adjoint.backward_pass import landing_gradient
+from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import field_direction, parallel_rays
 from .jacobian import ParameterColumns
 
@@ -47,9 +48,9 @@ class FocalLength:
         angles = np.array([-0.5, 0.5]) * _SMALL_FIELD
         light = field_direction(angles, np.zeros(2))
         w = telescope.default_wavelength if self.wavelength is None else self.wavelength
-        swept = sweep(telescope, parallel_rays(telescope, light, w, np.zeros((1, 2))))
-        change = np.diff(columns.derivatives(swept, landing_seeds(swept)), axis=1)[:, 0]
-        apart = np.diff(swept.landing[:2], axis=1)[:, 0]
+        forward = forward_pass(telescope, parallel_rays(telescope, light, w, np.zeros((1, 2))))
+        change = np.diff(columns.derivatives(forward, landing_gradient(forward)), axis=1)[:, 0]
+        apart = np.diff(forward.landing[:2], axis=1)[:, 0]
         length = float(np.hypot(*apart))
         rate = self.weight / (2.0 * np.tan(0.5 * _SMALL_FIELD))
         return np.array([rate * length - self.weight * self.value]), (rate / length * apart @ change)[None]

@@ -12,9 +12,10 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.threads import thread_count
-from ...raytrace.adjoint.gradient import Seeds, position_seeds, sweep
+from ...raytrace.adjoint.backward_pass import OutputGradient, position_gradient
+from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import RayStatus, field_direction, parallel_rays
-from .jacobian import ParameterColumns, sphere_seeds
+from .jacobian import ParameterColumns, sphere_gradient
 
 Result = TypeVar("Result")
 #: Rays at once: what their sweep back leaves should stay in the processor's cache until it is summed up.
@@ -128,23 +129,23 @@ class FieldWavefronts:
         telescope = columns.telescope
         self._columns, self._threads, self._size = columns, thread_count(threads), (len(fields), len(pupil))
         light = field_direction(fields[:, 0], fields[:, 1], projection)
-        chief = sweep(telescope, parallel_rays(telescope, light, wavelength, np.zeros((1, 2))), threads=1)
+        chief = forward_pass(telescope, parallel_rays(telescope, light, wavelength, np.zeros((1, 2))), threads=1)
         if not chief.arrived.all():
             x, y = np.rad2deg(fields[~chief.arrived][0])
             raise DomainError(f"field = ({x:.6g}, {y:.6g}) deg: the chief ray does not reach the image")
-        seeds, path = sphere_seeds(chief, chief.position, telescope.reference_sphere_radius)
+        gradient, path = sphere_gradient(chief, chief.position, telescope.reference_sphere_radius)
         self._rays = columns.to_spheres(light, chief.indices, pupil, chief.position, path, lit_only=lit_only)
         # Landing points and paths together, four outputs.
-        axes, zero = position_seeds(chief), np.zeros((3, len(fields)))
-        both = Seeds(
-            np.concatenate([axes.position, seeds.position]),
-            np.concatenate([axes.direction, seeds.direction]),
-            np.append(axes.path, seeds.path),
-            index=np.concatenate([zero, seeds.index]),
+        axes, zero = position_gradient(chief), np.zeros((3, len(fields)))
+        both = OutputGradient(
+            np.concatenate([axes.position, gradient.position]),
+            np.concatenate([axes.direction, gradient.direction]),
+            np.append(axes.path, gradient.path),
+            index=np.concatenate([zero, gradient.index]),
         )
         derivatives = columns.derivatives(chief, both, threads=1)
         self._moved = derivatives[:3].transpose(1, 0, 2)
-        self._piston = derivatives[3] - np.einsum("in,nip->np", seeds.position[0], self._moved)
+        self._piston = derivatives[3] - np.einsum("in,nip->np", gradient.position[0], self._moved)
 
     def map(self, work: Callable[[WavefrontBlock], Result]) -> list[Result]:
         """Return what a function makes of each block, in the order of the fields; blocks are worked on side by side."""
@@ -160,7 +161,7 @@ class FieldWavefronts:
 
     def block(self, part: slice) -> WavefrontBlock:
         """Return the block of some of the field points, worked out on one thread."""
-        response, status = self._rays.respond(part, threads=1)
+        response, status = self._rays.matrix(part, threads=1)
         table = self._columns.of_path(response)
         lost = status > RayStatus.VIGNETTED
         if lost.any():

@@ -7,6 +7,8 @@ never depends on its neighbours: cutting a batch differently changes no byte.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -29,6 +31,29 @@ def lanes_sqrt(a: lanes):
     for i in range(LANES):
         out[i] = wp.sqrt(a[i])
     return out
+
+
+@wp.struct
+class RayPackets:
+    """Packets of rays at some surfaces, in the telescope frame.
+
+    ``position`` [surface, 3, packet] [m], ``direction`` [surface, 3, packet], optical ``path`` [surface, packet] [m],
+    ``status`` [surface, packet]. Without surfaces there is nothing to store.
+    """
+
+    position: wp.array3d(dtype=lanes)
+    direction: wp.array3d(dtype=lanes)
+    path: wp.array2d(dtype=lanes)
+    status: wp.array2d(dtype=lane_flags)
+
+
+def ray_packets(n_surface: int = 0, n_packet: int = 0) -> Any:
+    """Return unset :class:`RayPackets` for a number of surfaces and of packets."""
+    packets = RayPackets()
+    packets.position, packets.direction = (wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu") for _ in "pd")
+    packets.path = wp.empty((n_surface, n_packet), dtype=lanes, device="cpu")
+    packets.status = wp.empty((n_surface, n_packet), dtype=lane_flags, device="cpu")
+    return packets
 
 
 def packet_count(n: int) -> int:

@@ -10,7 +10,7 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from .kernel_pair import kernel_pair
-from .packet import lane_flags, lanes, lanes_sqrt
+from .packet import RayPackets, lane_flags, lanes, lanes_sqrt
 from .surface import ZERO
 from .trace import LOOPS, PackedSurfaces, statuses
 
@@ -42,10 +42,7 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
         distance: wp.float64,
         reference: wp.array2d(dtype=wp.float64),
         radius: wp.float64,
-        no_position: wp.array3d(dtype=lanes),
-        no_direction: wp.array3d(dtype=lanes),
-        no_path: wp.array2d(dtype=lanes),
-        no_status: wp.array2d(dtype=lane_flags),
+        no_rays: RayPackets,
         displacement_x: wp.array2d(dtype=lanes),
         displacement_y: wp.array2d(dtype=lanes),
         path_out: wp.array2d(dtype=lanes),
@@ -78,10 +75,7 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
             lanes(dw),
             lanes(ZERO),
             p,
-            no_position,
-            no_direction,
-            no_path,
-            no_status,
+            no_rays,
         )
         x = x - lanes(reference[b, 0])
         y = y - lanes(reference[b, 1])

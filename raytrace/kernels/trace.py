@@ -14,7 +14,7 @@ from .aperture import PackedApertures, through_aperture
 from .kernel_pair import kernel_pair
 from .mesh import PackedMeshes, mesh_distance
 from .obstruction import PackedObstructions, past_obstructions
-from .packet import LANES, lane_flags, lanes
+from .packet import LANES, RayPackets, lane_flags, lanes
 from .shape import PackedDeformations, deformed_distance, through_screen
 from .surface import (
     FAR,
@@ -158,10 +158,7 @@ def surface_loop(special: bool) -> wp.Function:
         w: lanes,
         path: lanes,
         packet: wp.int32,
-        position_out: wp.array3d(dtype=lanes),
-        direction_out: wp.array3d(dtype=lanes),
-        path_out: wp.array2d(dtype=lanes),
-        status_out: wp.array2d(dtype=lane_flags),
+        out: RayPackets,
     ):
         """Carry a packet through every surface, and write it after the last ones, as many as the outputs have room for.
 
@@ -170,7 +167,7 @@ def surface_loop(special: bool) -> wp.Function:
         """
         status = lanes(OK)
         n_surfaces = surfaces.kinds.shape[0]
-        skipped = n_surfaces - position_out.shape[0]
+        skipped = n_surfaces - out.position.shape[0]
         for s in range(n_surfaces):
             before = indices[row, s]
             after = indices[row, s + 1]
@@ -280,14 +277,14 @@ def surface_loop(special: bool) -> wp.Function:
             z = z + lanes(surfaces.numbers[s, VERTEX + 2])
             if s >= skipped:
                 o = s - skipped
-                position_out[o, 0, packet] = x
-                position_out[o, 1, packet] = y
-                position_out[o, 2, packet] = z
-                direction_out[o, 0, packet] = u
-                direction_out[o, 1, packet] = v
-                direction_out[o, 2, packet] = w
-                path_out[o, packet] = path
-                status_out[o, packet] = statuses(status)
+                out.position[o, 0, packet] = x
+                out.position[o, 1, packet] = y
+                out.position[o, 2, packet] = z
+                out.direction[o, 0, packet] = u
+                out.direction[o, 1, packet] = v
+                out.direction[o, 2, packet] = w
+                out.path[o, packet] = path
+                out.status[o, packet] = statuses(status)
         return x, y, z, u, v, w, path, status
 
     return through_telescope
@@ -307,13 +304,8 @@ def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
         first: wp.int32,
         surfaces: PackedSurfaces,
         indices: wp.array2d(dtype=wp.float64),
-        position: wp.array2d(dtype=lanes),
-        direction: wp.array2d(dtype=lanes),
-        path_in: wp.array(dtype=lanes),
-        position_out: wp.array3d(dtype=lanes),
-        direction_out: wp.array3d(dtype=lanes),
-        path_out: wp.array2d(dtype=lanes),
-        status_out: wp.array2d(dtype=lane_flags),
+        start: RayPackets,
+        out: RayPackets,
     ):
         """Trace one packet of given rays through every surface; write the last surface, or all of them.
 
@@ -325,18 +317,15 @@ def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
             surfaces,
             indices,
             0,
-            position[0, p],
-            position[1, p],
-            position[2, p],
-            direction[0, p],
-            direction[1, p],
-            direction[2, p],
-            path_in[p],
+            start.position[0, 0, p],
+            start.position[0, 1, p],
+            start.position[0, 2, p],
+            start.direction[0, 0, p],
+            start.direction[0, 1, p],
+            start.direction[0, 2, p],
+            start.path[0, p],
             p,
-            position_out,
-            direction_out,
-            path_out,
-            status_out,
+            out,
         )
 
     return trace_rays

@@ -11,9 +11,9 @@ import warp as wp
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...models.telescope import Telescope
-from ...raytrace.kernels.packet import lane_flags, lanes, packet_count, to_packets
-from ...raytrace.kernels.trace import trace_rays
-from ...raytrace.pack.surfaces import clear_ring, pack_surfaces, refractive_indices
+from ...raytrace.pack.surfaces import clear_ring, pack_surfaces
+from ...raytrace.rays import Rays
+from ...raytrace.trace import trace_packets
 from .clear_pupil_kernels import find_edges
 from .sample_packets import shared
 
@@ -126,26 +126,10 @@ def clear_edges(
     along = sum(direction[:, axis, None] * point[axis] for axis in range(3)) + telescope.launch_distance
     start = (point[:, None] - direction.T[:, :, None] * along).reshape(3, -1)
     heading = np.repeat(direction.T, point.shape[1], axis=1)
-    n_ray = start.shape[1]
-    n_surface, n_packet = len(telescope.surfaces), packet_count(n_ray)
-    places = wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu")
+    n_ray, n_surface = start.shape[1], len(telescope.surfaces)
+    rays = Rays(start.T, heading.T, np.zeros(n_ray), wavelength)
+    places = trace_packets(telescope, rays, n_surface, threads=threads).end.position
     surfaces = pack_surfaces(telescope)
-    launch(
-        trace_rays.suited(surfaces),
-        n_packet,
-        [
-            surfaces,
-            wp.array(refractive_indices(telescope, wavelength)[None], dtype=wp.float64, device="cpu"),
-            wp.array(to_packets(start), dtype=lanes, device="cpu", copy=False),
-            wp.array(to_packets(heading), dtype=lanes, device="cpu", copy=False),
-            wp.zeros(n_packet, dtype=lanes, device="cpu"),
-            places,
-            wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu"),
-            wp.empty((n_surface, n_packet), dtype=lanes, device="cpu"),
-            wp.empty((n_surface, n_packet), dtype=lane_flags, device="cpu"),
-        ],
-        threads=threads,
-    )
     edges = np.empty((n_star, n_spoke, 2))
     launch(
         find_edges,

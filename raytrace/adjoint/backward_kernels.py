@@ -1,22 +1,22 @@
-"""The backward sweep: from a number that rays end with to every surface that made it.
+"""Backward pass: derivatives of an output of rays, carried from the last surface back to the start.
 
-A ray is carried from surface to surface by functions of where it is and where it goes. Transposed and taken from the
-last surface to the first, their derivatives carry a row vector (the adjoint: derivatives of one output with respect to
-position and direction of the ray) back to the start, and tell on the way what each surface's own figures would have
-done. With the hit Q = P + t d, the normal N = (-sx, -sy, 1) of the sag z = sag(x, y), a = d.N and S = N.N, in the
-surface's frame::
+The position and direction of a ray after each surface are functions of those before it. Their transposed derivatives,
+applied from the last surface to the first, carry the adjoint: the derivatives of one output with respect to position
+and direction of the ray. At each surface the adjoint gives the derivatives by the parameters of that surface. With the
+intersection Q = P + t d, the normal N = (-sx, -sy, 1) of the sag z = sag(x, y), a = d.N and S = N.N, in the frame of
+the surface::
 
-    hit         dt = (f - N.(dP + t dd)) / a              f: a change of the sag
-    normal      dN = -(H dQ + grad f)                     H: second derivatives of the sag
-    refraction  d' = mu d + g N,  g = (root - mu a) / S,  root = sign(a) sqrt((1 - mu^2) S + mu^2 a^2)
-    mirror      the same with mu = 1 and root = -a
-    path        dL = n dt + t dn
+    intersection  dt = (f - N.(dP + t dd)) / a            f: a change of the sag
+    normal        dN = -(H dQ + grad f)                   H: second derivatives of the sag
+    refraction    d' = mu d + g N,  g = (root - mu a) / S,  root = sign(a) sqrt((1 - mu^2) S + mu^2 a^2)
+    mirror        the same with mu = 1 and root = -a
+    path          dL = n dt + t dn
 
-so a ray costs a second sweep of about the same work, however many figures there are.
+A backward pass takes about as long as a forward pass, whatever the number of parameters.
 
-A rigid motion is read off the adjoint alone. With A and B the derivatives with respect to position P and direction d
-of a ray in the gap between two surfaces, the force A and the torque P x A + d x B are the same all along the gap, and a
-body that moves by ``v + w x r`` answers with v.(force) + w.(torque) behind it less that in front of it.
+Rigid motions follow from the adjoint alone. With A and B the derivatives with respect to position P and direction d of
+a ray in the gap between two surfaces, the force A and the torque P x A + d x B are constant along the gap. The
+derivative by a motion ``v + w x r`` of a body is v.(force) + w.(torque) behind it less that in front of it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
-from ..kernels.packet import LANES, lanes, lanes_sqrt
+from ..kernels.packet import LANES, RayPackets, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import extra_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
 from ..kernels.trace import (
@@ -40,23 +40,21 @@ from ..kernels.trace import (
     to_local,
     to_telescope,
 )
-from .adjoint_kernels import HIT, INDEX, SAG, dot, keep, keep_gap, polynomial_response, sag_derivatives
+from .column_kernels import INDEX, INTERSECTION, SAG, dot, polynomial_columns, sag_derivatives, write_column, write_gap
 
 wp.set_module_options(FORWARD_OPTIONS)
 
 
-def back_loop(special: bool) -> wp.Function:
-    """Return the loop back over the surfaces, with or without what only few telescopes need, as `surface_loop` does."""
+def backward_loop(special: bool) -> wp.Function:
+    """Return the loop back over the surfaces, for plain telescopes or for any, as `surface_loop` does."""
 
     @wp.func
-    def back_through(
+    def backward_through(
         surfaces: PackedSurfaces,
         indices: wp.array(dtype=wp.float64),
-        start: wp.array2d(dtype=lanes),
-        start_direction: wp.array2d(dtype=lanes),
-        position: wp.array3d(dtype=lanes),
-        direction: wp.array3d(dtype=lanes),
-        kept: wp.int32,
+        start: RayPackets,
+        rays: RayPackets,
+        slot: wp.int32,
         per_path: lanes,
         ax: lanes,
         ay: lanes,
@@ -64,59 +62,59 @@ def back_loop(special: bool) -> wp.Function:
         bx: lanes,
         by: lanes,
         bz: lanes,
-        rows: wp.array2d(dtype=wp.int32),
+        columns: wp.array2d(dtype=wp.int32),
         o: wp.int32,
         p: wp.int32,
-        response: wp.array3d(dtype=lanes),
+        matrix: wp.array3d(dtype=lanes),
     ):
         """Carry the adjoint of output ``o`` back through packet ``p``, and return it at the start of the rays.
 
-        ``start``, ``position`` and ``direction`` at ``kept`` are what the forward sweep began with and left after every
-        surface; a, b and ``per_path`` the derivatives of the output with respect to the last of them and to the path,
-        all in the telescope frame. ``rows`` says in which row of ``response`` a column of a surface belongs, -1 where
-        nobody asks; force and torque are asked for together.
+        Packet ``slot`` of ``start`` and ``rays`` holds the rays before the first surface and after each. a, b and
+        ``per_path`` are the derivatives of the output with respect to position, direction and path after the last
+        surface, all in the telescope frame. ``columns`` gives the column of ``matrix`` for each quantity of a surface,
+        -1 for none; force and torque have columns together.
         """
         n_surfaces = surfaces.kinds.shape[0]
         last = n_surfaces - 1
-        keep_gap(
-            rows,
+        write_gap(
+            columns,
             n_surfaces,
             o,
             p,
-            position[last, 0, kept],
-            position[last, 1, kept],
-            position[last, 2, kept],
-            direction[last, 0, kept],
-            direction[last, 1, kept],
-            direction[last, 2, kept],
+            rays.position[last, 0, slot],
+            rays.position[last, 1, slot],
+            rays.position[last, 2, slot],
+            rays.direction[last, 0, slot],
+            rays.direction[last, 1, slot],
+            rays.direction[last, 2, slot],
             ax,
             ay,
             az,
             bx,
             by,
             bz,
-            response,
+            matrix,
         )
         for back in range(n_surfaces):
             s = last - back
             before = indices[s]
             after = indices[s + 1]
-            x = position[s, 0, kept]
-            y = position[s, 1, kept]
-            z = position[s, 2, kept]
-            du = start_direction[0, kept]
-            dv = start_direction[1, kept]
-            dw = start_direction[2, kept]
-            px = start[0, kept]
-            py = start[1, kept]
-            pz = start[2, kept]
+            x = rays.position[s, 0, slot]
+            y = rays.position[s, 1, slot]
+            z = rays.position[s, 2, slot]
+            du = start.direction[0, 0, slot]
+            dv = start.direction[0, 1, slot]
+            dw = start.direction[0, 2, slot]
+            px = start.position[0, 0, slot]
+            py = start.position[0, 1, slot]
+            pz = start.position[0, 2, slot]
             if s > 0:
-                du = direction[s - 1, 0, kept]
-                dv = direction[s - 1, 1, kept]
-                dw = direction[s - 1, 2, kept]
-                px = position[s - 1, 0, kept]
-                py = position[s - 1, 1, kept]
-                pz = position[s - 1, 2, kept]
+                du = rays.direction[s - 1, 0, slot]
+                dv = rays.direction[s - 1, 1, slot]
+                dw = rays.direction[s - 1, 2, slot]
+                px = rays.position[s - 1, 0, slot]
+                py = rays.position[s - 1, 1, slot]
+                pz = rays.position[s - 1, 2, slot]
             t = dot(x - px, y - py, z - pz, du, dv, dw)
             u = du
             v = dv
@@ -187,25 +185,25 @@ def back_loop(special: bool) -> wp.Function:
             if wp.static(special):
                 if interaction == PHASE:
                     # d' = (u + sx / n, v + sy / n, +-root): the third component follows from the first two.
-                    bend_x = u + (ONE / before) * sx
-                    bend_y = v + (ONE / before) * sy
-                    ahead = lanes_sqrt(lanes(ONE) - wp.cw_mul(bend_x, bend_x) - wp.cw_mul(bend_y, bend_y))
+                    ahead_x = u + (ONE / before) * sx
+                    ahead_y = v + (ONE / before) * sy
+                    ahead = lanes_sqrt(lanes(ONE) - wp.cw_mul(ahead_x, ahead_x) - wp.cw_mul(ahead_y, ahead_y))
                     for i in range(LANES):
                         ahead[i] = wp.where(w[i] < ZERO, -ahead[i], ahead[i])
-                    fx = bx - wp.cw_div(wp.cw_mul(bz, bend_x), ahead)
-                    fy = by - wp.cw_div(wp.cw_mul(bz, bend_y), ahead)
+                    fx = bx - wp.cw_div(wp.cw_mul(bz, ahead_x), ahead)
+                    fy = by - wp.cw_div(wp.cw_mul(bz, ahead_y), ahead)
                     fz = lanes(ZERO)
                     cx = (-ONE / before) * fx
                     cy = (-ONE / before) * fy
                     by_value = per_path
-            # With respect to the hit, along the surface and along the ray; a screen's map adds to the path there.
+            # With respect to the intersection, along the surface and the ray; a screen's map adds to the path there.
             hx = ax - wp.cw_mul(sxx, cx) - wp.cw_mul(sxy, cy)
             hy = ay - wp.cw_mul(sxy, cx) - wp.cw_mul(syy, cy)
             if wp.static(special):
                 hx = hx + wp.cw_mul(by_value, sx)
                 hy = hy + wp.cw_mul(by_value, sy)
             height = wp.cw_div(dot(hx, hy, az, u, v, w) + before * per_path, along)
-            # With respect to the ray in front, its position anywhere along it and its direction about the hit.
+            # With respect to the ray in front, its position anywhere along it and its direction about the intersection.
             ex = hx - wp.cw_mul(height, nx)
             ey = hy - wp.cw_mul(height, ny)
             ez = az - height
@@ -213,22 +211,22 @@ def back_loop(special: bool) -> wp.Function:
             if wp.static(special):
                 if interaction == PHASE:
                     height = by_value
-            keep(rows, s, SAG, o, p, height, response)
-            keep(rows, s, SAG + 1, o, p, -cx, response)
-            keep(rows, s, SAG + 2, o, p, -cy, response)
-            keep(rows, s, HIT, o, p, x, response)
-            keep(rows, s, HIT + 1, o, p, y, response)
+            write_column(columns, s, SAG, o, p, height, matrix)
+            write_column(columns, s, SAG + 1, o, p, -cx, matrix)
+            write_column(columns, s, SAG + 2, o, p, -cy, matrix)
+            write_column(columns, s, INTERSECTION, o, p, x, matrix)
+            write_column(columns, s, INTERSECTION + 1, o, p, y, matrix)
             by_mu = lanes(ZERO)
             if interaction == REFRACT:
                 by_mu = dot(bx, by, bz, u, v, w) + wp.cw_mul(b_normal, g_mu)
             if wp.static(special):
                 if interaction == PHASE:
                     by_mu = wp.cw_mul(cx, sx) + wp.cw_mul(cy, sy)
-            keep(rows, s, INDEX, o, p, wp.cw_mul(per_path, t) + (ONE / after) * by_mu, response)
+            write_column(columns, s, INDEX, o, p, wp.cw_mul(per_path, t) + (ONE / after) * by_mu, matrix)
             if wp.static(special):
                 if interaction == PHASE:
                     by_mu = lanes(ZERO)
-            keep(rows, s, INDEX + 1, o, p, (-before / (after * after)) * by_mu, response)
+            write_column(columns, s, INDEX + 1, o, p, (-before / (after * after)) * by_mu, matrix)
 
             ax = ex
             ay = ey
@@ -239,77 +237,72 @@ def back_loop(special: bool) -> wp.Function:
             if turned == 1:
                 ax, ay, az = to_telescope(surfaces, s, ax, ay, az)
                 bx, by, bz = to_telescope(surfaces, s, bx, by, bz)
-            keep_gap(rows, s, o, p, px, py, pz, du, dv, dw, ax, ay, az, bx, by, bz, response)
+            write_gap(columns, s, o, p, px, py, pz, du, dv, dw, ax, ay, az, bx, by, bz, matrix)
         return ax, ay, az, bx, by, bz
 
-    return back_through
+    return backward_through
 
 
-#: Without and with figures beside conics with even powers, and phase screens.
-BACK_LOOPS = (back_loop(False), back_loop(True))
+#: The loop for plain telescopes, and that for any.
+BACKWARD_LOOPS = (backward_loop(False), backward_loop(True))
 
 
 @kernel_pair
-def sweep_back(special: bool, module: wp.Module) -> wp.Kernel:
-    """Return the kernel that sweeps back."""
-    back_through = BACK_LOOPS[special]
+def backward_rays(special: bool, module: wp.Module) -> wp.Kernel:
+    """Return the kernel of the backward pass."""
+    backward_through = BACKWARD_LOOPS[special]
 
     @wp.kernel(module=module)
-    def sweep_back(
+    def backward_rays(
         first: wp.int32,
         surfaces: PackedSurfaces,
         indices: wp.array(dtype=wp.float64),
         n_packets: wp.int32,
-        start: wp.array2d(dtype=lanes),
-        start_direction: wp.array2d(dtype=lanes),
-        position: wp.array3d(dtype=lanes),
-        direction: wp.array3d(dtype=lanes),
-        seed_position: wp.array3d(dtype=lanes),
-        seed_direction: wp.array3d(dtype=lanes),
-        seed_path: wp.array(dtype=wp.float64),
-        rows: wp.array2d(dtype=wp.int32),
+        start: RayPackets,
+        rays: RayPackets,
+        by_position: wp.array3d(dtype=lanes),
+        by_direction: wp.array3d(dtype=lanes),
+        by_path: wp.array(dtype=wp.float64),
+        columns: wp.array2d(dtype=wp.int32),
         polynomials: wp.array2d(dtype=wp.int32),
         scales: wp.array(dtype=wp.float64),
-        response: wp.array3d(dtype=lanes),
-        response_start: wp.array3d(dtype=lanes),
+        matrix: wp.array3d(dtype=lanes),
+        at_start: wp.array3d(dtype=lanes),
     ):
         """Carry the adjoint of output ``item // n_packets`` back through packet ``item % n_packets``.
 
-        The seeds are the derivatives of each output with respect to position, direction and path after the last
-        surface.
-        ``response_start`` takes those with respect to the start of the ray, position and direction, if it has room.
+        ``by_position``, ``by_direction`` and ``by_path`` are the derivatives of each output with respect to the rays
+        after the last surface. ``at_start``, unless empty, takes those with respect to the start of the ray.
         """
         item = first + wp.tid()
         o = item / n_packets
         p = item - o * n_packets
-        ax, ay, az, bx, by, bz = back_through(
+        ax, ay, az, bx, by, bz = backward_through(
             surfaces,
             indices,
             start,
-            start_direction,
-            position,
-            direction,
+            rays,
             p,
-            lanes(seed_path[o]),
-            seed_position[o, 0, p],
-            seed_position[o, 1, p],
-            seed_position[o, 2, p],
-            seed_direction[o, 0, p],
-            seed_direction[o, 1, p],
-            seed_direction[o, 2, p],
-            rows,
+            lanes(by_path[o]),
+            by_position[o, 0, p],
+            by_position[o, 1, p],
+            by_position[o, 2, p],
+            by_direction[o, 0, p],
+            by_direction[o, 1, p],
+            by_direction[o, 2, p],
+            columns,
             o,
             p,
-            response,
+            matrix,
         )
         for j in range(scales.shape[0]):
-            polynomial_response(polynomials, scales[j], j, o, p, response)
-        if response_start.shape[0] > 0:
-            response_start[o, 0, p] = ax
-            response_start[o, 1, p] = ay
-            response_start[o, 2, p] = az
-            response_start[o, 3, p] = bx
-            response_start[o, 4, p] = by
-            response_start[o, 5, p] = bz
+            polynomial_columns(polynomials, scales[j], j, o, p, matrix)
+        if at_start.shape[0] > 0:
+            at_start[o, 0, p] = ax
+            at_start[o, 1, p] = ay
+            at_start[o, 2, p] = az
+            at_start[o, 3, p] = bx
+            at_start[o, 4, p] = by
+            at_start[o, 5, p] = bz
 
-    return sweep_back
+    return backward_rays

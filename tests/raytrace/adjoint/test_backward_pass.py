@@ -12,16 +12,10 @@ from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.surface import Conic, Interaction, Plane, Surface
 from pachon.models.telescope import VACUUM
-from pachon.raytrace.adjoint.gradient import (
-    Seeds,
-    columns,
-    landing_seeds,
-    polynomial_terms,
-    position_seeds,
-    respond,
-    sweep,
-)
-from pachon.raytrace.adjoint.sphere_sweep import SphereSweep
+from pachon.raytrace.adjoint.adjoint_matrix import column_table, polynomial_terms
+from pachon.raytrace.adjoint.backward_pass import OutputGradient, backward_pass, landing_gradient, position_gradient
+from pachon.raytrace.adjoint.forward_pass import forward_pass
+from pachon.raytrace.adjoint.sphere_adjoint import SphereAdjoint
 from pachon.raytrace.rays import RayStatus, field_direction
 from pachon.wavefront.reference_sphere import distance_to_sphere, sphere_distance_derivatives
 
@@ -36,7 +30,7 @@ def bare(telescope):
 
 @pytest.fixture(scope="module")
 def crooked(lsst_r):
-    """An LSST in which nothing is aligned, with a Zernike figure on M3, and a phase screen in front of the filter."""
+    """A misaligned LSST with a Zernike deformation of M3 and a phase screen in front of the filter."""
     moved = bare(lsst_r).perturbed("M2", shift=(1e-3, 2e-3, 1e-4), tilt=(1e-4, 2e-4, 0.01))
     moved = moved.perturbed("Camera", shift=(1e-3, -2e-3, 1e-4), tilt=(1e-4, -2e-4, 0.03))
     moved = moved.with_deformation("M3", ZernikeSag((0.0,) * 6 + (2e-6, -3e-6, 1e-6), 2.508, 0.55))
@@ -59,14 +53,14 @@ def rays(crooked, annulus_points):
 
 
 @pytest.fixture(scope="module")
-def swept(crooked, rays):
-    return sweep(crooked, rays)
+def forward(crooked, rays):
+    return forward_pass(crooked, rays)
 
 
 @pytest.fixture(scope="module")
-def center(swept):
+def center(forward):
     # Off the rays, so that all terms of the sphere count.
-    return swept.position[:, 0] + [2e-5, 1e-5, 0.0]
+    return forward.position[:, 0] + [2e-5, 1e-5, 0.0]
 
 
 @pytest.fixture(scope="module")
@@ -81,11 +75,13 @@ def outputs(rays, center):
 
 
 @pytest.fixture(scope="module")
-def responses(swept, center):
-    where = np.repeat(center[:, None], swept.count, axis=1)
-    distance, by_position, by_direction = sphere_distance_derivatives(swept.position, swept.direction, where, RADIUS)
-    to_sphere = Seeds(by_position[None], by_direction[None], np.ones(1), index=distance[None])
-    return respond(swept, landing_seeds(swept)), respond(swept, to_sphere)
+def responses(forward, center):
+    where = np.repeat(center[:, None], forward.n_rays, axis=1)
+    distance, by_position, by_direction = sphere_distance_derivatives(
+        forward.position, forward.direction, where, RADIUS
+    )
+    to_sphere = OutputGradient(by_position[None], by_direction[None], np.ones(1), index=distance[None])
+    return backward_pass(forward, landing_gradient(forward)), backward_pass(forward, to_sphere)
 
 
 def both(responses, surface, what):
@@ -113,7 +109,7 @@ def test_motions_of_each_surface(crooked, outputs, responses, slope, k):
 
 
 @pytest.mark.parametrize(
-    ("name", "figure", "step"),
+    ("name", "parameter", "step"),
     [
         ("M1", "radius", 1e-3),
         ("M1", "conic", 1e-3),
@@ -127,21 +123,21 @@ def test_motions_of_each_surface(crooked, outputs, responses, slope, k):
         ("screen", "Z4", 1e-5),
     ],
 )
-def test_figures(crooked, outputs, responses, slope, name, figure, step):
+def test_shape_parameters(crooked, outputs, responses, slope, name, parameter, step):
     k = crooked.surface_names.index(name)
     shape = crooked.surfaces[k].shape
-    value = shape.parameters[figure]
-    f, fx, fy = shape.sag_derivative(figure, *responses[0].hit(k))
+    value = shape.parameters[parameter]
+    f, fx, fy = shape.sag_derivative(parameter, *responses[0].intersection(k))
     sag = both(responses, k, "sag")
     change = step * (sag[:, 0] * f + sag[:, 1] * fx + sag[:, 2] * fy)
-    numeric = slope(lambda h: outputs(crooked.with_shape(name, shape.with_parameter(figure, value + h * step))), 1.0)
+    numeric = slope(lambda h: outputs(crooked.with_shape(name, shape.with_parameter(parameter, value + h * step))), 1.0)
     # 4e-15 m of rounding in each of the outputs, as above; changes are 1e-8 to 1e-4 m.
     assert np.abs(change).max() > 1e-9
     assert np.abs(change - numeric).max() < 4e-14 + 1e-9 * np.abs(numeric).max()
 
 
 @pytest.mark.parametrize("k", [3, 4, 8, 11])
-def test_indices(swept, responses, rays, slope, k, monkeypatch, center, crooked):
+def test_indices(forward, responses, rays, slope, k, monkeypatch, center, crooked):
     """The index behind surface k, changed in the kernel's own table: of the next one it is the index in front."""
     from pachon.raytrace import trace as module
 
@@ -167,8 +163,8 @@ def test_indices(swept, responses, rays, slope, k, monkeypatch, center, crooked)
     assert np.abs(found - numeric).max() < ROUNDING * max(1.0, np.abs(numeric).max())
 
 
-def test_start_of_the_rays(crooked, rays, swept, slope):
-    response = respond(swept, position_seeds(swept), start=True)
+def test_start_of_the_rays(crooked, rays, forward, slope):
+    response = backward_pass(forward, position_gradient(forward), start=True)
     for axis in range(6):
         unit = np.eye(6)[axis]
 
@@ -192,10 +188,10 @@ def test_start_of_the_rays(crooked, rays, swept, slope):
     assert np.abs(slope(turned, 1e-4) - expected).max() < 10 * ROUNDING
 
 
-def test_moving_everything_is_moving_the_light(swept, responses):
+def test_moving_everything_is_moving_the_light(forward, responses):
     """Forces and torques telescope: the sum over all surfaces is that of the light, the other way round."""
     landing, path = responses
-    count = len(swept.telescope.surfaces)
+    count = len(forward.telescope.surfaces)
     total = sum(path.motion(k) for k in range(count))
     assert np.allclose(total, path.gap(count) - path.gap(0), atol=1e-13)
     # In the detector's own frame nothing is left behind it.
@@ -213,8 +209,8 @@ def test_a_plane_mirror_turns_light_by_twice_its_tilt(lsst_r):
         group_frames={},
     )
     rays = pachon.launch_rays(folded, (0.0, 0.0), WAVELENGTH, ([0.5, 0.0], [0.0, -1.5]))
-    swept = sweep(folded, rays)
-    turn = respond(swept, landing_seeds(swept)).motion(0)[:, 3:]
+    forward = forward_pass(folded, rays)
+    turn = backward_pass(forward, landing_gradient(forward)).motion(0)[:, 3:]
     # About y by a: the light turns by 2 a towards +x over 3 m; the hit at x rises by -a x, which moves nothing here.
     assert np.allclose(turn[0, 1], 2 * 3.0, atol=1e-14)
     assert np.allclose(turn[1, 0], -2 * 3.0, atol=1e-14)
@@ -223,11 +219,11 @@ def test_a_plane_mirror_turns_light_by_twice_its_tilt(lsst_r):
 def test_a_change_of_sag_is_a_change_of_path(perfect):
     """Raised by f, a mirror moves by f cos(i) along its normal and shortens the path by 2 f cos(i)^2; slope tan(i)."""
     telescope, rays = perfect
-    swept = sweep(telescope, rays)
-    where = np.repeat(swept.position[:, :1], swept.count, axis=1)
-    _, by_position, by_direction = sphere_distance_derivatives(swept.position, swept.direction, where, 1.0)
-    response = respond(swept, Seeds(by_position[None], by_direction[None], np.ones(1)))
-    sx, sy = telescope.surfaces[0].shape.gradient(*response.hit(0))
+    forward = forward_pass(telescope, rays)
+    where = np.repeat(forward.position[:, :1], forward.n_rays, axis=1)
+    _, by_position, by_direction = sphere_distance_derivatives(forward.position, forward.direction, where, 1.0)
+    response = backward_pass(forward, OutputGradient(by_position[None], by_direction[None], np.ones(1)))
+    sx, sy = telescope.surfaces[0].shape.gradient(*response.intersection(0))
     assert np.allclose(response.sag(0)[0, 0], -2.0 / (1.0 + sx**2 + sy**2), atol=1e-14)
     # Fermat: slopes turn a ray about its focus, which changes no path.
     assert np.abs(response.sag(0)[0, 1:]).max() < 1e-14
@@ -243,23 +239,23 @@ def perfect():
     return telescope, pachon.launch_rays(telescope, (0.0, 0.0), WAVELENGTH, ([0.3, 0.0, 0.5], [0.0, 0.4, 0.5]))
 
 
-def test_polynomials(swept, crooked):
-    wanted = {(0, "sag"), (0, "hit"), (7, "sag"), (7, "hit")}
-    rows = columns(crooked, wanted)
+def test_polynomials(forward, crooked):
+    wanted = {(0, "sag"), (0, "intersection"), (7, "sag"), (7, "intersection")}
+    rows = column_table(crooked, wanted)
     first, blocks = int(rows.max()) + 1, []
     for surface, scale, degree in ((0, 4.0, 7), (7, 0.5, 4)):
         terms = polynomial_terms(degree)
         places = np.arange(first, first + len(terms), dtype=np.int32)
-        # One that nobody asks for takes no row.
+        # A term left out takes no column.
         places[3] = -1
         places[4:] -= 1
         blocks.append((surface, scale, degree, places))
         first = int(places.max()) + 1
-    response = respond(swept, landing_seeds(swept), rows, polynomials=blocks)
+    response = backward_pass(forward, landing_gradient(forward), rows, polynomials=blocks)
     assert response.values.shape[1] == first
     for surface, scale, degree, places in blocks:
         f, gx, gy = np.moveaxis(response.sag(surface), 1, 0)
-        x, y = response.hit(surface) / scale
+        x, y = response.intersection(surface) / scale
         for (m, k, imaginary), row in zip(polynomial_terms(degree), places, strict=True):
             if row < 0:
                 continue
@@ -275,22 +271,24 @@ def test_polynomials(swept, crooked):
 
 
 @pytest.mark.parametrize("lit_only", [False, True])
-def test_one_go_is_two_sweeps(crooked, annulus_points, swept, center, responses, lit_only):
-    rows = columns(crooked, {(0, "sag"), (0, "hit"), (5, "index"), (12, "index"), (1, "gap"), (13, "gap")})
+def test_one_kernel_equals_forward_and_backward_pass(crooked, annulus_points, forward, center, responses, lit_only):
+    rows = column_table(
+        crooked, {(0, "sag"), (0, "intersection"), (5, "index"), (12, "index"), (1, "gap"), (13, "gap")}
+    )
     first = int(rows.max()) + 1
     stopped = replace(crooked, surfaces=(replace(crooked.surfaces[0], aperture=Circle(3.6)), *crooked.surfaces[1:]))
     directions = field_direction(*np.transpose([(0.0, 0.01), FIELD]))
-    centers, zeros = np.stack([swept.position[:, 5], center], axis=1), np.array([3.0, 17.0])
+    centers, zeros = np.stack([forward.position[:, 5], center], axis=1), np.array([3.0, 17.0])
     pupil = np.stack(annulus_points(45, seed=4), axis=1)
-    one_go = SphereSweep(
-        stopped, directions, swept.indices, pupil, centers, zeros, RADIUS, rows, first, lit_only=lit_only
+    one_go = SphereAdjoint(
+        stopped, directions, forward.indices, pupil, centers, zeros, RADIUS, rows, first, lit_only=lit_only
     )
-    one = [one_go.respond(slice(0, 2), threads=n) for n in (1, 2, 5)]
+    one = [one_go.matrix(slice(0, 2), threads=n) for n in (1, 2, 5)]
     for response, status in one[1:]:
         assert np.array_equal(response.values, one[0][0].values)
         assert np.array_equal(status, one[0][1])
-    # A field point does not know of those before it.
-    response, status = one_go.respond(slice(1, 2))
+    # A field point does not depend on those before it.
+    response, status = one_go.matrix(slice(1, 2))
     assert np.array_equal(response.values, one[0][0].values[:, :, 1:])
     assert np.array_equal(status, one[0][1][1:])
     vignetted = status[0] == RayStatus.VIGNETTED
@@ -299,11 +297,11 @@ def test_one_go_is_two_sweeps(crooked, annulus_points, swept, center, responses,
     counts = np.where(vignetted & lit_only, 0.0, 1.0)
     values = response.values[0, :, 0]
     where = np.repeat(center[:, None], len(pupil), axis=1)
-    distance, by_position, _ = sphere_distance_derivatives(swept.position, swept.direction, where, RADIUS)
-    assert np.allclose(values[first], counts * (swept.path + distance - 17.0), atol=2e-14)
+    distance, by_position, _ = sphere_distance_derivatives(forward.position, forward.direction, where, RADIUS)
+    assert np.allclose(values[first], counts * (forward.path_length + distance - 17.0), atol=2e-14)
     assert np.allclose(values[first + 1 : first + 4], counts * by_position, atol=1e-14)
     # The rays start where NumPy puts them, but for rounding of some ten metres.
-    assert np.allclose(response.hit(0)[:, 0], responses[1].hit(0), atol=2e-14)
+    assert np.allclose(response.intersection(0)[:, 0], responses[1].intersection(0), atol=2e-14)
     for what, surface in (("sag", 0), ("index", 5), ("index", 12), ("gap", 1), ("gap", 13)):
         # The same arithmetic but for the order of a few sums.
         expected = counts * getattr(responses[1], what)(surface)
@@ -317,10 +315,10 @@ def test_a_mesh_is_refused(crooked):
     meshed = crooked.with_shape("M3", MeshSurface(vertices, np.array(faces)))
     point = np.zeros((1, 2))
     with pytest.raises(DomainError, match="surface M3: expected a shape that can be differentiated, not a mesh"):
-        sweep(meshed, pachon.launch_rays(meshed, FIELD, WAVELENGTH, point.T))
-    rows = columns(meshed, ())
+        forward_pass(meshed, pachon.launch_rays(meshed, FIELD, WAVELENGTH, point.T))
+    rows = column_table(meshed, ())
     with pytest.raises(DomainError, match="surface M3: expected a shape that can be differentiated, not a mesh"):
-        SphereSweep(
+        SphereAdjoint(
             meshed, np.array([[0.0, 0.0, -1.0]]), np.ones(15), point, np.zeros((3, 1)), np.zeros(1), 5.0, rows, 0
         )
 
@@ -328,8 +326,8 @@ def test_a_mesh_is_refused(crooked):
 def test_lost_rays_do_not_spoil_others(crooked, annulus_points):
     px, py = annulus_points(40, seed=4)
     far = np.concatenate([px[:20], [60.0], px[20:]]), np.concatenate([py[:20], [0.0], py[20:]])
-    some = sweep(crooked, pachon.launch_rays(crooked, FIELD, WAVELENGTH, far))
-    others = sweep(crooked, pachon.launch_rays(crooked, FIELD, WAVELENGTH, (px, py)))
+    some = forward_pass(crooked, pachon.launch_rays(crooked, FIELD, WAVELENGTH, far))
+    others = forward_pass(crooked, pachon.launch_rays(crooked, FIELD, WAVELENGTH, (px, py)))
     assert some.arrived.sum() == 40
-    with_lost = respond(some, landing_seeds(some)).values[:, :, some.arrived]
-    assert np.array_equal(with_lost, respond(others, landing_seeds(others)).values)
+    with_lost = backward_pass(some, landing_gradient(some)).values[:, :, some.arrived]
+    assert np.array_equal(with_lost, backward_pass(others, landing_gradient(others)).values)

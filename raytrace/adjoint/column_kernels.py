@@ -1,4 +1,4 @@
-"""Pieces of the backward sweep: the columns that it leaves, curvatures of sags, responses to polynomial sags."""
+"""Columns of the adjoint matrix: their storage, second derivatives of sags, and polynomial sags."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ..kernels.trace import CONIC, CURVATURE, TERMS, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-# What a surface answers for, as columns: a change f of its sag and of its slopes at the hit; the index before and
-# after; the hit itself; and force and torque in the gap in front of it. A row more holds those behind the last.
+# Quantities of a surface, a column each: a change of its sag and the slopes of that change; the index before and after;
+# the intersection itself; force and torque in the gap in front of it. One surface more holds the gap behind the last.
 SAG = wp.constant(0)
 INDEX = wp.constant(3)
-HIT = wp.constant(5)
+INTERSECTION = wp.constant(5)
 FORCE = wp.constant(7)
 TORQUE = wp.constant(10)
-COLUMNS = 13
+QUANTITIES = 13
 
 
 @wp.func
@@ -41,17 +41,17 @@ def dot(ax: lanes, ay: lanes, az: lanes, bx: lanes, by: lanes, bz: lanes):
 def sag_derivatives(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes):
     """First and second derivatives of conic and even powers of a surface: sx, sy, sxx, sxy, syy.
 
-    A figure of revolution has the slope r m(r^2) with m = c / q + p, q = sqrt(1 - (1 + k) c^2 r^2) and p that of the
+    A shape of revolution has the slope r m(r^2) with m = c / q + p, q = sqrt(1 - (1 + k) c^2 r^2) and p that of the
     polynomial; m' below is the derivative of m with respect to r^2.
     """
     c = surfaces.numbers[s, CURVATURE]
     k = surfaces.numbers[s, CONIC]
     terms = surfaces.kinds[s, TERMS]
     r2 = wp.cw_mul(x, x) + wp.cw_mul(y, y)
-    bend = (ONE + k) * c * c
-    inverse = wp.cw_div(lanes(ONE), lanes_sqrt(lanes(ONE) - bend * r2))
+    square = (ONE + k) * c * c
+    inverse = wp.cw_div(lanes(ONE), lanes_sqrt(lanes(ONE) - square * r2))
     m = c * inverse
-    change = (wp.float64(0.5) * bend) * wp.cw_mul(m, wp.cw_mul(inverse, inverse))
+    change = (wp.float64(0.5) * square) * wp.cw_mul(m, wp.cw_mul(inverse, inverse))
     slope = lanes(ZERO)
     slope_change = lanes(ZERO)
     for j in range(terms):
@@ -71,24 +71,24 @@ def sag_derivatives(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes):
 
 
 @wp.func
-def keep(
-    rows: wp.array2d(dtype=wp.int32),
+def write_column(
+    columns: wp.array2d(dtype=wp.int32),
     s: wp.int32,
-    column: wp.int32,
+    quantity: wp.int32,
     output: wp.int32,
     packet: wp.int32,
     value: lanes,
-    response: wp.array3d(dtype=lanes),
+    matrix: wp.array3d(dtype=lanes),
 ):
-    """Write one column, if it is wanted."""
-    row = rows[s, column]
-    if row >= 0:
-        response[output, row, packet] = value
+    """Write the column of one quantity, if it has one."""
+    column = columns[s, quantity]
+    if column >= 0:
+        matrix[output, column, packet] = value
 
 
 @wp.func
-def keep_gap(
-    rows: wp.array2d(dtype=wp.int32),
+def write_gap(
+    columns: wp.array2d(dtype=wp.int32),
     gap: wp.int32,
     output: wp.int32,
     packet: wp.int32,
@@ -104,46 +104,45 @@ def keep_gap(
     bx: lanes,
     by: lanes,
     bz: lanes,
-    response: wp.array3d(dtype=lanes),
+    matrix: wp.array3d(dtype=lanes),
 ):
-    """Write force and torque in a gap, if they are wanted; all vectors in the telescope frame."""
-    if rows[gap, FORCE] >= 0:
+    """Write force and torque in a gap, if they have columns; all vectors in the telescope frame."""
+    if columns[gap, FORCE] >= 0:
         mx, my, mz = cross(px, py, pz, ax, ay, az)
         ox, oy, oz = cross(u, v, w, bx, by, bz)
-        keep(rows, gap, FORCE, output, packet, ax, response)
-        keep(rows, gap, FORCE + 1, output, packet, ay, response)
-        keep(rows, gap, FORCE + 2, output, packet, az, response)
-        keep(rows, gap, TORQUE, output, packet, mx + ox, response)
-        keep(rows, gap, TORQUE + 1, output, packet, my + oy, response)
-        keep(rows, gap, TORQUE + 2, output, packet, mz + oz, response)
+        write_column(columns, gap, FORCE, output, packet, ax, matrix)
+        write_column(columns, gap, FORCE + 1, output, packet, ay, matrix)
+        write_column(columns, gap, FORCE + 2, output, packet, az, matrix)
+        write_column(columns, gap, TORQUE, output, packet, mx + ox, matrix)
+        write_column(columns, gap, TORQUE + 1, output, packet, my + oy, matrix)
+        write_column(columns, gap, TORQUE + 2, output, packet, mz + oz, matrix)
 
 
 @wp.func
-def polynomial_response(
+def polynomial_columns(
     polynomials: wp.array2d(dtype=wp.int32),
     scale: wp.float64,
     j: wp.int32,
     o: wp.int32,
     p: wp.int32,
-    response: wp.array3d(dtype=lanes),
+    matrix: wp.array3d(dtype=lanes),
 ):
-    """Write the responses to the sags s^k (x + i y)^m, m + 2 k <= degree, from those to sag and slopes at the hit.
+    """Write the columns of the sags s^k (x + i y)^m, m + 2 k <= degree, from those of sag, slopes and intersection.
 
-    Row ``j`` of the table holds the degree, the first row of the sag's columns and of the hit's, and then the row in
-    which each sag belongs, -1 where nobody asks, in the order: m from 0, for each k from 0, the real part and, for
-    m > 0, the imaginary part. x and y are in units of ``scale``, s = x^2 + y^2. With F the response to the sag and G to
-    its slopes::
+    Row ``j`` of the table holds the degree, the first column of the sag and of the intersection, and then the column of
+    each sag, -1 for none, in the order: m from 0, for each k from 0, the real part and, for m > 0, the imaginary part.
+    x and y are in units of ``scale``, s = x^2 + y^2. With F the derivative by the sag and G by its slopes::
 
         F s^k z^m + G.grad(s^k z^m) = z^m (F s^k + 2 k s^(k-1) (G.r)) + s^k m z^(m-1) (Gx + i Gy)
     """
     degree = polynomials[j, 0]
-    sag_row = polynomials[j, 1]
-    hit_row = polynomials[j, 2]
-    f = response[o, sag_row, p]
-    gx = (ONE / scale) * response[o, sag_row + 1, p]
-    gy = (ONE / scale) * response[o, sag_row + 2, p]
-    x = (ONE / scale) * response[o, hit_row, p]
-    y = (ONE / scale) * response[o, hit_row + 1, p]
+    sag_column = polynomials[j, 1]
+    place_column = polynomials[j, 2]
+    f = matrix[o, sag_column, p]
+    gx = (ONE / scale) * matrix[o, sag_column + 1, p]
+    gy = (ONE / scale) * matrix[o, sag_column + 2, p]
+    x = (ONE / scale) * matrix[o, place_column, p]
+    y = (ONE / scale) * matrix[o, place_column + 1, p]
     s = wp.cw_mul(x, x) + wp.cw_mul(y, y)
     outward = TWO * (wp.cw_mul(gx, x) + wp.cw_mul(gy, y))
     place = int(3)
@@ -157,14 +156,14 @@ def polynomial_response(
         change = lanes(ZERO)
         for _k in range((degree - m) / 2 + 1):
             radial = wp.cw_mul(f, power) + wp.cw_mul(outward, change)
-            row = polynomials[j, place]
-            if row >= 0:
-                response[o, row, p] = wp.cw_mul(zr, radial) + wp.cw_mul(power, tr)
+            column = polynomials[j, place]
+            if column >= 0:
+                matrix[o, column, p] = wp.cw_mul(zr, radial) + wp.cw_mul(power, tr)
             place += 1
             if m > 0:
-                row = polynomials[j, place]
-                if row >= 0:
-                    response[o, row, p] = wp.cw_mul(zi, radial) + wp.cw_mul(power, ti)
+                column = polynomials[j, place]
+                if column >= 0:
+                    matrix[o, column, p] = wp.cw_mul(zi, radial) + wp.cw_mul(power, ti)
                 place += 1
             change = power + wp.cw_mul(change, s)
             power = wp.cw_mul(power, s)

@@ -1,4 +1,4 @@
-"""Optical paths to reference spheres and their derivatives, the forward sweep and the way back in one go."""
+"""Optical paths to reference spheres and their derivatives, forward and backward pass in one kernel."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from ...core.launch import launch
 from ...core.threads import thread_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
-from ..kernels.packet import LANES, lane_flags, lanes, to_packets
+from ..kernels.packet import LANES, lane_flags, lanes, ray_packets, to_packets
 from ..pack.surfaces import pack_surfaces
-from .gradient import Polynomials, SurfaceResponse, check_differentiable, polynomial_tables, row_count
-from .sphere_sweep_kernels import SPHERE_ROWS, sweep_sphere
+from .adjoint_matrix import AdjointMatrix, Polynomials, column_count, polynomial_tables
+from .forward_pass import check_differentiable
+from .sphere_kernels import SPHERE_COLUMNS, sphere_paths
 
 
-class SphereSweep:
-    """Rays of several field points to their reference spheres, and the derivatives of their optical path.
+class SphereAdjoint:
+    """Optical paths of several field points to their reference spheres, and their derivatives.
 
-    What :func:`~.sweep` and :func:`~pachon.raytrace.adjoint.gradient.respond` do in two, but the rays
-    never leave the processor's cache. All that field points share is made ready once.
+    Equal to :func:`~pachon.raytrace.adjoint.forward_pass.forward_pass` followed by
+    :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, but the rays stay in the processor's cache.
 
     Parameters
     ----------
@@ -37,13 +38,13 @@ class SphereSweep:
         Optical path [m] that is subtracted from those of the rays: the chief ray's.
     radius : float
         Radius of the spheres [m].
-    rows : ndarray of int, shape [n_surface + 1, 13]
-        Columns wanted, from :func:`~pachon.raytrace.adjoint.gradient.columns`, which leave out four rows.
-    sphere_row : int
+    columns : ndarray of int, shape [n_surface + 1, 13]
+        Columns to compute, from :func:`~pachon.raytrace.adjoint.adjoint_matrix.column_table`; four are left free.
+    sphere_column : int
         The first of these: the path less `path` [m] and its derivatives with respect to the landing point, which are
         opposite to those with respect to the centre.
-    polynomials : sequence of (surface, scale, degree, rows)
-        As in :func:`~pachon.raytrace.adjoint.gradient.respond`.
+    polynomials : sequence of (surface, scale, degree, columns)
+        As in :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`.
     lit_only : bool
         Whether all is zero for rays that are vignetted.
 
@@ -62,15 +63,15 @@ class SphereSweep:
         center: np.ndarray,
         path: np.ndarray,
         radius: float,
-        rows: np.ndarray,
-        sphere_row: int,
+        columns: np.ndarray,
+        sphere_column: int,
         polynomials: Polynomials = (),
         *,
         lit_only: bool = False,
     ) -> None:
         check_differentiable(telescope)
-        self._rows, self._surfaces, self._n_pupil = rows, len(telescope.surfaces), len(pupil)
-        self._n_rows = max(sphere_row + SPHERE_ROWS, row_count(rows, polynomials))
+        self._columns, self._n_surface, self._n_pupil = columns, len(telescope.surfaces), len(pupil)
+        self._n_columns = max(sphere_column + SPHERE_COLUMNS, column_count(columns, polynomials))
         points = to_packets(pupil.T)
         self._n_packets = points.shape[1]
         self._inputs = [
@@ -82,14 +83,14 @@ class SphereSweep:
             float(telescope.stop_z),
             float(telescope.launch_distance),
             float(radius),
-            warp_array(rows, wp.int32),
-            *polynomial_tables(rows, polynomials),
-            sphere_row,
+            warp_array(columns, wp.int32),
+            *polynomial_tables(columns, polynomials),
+            sphere_column,
             int(lit_only),
         ]
 
-    def respond(self, fields: slice, *, threads: int | None = None) -> tuple[SurfaceResponse, np.ndarray]:
-        """Trace the rays of some of the field points and carry the derivatives back.
+    def matrix(self, fields: slice, *, threads: int | None = None) -> tuple[AdjointMatrix, np.ndarray]:
+        """Return the adjoint matrix of the paths of some field points, and the status of their rays.
 
         Parameters
         ----------
@@ -100,7 +101,7 @@ class SphereSweep:
 
         Returns
         -------
-        response : SurfaceResponse
+        matrix : AdjointMatrix
             One output; the axis of rays is two, [n_field, n_pupil].
         status : ndarray of int32, shape [n_field, n_pupil]
             A :class:`~pachon.raytrace.rays.RayStatus` each.
@@ -109,20 +110,18 @@ class SphereSweep:
         count = n_fields * self._n_packets
         # As many parts as threads: each thread keeps the rays of one packet at all surfaces, not more.
         parts = min(thread_count(threads), max(count, 1))
-        response = wp.empty((1, self._n_rows, count), dtype=lanes, device="cpu")
+        matrix = wp.empty((1, self._n_columns, count), dtype=lanes, device="cpu")
         status = wp.empty(count, dtype=lane_flags, device="cpu")
         launch(
-            sweep_sphere.suited(self._inputs[0]),
+            sphere_paths.suited(self._inputs[0]),
             parts,
             [
                 *self._inputs,
                 fields.start,
                 parts,
-                *(wp.empty((3, parts), dtype=lanes, device="cpu") for _ in range(2)),
-                *(wp.empty((self._surfaces, 3, parts), dtype=lanes, device="cpu") for _ in range(2)),
-                wp.empty((self._surfaces, parts), dtype=lanes, device="cpu"),
-                wp.empty((self._surfaces, parts), dtype=lane_flags, device="cpu"),
-                response,
+                ray_packets(1, parts),
+                ray_packets(self._n_surface, parts),
+                matrix,
                 status,
             ],
             threads=threads,
@@ -131,4 +130,4 @@ class SphereSweep:
         def as_rays(values: wp.array) -> np.ndarray:
             return values.numpy().reshape(*values.shape[:-1], n_fields, self._n_packets * LANES)[..., : self._n_pupil]
 
-        return SurfaceResponse(self._rows, as_rays(response)), as_rays(status)
+        return AdjointMatrix(self._columns, as_rays(matrix)), as_rays(status)

@@ -1,0 +1,136 @@
+"""Backward pass: exact derivatives of outputs of rays by every surface, in reverse mode.
+
+:func:`~pachon.raytrace.adjoint.forward_pass.forward_pass` traces rays to every surface. :func:`backward_pass` takes the
+gradient of some outputs with respect to the rays at the last surface (landing points, optical paths to a sphere: any
+function of those rays) and carries it back through all surfaces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ...core.launch import launch
+from ...core.warp_arrays import warp_array
+from ..kernels.packet import LANES, lanes
+from ..pack.surfaces import pack_surfaces
+from .adjoint_matrix import AdjointMatrix, Polynomials, column_count, column_table, polynomial_tables
+from .backward_kernels import backward_rays
+from .column_kernels import FORCE, INDEX
+from .forward_pass import ForwardPass
+
+
+@dataclass(frozen=True)
+class OutputGradient:
+    """Derivatives of outputs with respect to the rays at the last surface.
+
+    Attributes
+    ----------
+    position, direction : ndarray, shape [n_output, 3, n]
+        With respect to position [1/m] and direction of each ray, telescope frame; the direction taken as a free vector.
+    path : ndarray, shape [n_output]
+        With respect to the optical path: 1 or 0.
+    index : ndarray, shape [n_output, n], optional
+        With respect to the refractive index before the last surface, where an output depends on that directly.
+    own_frame : bool
+        Whether the outputs are x and y in the frame of the last surface, which then moves with it.
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    index: np.ndarray | None = None
+    own_frame: bool = False
+
+
+def landing_gradient(forward: ForwardPass) -> OutputGradient:
+    """Return the gradient of the landing x and y in the frame of the last surface: two outputs [m]."""
+    axes = forward.telescope.surfaces[-1].matrix[:, :2].T
+    position = np.broadcast_to(axes[:, :, None], (2, 3, forward.n_rays))
+    return OutputGradient(position, np.zeros_like(position), np.zeros(2), own_frame=True)
+
+
+def position_gradient(forward: ForwardPass) -> OutputGradient:
+    """Return the gradient of the landing point in the telescope frame: three outputs [m]."""
+    position = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, forward.n_rays))
+    return OutputGradient(position, np.zeros_like(position), np.zeros(3))
+
+
+def backward_pass(
+    forward: ForwardPass,
+    gradient: OutputGradient,
+    columns: np.ndarray | None = None,
+    *,
+    polynomials: Polynomials = (),
+    start: bool = False,
+    threads: int | None = None,
+) -> AdjointMatrix:
+    """Carry the gradient of outputs back through all surfaces.
+
+    Parameters
+    ----------
+    forward : ForwardPass
+        The rays at every surface.
+    gradient : OutputGradient
+        Derivatives of the outputs with respect to the rays at the last surface.
+    columns : ndarray of int, shape [n_surface + 1, 13], optional
+        Columns to compute, from :func:`~pachon.raytrace.adjoint.adjoint_matrix.column_table`; all by default.
+    polynomials : sequence of (surface, scale, degree, columns)
+        Surfaces with derivatives by polynomial sags: the column of each term of
+        :func:`~pachon.raytrace.adjoint.adjoint_matrix.polynomial_terms`, -1 for terms left out, with x and y in units
+        of ``scale`` [m]. Their "sag" and "intersection" must be among the columns.
+    start : bool
+        Whether to return the derivatives with respect to the start of the rays too.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Returns
+    -------
+    AdjointMatrix
+    """
+    packets, packed = forward.packets, pack_surfaces(forward.telescope)
+    outputs, count = len(gradient.path), packets.start.position.shape[2]
+    columns = column_table(forward.telescope) if columns is None else columns
+    matrix = wp.empty((outputs, column_count(columns, polynomials), count), dtype=lanes, device="cpu")
+    at_start = wp.empty((outputs if start else 0, 6, count), dtype=lanes, device="cpu")
+    launch(
+        backward_rays.suited(packed),
+        outputs * count,
+        [
+            packed,
+            warp_array(packets.indices),
+            count,
+            packets.start,
+            packets.end,
+            _zero_filled(gradient.position, count),
+            _zero_filled(gradient.direction, count),
+            warp_array(gradient.path),
+            warp_array(columns, wp.int32),
+            *polynomial_tables(columns, polynomials),
+            matrix,
+            at_start,
+        ],
+        threads=threads,
+    )
+    values = _as_rays(matrix, forward.n_rays)
+    if gradient.index is not None and columns[-2, INDEX] >= 0:
+        values[:, columns[-2, INDEX]] += gradient.index
+    if gradient.own_frame and columns[-1, FORCE] >= 0:
+        # The frame of the outputs moves with the last surface, and so does the gap behind it.
+        values[:, columns[-1, FORCE:]] = 0.0
+    return AdjointMatrix(columns, values, _as_rays(at_start, forward.n_rays) if start else None)
+
+
+def _as_rays(values: wp.array, n: int) -> np.ndarray:
+    """Return packets [n_output, n_column, n_packet] as rays, shape [n_output, n_column, n]."""
+    outputs, columns, count = values.shape
+    return values.numpy().reshape(outputs, columns, count * LANES)[:, :, :n]
+
+
+def _zero_filled(values: np.ndarray, count: int) -> wp.array:
+    """Return derivatives [n_output, 3, n] as packets, the last one filled up with zeros."""
+    padded = np.zeros((*values.shape[:2], count * LANES))
+    padded[:, :, : values.shape[2]] = values
+    return warp_array(padded.reshape(*values.shape[:2], count, LANES), lanes)
