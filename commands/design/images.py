@@ -58,9 +58,9 @@ def psf(
     where = given.telescope, given.fields, given.wavelengths
     with given.stage("diffraction images", given.images) as progress:
         if huygens:
-            result = huygens_psf(*where, advance=progress, **how)
+            result = huygens_psf(*where, progress=progress, **how)
         else:
-            result = fft_psf(*where, pupil_points=pupil_points, advance=progress, **how)
+            result = fft_psf(*where, pupil_points=pupil_points, progress=progress, **how)
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -103,7 +103,7 @@ def ee(
     where = given.telescope, given.fields, given.wavelengths
     with given.stage("encircled energy", total) as progress:
         how = dict(pixels=pixels, pupil_points=pupil_points, **given.how)
-        return encircled_energy(*where, kind=kind, advance=progress, **how)
+        return encircled_energy(*where, kind=kind, progress=progress, **how)
 
 
 @design_command(
@@ -130,7 +130,7 @@ def mtf(
 
     where = given.telescope, given.fields, given.wavelengths
     with given.stage("modulation transfer", given.images) as progress:
-        return compute(*where, pupil_points=pupil_points, advance=progress, **given.how)
+        return compute(*where, pupil_points=pupil_points, progress=progress, **given.how)
 
 
 @design_command(
@@ -180,7 +180,7 @@ def ghosts(
     how: dict[str, Any] = dict(reflectivity=_reflectivities(reflectivity or []), **given.how)
     field = None if given.fields is None else given.fields[0]
     with given.stage("ghosts", max(len(ghost_pairs(given.telescope)), 1)) as progress:
-        how |= dict(detector_reflectivity=detector_reflectivity, rays=rays, advance=progress)
+        how |= dict(detector_reflectivity=detector_reflectivity, rays=rays, progress=progress)
         return Outcome(compute(given.telescope, field, given.wavelength, **how))
 
 

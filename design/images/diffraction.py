@@ -58,7 +58,7 @@ def fft_psf(
     reference: str = "centroid",
     projection: str = "zemax",
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
     """Make diffraction images by Fourier sums over a square lattice of direction cosines at the image.
 
@@ -86,8 +86,8 @@ def fft_psf(
         Meaning of the field angles.
     threads : int, optional
         Number of threads for tracing; all processors by default.
-    advance : callable, optional
-        Called after each field and wavelength.
+    progress : callable, optional
+        Called with the number of images finished since the last call.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def fft_psf(
         found = lattice(field, wavelength, center)
         return found.wavelets, lambda x, y: lattice_sum(found, x, y)
 
-    return plan.image("fft", waves, int(across), advance)
+    return plan.image("fft", waves, int(across), progress)
 
 
 def huygens_psf(
@@ -142,7 +142,7 @@ def huygens_psf(
     reference: str = "centroid",
     projection: str = "zemax",
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
     """Make diffraction images by summing the plane wave of every ray at every pixel.
 
@@ -163,7 +163,7 @@ def huygens_psf(
         found = traced_wavelets(telescope, field, wavelength, center, points, projection, threads)
         return found, lambda x, y: wavelet_sum(found, x, y)
 
-    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(points) / np.pi)), advance)
+    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(points) / np.pi)), progress)
 
 
 _Sum = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -257,7 +257,7 @@ class _Plan:
         method: str,
         waves: Callable[[np.ndarray, float, np.ndarray], tuple[Wavelets, _Sum]],
         pupil_points: int,
-        advance: Callable[[], None] | None,
+        progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
         axis = pixel_axis(self.pixel, self.pixels)
         images, light, strehl = [], [], []
@@ -268,8 +268,8 @@ class _Plan:
                 wavelets, irradiance = waves(field, float(wavelength), center)
                 found.append((float(share), wavelets, irradiance))
                 total += share * irradiance(axis, axis)
-                if advance is not None:
-                    advance()
+                if progress is not None:
+                    progress(1)
             whole = sum(share * wavelets.light for share, wavelets, _ in found)
             perfect = sum(share * wavelets.perfect_peak for share, wavelets, _ in found)
             images.append(total * self.pixel**2 / whole)

@@ -113,7 +113,7 @@ def encircled_energy(
     pupil_points: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> EncircledEnergy:
     """Return the encircled energy of a star over the field.
 
@@ -141,8 +141,8 @@ def encircled_energy(
         Meaning of the field angles.
     threads : int, optional
         Number of threads for tracing; all processors by default.
-    advance : callable, optional
-        Called after each field and wavelength, for "diffraction".
+    progress : callable, optional
+        Called with the number of images finished since the last call, for "diffraction".
 
     Raises
     ------
@@ -182,7 +182,7 @@ def encircled_energy(
         reference=reference,
         projection=projection,
         threads=threads,
-        advance=advance,
+        progress=progress,
     )
     return energy_of_psf(psf, given)
 

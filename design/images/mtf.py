@@ -154,7 +154,7 @@ def mtf(
     pupil_points: int = _ACROSS,
     projection: str = "zemax",
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Mtf:
     """Return the modulation transfer of the telescope over the field.
 
@@ -174,8 +174,8 @@ def mtf(
         Meaning of the field angles.
     threads : int, optional
         Number of threads for tracing; all processors by default.
-    advance : callable, optional
-        Called after each field and wavelength.
+    progress : callable, optional
+        Called with the number of images finished since the last call.
 
     Raises
     ------
@@ -222,8 +222,8 @@ def mtf(
                     # Where a rim leaves part of a cell, the square of the part is too little light.
                     overlap[0] = found.wavelets.light * (found.spacing / wavelength) ** 2
                     total[axis, i] += share * overlap
-            if advance is not None:
-                advance()
+            if progress is not None:
+                progress(1)
         directions = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         place = np.where(diagram.weight[i][..., None] > 0, diagram.displacement[i], 0.0) @ directions.T
         for axis in (0, 1):

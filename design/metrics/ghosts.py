@@ -181,7 +181,7 @@ def ghosts(
     rays: int = _RAYS,
     projection: str = "zemax",
     threads: int | None = None,
-    advance: Callable[[], None] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Ghosts:
     """Trace every ghost of a star that two reflections make.
 
@@ -204,8 +204,8 @@ def ghosts(
         Meaning of the field angles.
     threads : int, optional
         Number of threads; all processors by default.
-    advance : callable, optional
-        Called after each pair of surfaces.
+    progress : callable, optional
+        Called with the number of ghosts traced since the last call.
 
     Raises
     ------
@@ -237,8 +237,8 @@ def ghosts(
     landings = []
     for first, second in pairs:
         landings.append(follow(ghost_path(telescope, first, second), start, coatings, threads))
-        if advance is not None:
-            advance()
+        if progress is not None:
+            progress(1)
     rim = trace_bundles(
         telescope,
         telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]),
