@@ -23,7 +23,7 @@ import numpy as np
 import pachon
 from pachon.pipeline.ccd_product import product_path, write_product
 from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run_folder import stamp_of
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
@@ -111,7 +111,7 @@ def time_models():
             "atmosphere__screen_size": 2048,
             "atmosphere__screen_length_m": 325.0,
         }
-        experiment = prepare(resolve(with_options(Configuration(), **options)))
+        experiment = Experiment.from_config(with_options(Configuration(), **options))
         exposure = expose_ccd(experiment, "R22_S11")
         start = time.perf_counter()
         product = model_ccd(experiment, exposure)

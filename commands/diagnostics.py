@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .inputs import interruptible, resolved_configuration
+from .inputs import configured_experiment, interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, name_list, one_name_list
 from .tables import Rows, wide_console
 
@@ -90,9 +90,9 @@ def attribute_command(
 
     names = one_name_list(ccds=ccds, raft=raft)
     engine = "long_exposure" if average else None
-    resolved = resolved_configuration(
+    resolved = configured_experiment(
         config, ccds=names, stars__truth=truth_stars, stars__observed=observed_stars, psf__engine=engine
-    )
+    ).config
     chosen = checked_causes(resolved, None if causes is None else name_list(causes, "--causes"))
     make_folder(out)
     with interruptible(quiet) as reporter:

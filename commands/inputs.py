@@ -15,7 +15,7 @@ from ..core.errors import PachonError
 if TYPE_CHECKING:
     from ..core.progress import Reporter
     from ..models.telescope import Telescope
-    from ..pipeline.config import Configuration
+    from ..pipeline.experiment import Experiment
 
 
 class InterruptedRunError(Exception):
@@ -48,8 +48,8 @@ def interruptible(quiet: bool, finished: str = "") -> Iterator[Reporter]:
         raise InterruptedRunError(f"interrupted; {finished}" if finished else "interrupted") from None
 
 
-def resolved_configuration(config: Path | None, **options: object) -> Configuration:
-    """Return the configuration of a file and of the options of the command line, every default filled in.
+def configured_experiment(config: Path | None, **options: object) -> Experiment:
+    """Return the experiment of a configuration file with the options of the command line.
 
     Parameters
     ----------
@@ -65,12 +65,12 @@ def resolved_configuration(config: Path | None, **options: object) -> Configurat
         it alone can be at fault.
     """
     from ..pipeline.config import Configuration, load_configuration, with_options
-    from ..pipeline.experiment import resolve
+    from ..pipeline.experiment import Experiment
 
     base = Configuration() if config is None else load_configuration(config)
     settings = with_options(base, **options)
     try:
-        return resolve(settings, None if config is None else config.parent)
+        return Experiment.from_config(settings, None if config is None else config.parent)
     except PachonError as error:
         if config is None or settings is not base:
             raise

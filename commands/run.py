@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .inputs import interruptible, resolved_configuration
+from .inputs import configured_experiment, interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
 from .tables import Rows, plain_table, wide_console
 
@@ -55,11 +55,11 @@ def run_command(
     from ..pipeline.simulate.ccd_loop import left_out_line
 
     names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
-    resolved = resolved_configuration(
+    experiment = configured_experiment(
         config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
     )
     with interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter:
-        result = run(resolved, out, resume=resume, strict=strict, threads=threads, reporter=reporter)
+        result = run(experiment, out, resume=resume, strict=strict, threads=threads, reporter=reporter)
     if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
             print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from ..core.errors import ConfigError
-from .inputs import interruptible, resolved_configuration
+from .inputs import configured_experiment, interruptible
 from .options import Config, Json, Quiet, Threads, TruthStars, name_list, one_name_list
 from .tables import Rows, wide_console
 
@@ -64,10 +64,10 @@ def study_command(
     from ..core.files import json_text, make_folder
     from ..studies.psf_choice.plan import make_plan
     from ..studies.psf_choice.product import study_summary, write_study
-    from ..studies.psf_choice.study import STUDY_CCDS, study, study_configuration
+    from ..studies.psf_choice.study import STUDY_CCDS, study, study_experiment
 
     names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
-    resolved = resolved_configuration(config, ccds=names, stars__truth=truth_stars)
+    resolved = configured_experiment(config, ccds=names, stars__truth=truth_stars).config
     plan = make_plan(
         resolved,
         stars=_numbers(stars, "--stars", int),
@@ -76,7 +76,7 @@ def study_command(
         snrs=_numbers(snr, "--snr", float),
         draws=draws,
     )
-    study_configuration(resolved, plan)  # raises for a bad plan, before anything is written
+    study_experiment(resolved, plan)  # raises for a bad plan, before anything is written
     make_folder(out)
     with interruptible(quiet) as reporter:
         result = study(resolved, plan, threads=threads, reporter=reporter)

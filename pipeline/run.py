@@ -21,7 +21,7 @@ from ..core.progress import Reporter
 from ..core.threads import thread_count
 from .ccd_product import product_path, read_product, write_product
 from .config import Configuration
-from .experiment import Experiment, prepare
+from .experiment import Experiment
 from .measure.summary import correlations, run_figures
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
@@ -60,7 +60,7 @@ class RunResult:
 
 
 def run(
-    config: Configuration,
+    config: Configuration | Experiment,
     folder: Path,
     *,
     resume: bool = False,
@@ -68,15 +68,15 @@ def run(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> RunResult:
-    """Run a resolved configuration: stars, PSFs, models, correlations, report.
+    """Simulate the CCDs of a configuration, model their PSFs and write the report.
 
     Every product but ``timings.json`` has the same bytes whenever, wherever on one machine, and with however many
     threads the configuration is run; those of a CCD do not depend on which others are asked for.
 
     Parameters
     ----------
-    config : Configuration
-        Resolved configuration, as :func:`~pachon.pipeline.experiment.resolve` gives it.
+    config : Configuration or Experiment
+        Configuration, or the experiment made from it.
     folder : Path
         Where to put the products; made if it is not there.
     resume : bool
@@ -96,14 +96,14 @@ def run(
         `strict`, if one of them cannot.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    experiment = prepare(config)
-    names = config.ccds or ()
-    # To draw the report of a finished run again, no screen is needed.
-    if not (resume and all(product_path(folder, name).exists() for name in names)):
-        check_memory(experiment, threads)
-    claim_folder(folder, experiment, resume=resume)
+    experiment = config if isinstance(config, Experiment) else Experiment.from_config(config)
+    names = experiment.config.ccds or ()
     kept = finished_ccds(folder, experiment) if resume else ()
     missing = tuple(name for name in names if name not in kept)
+    # The report of a finished run needs no screens.
+    if missing:
+        check_memory(experiment, threads)
+    claim_folder(folder, experiment, resume=resume)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     failed: dict[str, str] = {}

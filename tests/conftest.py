@@ -4,7 +4,7 @@ import yaml
 
 import pachon
 from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.run import run
 
 # A run small enough for tests: far too few stars and steps for figures that mean anything, every stage real.
@@ -62,7 +62,7 @@ def tiny():
         flat = {}
         for key, value in SETTINGS.items():
             flat |= {f"{key}__{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
-        return resolve(with_options(Configuration(), **(flat | options)))
+        return Experiment.from_config(with_options(Configuration(), **(flat | options))).config
 
     return make
 

@@ -20,7 +20,7 @@ from ...core.errors import PachonError, ProductError
 from ...core.files import Stamp, described_table, make_folder, write_bytes, write_ecsv, write_json
 from ..ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
-from ..experiment import prepare
+from ..experiment import Experiment
 from ..report.diagnostics_plots import residual_map, rho_figure
 from ..report.statistics_plots import correlation_figure
 from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
@@ -106,7 +106,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
         raise ProductError(f"{folder}: expected the folder of a run, there is no {CONFIG_NAME} in it")
     config = load_configuration(path)
     try:
-        experiment = prepare(config)
+        experiment = Experiment.from_config(config)
     except PachonError as error:
         raise ProductError(f"{path}: no configuration that pachon run wrote ({error})") from None
     stamp, names = stamp_of(experiment), config.ccds or ()

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..ccd_product import CcdProduct
 from ..config import ReconstructionConfig, to_yaml
-from ..experiment import Experiment, truth_components
+from ..defaults import truth_components
+from ..experiment import Experiment
 from ..measure.correlation import Correlation
 from .focal_plane_plots import close_up_figure, heights_figure, whiskers_figure
 from .page import Picture, render

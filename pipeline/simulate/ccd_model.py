@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, ObservedStars, TruthStars
-from ..experiment import Experiment, truth_components
+from ..defaults import truth_components
+from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel

@@ -30,7 +30,7 @@ from ...core.progress import Reporter
 from ...models.site import load_site
 from ...pipeline.ccd_product import KINDS, CcdProduct
 from ...pipeline.config import Configuration, to_yaml, with_options
-from ...pipeline.experiment import Experiment, prepare, resolve
+from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import Correlation, jackknife_error
 from ...pipeline.measure.diagnostics import correlation_columns
 from ...pipeline.measure.summary import (
@@ -135,7 +135,7 @@ def attribute(
     Parameters
     ----------
     config : Configuration
-        Resolved configuration, as :func:`~pachon.pipeline.experiment.resolve` gives it.
+        Resolved configuration.
     causes : sequence of str, optional
         Of :data:`CAUSES`; all of :func:`causes_of` by default.
     threads : int, optional
@@ -152,7 +152,7 @@ def attribute(
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     chosen = checked_causes(config, causes)
-    full = prepare(config)
+    full = Experiment.from_config(config)
     check_memory(full, threads)
     correlated, figures = {}, {}
     cases = [FULL, *(c for c in chosen if c != NOISE)]
@@ -187,7 +187,7 @@ def write_attribution(result: Attribution, folder: Path, config: Configuration) 
     ProductError
         If it cannot be written.
     """
-    stamp = stamp_of(prepare(config))
+    stamp = stamp_of(Experiment.from_config(config))
     meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed}
     cases = list(result.figures)
     keys = list(dict.fromkeys(key for figures in result.figures.values() for key in figures))
@@ -234,7 +234,7 @@ def _why_not(config: Configuration, cause: str) -> str | None:
 
 def _without(full: Experiment, cause: str) -> Experiment:
     """Return the experiment with one cause off. All that a default filled in stays: pixels, stamps, weight."""
-    experiment = prepare(resolve(with_options(full.config, **_SWITCHES[cause])))
+    experiment = Experiment.from_config(with_options(full.config, **_SWITCHES[cause]))
     if full.atmosphere is not None and experiment.atmosphere is not None:
         # Screens are the same and take their time.
         experiment = replace(experiment, atmosphere=full.atmosphere.at_altitudes(experiment.atmosphere.altitudes))

@@ -22,7 +22,7 @@ from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
-from ...pipeline.experiment import Experiment, prepare, resolve
+from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
 from ..metrics.optics import OPTICS
@@ -244,9 +244,9 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
     base = load_configuration(configuration)
     engine = "long_exposure" if base.atmosphere.enabled else None
     try:
-        resolved = resolve(with_options(base, telescope=model, psf__engine=engine), configuration.parent)
-        experiment = prepare(resolved)
-        return replace(experiment, telescope=apply_changes(telescope, resolved.changes))
+        config = with_options(base, telescope=model, psf__engine=engine)
+        experiment = Experiment.from_config(config, configuration.parent)
+        return replace(experiment, telescope=apply_changes(telescope, experiment.config.changes))
     except PachonError as error:
         raise ConfigError(f"{configuration}: {error}") from None
 

@@ -11,12 +11,11 @@ import numpy as np
 
 from ...core.files import write_bytes, write_ecsv, write_json
 from ...pipeline.config import Configuration, to_yaml
-from ...pipeline.experiment import prepare
 from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN
 from ...pipeline.run_folder import CONFIG_NAME, stamp_of
 from .plan import INTERPOLATIONS
 from .plots import choices_figure, stars_figure
-from .study import Study, study_configuration
+from .study import Study, study_experiment
 
 
 def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str, ...]:
@@ -36,7 +35,7 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
     ProductError
         If it cannot be written.
     """
-    stamp = stamp_of(prepare(study_configuration(config, result.plan)))
+    stamp = stamp_of(study_experiment(config, result.plan))
     meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed, "draws": result.plan.draws}
     write_ecsv(folder / "study.ecsv", study_columns(result), {"what": "PSF models against the truth", **meta})
     write_bytes(folder / "study_stars.png", stars_figure(result))

@@ -20,7 +20,7 @@ from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread
 from ...pipeline.config import Configuration, with_options
-from ...pipeline.experiment import Experiment, prepare, resolve
+from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import jackknife_error, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN
@@ -138,8 +138,8 @@ class _Sample:
     lost: int
 
 
-def study_configuration(config: Configuration, plan: Plan) -> Configuration:
-    """Return the resolved configuration of the simulation: as many observed stars as the largest case needs.
+def study_experiment(config: Configuration, plan: Plan) -> Experiment:
+    """Return the experiment to simulate: as many observed stars as the largest case needs.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def study_configuration(config: Configuration, plan: Plan) -> Configuration:
     for key in ("neighbours", "cosmic_rays", "saturated"):
         if (value := getattr(config.stars, key)) > 0.0:
             raise ConfigError(f"stars.{key} = {value:g}: expected 0, the stars of a study have noise but no defects")
-    return resolve(with_options(config, stars__observed=max(plan.stars)))
+    return Experiment.from_config(with_options(config, stars__observed=max(plan.stars)))
 
 
 def study(config: Configuration, plan: Plan, *, threads: int | None = None, reporter: Reporter | None = None) -> Study:
@@ -158,7 +158,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     Parameters
     ----------
     config : Configuration
-        Resolved configuration, as :func:`~pachon.pipeline.experiment.resolve` gives it.
+        Configuration of the stars and of the standard model.
     plan : Plan
         What to try.
     threads : int, optional
@@ -172,7 +172,7 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
         If the stars cannot be simulated, or no case can be fitted; otherwise, one that cannot is in the result.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    experiment = prepare(study_configuration(config, plan))
+    experiment = study_experiment(config, plan)
     check_memory(experiment, threads)
     ccds = _simulate(experiment, threads, reporter)
     cases = plan.cases()

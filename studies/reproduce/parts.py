@@ -18,7 +18,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...pipeline.ccd_product import CcdProduct, product_path, read_product
 from ...pipeline.config import Configuration, digest, with_options
-from ...pipeline.experiment import Experiment, prepare, resolve
+from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import Correlation
 from ...pipeline.measure.summary import correlations, run_figures
 from ...pipeline.run import run
@@ -248,7 +248,7 @@ class Bench:
             "atmosphere__screen_size": self.scale.screen_size,
             "atmosphere__time_step_s": self.scale.time_step,
         }
-        return resolve(with_options(Configuration(), **options))
+        return Experiment.from_config(with_options(Configuration(), **options)).config
 
     @cached_property
     def optics(self) -> Experiment:
@@ -256,7 +256,7 @@ class Bench:
         quiet = with_options(
             Configuration(), ccds=("all",), seed=self.seed, atmosphere__enabled=False, wavelengths_nm=[624.0]
         )
-        return prepare(resolve(quiet))
+        return Experiment.from_config(quiet)
 
     @property
     def telescope(self) -> Telescope:
@@ -282,7 +282,7 @@ class Bench:
     def pipeline(self) -> PipelineRun:
         """The pipeline's run: read where its folder has all of it, else begun or resumed."""
         folder = self.folder / "run"
-        experiment = prepare(self.configuration)
+        experiment = Experiment.from_config(self.configuration)
         names: Sequence[str] = self.configuration.ccds or ()
         if len(finished_ccds(folder, experiment)) < len(names):
             run(self.configuration, folder, resume=True, strict=True, threads=self.threads, reporter=self.reporter)

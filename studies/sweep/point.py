@@ -22,10 +22,9 @@ from typing import Any
 from ...core.errors import ConfigError, PachonError, unknown_name
 from ...core.schema import known_keys
 from ...design.parameters.changes import parse_change
-from ...models.camera.camera import load_camera
-from ...models.io.prescription import load_telescope
 from ...pipeline.config import Configuration, configuration_of
-from ...pipeline.experiment import Experiment, prepare, resolve
+from ...pipeline.defaults import resolve
+from ...pipeline.experiment import Experiment
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
 from .compensation import compensated
@@ -72,7 +71,7 @@ class PointMeasurement:
 
 
 def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int, folder: Path) -> Configuration:
-    """Return the resolved configuration of one point.
+    """Return the configuration of one point; defaults stay open.
 
     Raises
     ------
@@ -96,24 +95,21 @@ def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int,
             raise unknown_name("parameter", name, keys)
         else:
             changes[name] = value
-    config = resolve(configuration_of(content, f"sweep {sweep.name}"), folder)
-    if not changes:
-        return config
-    camera = load_camera(load_telescope(config.telescope or "").camera or "")
+    camera = resolve(configuration_of(content, f"sweep {sweep.name}"), folder).camera if changes else None
     for name, value in changes.items():
         body, _, quantity = name.partition(".")
-        if body not in camera.raft_names and body not in camera.ccd_names:
+        if camera is None or body not in (*camera.raft_names, *camera.ccd_names):
             _set(content, ["changes", name], value)
         elif quantity in _MOTIONS:
             _set(content, ["focal_plane", "moved", body, quantity], value)
         else:
             raise unknown_name(f"motion of {body}", quantity, _MOTIONS)
-    return resolve(configuration_of(content, f"sweep {sweep.name}"), folder)
+    return configuration_of(content, f"sweep {sweep.name}")
 
 
 def point_experiment(sweep: SweepFile, point: SweepPoint, folder: Path) -> Experiment:
     """Return the telescope, focal plane and atmosphere of one point."""
-    return prepare(point_configuration(sweep, point.parameters, point.seed, folder))
+    return Experiment.from_config(point_configuration(sweep, point.parameters, point.seed, folder), folder)
 
 
 def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> None:
@@ -140,7 +136,7 @@ def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> Non
         for point in (ordered[0], ordered[-1]):
             if point.number not in tried:
                 tried.add(point.number)
-                point_configuration(sweep, point.parameters, point.seed, folder)
+                point_experiment(sweep, point, folder)
 
 
 _kept: list[Experiment] = []

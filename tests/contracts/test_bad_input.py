@@ -13,7 +13,7 @@ import pytest
 from pachon.core.errors import PachonError
 from pachon.models.io.prescription import DATA, load_telescope
 from pachon.pipeline.config import load_configuration, to_yaml
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import launch_rays
 from pachon.raytrace.trace import trace
 from pachon.studies.sweep.design import point_count
@@ -25,7 +25,9 @@ hypothesis = pytest.importorskip("hypothesis")
 st = hypothesis.strategies
 
 SWEEP = (Path(__file__).parents[2] / "studies/sweep/examples/table1_small.yaml").read_text()
-CONFIG = to_yaml(resolve(load_configuration(Path(__file__).parents[2] / "docs/examples/optics_alone.yaml")))
+CONFIG = to_yaml(
+    Experiment.from_config(load_configuration(Path(__file__).parents[2] / "docs/examples/optics_alone.yaml")).config
+)
 TELESCOPE = (DATA / "lsst_v3.3_r.yaml").read_text()
 FREEFORM = (DATA / "rubin_v3.14_r.yaml").read_text()
 
@@ -86,9 +88,8 @@ def use_telescope(path):
 
 
 def use_configuration(path):
-    config = resolve(load_configuration(path), path.parent)
     # Heights and optics are made; the turbulence would only take its time.
-    prepare(config)
+    Experiment.from_config(load_configuration(path), path.parent)
 
 
 def use_sweep(path):

@@ -1,13 +1,17 @@
 """Configuration: every problem is one line with file, key, value and what was expected; resolving fills in all else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError, PachonError
+from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.site import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
-from pachon.pipeline.experiment import DEFAULT_CCDS, prepare, resolve
+from pachon.pipeline.defaults import DEFAULT_CCDS
+from pachon.pipeline.experiment import Experiment
 from pachon.wavefront.aberration import LARGEST_RMS, ResidualWavefront
 
 # Screens are not made by what is tested here, so their size costs nothing.
@@ -87,7 +91,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
 )
 def test_what_does_not_fit_together_is_said_in_one_line(options, parts):
     with pytest.raises(PachonError) as caught:
-        resolve(with_options(Configuration(), **options))
+        Experiment.from_config(with_options(Configuration(), **options))
     message = str(caught.value)
     assert "\n" not in message
     for part in parts:
@@ -95,13 +99,13 @@ def test_what_does_not_fit_together_is_said_in_one_line(options, parts):
 
 
 def test_screens_that_cannot_hold_the_cutoff_name_the_section():
-    config = resolve(with_options(Configuration(), atmosphere__screen_size=64))
     with pytest.raises(ConfigError, match=r"^atmosphere: "):
-        prepare(config)
+        Experiment.from_config(with_options(Configuration(), atmosphere__screen_size=64))
 
 
 def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
-    config = resolve(Configuration())
+    experiment = Experiment.from_config(Configuration())
+    config = experiment.config
     assert config.telescope == "lsst_v3.3_r"
     assert config.band == "r"
     assert config.ccds == DEFAULT_CCDS
@@ -109,7 +113,6 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     # Five equally spaced wavelengths over 545 to 703 nm.
     assert config.wavelengths_nm == (545.0, 584.5, 624.0, 663.5, 703.0)
     assert (config.stars.truth, config.stars.observed) == (100, 40)
-    experiment = prepare(config)
     radius = experiment.field_radius_on_detector
     x, y = experiment.camera.centers[[experiment.camera.ccd_index(n) for n in config.ccds]].T
     nearest, farthest = abs(x[0] + 1j * y[0]), (x**2 + y**2).max() ** 0.5
@@ -118,35 +121,44 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
 
 
 def test_band_and_telescope_follow_each_other():
-    assert resolve(with_options(Configuration(), band="i")).telescope == "lsst_v3.3_i"
-    assert resolve(with_options(Configuration(), telescope="lsst_v3.3_z")).band == "z"
+    assert Experiment.from_config(with_options(Configuration(), band="i")).config.telescope == "lsst_v3.3_i"
+    assert Experiment.from_config(with_options(Configuration(), telescope="lsst_v3.3_z")).config.band == "z"
 
 
 def test_without_an_atmosphere_pixels_and_weight_are_finer():
-    config = resolve(with_options(Configuration(), atmosphere__enabled=False))
+    experiment = Experiment.from_config(with_options(Configuration(), atmosphere__enabled=False))
+    config = experiment.config
     assert config.reconstruction.weight_fwhm_arcsec == 0.3
     assert (config.psf.pixel_um, config.psf.stamp, config.psf.diffusion_pixels) == (2.5, 61, 0.0)
-    assert prepare(config).atmosphere is None
+    assert experiment.atmosphere is None
+
+
+def test_charge_diffusion_is_a_fraction_of_the_pixel_of_the_camera():
+    experiment = Experiment.from_config(with_options(Configuration(), psf__diffusion_pixels=0.3, **SMALL))
+    assert experiment.diffusion == pytest.approx(0.3 * 10e-6)
+    wide = replace(experiment.camera, pixel_size=15e-6)
+    other = replace(experiment, focal_plane=FocalPlane.flat(wide))
+    assert other.diffusion == pytest.approx(0.3 * 15e-6)
 
 
 def test_ccds_are_put_in_the_order_of_the_camera_each_once():
     names = ("R24_S12", "R22", "R22_S11")
-    chosen = resolve(with_options(Configuration(), ccds=names)).ccds
+    chosen = Experiment.from_config(with_options(Configuration(), ccds=names)).config.ccds
     assert chosen == (*(f"R22_S{row}{column}" for row in "012" for column in "012"), "R24_S12")
-    assert len(resolve(with_options(Configuration(), ccds=("all",))).ccds) == 189
+    assert len(Experiment.from_config(with_options(Configuration(), ccds=("all",))).config.ccds) == 189
 
 
 def test_a_resolved_configuration_is_read_back_as_it_was(tmp_path):
-    config = resolve(with_options(Configuration(), seed=7, focal_plane__tilt=False, **SMALL))
+    config = Experiment.from_config(with_options(Configuration(), seed=7, focal_plane__tilt=False, **SMALL)).config
     path = written(tmp_path, to_yaml(config, ["heading"]))
-    again = resolve(load_configuration(path), tmp_path)
+    again = Experiment.from_config(load_configuration(path), tmp_path).config
     assert again == config
     assert to_yaml(again, ["heading"]) == path.read_text()
 
 
 def test_the_hash_tells_settings_apart_but_not_sets_of_ccds():
     def hash_of(**options):
-        return prepare(resolve(with_options(Configuration(), **SMALL, **options))).config_hash
+        return Experiment.from_config(with_options(Configuration(), **SMALL, **options)).config_hash
 
     base = hash_of()
     assert hash_of(ccds=("R22_S11",)) == base
@@ -162,9 +174,9 @@ def test_a_prescription_counts_by_its_content_wherever_it_lies(tmp_path):
         save_telescope(load_telescope("lsst_v3.3_r"), tmp_path / folder / "mine.yaml")
         path = tmp_path / folder / "run.yaml"
         path.write_text("telescope: mine.yaml\n")
-        config = resolve(load_configuration(path), path.parent)
-        assert config.telescope == str((tmp_path / folder / "mine.yaml").resolve())
-        hashes.append(prepare(config).config_hash)
+        experiment = Experiment.from_config(load_configuration(path), path.parent)
+        assert experiment.config.telescope == str((tmp_path / folder / "mine.yaml").resolve())
+        hashes.append(experiment.config_hash)
     assert hashes[0] == hashes[1]
 
 
@@ -176,11 +188,11 @@ def test_a_site_lies_beside_the_configuration_and_counts_by_its_content(tmp_path
         (tmp_path / folder / "my_site.yaml").write_text(text.replace("r0: 0.16 ", f"r0: {r0}"))
         path = tmp_path / folder / "run.yaml"
         path.write_text("atmosphere: {site: my_site.yaml, outer_scale_m: 20}\n")
-        config = resolve(load_configuration(path), path.parent)
+        experiment = Experiment.from_config(load_configuration(path), path.parent)
+        config = experiment.config
         assert config.atmosphere.site == str((tmp_path / folder / "my_site.yaml").resolve())
         # The site gives what the configuration leaves open.
         assert (config.atmosphere.r0_m, config.atmosphere.outer_scale_m) == (float(r0), 20.0)
-        experiment = prepare(config)
         assert experiment.atmosphere.r0 == float(r0)
         hashes.append(experiment.config_hash)
     assert hashes[0] == hashes[1] != hashes[2]
@@ -189,7 +201,7 @@ def test_a_site_lies_beside_the_configuration_and_counts_by_its_content(tmp_path
 def test_visits_differ_in_air_and_aberration_and_not_in_the_telescope():
     options = {"active_optics__residual_um": 0.2, "psf__jitter_arcsec": 0.05, **SMALL}
     first, second = (
-        prepare(resolve(with_options(Configuration(), atmosphere__epoch=epoch, **options))) for epoch in (0, 1)
+        Experiment.from_config(with_options(Configuration(), atmosphere__epoch=epoch, **options)) for epoch in (0, 1)
     )
     assert not np.allclose(first.atmosphere.velocities, second.atmosphere.velocities)
     assert np.all(first.aberration.coefficients != second.aberration.coefficients)
@@ -199,18 +211,18 @@ def test_visits_differ_in_air_and_aberration_and_not_in_the_telescope():
     np.testing.assert_array_equal(second.aberration.coefficients, expected.coefficients)
     assert first.jitter == pytest.approx(0.05 * np.pi / 648000)
     # Off by default.
-    plain = prepare(resolve(with_options(Configuration(), **SMALL)))
+    plain = Experiment.from_config(with_options(Configuration(), **SMALL))
     assert plain.aberration is None
     assert plain.jitter == 0.0
     # The largest value that the file may have is the largest that can be drawn.
-    largest = prepare(resolve(with_options(Configuration(), **(options | {"active_optics__residual_um": 2.0}))))
+    largest = Experiment.from_config(with_options(Configuration(), **(options | {"active_optics__residual_um": 2.0})))
     assert largest.aberration is not None
     assert LARGEST_RMS == 2e-6
 
 
 def test_differences_name_key_old_and_new():
-    old = resolve(Configuration()).as_dict()
-    new = resolve(with_options(Configuration(), seed=2, stars__truth=50)).as_dict()
+    old = Experiment.from_config(Configuration()).config.as_dict()
+    new = Experiment.from_config(with_options(Configuration(), seed=2, stars__truth=50)).config.as_dict()
     assert differences(old, new) == ["seed: 1 -> 2", "stars.truth: 100 -> 50"]
     assert differences(old, old) == []
 

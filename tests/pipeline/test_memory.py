@@ -15,7 +15,7 @@ from pachon.core.memory import available_bytes, readable
 from pachon.pipeline import memory as run_memory
 from pachon.pipeline import run as run_module
 from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.memory import check_memory, needed_bytes
 
 GB = 1_000_000_000
@@ -113,7 +113,7 @@ def test_sizes_are_readable():
 
 
 def experiment(**options):
-    return prepare(resolve(with_options(Configuration(), ccds=("R22_S11",), **options)))
+    return Experiment.from_config(with_options(Configuration(), ccds=("R22_S11",), **options))
 
 
 def test_screens_are_most_of_what_is_needed():
@@ -162,6 +162,18 @@ def test_a_run_that_does_not_fit_leaves_nothing_and_a_finished_one_is_reported_a
     assert run_module.run(tiny(), folder, resume=True).computed == ()
 
 
+def test_a_damaged_product_counts_as_one_to_be_computed(monkeypatch, tmp_path, tiny, finished_run):
+    folder = tmp_path / "out"
+    shutil.copytree(finished_run, folder)
+    product = folder / "ccd_R24_S12.fits"
+    product.write_bytes(product.read_bytes()[:-2880])
+    before = product.read_bytes()
+    monkeypatch.setattr(run_memory, "available_bytes", lambda: 1000)
+    with pytest.raises(ConfigError, match="needs about"):
+        run_module.run(tiny(), folder, resume=True)
+    assert product.read_bytes() == before
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="counts kibibytes, as Linux does")
 @pytest.mark.parametrize(
@@ -176,10 +188,9 @@ def test_the_estimate_is_near_the_peak_of_a_run(options, tmp_path):
     """Whole runs of one CCD in a process of their own; the report's pictures included."""
     code = (
         "import json, resource, sys; from pathlib import Path; from pachon.pipeline.run import run;"
-        "from pachon.pipeline.experiment import resolve;"
         "from pachon.pipeline.config import Configuration, with_options;"
         "options = json.loads(sys.argv[1]);"
-        "run(resolve(with_options(Configuration(), ccds=('R22_S11',), **options)), Path(sys.argv[2]), threads=2);"
+        "run(with_options(Configuration(), ccds=('R22_S11',), **options), Path(sys.argv[2]), threads=2);"
         "print(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
     arguments = [sys.executable, "-c", code, json.dumps(options), str(tmp_path / "out")]

@@ -13,7 +13,7 @@ from pachon.pipeline import run as run_module
 from pachon.pipeline import run_folder
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import load_configuration, with_options
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.measure.summary import separation_bins
 from pachon.pipeline.run import run
@@ -57,7 +57,7 @@ def test_a_run_leaves_its_files_and_no_other(finished_run):
 
 
 def test_running_its_configuration_again_gives_the_same_bytes_on_two_threads(finished_run, tmp_path):
-    config = resolve(load_configuration(finished_run / "config.yaml"), finished_run)
+    config = Experiment.from_config(load_configuration(finished_run / "config.yaml"), finished_run).config
     run(config, tmp_path / "again", threads=2)
     assert contents(tmp_path / "again") == contents(finished_run)
 
@@ -248,7 +248,7 @@ def test_the_summary_holds_what_the_products_say(finished_run, tiny):
     summary = json.loads((finished_run / "summary.json").read_text())
     assert summary["seed"] == 1
     assert list(summary["ccd"]) == list(CCDS)
-    experiment = prepare(tiny())
+    experiment = Experiment.from_config(tiny())
     assert summary["config_hash"] == experiment.config_hash
     residuals = []
     for name in CCDS:
@@ -266,7 +266,7 @@ def test_the_summary_holds_what_the_products_say(finished_run, tiny):
 
 def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run, tiny):
     product = read_product(finished_run / "ccd_R24_S12.fits")
-    camera = prepare(tiny()).camera
+    camera = Experiment.from_config(tiny()).camera
     for stars in (product.truth, product.observed):
         assert np.all(camera.ccd_at(stars.x, stars.y) == camera.ccd_index("R24_S12"))
         # 10.31 m of focal length: a detector position is the tangent of the field angle to a per cent (distortion).
@@ -280,14 +280,14 @@ def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run
     assert product.observed.snr.min() >= 30.0 * (1 - 1e-9)
     assert product.observed.used.all()
     # At 1.66 deg the camera and the mirrors' rims take some 5 to 10 % of the light.
-    exposure = prepare(tiny()).config.atmosphere.exposure_s
+    exposure = Experiment.from_config(tiny()).config.atmosphere.exposure_s
     light = product.observed.electrons / electrons(product.observed.magnitude, "r", exposure)
     assert np.all((light > 0.86) & (light < 0.98))
 
 
 def computed(config):
     """The product of the one CCD of a configuration."""
-    experiment = prepare(config)
+    experiment = Experiment.from_config(config)
     return model_ccd(experiment, ccd_exposure.expose_ccd(experiment, config.ccds[0]))
 
 
@@ -316,7 +316,7 @@ def test_residual_aberration_and_jitter_reach_the_stars(tiny):
 
 def test_without_an_atmosphere_the_optics_alone_make_the_psf(tmp_path, tiny, no_report):
     config = tiny(ccds=("R22_S11",), atmosphere__enabled=False, stars__truth=8, stars__observed=8)
-    config = resolve(with_options(config, reconstruction__components=2))
+    config = Experiment.from_config(with_options(config, reconstruction__components=2)).config
     run(config, tmp_path / "optics")
     product = read_product(tmp_path / "optics" / "ccd_R22_S11.fits")
     # A tenth of an arcsecond of aberrations and no half arcsecond of seeing.

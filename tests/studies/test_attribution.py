@@ -9,7 +9,7 @@ from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, UnknownNameError
 from pachon.pipeline.ccd_product import KINDS
 from pachon.pipeline.config import load_configuration, with_options
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.measure.summary import correlations
@@ -47,7 +47,7 @@ def test_the_full_case_is_the_run(finished_run, attributed):
 
 
 def test_a_case_is_a_run_without_the_cause(tiny, attributed):
-    experiment = prepare(resolve(with_options(tiny(), focal_plane__tilt=False)))
+    experiment = Experiment.from_config(with_options(tiny(), focal_plane__tilt=False))
     names = experiment.config.ccds
     products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1)) for name in names]
     e = np.concatenate([[p.truth.e1, p.truth.e2] for p in products], axis=1)
@@ -101,7 +101,7 @@ def test_without_noise_the_truth_stays(attributed):
 
 def test_without_noise_the_model_is_that_of_bright_stars(tiny):
     # The limit of ever brighter stars through the noisy path: photons of 1e11 electrons scatter by 3e-6 of the light.
-    experiment = prepare(tiny(ccds=("R22_S11",)))
+    experiment = Experiment.from_config(tiny(ccds=("R22_S11",)))
     exposure = expose_ccd(experiment, "R22_S11", threads=1)
     product = model_ccd(experiment, exposure)
     quiet = model_ccd(experiment, exposure, noisy=False)
@@ -139,7 +139,7 @@ def test_optics_off_leaves_the_air_alone(tiny):
     assert figures["full"]["rms_e_truth"] > figures["heights"]["rms_e_truth"] > figures[OPTICS]["rms_e_truth"]
     # A flat detector stretches the sky by 1/cos along the radius more than across: e = 2.2e-4 at 1.7 deg.
     assert figures[OPTICS]["rms_e_truth"] < 3e-4
-    experiment = prepare(config)
+    experiment = Experiment.from_config(config)
     alone = attribution._without(experiment, OPTICS)
     full, air = (expose_ccd(e, "R24_S12", threads=1) for e in (experiment, alone))
     np.testing.assert_array_equal(full.truth.fields, air.truth.fields)
@@ -161,11 +161,11 @@ def test_optics_off_leaves_the_air_alone(tiny):
 
 
 def test_a_lifted_ground_layer_is_the_same_air(tiny):
-    full = prepare(tiny())
+    full = Experiment.from_config(tiny())
     lifted = attribution._without(full, "ground_layer")
     np.testing.assert_array_equal(lifted.atmosphere.altitudes[1:], full.atmosphere.altitudes[1:])
     assert (full.atmosphere.altitudes[0], lifted.atmosphere.altitudes[0]) == (0.0, attribution.GROUND_LIFT)
-    asked = prepare(resolve(with_options(tiny(), atmosphere__ground_lift_m=attribution.GROUND_LIFT)))
+    asked = Experiment.from_config(with_options(tiny(), atmosphere__ground_lift_m=attribution.GROUND_LIFT))
     np.testing.assert_array_equal(lifted.atmosphere.altitudes, asked.atmosphere.altitudes)
     assert lifted.atmosphere.screens("slopes") is full.atmosphere.screens("slopes")
 

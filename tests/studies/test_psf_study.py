@@ -8,7 +8,7 @@ from astropy.table import Table
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
 from pachon.pipeline.config import load_configuration
-from pachon.pipeline.experiment import prepare
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.psf_model.polynomial import mapped
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, Exposed
@@ -59,7 +59,7 @@ def _figures(experiment, case, ccds, draws):
 
 @pytest.fixture(scope="module")
 def experiment(tiny):
-    return prepare(tiny())
+    return Experiment.from_config(tiny())
 
 
 def test_a_cubic_field_is_recovered_by_order_three(experiment):
@@ -221,7 +221,7 @@ def test_every_case_has_figures_or_a_problem(small):
 
 def test_a_case_is_what_its_parts_give(small, tiny):
     plan, result = small
-    experiment = prepare(psf_study.study_configuration(tiny(), plan))
+    experiment = psf_study.study_experiment(tiny(), plan)
     ccds = psf_study._simulate(experiment, 2, psf_study.Reporter(quiet=True))  # and two threads change nothing
     for case in (plan.base, replace(plan.base, stars=6, interpolation="snr"), replace(plan.base, basis="pixels")):
         # Principal components of one fit are truncated, by rounding those of a fit of fewer.

@@ -13,7 +13,7 @@ import pytest
 
 from pachon.core.plotting import new_figure, png_bytes
 from pachon.pipeline.ccd_product import read_product
-from pachon.pipeline.experiment import prepare
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.report.focal_plane_axes import key_ellipticity, whiskers
 from pachon.pipeline.report.report import build_report, closest_middle_farthest
 from pachon.pipeline.report.tables import percent
@@ -85,7 +85,7 @@ def test_each_picture_says_what_it_shows_and_what_the_paper_shows(page):
 
 
 def test_text_of_a_user_is_escaped(finished_run, tiny):
-    experiment = prepare(tiny())
+    experiment = Experiment.from_config(tiny())
     telescope = dataclasses.replace(experiment.telescope, description="<b>mine</b> & yours")
     experiment = dataclasses.replace(experiment, telescope=telescope)
     page = build_report(experiment, json.loads((finished_run / "summary.json").read_text()), [])

@@ -7,7 +7,7 @@ import pytest
 
 from pachon.core.errors import ConfigError, DomainError
 from pachon.pipeline.config import with_options
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.star_selection import StarFlag
 from pachon.pipeline.psf_model.checks import snr_weights
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
@@ -20,7 +20,7 @@ N = 40
 
 @pytest.fixture(scope="module")
 def experiment(tiny):
-    return prepare(tiny(ccds=(NAME,), stars__observed=N))
+    return Experiment.from_config(tiny(ccds=(NAME,), stars__observed=N))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,9 @@ def plain(experiment, exposure):
 
 def asked(experiment, **options):
     """The experiment with other stars or another model; the PSFs of its stars do not depend on them."""
-    return dataclasses.replace(experiment, config=resolve(with_options(experiment.config, **options)))
+    return dataclasses.replace(
+        experiment, config=Experiment.from_config(with_options(experiment.config, **options)).config
+    )
 
 
 def seen(experiment, exposure, electrons=2e5, **options):
@@ -105,7 +107,9 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
     config = experiment.config
     if basis == "pixels":
         fit = config.reconstruction.model_copy(update={"components": None, "basis": "pixels"})
-        chosen = dataclasses.replace(experiment, config=resolve(config.model_copy(update={"reconstruction": fit})))
+        chosen = dataclasses.replace(
+            experiment, config=Experiment.from_config(config.model_copy(update={"reconstruction": fit})).config
+        )
     else:
         chosen = asked(experiment, stars__truth=60, **options)
     product = model_ccd(chosen, exposure)
@@ -150,7 +154,10 @@ def test_models_that_cannot_be_are_one_line(tiny, options, message):
 def test_defaults_follow_basis_and_interpolation(tiny):
     config = tiny()
     fresh = type(config)(**{"reconstruction": {"interpolation": "gp"}})
-    assert resolve(fresh).reconstruction.order == 0
-    assert resolve(fresh).reconstruction.components == 20
-    assert resolve(type(config)(**{"reconstruction": {"basis": "pixels"}})).reconstruction.components is None
-    assert resolve(type(config)()).reconstruction.order == 3
+    assert Experiment.from_config(fresh).config.reconstruction.order == 0
+    assert Experiment.from_config(fresh).config.reconstruction.components == 20
+    assert (
+        Experiment.from_config(type(config)(**{"reconstruction": {"basis": "pixels"}})).config.reconstruction.components
+        is None
+    )
+    assert Experiment.from_config(type(config)()).config.reconstruction.order == 3

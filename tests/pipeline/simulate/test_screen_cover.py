@@ -11,7 +11,8 @@ from pachon.models.camera.camera import load_camera
 from pachon.models.io.prescription import load_telescope
 from pachon.models.site import load_site
 from pachon.pipeline.config import Configuration, with_options
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.defaults import resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.screen_cover import swept_lengths
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront.pupil_optics import fields_at
@@ -23,9 +24,9 @@ def swept(config):
 
 
 def test_the_default_and_all_ccds_fit():
-    lengths = swept(resolve(Configuration()))
+    lengths = swept(Experiment.from_config(Configuration()).config)
     assert lengths.max() < 1300.0
-    everything = swept(resolve(with_options(Configuration(), ccds=("all",))))
+    everything = swept(Experiment.from_config(with_options(Configuration(), ccds=("all",))).config)
     # The top layer: 20 m/s for 15 s, 15.46 km seen from +-0.3167 m of focal plane at 10.31 m, and the pupil.
     assert everything[5] == pytest.approx(300.0 + 2 * 15460.0 * 0.3167 / 10.31 + 8.36, rel=2e-3)
     # The ground layer is not seen from different places.
@@ -38,8 +39,8 @@ def test_no_light_leaves_the_swept_length(zenith):
     """Stars in the corners of the CCDs, rim of the pupil, begin and end of the exposure."""
     names = ("R22_S11", "R31_S02", "R24_S21")
     options = {"ccds": names, "atmosphere__zenith_angle_deg": zenith, "atmosphere__ground_lift_m": 300.0}
-    config = resolve(with_options(Configuration(), seed=3, **options))
-    experiment = prepare(config)
+    config = Experiment.from_config(with_options(Configuration(), seed=3, **options)).config
+    experiment = Experiment.from_config(config)
     camera = experiment.camera
     half = camera.half_size * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
     corners = np.concatenate([camera.centers[camera.ccd_index(n)] + half for n in names])
@@ -77,7 +78,7 @@ def test_screens_that_come_round_are_refused_and_what_is_asked_for_is_enough(opt
         r"screen_length_m of at least (\d+) \(and atmosphere.screen_size = (\d+) ", message
     ).groups()
     enough = {**options, "atmosphere__screen_length_m": float(length), "atmosphere__screen_size": int(size)}
-    config = resolve(with_options(Configuration(), **enough))
+    config = resolve(with_options(Configuration(), **enough)).config
     before = with_options(Configuration(), **options).atmosphere
     pixel, old = (a.screen_length_m / a.screen_size for a in (config.atmosphere, before))
     # A fast size for the Fourier transform may be some per cent larger than need be.
@@ -89,11 +90,13 @@ def test_screens_that_come_round_are_refused_and_what_is_asked_for_is_enough(opt
 
 def test_what_reads_no_screens_needs_none():
     config = with_options(Configuration(), atmosphere__enabled=False, atmosphere__exposure_s=600.0)
-    assert resolve(config).atmosphere.exposure_s == 600.0
+    assert Experiment.from_config(config).config.atmosphere.exposure_s == 600.0
 
 
 def test_one_ccd_may_be_exposed_longer():
-    config = resolve(with_options(Configuration(), ccds=("R22_S11",), atmosphere__exposure_s=60.0))
+    config = Experiment.from_config(
+        with_options(Configuration(), ccds=("R22_S11",), atmosphere__exposure_s=60.0)
+    ).config
     # A CCD covers 0.041 m / 10.31 m of angle.
     assert swept(config)[5] == pytest.approx(1200.0 + 15460.0 * 0.04096 / 10.31 + 8.36, rel=1e-3)
     assert math.isclose(config.atmosphere.exposure_s, 60.0)

@@ -3,7 +3,7 @@ import pytest
 
 from pachon.core.errors import PachonError
 from pachon.pipeline.config import configuration_of
-from pachon.pipeline.experiment import prepare, resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import launch_rays
 from pachon.raytrace.trace import trace
 from pachon.studies.sweep.compensation import compensated
@@ -16,7 +16,9 @@ CCDS = ("R01_S11", "R10_S11", "R22_S11", "R34_S11", "R43_S11")
 
 def experiment(changes=None, **focal_plane):
     content = {"ccds": list(CCDS), "wavelengths_nm": [624], "changes": changes or {}}
-    return prepare(resolve(configuration_of(content | {"focal_plane": focal_plane or {"budget": "flat"}}, "test")))
+    return Experiment.from_config(
+        configuration_of(content | {"focal_plane": focal_plane or {"budget": "flat"}}, "test")
+    )
 
 
 def mean_square(at, motion):

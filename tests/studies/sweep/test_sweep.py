@@ -19,8 +19,8 @@ from pachon.models.camera.camera import CAMERAS, lsst_camera
 from pachon.models.io.prescription import DATA
 from pachon.studies.metrics.stars import STARS
 from pachon.studies.sweep.file import load_sweep, read_sweep
-from pachon.studies.sweep.point import point_configuration
-from pachon.studies.sweep.store import SweepStore
+from pachon.studies.sweep.point import point_experiment
+from pachon.studies.sweep.store import SweepPoint, SweepStore
 from pachon.studies.sweep.sweep import check_room
 
 SWEEP = """
@@ -327,7 +327,7 @@ def test_motions_are_those_of_the_points_own_camera(folder, monkeypatch):
 
     def configuration(parameter):
         content = {"base": base, "parameters": {parameter: {"values": [5]}}, "design": {"kind": "grid"}}
-        return point_configuration(read_sweep(content, "test"), {parameter: 5}, 1, folder)
+        return point_experiment(read_sweep(content, "test"), SweepPoint(0, {parameter: 5}, 1), folder).config
 
     assert configuration("B_2.dz_um").focal_plane.moved["B_2"].dz_um == 5
     assert configuration("A.rx_urad").focal_plane.moved["A"].rx_urad == 5

@@ -12,7 +12,7 @@ from pachon.models.aperture import Circle, Complement, Vane
 from pachon.models.obstruction import Obstruction
 from pachon.models.surface import Interaction, Plane, Surface
 from pachon.pipeline.config import Configuration
-from pachon.pipeline.experiment import resolve
+from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront.aberration import ResidualWavefront
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
@@ -415,11 +415,11 @@ def test_needs_turbulence(lsst_r):
 
 
 def test_in_a_run():
-    config = resolve(Configuration.model_validate({"psf": {"engine": "long_exposure"}}))
+    config = Experiment.from_config(Configuration.model_validate({"psf": {"engine": "long_exposure"}})).config
     assert config.psf.n_pupil == PUPIL_POINTS == 80
     given = {"psf": {"engine": "long_exposure"}, "atmosphere": {"enabled": False}}
     with pytest.raises(ConfigError, match=r"psf\.engine = long_exposure: expected atmosphere\.enabled = true"):
-        resolve(Configuration.model_validate(given))
+        Experiment.from_config(Configuration.model_validate(given))
 
 
 def test_large_stamps(lsst_r):

@@ -1,0 +1,222 @@
+"""Defaults of a configuration that depend on telescope, camera and site, and checks across several values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from pydantic import BaseModel
+
+from ..core.errors import ConfigError
+from ..design.parameters.changes import apply_changes
+from ..models.camera.camera import Camera, load_camera
+from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
+from ..models.site import Site, load_site
+from ..models.telescope import Telescope
+from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
+from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
+from .config import BandName, Configuration
+from .psf_model.fit import COMPONENTS
+from .psf_model.polynomial import term_count
+from .simulate.screen_cover import check_screens
+
+#: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
+DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
+_WAVELENGTHS = 5
+# The optics alone are seen as the paper's Fig. 8 has them: without charge diffusion, which would hide most of their
+# ellipticity, and on pixels fine enough for a weight of 0.3".
+_WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "pixel_um": 10.0, "stamp": 31, "diffusion_pixels": 0.4}
+_OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "pixel_um": 2.5, "stamp": 61, "diffusion_pixels": 0.0}
+_ENGINE_DEFAULTS: dict[str, dict[str, float]] = {"long_exposure": {"n_pupil": PUPIL_POINTS_LONG}}
+_T = TypeVar("_T")
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class ResolvedConfiguration:
+    """Configuration without open values, and the models that it names.
+
+    Attributes
+    ----------
+    config : Configuration
+        Every default filled in, paths absolute.
+    telescope : Telescope
+        Telescope, changes applied.
+    camera : Camera
+        Camera of the telescope.
+    site : Site
+        Site of the atmosphere.
+    """
+
+    config: Configuration
+    telescope: Telescope
+    camera: Camera
+    site: Site
+
+
+def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfiguration:
+    """Fill in every default, and check values that depend on each other.
+
+    Parameters
+    ----------
+    config : Configuration
+        Configuration of a file or a command line; a resolved one stays as it is.
+    folder : Path, optional
+        Folder that relative paths in the configuration start from; the current one by default.
+
+    Raises
+    ------
+    ConfigError, UnknownNameError, PrescriptionError, DomainError
+        If a name does not exist, or values do not fit together.
+    """
+    name, band = config.telescope, config.band
+    if name is None:
+        band = band or "r"
+        name = f"lsst_v3.3_{band}"
+    else:
+        name = _absolute(name, folder, bundled_names())
+        band = band or _band_of(name)
+    telescope = load_telescope(name)
+    if telescope.camera is None:
+        raise ConfigError(f"telescope = {name}: expected a model with a camera, such as lsst_v3.3_{band}")
+    camera = load_camera(telescope.camera)
+    atmosphere = config.atmosphere
+    site_name = _absolute(atmosphere.site, folder, ())
+    site = load_site(site_name)
+    wavelengths = config.wavelengths_nm
+    if wavelengths is None:
+        low, high = telescope.band or telescope.wavelength_range
+        wavelengths = tuple(round(float(w) * 1e9, 3) for w in np.linspace(low, high, _WAVELENGTHS))
+    resolved = config.model_copy(
+        update={
+            "band": band,
+            "telescope": name,
+            "ccds": chosen_ccds(camera, DEFAULT_CCDS if config.ccds is None else config.ccds),
+            "wavelengths_nm": wavelengths,
+            "atmosphere": _filled(
+                atmosphere.model_copy(update={"site": site_name}),
+                {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
+            ),
+            "psf": _filled(
+                config.psf,
+                (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
+                | _ENGINE_DEFAULTS.get(config.psf.engine, {}),
+            ),
+            "reconstruction": _filled(
+                config.reconstruction,
+                {
+                    "weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3,
+                    "components": None if config.reconstruction.basis == "pixels" else COMPONENTS,
+                    "order": 3 if config.reconstruction.interpolation == "polynomial" else 0,
+                },
+            ),
+        }
+    )
+    telescope = apply_changes(telescope, resolved.changes)
+    _check(resolved, telescope)
+    check_screens(resolved, telescope, camera, site)
+    return ResolvedConfiguration(resolved, telescope, camera, site)
+
+
+def truth_components(config: Configuration) -> int:
+    """Return how many principal components describe the noise-free PSFs of a resolved configuration."""
+    components = config.reconstruction.components
+    return min(COMPONENTS, config.stars.truth - 1) if components is None else components
+
+
+def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of CCDs in the order of the camera, each once; rafts and ``all`` stand for all of theirs.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such CCD or raft; the nearest names are offered.
+    ConfigError
+        If none is given.
+    """
+    indices: set[int] = set()
+    for name in names:
+        if name == "all":
+            indices.update(range(len(camera)))
+        elif "_" not in name:
+            indices.update(camera.ccd_index(n) for n in camera.ccds_of_raft(name))
+        else:
+            indices.add(camera.ccd_index(name))
+    if not indices:
+        raise ConfigError("ccds = []: expected at least one name, such as R22_S11, or all")
+    return tuple(camera.ccd_names[i] for i in sorted(indices))
+
+
+def _check(config: Configuration, telescope: Telescope) -> None:
+    """Check what several values must be together."""
+    for i, wavelength in enumerate(given(config.wavelengths_nm)):
+        low, high = (1e9 * w for w in telescope.wavelength_range)
+        if not low <= wavelength <= high:
+            raise ConfigError(
+                f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g}, which {telescope.name} covers"
+            )
+    if not config.wavelengths_nm:
+        raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")
+    if given(config.psf.stamp) % 2 == 0:
+        raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
+    fit, stars = config.reconstruction, config.stars
+    if fit.basis == "pixels" and fit.components is not None:
+        raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
+    if fit.interpolation == "gp" and fit.weights != "equal":
+        raise ConfigError(f"reconstruction.weights = {fit.weights}: expected equal with interpolation = gp")
+    for kind in ("observed", "truth"):
+        count = getattr(stars, kind)
+        # The noise-free PSFs are always described by principal components.
+        components = truth_components(config) if kind == "truth" else fit.components
+        if components is not None and components > count - 1 and (kind == "truth" or fit.basis == "pca"):
+            raise ConfigError(
+                f"reconstruction.components = {components}: expected at most {count - 1}, one less than "
+                f"stars.{kind} = {count}"
+            )
+        key = "order" if kind == "observed" else "truth_order"
+        terms = term_count(getattr(fit, key))
+        if terms > count:
+            raise ConfigError(
+                f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
+                f"stars.{kind} = {count}"
+            )
+    if config.focal_plane.budget == "flat" and config.focal_plane.sizes:
+        raise ConfigError(
+            "focal_plane.budget = flat: expected simulated or specification where sizes of its terms are given"
+        )
+    if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:
+        raise ConfigError("psf.engine = long_exposure: expected atmosphere.enabled = true, whose mean it takes")
+    if config.atmosphere.time_step_s > config.atmosphere.exposure_s:
+        raise ConfigError(
+            f"atmosphere.time_step_s = {config.atmosphere.time_step_s:g}: expected at most the exposure, "
+            f"atmosphere.exposure_s = {config.atmosphere.exposure_s:g}"
+        )
+
+
+def given(value: _T | None) -> _T:
+    """Return a value that a resolved configuration always has."""
+    if value is None:
+        raise ConfigError("the configuration is not resolved")
+    return value
+
+
+def _filled(section: _Model, defaults: Mapping[str, object]) -> _Model:
+    """Return a section with defaults in place of what was left open."""
+    return section.model_copy(update={key: v for key, v in defaults.items() if getattr(section, key) is None})
+
+
+def _band_of(name: str) -> BandName:
+    """Return the band that the name of a model ends in, such as lsst_v3.3_i; r where it does not."""
+    ending = Path(name).stem.rpartition("_")[2] if Path(name).suffix.lower() in ENDINGS else name.rpartition("_")[2]
+    bands: dict[str, BandName] = {"u": "u", "g": "g", "r": "r", "i": "i", "z": "z", "y": "y"}
+    return bands.get(ending, "r")
+
+
+def _absolute(name: str, folder: Path | None, bundled: Sequence[str]) -> str:
+    """Return a bundled name as it is, and the path of a file as an absolute one."""
+    if name in bundled or Path(name).suffix.lower() not in ENDINGS:
+        return name
+    return str(((folder or Path()) / name).resolve())
