@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .inputs import interruptible
@@ -35,15 +36,14 @@ def baseline_group() -> None:
 @baseline_app.command("save")
 def baseline_save(
     model: Model,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Baseline to write, NAME.baseline.json.")],
+    out: Annotated[Path, Option("--out", "-o", help="Baseline to write, NAME.baseline.json.")],
     config: Annotated[
-        Path | None,
-        typer.Option(metavar="RUN.yaml", help="Run configuration: adds CCD heights, PSFs and a reconstruction."),
+        Path | None, Option(metavar="RUN.yaml", help="Run configuration: adds heights, PSFs, a PSF model.")
     ] = None,
     field_deg: FieldsDeg = None,
     wavelength_nm: WavelengthsNm = None,
     ccds: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="CCDs for PSFs, separated by commas; the first is modelled.")
+        str | None, Option(metavar="NAMES", help="CCDs for PSFs, with commas; the first is modelled.")
     ] = None,
     threads: Threads = None,
     as_json: Json = False,
@@ -85,7 +85,7 @@ def baseline_save(
 
 @baseline_app.command("update")
 def baseline_update(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="Baseline to update.")],
+    path: Annotated[Path, Argument(metavar="FILE", help="Baseline to update.")],
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -112,15 +112,11 @@ def baseline_update(
 @app.command("check")
 def check_command(
     files: Annotated[
-        list[Path] | None, typer.Argument(metavar="[FILE]...", help="Baselines; the bundled ones by default.")
+        list[Path] | None, Argument(metavar="[FILE]...", help="Baselines; the bundled by default.")
     ] = None,
-    model: Annotated[
-        str | None, typer.Option(help="Telescope in place of the baseline's own: bundled, or a path.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="RUN.yaml", help="Run configuration in place of the baseline's own.")
-    ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Show all metrics, not the worst alone.")] = False,
+    model: Annotated[str | None, Option(help="Telescope in place of the baseline's own: bundled, or a path.")] = None,
+    config: Annotated[Path | None, Option(metavar="RUN.yaml", help="Run configuration in place of its own.")] = None,
+    everything: Annotated[bool, Option("--all", help="Show all metrics, not the worst alone.")] = False,
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,

@@ -16,6 +16,7 @@ from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from ..core.errors import PachonError
 from . import baseline, design, diagnostics, reproduce, run, study, sweep, telescope
@@ -82,7 +83,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _common(
     show_version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     del show_version

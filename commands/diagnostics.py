@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from .inputs import configured_experiment, interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, name_list, one_name_list
@@ -16,14 +17,9 @@ app = typer.Typer()
 
 @app.command("diagnose")
 def diagnose_command(
-    folder: Annotated[Path, typer.Argument(metavar="RUN_FOLDER", help="Folder of a run, finished or not.")],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder to write to; by default diagnostics, in that of the run.")
-    ] = None,
-    strict: Annotated[
-        bool,
-        typer.Option("--strict", help="End at the first CCD without a readable product; do not leave it out."),
-    ] = False,
+    folder: Annotated[Path, Argument(metavar="RUN_FOLDER", help="Folder of a run, finished or not.")],
+    out: Annotated[Path | None, Option(help="Folder to write to; by default diagnostics, in that of the run.")] = None,
+    strict: Annotated[bool, Option("--strict", help="End at the first CCD without a readable product.")] = False,
     as_json: Json = False,
 ) -> None:
     """Measure the residuals of a run: ellipticity and size of each CCD, correlations, rho statistics, with jackknife.
@@ -59,15 +55,13 @@ def attribute_command(
     raft: Raft = None,
     causes: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Causes to switch off, separated by commas, of global, raft, ccd, tilt, potato_chip, heights, "
             "active_optics, optics, atmosphere, ground_layer, diffusion, noise; all that are on by default."
         ),
     ] = None,
-    average: Annotated[
-        bool, typer.Option("--average", help="Average over all turbulence: quick; optics and heights remain.")
-    ] = False,
-    out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("pachon_attribution"),
+    average: Annotated[bool, Option("--average", help="Average over all turbulence; quick.")] = False,
+    out: Annotated[Path, Option(help="Folder to write to.")] = Path("pachon_attribution"),
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
     threads: Threads = None,

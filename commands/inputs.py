@@ -24,20 +24,7 @@ class InterruptedRunError(Exception):
 
 @contextmanager
 def interruptible(quiet: bool, finished: str = "") -> Iterator[Reporter]:
-    """Yield the reporter of a long command, which Ctrl-C ends with one line.
-
-    Parameters
-    ----------
-    quiet : bool
-        Print nothing at all.
-    finished : str
-        Place of the finished parts, if a later call can use them.
-
-    Raises
-    ------
-    InterruptedRunError
-        If Ctrl-C was pressed.
-    """
+    """Yield the reporter of a long command, which Ctrl-C ends with one line that names the finished parts."""
     from ..core.interrupt import remembered_interrupts
     from ..core.progress import Reporter
 
@@ -49,21 +36,7 @@ def interruptible(quiet: bool, finished: str = "") -> Iterator[Reporter]:
 
 
 def configured_experiment(config: Path | None, **options: object) -> Experiment:
-    """Return the experiment of a configuration file with the options of the command line.
-
-    Parameters
-    ----------
-    config : Path, optional
-        Configuration file; without one all has its default.
-    **options : object
-        Values by dotted key, as :func:`~pachon.pipeline.config.with_options` takes them; None where not given.
-
-    Raises
-    ------
-    PachonError
-        If something in the file or the options is wrong. The line names the file where no option was given: then
-        it alone can be at fault.
-    """
+    """Return the experiment of a configuration file and of options by key, None where not given."""
     from ..pipeline.config import Configuration, load_configuration, with_options
     from ..pipeline.experiment import Experiment
 
@@ -73,22 +46,12 @@ def configured_experiment(config: Path | None, **options: object) -> Experiment:
         return Experiment.from_config(settings, None if config is None else config.parent)
     except PachonError as error:
         if config is None or settings is not base:
-            raise
+            raise  # an option may be at fault, not the file
         raise error.within(file=config) from None
 
 
 def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Path] = ()) -> Telescope:
-    """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each.
-
-    Parameters
-    ----------
-    model : str
-        Bundled model, or path of a prescription.
-    lenient : bool
-        Of a Zemax or CODE V file: go on where something is not understood.
-    glass_catalogues : sequence of Path
-        Glass catalogues (.agf) to look glasses up in first.
-    """
+    """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each."""
     from ..core.errors import PrescriptionWarning
     from ..models.io.prescription import load_telescope
 

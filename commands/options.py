@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from ..core.errors import ConfigError
 
@@ -15,21 +15,17 @@ if TYPE_CHECKING:
 
     from ..models.telescope import Telescope
 
-Config = Annotated[Path | None, typer.Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")]
-Ccds = Annotated[str | None, typer.Option(help="CCDs, separated by commas: R22_S11,R22_S12.")]
-Raft = Annotated[str | None, typer.Option(help="All CCDs of rafts: R22 or R22,R23.")]
-TruthStars = Annotated[int | None, typer.Option(help="Noise-free PSFs on each CCD.")]
-ObservedStars = Annotated[int | None, typer.Option(help="Observed stars on each CCD.")]
-Model = Annotated[str, typer.Argument(help="Bundled model, or path of a prescription.")]
-Lenient = Annotated[
-    bool, typer.Option("--lenient", help="Of a Zemax or CODE V file: warn about what is not understood, and go on.")
-]
-WavelengthNm = Annotated[
-    float | None, typer.Option("--wavelength-nm", help="Wavelength [nm]; the model's own by default.")
-]
+Config = Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")]
+Ccds = Annotated[str | None, Option(help="CCDs, separated by commas: R22_S11,R22_S12.")]
+Raft = Annotated[str | None, Option(help="All CCDs of rafts: R22 or R22,R23.")]
+TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
+ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
+Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
+Lenient = Annotated[bool, Option("--lenient", help="Zemax or CODE V file: warn about unknown parts and go on.")]
+WavelengthNm = Annotated[float | None, Option("--wavelength-nm", help="Wavelength [nm]; the model's own by default.")]
 FieldsDeg = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--field-deg",
         metavar="X,Y | R",
         help="Field angle [deg], or a distance from the axis along +y; once for each field. "
@@ -37,33 +33,23 @@ FieldsDeg = Annotated[
     ),
 ]
 WavelengthsNm = Annotated[
-    list[float] | None,
-    typer.Option("--wavelength-nm", help="Wavelength [nm], once for each; the model's own by default."),
+    list[float] | None, Option("--wavelength-nm", help="Wavelength [nm], once for each; the model's own by default.")
 ]
 AcrossBand = Annotated[
-    int | None,
-    typer.Option("--across-band", min=2, max=99, metavar="N", help="In their place: so many across the pass band."),
+    int | None, Option("--across-band", min=2, max=99, metavar="N", help="In their place: wavelengths across the band.")
 ]
-Projection = Annotated[str, typer.Option(help="Meaning of the field angles: zemax, gnomonic or postel.")]
+Projection = Annotated[str, Option(help="Meaning of the field angles: zemax, gnomonic or postel.")]
 Picture = Annotated[
     Path | None,
-    typer.Option(
-        "--picture", "-o", help="Picture to write, .png, .pdf or .svg; by default named after command and model."
-    ),
+    Option("--picture", "-o", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
 ]
-Threads = Annotated[int | None, typer.Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress, no table.")]
-Json = Annotated[bool, typer.Option("--json", help="Print metrics as JSON on standard output, and nothing else there.")]
+Threads = Annotated[int | None, Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
+Quiet = Annotated[bool, Option("--quiet", help="No progress, no table.")]
+Json = Annotated[bool, Option("--json", help="Print metrics as JSON on standard output, and nothing else there.")]
 
 
 def name_list(text: str, option: str) -> tuple[str, ...]:
-    """Return the names in a text with commas.
-
-    Raises
-    ------
-    ConfigError
-        If there is none.
-    """
+    """Return the names in a text with commas; there must be one."""
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
         raise ConfigError(f"{option} = {text!r}: expected names separated by commas, such as R22_S11,R22_S12")
@@ -71,18 +57,7 @@ def name_list(text: str, option: str) -> tuple[str, ...]:
 
 
 def one_name_list(**options: str | None) -> tuple[str, ...] | None:
-    """Return the names in the one option that is given; None where none is.
-
-    Parameters
-    ----------
-    **options : str or None
-        Texts of the options, by their names without dashes.
-
-    Raises
-    ------
-    ConfigError
-        If more than one is given, or if there is no name in it.
-    """
+    """Return the names in the one option that is given; None where none is."""
     given = [(f"--{name}", text) for name, text in options.items() if text is not None]
     if len(given) > 1:
         *first, last = (f"--{name}" for name in options)
@@ -91,13 +66,7 @@ def one_name_list(**options: str | None) -> tuple[str, ...] | None:
 
 
 def degrees_pair(text: str, option: str) -> tuple[float, float]:
-    """Return the two angles [deg] in a text such as ``0,1.2``.
-
-    Raises
-    ------
-    ConfigError
-        If there are not two numbers.
-    """
+    """Return the two angles [deg] in a text such as ``0,1.2``."""
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -106,13 +75,7 @@ def degrees_pair(text: str, option: str) -> tuple[float, float]:
 
 
 def field_list(texts: Sequence[str] | None) -> np.ndarray | None:
-    """Return the field angles [rad], shape [n, 2], of options such as ``0.3,1.2`` or ``1.75``; None without any.
-
-    Raises
-    ------
-    ConfigError
-        If one is neither one number nor two.
-    """
+    """Return the field angles [rad], shape [n, 2], of options such as ``0.3,1.2`` or ``1.75``; None without any."""
     import numpy as np
 
     if not texts:
@@ -123,13 +86,7 @@ def field_list(texts: Sequence[str] | None) -> np.ndarray | None:
 def wavelength_list(
     telescope: Telescope, wavelengths_nm: Sequence[float] | None, across_band: int | None
 ) -> np.ndarray | None:
-    """Return the wavelengths [m] of the options; None without any.
-
-    Raises
-    ------
-    ConfigError
-        If both single wavelengths and the band are given.
-    """
+    """Return the wavelengths [m] of the options; None without any."""
     import numpy as np
 
     if wavelengths_nm and across_band:
@@ -140,13 +97,7 @@ def wavelength_list(
 
 
 def picture_kind(picture: Path | None) -> str:
-    """Return the format of a picture by the end of its name; png where there is no name.
-
-    Raises
-    ------
-    ConfigError
-        If the format is none of png, pdf and svg.
-    """
+    """Return the format of a picture by the end of its name; png where there is no name."""
     kind = "png" if picture is None else picture.suffix.lower().removeprefix(".")
     if kind not in ("png", "pdf", "svg"):
         raise ConfigError(f"--picture = {picture}: expected a name that ends in .png, .pdf or .svg")

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.table import Table
+from typer import Argument, Option
 
 from .inputs import interruptible
 from .options import Json, Quiet, Threads
@@ -18,11 +19,11 @@ app = typer.Typer()
 @app.command("reproduce")
 def reproduce_command(
     figures: Annotated[
-        list[str] | None, typer.Argument(metavar="fig1 ... fig14 | table1 | all", help="Figures; all by default.")
+        list[str] | None, Argument(metavar="fig1 ... fig14 | table1 | all", help="Figures; all by default.")
     ] = None,
-    scale: Annotated[str, typer.Option(help="small (a minute or two) or paper (189 CCDs, about an hour).")] = "small",
-    out: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("pachon_figures"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+    scale: Annotated[str, Option(help="small (a minute or two) or paper (189 CCDs, about an hour).")] = "small",
+    out: Annotated[Path, Option(help="Folder of the figures.")] = Path("pachon_figures"),
+    seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 1,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 
 from .inputs import configured_experiment, interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
@@ -20,15 +21,11 @@ def run_command(
     config: Config = None,
     ccds: Ccds = None,
     raft: Raft = None,
-    all_ccds: Annotated[bool, typer.Option("--all", help="All CCDs of the camera.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("pachon_run"),
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Keep the CCDs that are finished, compute the others.")
-    ] = False,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="End at the first CCD that cannot be modelled, in place of leaving it out.")
-    ] = False,
+    all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
+    out: Annotated[Path, Option(help="Folder of the run.")] = Path("pachon_run"),
+    seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Keep the CCDs that are finished, compute the others.")] = False,
+    strict: Annotated[bool, Option("--strict", help="End at the first CCD that cannot be modelled.")] = False,
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
     threads: Threads = None,

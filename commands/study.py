@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
+from typer import Option
 
 from ..core.errors import ConfigError
 from .inputs import configured_experiment, interruptible
@@ -36,15 +37,13 @@ _CAPTION = (
 @app.command("study")
 def study_command(
     config: Config = None,
-    ccds: Annotated[
-        str | None, typer.Option(help="CCDs, separated by commas; by default nine across the field.")
-    ] = None,
-    stars: Annotated[str, typer.Option(help="Stars of a CCD.")] = "10,20,40,80,160",
-    orders: Annotated[str, typer.Option(help="Orders of the polynomials.")] = "1,2,3,4,5,6",
-    components: Annotated[str, typer.Option(help="Components of the basis.")] = "5,10,20,40",
-    snr: Annotated[str, typer.Option(help="S/N of the faintest star.")] = "30,100,300",
-    draws: Annotated[int, typer.Option(min=1, help="Draws of the noise.")] = 4,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to.")] = Path("pachon_study"),
+    ccds: Annotated[str | None, Option(help="CCDs, separated by commas; by default nine across the field.")] = None,
+    stars: Annotated[str, Option(help="Stars of a CCD.")] = "10,20,40,80,160",
+    orders: Annotated[str, Option(help="Orders of the polynomials.")] = "1,2,3,4,5,6",
+    components: Annotated[str, Option(help="Components of the basis.")] = "5,10,20,40",
+    snr: Annotated[str, Option(help="S/N of the faintest star.")] = "30,100,300",
+    draws: Annotated[int, Option(min=1, help="Draws of the noise.")] = 4,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_study"),
     truth_stars: TruthStars = None,
     threads: Threads = None,
     quiet: Quiet = False,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .default_group import DefaultGroup
@@ -23,7 +24,7 @@ app = typer.Typer()
 sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
 app.add_typer(sweep_app, name="sweep")
 
-Store = Annotated[Path, typer.Argument(metavar="STORE", help="Store of a sweep, SWEEP.sweep.")]
+Store = Annotated[Path, Argument(metavar="STORE", help="Store of a sweep, SWEEP.sweep.")]
 
 
 @sweep_app.callback()
@@ -46,27 +47,17 @@ def sweep_group() -> None:
 
 @sweep_app.command("run")
 def sweep_run(
-    sweep: Annotated[Path | None, typer.Argument(metavar="SWEEP.yaml", help="Sweep to run.")] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Compute only the points that are missing.")] = False,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="Processes of this machine; one for each processor by default.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="Compute on the workers of a Dask cluster.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Compute on a Dask cluster of this machine, with its dashboard.")
-    ] = None,
-    example: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Write a bundled sweep and run it: table1, or table1_small.")
-    ] = None,
+    sweep: Annotated[Path | None, Argument(metavar="SWEEP.yaml", help="Sweep to run.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Compute only the points that are missing.")] = False,
+    processes: Annotated[int | None, Option(min=1, help="Processes; one for each processor by default.")] = None,
+    scheduler: Annotated[str | None, Option(metavar="tcp://HOST:PORT", help="Compute on a Dask cluster.")] = None,
+    workers: Annotated[int | None, Option(min=1, help="Start a local Dask cluster with so many workers.")] = None,
+    example: Annotated[str | None, Option(metavar="NAME", help="Run a bundled sweep: table1 or table1_small.")] = None,
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
-) -> None:  # fmt: skip
+) -> None:
     """Run a sweep and write its report; the word `run` may be left out.
 
     **Examples**
@@ -79,10 +70,7 @@ def sweep_run(
     path = sweep or _example(example or "")
     store = out or path.with_suffix(".sweep")
     resumed = f"go on with: pachon sweep {path} -o {store} --resume"
-    with (
-        interruptible(quiet, resumed) as reporter,
-        _workers(processes, scheduler, workers, threads, reporter) as maker,
-    ):
+    with interruptible(quiet, resumed) as reporter, _workers(processes, scheduler, workers, threads, reporter) as maker:
         outcome = _run(path, store, resume, maker, reporter)
     _show(outcome, as_json, quiet)
 
@@ -175,11 +163,9 @@ def sweep_status(store: Store, as_json: Json = False) -> None:
 @sweep_app.command("export")
 def sweep_export(
     store: Store,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Table to write, .ecsv, .csv, .fits or .parquet.")
-    ] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Table to write, .ecsv, .csv, .fits or .parquet.")] = None,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Write the points of a store as a table; of a damaged store those that can still be read.
 
     **Examples**
@@ -187,8 +173,7 @@ def sweep_export(
     - `pachon sweep export heights.sweep`: heights.ecsv
     - `pachon sweep export heights.sweep -o heights.parquet`
     """
-    from ..core.errors import ProductError
-    from ..studies.sweep.store import SweepStore
+    from ..studies.sweep.store import DamagedStoreError, SweepStore
     from ..studies.sweep.table import export_table, salvage
 
     target = out or store.with_suffix(".ecsv")
@@ -196,9 +181,7 @@ def sweep_export(
     try:
         with SweepStore(store) as opened:
             count = export_table(opened, target)
-    except ProductError as error:
-        if "damaged" not in str(error):
-            raise
+    except DamagedStoreError as error:
         count, damaged = salvage(store, target), {"damaged": str(error)}
     _show({"table": str(target), "points": count, **damaged}, as_json)
 
@@ -206,7 +189,7 @@ def sweep_export(
 @sweep_app.command("report")
 def sweep_report(
     store: Store,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write to; beside the store.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder to write to; beside the store.")] = None,
     as_json: Json = False,
 ) -> None:
     """Write the report of a store: tornado chart, curves, error budget and allowances.

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from .inputs import load_model
 from .options import Json, Lenient, Model
@@ -16,7 +17,7 @@ app = typer.Typer()
 
 @app.command("info")
 def info_command(
-    model: Annotated[str | None, typer.Argument(help="Bundled model, or path of a prescription.")] = None,
+    model: Annotated[str | None, Argument(help="Bundled model, or path of a prescription.")] = None,
     lenient: Lenient = False,
     as_json: Json = False,
 ) -> None:
@@ -64,10 +65,9 @@ def info_command(
 @app.command("convert")
 def convert_command(
     model: Model,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .yaml (ours) or .zmx (Zemax).")],
+    out: Annotated[Path, Argument(metavar="OUT", help="File to write: .yaml (ours) or .zmx (Zemax).")],
     glass_catalogue: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE.agf", help="Glass catalogue to look glasses up in; once for each."),
+        list[Path] | None, Option(metavar="FILE.agf", help="Glass catalogue, once for each.")
     ] = None,
     lenient: Lenient = False,
 ) -> None:

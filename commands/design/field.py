@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import Column, Rows, number_texts
@@ -18,7 +18,7 @@ _MANY_RAYS = 10_000_000
 @design_command()
 def distortion(
     given: Given,
-    centroid: Annotated[bool, typer.Option("--centroid", help="Centroids of the light, not chief rays.")] = False,
+    centroid: Annotated[bool, Option("--centroid", help="Centroids of the light, not chief rays.")] = False,
 ) -> Outcome:
     """Compare where stars land with a scaled picture of the sky, r = f tan(theta).
 
@@ -51,8 +51,7 @@ def _distortion_rows(result: Any) -> Rows:
 
 @design_command()
 def vignetting(
-    given: Given,
-    rays: Annotated[int, typer.Option(min=16, max=10**7, help="Rays of each field.")] = 16384,
+    given: Given, rays: Annotated[int, Option(min=16, max=10**7, help="Rays of each field.")] = 16384
 ) -> Outcome:
     """Find how much of the pupil is lit against field, with an error, as profile and map.
 
@@ -90,9 +89,7 @@ def _vignetting_rows(result: Any) -> Rows:
 @design_command()
 def footprint(
     given: Given,
-    surface: Annotated[
-        list[str] | None, typer.Option(help="Name of a surface, once for each; all of them by default.")
-    ] = None,
+    surface: Annotated[list[str] | None, Option(help="Name of a surface, once for each; all by default.")] = None,
 ) -> Outcome:
     """Draw the footprints of beams on surfaces, over the clear apertures, and the light that each surface blocks.
 
@@ -131,10 +128,8 @@ def _footprint_rows(result: Any) -> Rows:
 )
 def draw(
     given: Given,
-    glb: Annotated[
-        Path | None, typer.Option(help="Write the telescope and its rays in three dimensions, .glb.")
-    ] = None,
-) -> Outcome:  # fmt: skip
+    glb: Annotated[Path | None, Option(help="Write the telescope and its rays in three dimensions, .glb.")] = None,
+) -> Outcome:
     """Draw a telescope: its section with rays of some fields, and a model in three dimensions.
 
     Surfaces are cut to their apertures; those without one go as far as the light of the field of view does.

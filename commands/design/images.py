@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column
 from .command import Given, Outcome, Study, design_command
 
 PupilPoints = Annotated[
-    int | None, typer.Option(min=16, max=4096, help="Lattice points across the pupil; enough of them by default.")
+    int | None, Option(min=16, max=4096, help="Lattice points across the pupil; enough by default.")
 ]
 
 
@@ -33,11 +33,11 @@ PupilPoints = Annotated[
 )
 def psf(
     given: Given,
-    huygens: Annotated[bool, typer.Option("--huygens", help="Sum the wave of every ray at every pixel.")] = False,
-    pixel_um: Annotated[float | None, typer.Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
-    pixels: Annotated[int, typer.Option(min=16, max=4096, help="Pixels on a side.")] = 128,
+    huygens: Annotated[bool, Option("--huygens", help="Sum the wave of every ray at every pixel.")] = False,
+    pixel_um: Annotated[float | None, Option(help="Distance of pixels [um]; λf/5 or more by default.")] = None,
+    pixels: Annotated[int, Option(min=16, max=4096, help="Pixels on a side.")] = 128,
     pupil_points: PupilPoints = None,
-    fits: Annotated[Path | None, typer.Option(help="FITS file to write the images to, [field, y, x].")] = None,
+    fits: Annotated[Path | None, Option(help="FITS file to write the images to, [field, y, x].")] = None,
 ) -> Study:
     """Make diffraction images of the telescope alone: Strehl ratio, FWHM, and the images themselves.
 
@@ -83,8 +83,8 @@ def psf(
 )
 def ee(
     given: Given,
-    geometric: Annotated[bool, typer.Option("--geometric", help="Of rays alone, without diffraction.")] = False,
-    pixels: Annotated[int, typer.Option(min=16, max=4096, help="Pixels of the images, on a side.")] = 256,
+    geometric: Annotated[bool, Option("--geometric", help="Of rays alone, without diffraction.")] = False,
+    pixels: Annotated[int, Option(min=16, max=4096, help="Pixels of the images, on a side.")] = 256,
     pupil_points: PupilPoints = None,
 ) -> Study:
     """Measure the encircled energy: radii that hold 50, 80 and 90 % of a star's light, in µm and arc seconds.
@@ -116,8 +116,7 @@ def ee(
     band=True,
 )
 def mtf(
-    given: Given,
-    pupil_points: Annotated[int, typer.Option(min=16, max=4096, help="Lattice points across the pupil.")] = 256,
+    given: Given, pupil_points: Annotated[int, Option(min=16, max=4096, help="Lattice points across the pupil.")] = 256
 ) -> Study:
     """Draw the modulation transfer, tangential and sagittal, beside that of a perfect wavefront and of rays alone.
 
@@ -152,19 +151,19 @@ def ghosts(
     given: Given,
     field_deg: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="X,Y | R",
             help="Field angle of the star [deg], or its distance from the axis along +y; half-way by default.",
         ),
     ] = None,
     reflectivity: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="R | NAME=R", help="Of the lens surfaces, one for all or by name; by default that of bare glass."
         ),
     ] = None,
-    detector_reflectivity: Annotated[float, typer.Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
-    rays: Annotated[int, typer.Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
+    detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
+    rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
 ) -> Outcome:
     """Trace every ghost that two reflections make: its light, irradiance, size and focus, the brightest first.
 

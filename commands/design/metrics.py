@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column, Rows, number_texts
@@ -25,10 +25,9 @@ from .command import Given, Outcome, Study, design_command
 )
 def spots(
     given: Given,
-    sampling: Annotated[str, typer.Option(help="Sampling of the pupil: gauss, rings, spiral or square.")] = "gauss",
+    sampling: Annotated[str, Option(help="Sampling of the pupil: gauss, rings, spiral or square.")] = "gauss",
     rays: Annotated[
-        int | None,
-        typer.Option(min=1, help="Rays along the radius (gauss, rings), in all (spiral), across (square)."),
+        int | None, Option(min=1, help="Rays along the radius (gauss, rings), in all (spiral), across.")
     ] = None,
 ) -> Study:
     """Draw and measure spot diagrams: rms radius, radius of 80 % of the rays, in micrometres and arc seconds.
@@ -61,11 +60,13 @@ def focus(
     given: Given,
     range_um: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="LOW HIGH", help="Heights of the detector [um]; by default until spots are three times "
-                     "their smallest."),
+        Option(
+            metavar="LOW HIGH",
+            help="Heights of the detector [um]; by default until spots are three times their smallest.",
+        ),
     ] = None,
-    steps: Annotated[int, typer.Option(min=3, max=10000, help="Heights in that range.")] = 61,
-) -> Study:  # fmt: skip
+    steps: Annotated[int, Option(min=3, max=10000, help="Heights in that range.")] = 61,
+) -> Study:
     """Move the detector through focus: spots, wavefront and Strehl ratio against its height, and the best focus.
 
     Heights are those of the detector above its place along its own z axis.
@@ -88,15 +89,13 @@ def focus(
 @design_command()
 def zernikes(
     given: Given,
-    jmax: Annotated[int, typer.Option(min=4, max=500, help="Highest Noll index in the pupil.")] = 28,
-    pupil: Annotated[
-        str, typer.Option(help="full: the whole annulus, orthogonal; lit: where light passes.")
-    ] = "full",
-    over_field: Annotated[bool, typer.Option("--map", help="Maps over the field of view.")] = False,
+    jmax: Annotated[int, Option(min=4, max=500, help="Highest Noll index in the pupil.")] = 28,
+    pupil: Annotated[str, Option(help="full: the whole annulus, orthogonal; lit: where light passes.")] = "full",
+    over_field: Annotated[bool, Option("--map", help="Maps over the field of view.")] = False,
     double: Annotated[
-        int | None, typer.Option(min=1, max=200, metavar="KMAX", help="Double Zernikes, so many terms in the field.")
+        int | None, Option(min=1, max=200, metavar="KMAX", help="Double Zernikes, terms in the field.")
     ] = None,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Fit annular Zernikes (Noll, in nm) to the wavefronts of field points, or over the whole field of view.
 
     **Examples**

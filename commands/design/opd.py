@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 from ..options import degrees_pair
 from ..tables import Column
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OpdPicture = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         "--picture",
         "--out",
         "-o",
@@ -85,9 +85,9 @@ def _names(result: FittedOpd) -> list[str]:
 )
 def opd(
     given: Given,
-    field_deg: Annotated[str, typer.Option(metavar="X,Y", help="Field angle [deg].")] = "0,0",
-    grid: Annotated[int, typer.Option(min=8, max=4096, help="Points across the pupil.")] = 256,
-    zernikes: Annotated[int, typer.Option(min=4, max=500, help="Highest Noll index to fit.")] = 28,
+    field_deg: Annotated[str, Option(metavar="X,Y", help="Field angle [deg].")] = "0,0",
+    grid: Annotated[int, Option(min=8, max=4096, help="Points across the pupil.")] = 256,
+    zernikes: Annotated[int, Option(min=4, max=500, help="Highest Noll index to fit.")] = 28,
 ) -> Outcome:
     """Draw and save the optical path difference of a telescope at one field point, with its Zernike terms.
 

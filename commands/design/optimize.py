@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from ...core.errors import ConfigError
 from ..options import name_list
@@ -33,18 +33,14 @@ def sensitivity(
     given: Given,
     parameters: Annotated[
         str | None,
-        typer.Option(help=f"{_ADDRESSES}. By default five motions of every mirror and group but the first mirror."),
+        Option(help=f"{_ADDRESSES}. By default five motions of every mirror and group but the first mirror."),
     ] = None,
     degrees_of_freedom: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME|FILE", help="In place of parameters: named degrees of freedom, lsst or a .yaml of them."
-        ),
+        Option(metavar="NAME|FILE", help="In place of parameters: named degrees of freedom, lsst or a .yaml of them."),
     ] = None,
-    zernikes: Annotated[int, typer.Option(min=4, max=500, help="Highest Noll index.")] = 28,
-    out: Annotated[
-        Path | None, typer.Option(help="Matrix to write, .fits or .ecsv; by default named after the model.")
-    ] = None,
+    zernikes: Annotated[int, Option(min=4, max=500, help="Highest Noll index.")] = 28,
+    out: Annotated[Path | None, Option(help="Matrix to write, .fits or .ecsv; named after the model.")] = None,
 ) -> Outcome:
     """Compute and save the sensitivity matrix: derivatives of Zernike terms, field by field, to degrees of freedom.
 
@@ -93,14 +89,14 @@ def sensitivity(
 )
 def optimize(
     given: Given,
-    variables: Annotated[str, typer.Option(help=f"{_ADDRESSES}.")],
-    merit: Annotated[str, typer.Option(help="Merit function to minimise: spots or wavefront.")] = "spots",
-    focal_length: Annotated[float | None, typer.Option(help="Focal length to be held [m].")] = None,
+    variables: Annotated[str, Option(help=f"{_ADDRESSES}.")],
+    merit: Annotated[str, Option(help="Merit function to minimise: spots or wavefront.")] = "spots",
+    focal_length: Annotated[float | None, Option(help="Focal length to be held [m].")] = None,
     bounds: Annotated[
         list[str] | None,
-        typer.Option(metavar="ADDRESS=LOW:HIGH", help="Limits of a variable; of a motion those of its change."),
+        Option(metavar="ADDRESS=LOW:HIGH", help="Limits of a variable; of a motion those of its change."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Prescription to write; by default named after the model.")] = None,
+    out: Annotated[Path | None, Option(help="Prescription to write; by default named after the model.")] = None,
 ) -> Outcome:
     """Optimise a telescope over chosen variables, compensators among them, with exact derivatives.
 

@@ -35,6 +35,10 @@ CREATE TABLE results (
 """
 
 
+class DamagedStoreError(ProductError):
+    """Store that SQLite cannot read."""
+
+
 @dataclass(frozen=True)
 class SweepPoint:
     """A point to compute: its number, the values of its parameters, and the seed of its random numbers."""
@@ -255,5 +259,7 @@ def _problem(path: Path, error: sqlite3.Error) -> ProductError:
     if "locked" in text:
         return ProductError(f"cannot write {path}: {text}; is another sweep writing to it?")
     if "malformed" in text or "not a database" in text or "no such table" in text:
-        return ProductError(f"{path}: damaged, or no store of a sweep ({text}); pachon sweep export saves what it can")
+        return DamagedStoreError(
+            f"damaged, or no store of a sweep ({text}); pachon sweep export saves what it can", file=path
+        )
     return ProductError(f"{path}: {text}")
