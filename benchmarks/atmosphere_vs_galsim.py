@@ -36,7 +36,8 @@ from pachon.core.random_streams import stream
 from pachon.models.ideal_telescope import without_aberration
 from pachon.models.telescope import Telescope
 from pachon.pipeline.measure.shapes import fwhm
-from pachon.wavefront.atmosphere.atmosphere import SLOPE_LAG, Atmosphere
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 
 ARCSEC = math.radians(1.0 / 3600.0)
 ARCMIN = 60.0 * ARCSEC

@@ -24,7 +24,7 @@ from ..raytrace.rays import field_direction
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
-from ..wavefront.psf.psf import SCREENS
+from ..wavefront.psf.engines import ENGINES
 from ..wavefront.pupil_optics import chief_rays
 from .config import Configuration, digest
 from .defaults import given, resolve
@@ -142,7 +142,7 @@ class Experiment:
     @property
     def screen_kinds(self) -> tuple[str, ...]:
         """Kinds of screens that the engine keeps of the atmosphere; none where there is none."""
-        return () if self.atmosphere is None else SCREENS[self.config.psf.engine]
+        return () if self.atmosphere is None else ENGINES[self.config.psf.engine].screens
 
     @contextmanager
     def screens(self, threads: int | None = None, reporter: Reporter | None = None) -> Iterator[None]:

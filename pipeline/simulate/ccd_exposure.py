@@ -13,9 +13,10 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.ideal_telescope import without_aberration
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
-from ...wavefront.psf.image_plane import focal_length
+from ...wavefront.psf.engine import center_focal_length
+from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
-from ...wavefront.pupil_optics import fields_at, trace_pupils
+from ...wavefront.pupil_optics import fields_at
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
 from .photometry import ARCSEC, limiting_magnitude
@@ -179,7 +180,7 @@ def _expose(
         offsets=offsets,
         recenter=recenter,
         dispersion=experiment.dispersion,
-        n_pupil=config.psf.n_pupil,
+        n_pupil=config.psf.n_pupil if "n_pupil" in ENGINES[config.psf.engine].options else None,
         threads=threads,
         progress=progress,
     )
@@ -199,11 +200,8 @@ def _seen_through(experiment: Experiment) -> _Seen:
     if not experiment.air_alone:
         return _Seen(telescope, experiment.focal_plane, experiment.aberration, 1.0)
     plain = without_aberration(telescope, _PLAIN_RATIO)
-    axis = np.zeros((1, 2))
-    here, there = (
-        focal_length(trace_pupils(t, axis, experiment.wavelengths, axis).jacobian)[0] for t in (telescope, plain)
-    )
-    return _Seen(plain, None, None, float(there / here))
+    here, there = (center_focal_length(t, experiment.wavelengths) for t in (telescope, plain))
+    return _Seen(plain, None, None, there / here)
 
 
 def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, float]:

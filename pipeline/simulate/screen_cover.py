@@ -12,7 +12,7 @@ from ...models.camera.camera import Camera
 from ...models.site import Site
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.layers import line_of_sight
-from ...wavefront.psf.psf import SCREENS
+from ...wavefront.psf.engines import ENGINES
 from ...wavefront.pupil_optics import fields_at
 from ..config import Configuration
 
@@ -53,7 +53,7 @@ def check_screens(config: Configuration, telescope: Telescope, camera: Camera, s
         Naming the layer and how long the screens must be.
     """
     air = config.atmosphere
-    if not air.enabled or not SCREENS.get(config.psf.engine):
+    if not air.enabled or not ENGINES[config.psf.engine].screens:
         return
     swept = swept_lengths(config, telescope, camera, site)
     layer = int(np.argmax(swept))

@@ -1,63 +1,98 @@
-"""Stand-ins that make the PSF engines' inputs exactly known: polynomial pupils and layers of a single mode."""
+"""Inputs of the PSF engines that are exactly known: polynomial pupils and layers of a single mode."""
 
-from types import SimpleNamespace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from pachon.models.aperture import Annulus
+from pachon.models.surface import Interaction, Plane, Surface
+from pachon.models.telescope import VACUUM, Telescope
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
-from pachon.wavefront.psf import fast as fast_psf
-from pachon.wavefront.psf import wave as wave_psf
+from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.pupil_optics import PupilOptics
 
 FOCAL_LENGTH = 10.31
 
 
-@pytest.fixture
-def polynomial_pupil(monkeypatch):
-    """Give both engines a telescope whose path over the unit pupil is a polynomial, and return that telescope.
+def ring_telescope(diameter, obscuration, clear):
+    """A pupil of which a ring from and to given radii [m] is clear, and a screen behind it."""
+    surfaces = (
+        Surface("ring", Interaction.PASS, Plane(), (0.0, 0.0, 0.0), VACUUM, Annulus(*clear)),
+        Surface("Detector", Interaction.DETECTOR, Plane(), (0.0, 0.0, -10.0), VACUUM),
+    )
+    return Telescope(
+        name="ring",
+        surfaces=surfaces,
+        stop_z=0.0,
+        pupil_diameter=diameter,
+        pupil_obscuration=obscuration,
+        launch_distance=20.0,
+        reference_sphere_radius=10.0,
+        field_radius=0.1,
+        field_limit=0.1,
+        wavelength_range=(3e-7, 1.1e-6),
+        default_wavelength=620e-9,
+    )
 
-    ``polynomial_pupil(defocus=, coma=, tilt=, ...)``: path = defocus r^2 + coma r^2 x [m] + tilt . p [rad]; vignetting
-    beyond ``cut`` (in units of the radius along x); ``jacobian`` for every star.
+
+@dataclass(frozen=True)
+class PolynomialPupil:
+    """Optics whose path over the unit pupil is a polynomial.
+
+    Path = defocus r^2 + coma r^2 x [m] + tilt . p [rad]; vignetting beyond ``cut`` (in units of the radius along x, one
+    number or one a wavelength); ``jacobian`` for every star; ``clear``: radii of the ring that is clear [m].
     """
 
-    def install(*, defocus=0.0, coma=0.0, tilt=(0.0, 0.0), cut=2.0, jacobian=None, diameter=8.36, obscuration=0.612):
-        radius = 0.5 * diameter
-        if jacobian is None:
-            jacobian = FOCAL_LENGTH * np.eye(2)
+    defocus: float = 0.0
+    coma: float = 0.0
+    tilt: tuple = (0.0, 0.0)
+    cut: float | tuple = 2.0
+    jacobian: np.ndarray | None = None
+    diameter: float = 8.36
+    obscuration: float = 0.612
+    clear: tuple | None = None
 
-        def trace(
-            telescope, fields, wavelengths, pupil, focal_plane=None, projection="zemax", threads=None, aberration=None
-        ):
-            assert aberration is None
-            fields, wavelengths = np.atleast_2d(fields), np.atleast_1d(wavelengths)
-            x, y = np.asarray(pupil).T / radius
-            square = x * x + y * y
-            path = defocus * square + coma * square * x + (tilt[0] * x + tilt[1] * y) * radius
-            slope_x = (2 * defocus * x + coma * (square + 2 * x * x)) / radius + tilt[0]
-            slope_y = (2 * defocus * y + 2 * coma * x * y) / radius + tilt[1]
-            landing = np.stack([slope_x, slope_y], axis=-1) @ np.asarray(jacobian).T
-            lit = (square < 1) & (square >= obscuration**2) & (x < cut)
+    @property
+    def telescope(self):
+        outer = 0.5 * self.diameter
+        return ring_telescope(self.diameter, self.obscuration, self.clear or (self.obscuration * outer, outer))
 
-            def same(values):
-                return np.broadcast_to(values, (len(fields), len(wavelengths), *values.shape)).copy()
+    def inputs(self, wavelengths, plane, **options):
+        return PsfInputs(self.telescope, wavelengths, plane, trace=self.trace, **({"threads": 1} | options))
 
-            return PupilOptics(
-                pupil=np.asarray(pupil),
-                displacement=same(landing.astype(np.float32)),
-                path=same(path),
-                lit=same(lit),
-                jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
-                reference=np.zeros((len(fields), 3)),
-                fields=fields,
-                wavelengths=wavelengths,
-            )
+    def trace(self, telescope, fields, wavelengths, pupil, **options):
+        assert options.get("aberration") is None
+        radius = 0.5 * self.diameter
+        jacobian = FOCAL_LENGTH * np.eye(2) if self.jacobian is None else np.asarray(self.jacobian)
+        fields, wavelengths = np.atleast_2d(fields), np.atleast_1d(wavelengths)
+        x, y = np.asarray(pupil).T / radius
+        square = x * x + y * y
+        path = self.defocus * square + self.coma * square * x + (self.tilt[0] * x + self.tilt[1] * y) * radius
+        slope_x = (2 * self.defocus * x + self.coma * (square + 2 * x * x)) / radius + self.tilt[0]
+        slope_y = (2 * self.defocus * y + 2 * self.coma * x * y) / radius + self.tilt[1]
+        landing = np.stack([slope_x, slope_y], axis=-1) @ jacobian.T
+        lit = (square < 1) & (square >= self.obscuration**2) & (x < np.reshape(self.cut, (-1, 1)))
 
-        monkeypatch.setattr(fast_psf, "trace_pupils", trace)
-        monkeypatch.setattr(wave_psf, "trace_pupils", trace)
-        return SimpleNamespace(pupil_diameter=diameter, pupil_obscuration=obscuration, trace=trace)
+        def same(values):
+            return np.broadcast_to(values, (len(fields), len(wavelengths), *values.shape)).copy()
 
-    return install
+        return PupilOptics(
+            pupil=np.asarray(pupil),
+            displacement=same(landing.astype(np.float32)),
+            path=same(path),
+            lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
+            jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
+            reference=np.zeros((len(fields), 3)),
+            fields=fields,
+            wavelengths=wavelengths,
+        )
+
+
+@pytest.fixture
+def polynomial_pupil():
+    """Make optics of known wavefront for any engine: ``polynomial_pupil(defocus=, coma=, ...)``."""
+    return PolynomialPupil
 
 
 class SingleModes(Atmosphere):

@@ -1,8 +1,9 @@
-"""The layers of an atmosphere: their heights, weights and winds, checked."""
+"""The frozen layers of an atmosphere: heights, weights and winds, and where lines of sight cross them."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +11,64 @@ from numpy.typing import ArrayLike
 from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ...models.site import WEIGHT_TOLERANCE, Site
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Layers:
+    """Frozen layers and their winds; attributes as in :class:`.Atmosphere`."""
+
+    altitudes: np.ndarray
+    weights: np.ndarray
+    velocities: np.ndarray
+    offsets: np.ndarray
+
+    @property
+    def layer_count(self) -> int:
+        """Number of layers."""
+        return len(self.altitudes)
+
+    def pupil_centers(self, direction: np.ndarray, time: ArrayLike = 0.0) -> np.ndarray:
+        """Return where the light through the pupil's centre crosses each layer, in the coordinates of its screens.
+
+        Parameters
+        ----------
+        direction : ndarray, shape [..., 3]
+            Directions in which the light travels, of any length.
+        time : array_like
+            Times since the start of the exposure [s]; its shape and that of the directions are broadcast.
+
+        Returns
+        -------
+        ndarray
+            Screen coordinates [m], shape [..., n_layer, 2], not yet taken modulo the side.
+        """
+        slopes = direction[..., None, :2] / -direction[..., None, 2:]
+        elapsed = np.asarray(time, dtype=np.float64)[..., None, None]
+        return self.offsets - self.altitudes[:, None] * slopes - self.velocities * elapsed
+
+    def screen_coordinates(
+        self, x: ArrayLike, y: ArrayLike, layer: int, *, field: tuple[float, float] = (0.0, 0.0), time: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return where light that meets the pupil at ``(x, y)`` crosses a layer.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Pupil coordinates [m].
+        layer : int
+            Index of the layer.
+        field : tuple of float
+            Slopes ``(tx, ty)`` of the light's travel [rad].
+        time : float
+            Time since the start of the exposure [s].
+
+        Returns
+        -------
+        tuple of ndarray
+            Screen coordinates x and y [m], not yet taken modulo the side.
+        """
+        shift = self.pupil_centers(np.array([*field, -1.0]), time)[layer]
+        return np.asarray(x, dtype=np.float64) + shift[0], np.asarray(y, dtype=np.float64) + shift[1]
 
 
 def checked_layers(

@@ -18,47 +18,15 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import scipy.fft
 
-from ...core.errors import DomainError, unknown_name
+from ...core.errors import DomainError
 from ...core.threads import thread_count
+from .spline import stencil_gain
 from .turbulence import path_spectrum, require_positive
 
-#: How a screen will be read, and so how its modes are amplified to come out right:
-#:
-#: - ``samples``: not at all; the values are the path at the samples.
-#: - ``spline``: coefficients of a uniform cubic B-spline that goes through the samples.
-STENCILS = ("samples", "spline")
 # Blocks of the two Fourier passes: fixed, so that no byte depends on the number of threads, and small enough for the
 # cache of one core.
 _COLUMN_BLOCK = 64
 _ROW_BLOCK = 128
-
-
-def stencil_gain(kx: np.ndarray, ky: np.ndarray, stencil: str) -> np.ndarray:
-    """Return the amplification of modes that makes up for the way in which the screen will be read.
-
-    Parameters
-    ----------
-    kx, ky : ndarray
-        Wavenumbers [rad per pixel], broadcast against each other.
-    stencil : str
-        One of :data:`STENCILS`.
-
-    Returns
-    -------
-    ndarray
-        Factor of each mode's amplitude.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such stencil.
-    """
-    if stencil not in STENCILS:
-        raise unknown_name("stencil", stencil, STENCILS)
-    if stencil == "spline":
-        # A B-spline of samples scales the amplitude of a mode by (2 + cos k)/3 along each axis.
-        return 9.0 / ((2.0 + np.cos(kx)) * (2.0 + np.cos(ky)))
-    return np.ones(np.broadcast_shapes(kx.shape, ky.shape))
 
 
 def band_modes(size: int, length: float, band: tuple[float, float]) -> tuple[int, np.ndarray]:
@@ -164,7 +132,7 @@ def phase_screen(
     weight : float
         Fraction of the turbulence that this screen holds; its amplitude goes with the square root.
     stencil : str
-        How the screen will be read, one of :data:`STENCILS`.
+        How the screen will be read, one of :data:`~.spline.STENCILS`.
     fixed_modulus : bool
         Give every mode its rms modulus and a random phase only, after Jee & Tyson 2011, eq. 2, in place of a Gaussian
         complex amplitude. Such a field is not Gaussian.
@@ -317,37 +285,3 @@ def _transform(modes: np.ndarray, size: int, threads: int | None, out: np.ndarra
         list(pool.map(along_y, range(0, count, _COLUMN_BLOCK)))
         list(pool.map(along_x, range(0, size, _ROW_BLOCK)))
     return field
-
-
-def evaluate(spline: np.ndarray, pixel: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the path at any place of a periodic screen.
-
-    Parameters
-    ----------
-    spline : ndarray
-        Screen as spline coefficients, shape [size, size].
-    pixel : float
-        Distance of the samples [m].
-    x, y : ndarray
-        Places [m], of one shape.
-
-    Returns
-    -------
-    ndarray
-        Path [m], float64, shape of ``x``.
-    """
-    index_x, weight_x = _line_weights(np.asarray(x) / pixel, spline.shape[1])
-    index_y, weight_y = _line_weights(np.asarray(y) / pixel, spline.shape[0])
-    result = np.zeros(np.shape(x))
-    for row, row_weight in zip(index_y, weight_y, strict=True):
-        for column, column_weight in zip(index_x, weight_x, strict=True):
-            result += row_weight * column_weight * spline[row, column]
-    return result
-
-
-def _line_weights(place: np.ndarray, size: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the periodic sample indices along one axis and their weights at places in pixels."""
-    first = np.floor(place).astype(np.int64)
-    u = place - first
-    weights = [(1 - u) ** 3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6, u**3 / 6]
-    return [(first + k) % size for k in (-1, 0, 1, 2)], weights

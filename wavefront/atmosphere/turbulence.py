@@ -17,7 +17,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 from scipy.special import gamma, j0, kv
 
@@ -137,68 +136,6 @@ def _gauss_panels(end: float, panels: int) -> tuple[np.ndarray, np.ndarray]:
     return nodes.ravel(), np.tile(0.5 * width * weight, panels)
 
 
-def _low_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
-    """Return the structure function [m^2] of the modes at and below the cut-off."""
-    # nu = sinh(t) / L0 spreads the knee of the spectrum at 1/L0 evenly over the nodes.
-    end = math.asinh(cutoff / (2.0 * math.pi) * outer_scale)
-    # A panel spans at most 2 in t and 24 rad of the Bessel function's phase: exact to rounding with 32 nodes.
-    longest = float(np.max(separation, initial=0.0))
-    t, weight = _gauss_panels(end, math.ceil(end / 2.0) + math.ceil(end * cutoff * longest / 24.0))
-    nu = np.sinh(t) / outer_scale
-    weight = weight * 4.0 * math.pi * nu * np.cosh(t) / outer_scale * path_spectrum(nu, r0, outer_scale)
-    result = np.empty_like(separation)
-    rows = max(1, 4_000_000 // t.size)
-    for first in range(0, separation.size, rows):
-        part = separation[first : first + rows, np.newaxis]
-        result[first : first + rows] = (1.0 - j0(2.0 * math.pi * nu * part)) @ weight
-    return result
-
-
-def high_structure_function(separation: ArrayLike, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
-    """Return the structure function of the modes above a cut-off wavenumber alone.
-
-    It is the closed form less an integral over the finite disc of wavenumbers below the cut-off, so modes of
-    every wavenumber above are in it, beyond the Nyquist limit of any screen too.
-
-    Parameters
-    ----------
-    separation : array_like
-        Distance of the two points [m].
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    cutoff : float
-        Cut-off wavenumber [rad/m].
-
-    Returns
-    -------
-    ndarray
-        Mean squared difference of path [m^2], shape of ``separation``.
-
-    Raises
-    ------
-    DomainError
-        If the Fried parameter, the outer scale or the cut-off is not positive.
-    """
-    cutoff = require_positive(cutoff, "cutoff", "radians per metre")
-    b = np.abs(np.asarray(separation, dtype=np.float64))
-    total = structure_function(b, r0, outer_scale)
-    flat = b.ravel()
-    longest = float(np.max(flat, initial=0.0))
-    # The subtracted part is band-limited, so cubic interpolation at 1/20 rad of its fastest mode is exact to 1e-8
-    # of the modes' variance; it is used where it needs fewer integrals than there are separations.
-    knots = math.ceil(20.0 * cutoff * longest) + 5
-    if knots < flat.size:
-        grid = np.linspace(0.0, max(longest, 1e-3 / cutoff), knots)
-        low = CubicSpline(
-            grid, _low_structure_function(grid, r0, outer_scale, cutoff), bc_type=("clamped", "not-a-knot")
-        )(flat)
-    else:
-        low = _low_structure_function(flat, r0, outer_scale, cutoff)
-    return np.maximum(total - low.reshape(b.shape), 0.0)
-
-
 def slope_variance(r0: float, outer_scale: float, cutoff: float, lag: float = 0.0) -> float:
     """Return the variance of one component of the slope of the modes at and below a cut-off wavenumber.
 
@@ -274,6 +211,19 @@ def diffraction_otf(separation: ArrayLike, diameter: float, obscuration: float =
     return np.maximum(common, 0.0) / (math.pi * (outer**2 - inner**2))
 
 
+def coherence(structure: np.ndarray, wavelength: float | np.ndarray) -> np.ndarray:
+    """Return the mean transfer function ``exp(-k^2 D / 2)`` of a structure function of the path (Roddier 1981, sec. 4).
+
+    Parameters
+    ----------
+    structure : ndarray
+        Structure function D [m^2].
+    wavelength : float or ndarray
+        Wavelengths [m], broadcast against ``structure``.
+    """
+    return np.exp(-0.5 * (2.0 * math.pi / wavelength) ** 2 * structure)
+
+
 def long_exposure_otf(
     separation: ArrayLike,
     wavelength: float,
@@ -310,8 +260,8 @@ def long_exposure_otf(
     DomainError
         If the wavelength, the Fried parameter, the outer scale or the pupil is outside its range.
     """
-    wavenumber = 2.0 * math.pi / require_positive(wavelength, "wavelength", "metres")
-    otf = np.exp(-0.5 * wavenumber**2 * structure_function(separation, r0, outer_scale))
+    wavelength = require_positive(wavelength, "wavelength", "metres")
+    otf = coherence(structure_function(separation, r0, outer_scale), wavelength)
     if diameter is not None:
         otf = otf * diffraction_otf(separation, diameter, obscuration)
     return otf

@@ -19,8 +19,6 @@ the r band 0.1 % too wide for a cut-off of 1/r0 and 0.5 % for 1.4/r0 (plain high
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import scipy.fft
@@ -28,16 +26,12 @@ import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
-from ...core.threads import thread_count
-from ...models.camera.focal_plane import FocalPlane
-from ...models.telescope import Telescope
-from ...raytrace.rays import field_direction
-from ..aberration import ResidualWavefront
-from ..atmosphere.atmosphere import SLOPE_LAG, Atmosphere
-from ..atmosphere.turbulence import diffraction_otf, slope_variance, structure_function
-from ..pupil_optics import PupilOptics, trace_pupils
+from ..atmosphere.layer_screens import SLOPE_LAG
+from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
+from ..pupil_optics import PupilOptics
+from .engine import Exposed, PsfEngine, PsfInputs, metric_of
 from .fast_kernels import combine_wavelengths, deposit_rays
-from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length, square_transfer
+from .image_plane import square_transfer
 from .pupil_lattice import PupilLattice
 from .sample_packets import indices, samples, shared, to_packets
 
@@ -80,89 +74,42 @@ def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: floa
     return np.maximum.accumulate(np.maximum(rest, 0.0))
 
 
-class FastPsfEngine:
-    """Renders stars by rays through the low modes of the atmosphere, and filters.
+class FastPsfEngine(PsfEngine):
+    """Geometric optics with filters.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
-    plane : ImagePlane
-        Stamp and detector.
-    focal_plane : FocalPlane, optional
-        CCD heights.
-    atmosphere : Atmosphere, optional
-        The exposure.
-    dispersion : ndarray, shape [n_wave, 2]
-        Shift in field angle of each wavelength [rad].
-    n_pupil : int, optional
-        About how many pupil points to use; the lattice is a whole number of screen pixels wide.
-    oversampling : int, optional
-        Cells of the fine grid to a pixel.
-    projection : str
-        Meaning of the field angles.
-    aberration : ResidualWavefront, optional
-        Added to the traced wavefront.
-    threads : int, optional
-        Number of threads; no byte depends on it.
+    ``n_pupil`` gives the approximate number of pupil points: the lattice is a whole number of screen pixels wide.
     """
 
-    def __init__(
-        self,
-        telescope: Telescope,
-        wavelengths: np.ndarray,
-        plane: ImagePlane,
-        *,
-        dispersion: np.ndarray,
-        focal_plane: FocalPlane | None = None,
-        atmosphere: Atmosphere | None = None,
-        n_pupil: int | None = None,
-        oversampling: int | None = None,
-        projection: str = "zemax",
-        aberration: ResidualWavefront | None = None,
-        threads: int | None = None,
-    ) -> None:
+    name = "fast"
+    options = ("n_pupil", "oversampling")
+    screens = ("slopes",)
+
+    def __init__(self, inputs: PsfInputs) -> None:
+        super().__init__(inputs)
+        still, n_pupil, oversampling = inputs.atmosphere is None, inputs.n_pupil, inputs.oversampling
         if n_pupil is None:
-            n_pupil = PUPIL_POINTS_STILL if atmosphere is None else PUPIL_POINTS
+            n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
         if oversampling is None:
-            oversampling = OVERSAMPLING_STILL if atmosphere is None else OVERSAMPLING
+            oversampling = OVERSAMPLING_STILL if still else OVERSAMPLING
         if not n_pupil >= 10:
             raise DomainError(f"n_pupil = {n_pupil!r}: expected at least 10 pupil points")
         if int(oversampling) != oversampling or not 1 <= oversampling <= 32:
             raise DomainError(f"oversampling = {oversampling!r}: expected a whole number of cells, 1 to 32 to a pixel")
-        self._telescope = telescope
-        self._wavelengths = wavelengths
-        self._plane = plane
-        self._dispersion = dispersion
-        self._focal_plane = focal_plane
-        self._atmosphere = atmosphere
         self._oversampling = int(oversampling)
-        self._projection = projection
-        self._aberration = aberration
-        self._threads = threads
         self._place_pupil(n_pupil)
-        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
-        #: Effective focal length on the axis [m].
-        self.focal_length = float(focal_length(center.jacobian)[0])
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
-        if atmosphere is None:
-            self._screens, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
+        if inputs.atmosphere is None:
+            self._slopes, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
         else:
-            screens = atmosphere.screens("slopes", threads)
-            self._screens = screens.reshape(len(screens), -1)
-            self._units = np.array([atmosphere.slope_unit(n) for n in range(len(screens))], dtype=np.float32)
-
-    @property
-    def batch(self) -> int:
-        """Number of stars to render at a time."""
+            slopes = inputs.atmosphere.screens("slopes", inputs.threads)
+            self._slopes = slopes.reshape(len(slopes), -1)
+            self._units = np.array([inputs.atmosphere.slope_unit(n) for n in range(len(slopes))], dtype=np.float32)
         star_bytes = 4 * len(self._wavelengths) * self._grid_size**2
-        return max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
+        self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
     def _place_pupil(self, n_pupil: int) -> None:
-        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
+        diameter, obscuration = self._diameter, self._obscuration
         spacing = 0.5 * diameter * math.sqrt(math.pi * (1.0 - obscuration**2) / n_pupil)
         self._stride = 1
         if self._atmosphere is not None:
@@ -196,76 +143,49 @@ class FastPsfEngine:
         # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
         longest = 1.5 * self.focal_length * float(self._wavelengths.max()) / (2.0 * self._cell)
         baseline = np.linspace(0.0, longest, _TABLE_SIZE)
-        otf = diffraction_otf(baseline, self._telescope.pupil_diameter, self._telescope.pupil_obscuration)
+        otf = diffraction_otf(baseline, self._diameter, self._obscuration)
         table = np.repeat(otf[None], len(self._wavelengths), axis=0)
         atmosphere = self._atmosphere
         if atmosphere is not None:
             rest = rest_structure_function(baseline, atmosphere.r0, atmosphere.outer_scale, atmosphere.cutoff)
-            table *= np.exp(-0.5 * (2.0 * math.pi / self._wavelengths[:, None]) ** 2 * rest)
+            table *= coherence(rest, self._wavelengths[:, None])
         return float(baseline[1]), table.astype(np.float32)
 
-    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
-        """Render one batch of stars.
-
-        Parameters
-        ----------
-        fields : ndarray, shape [n_star, 2]
-            Field angles [rad].
-        offsets : ndarray, shape [n_star, 2]
-            Places of the reference points from the centre of the middle pixel [pixels].
-        recenter : callable, optional
-            As :func:`~pachon.wavefront.psf.psf.make_psfs` takes it.
-
-        Returns
-        -------
-        RenderedStars
-        """
-        optics = trace_pupils(
-            self._telescope,
-            fields,
-            self._wavelengths,
-            self._lattice.points,
-            self._focal_plane,
-            self._projection,
-            self._threads,
-            aberration=self._aberration,
-        )
-        n_star, n = len(fields), self._grid_size
+    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        optics = self._trace(fields, self._lattice.points, self._threads)
         light = optics.lit * self._weights
         deposit = self._deposit(optics, light)
         # One transform a star, so that its bytes do not depend on its neighbours.
-        spectra = np.empty((*deposit.shape[:-1], n // 2 + 1), dtype=np.complex64)
-        self._for_each(n_star, lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])))
+        spectra = np.empty((*deposit.shape[:-1], self._grid_size // 2 + 1), dtype=np.complex64)
+        self._map(lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])), range(len(fields)))
         combined = self._combine(spectra, optics, offsets)
         n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
         # A dark star has no light to divide by.
         total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * n_time
-        stamps = self._stamps(combined, total)
-        if recenter is not None:
-            shift = recenter(stamps)
-            offsets = offsets - shift
-            # A move of the whole star is a ramp of phase; the rays need not be traced nor binned again.
-            turn = 1j * self._plane.pixel_size * shift[:, :, None]
-            combined *= np.exp(turn[:, 1] * self._ky).astype(np.complex64)[:, :, None]
-            combined *= np.exp(turn[:, 0] * self._kx).astype(np.complex64)[:, None, :]
-            stamps = self._stamps(combined, total)
-        return RenderedStars(stamps, optics.lit.mean(axis=2), optics.reference, offsets)
+
+        def draw(shift: np.ndarray | None) -> np.ndarray:
+            moved = combined
+            if shift is not None:
+                # A move of the whole star is a ramp of phase; the rays need not be traced nor binned again.
+                ramp = 1j * self._plane.pixel_size * shift[:, :, None]
+                moved = moved * np.exp(ramp[:, 1] * self._ky).astype(np.complex64)[:, :, None]
+                moved *= np.exp(ramp[:, 0] * self._kx).astype(np.complex64)[:, None, :]
+            return self._stamps(moved, total)
+
+        return Exposed(draw, optics.lit.mean(axis=2), optics.reference)
 
     def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""
         n, side = self._grid_size, self._plane.stamp_size
         span = slice(0, side * self._oversampling, self._oversampling)
         stamps = np.empty((len(combined), side, side))
-        self._for_each(
-            len(combined), lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span])
+        self._map(
+            lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span]),
+            range(len(combined)),
         )
         # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
         stamps *= (self._oversampling**2 / light)[:, None, None]
         return stamps
-
-    def _for_each(self, count: int, job: Callable[[int], None]) -> None:
-        with ThreadPoolExecutor(thread_count(self._threads)) as pool:
-            list(pool.map(job, range(count)))
 
     def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
         """Return the rays of each star, with their light, on the fine grid, [n_star, n_wave, grid_size, grid_size]."""
@@ -277,8 +197,9 @@ class FastPsfEngine:
         else:
             pixel, screen_size = atmosphere.screen_pixel, atmosphere.screen_size
             n_layer, n_time = atmosphere.layer_count, len(atmosphere.times)
-            direction = field_direction(optics.fields[:, 0], optics.fields[:, 1], self._projection)
-            start = (atmosphere.pupil_centers(direction, atmosphere.times[0]) + self._lattice.origin) / pixel
+            start = (
+                atmosphere.pupil_centers(self._direction(optics.fields), atmosphere.times[0]) + self._lattice.origin
+            ) / pixel
             step = -atmosphere.velocities * (atmosphere.exposure / n_time) / pixel
         column, row = self._lattice.column * self._stride, self._lattice.row * self._stride
         lattice = to_packets(row * screen_size + column, np.int32)
@@ -291,7 +212,7 @@ class FastPsfEngine:
             deposit_rays,
             n_star,
             [
-                shared(self._screens, wp.int32),
+                shared(self._slopes, wp.int32),
                 shared(self._units, wp.float32),
                 screen_size,
                 n_layer,
@@ -314,7 +235,6 @@ class FastPsfEngine:
     def _combine(self, spectra: np.ndarray, optics: PupilOptics, offsets: np.ndarray) -> np.ndarray:
         """Return the filtered sum over wavelengths of the transforms of each star, shape [n_star, ky, kx]."""
         n_star, _, n_row, n_column = spectra.shape
-        metric = optics.jacobian @ np.swapaxes(optics.jacobian, 1, 2)
         shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)
         # The deposit has its origin in the middle cell; the first pixel of the stamp is wanted in the first.
         middle = self._plane.middle * self._plane.pixel_size - self._grid_size // 2 * self._cell
@@ -326,7 +246,7 @@ class FastPsfEngine:
             [
                 shared(spectra, wp.vec2f),
                 float(self._kx[1]),
-                shared(metric.reshape(n_star, 4)[:, [0, 1, 3]].astype(np.float32), wp.float32),
+                shared(metric_of(optics.jacobian), wp.float32),
                 shared((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
                 shared(self._filter, wp.float32),
                 self._filter_step,

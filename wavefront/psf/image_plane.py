@@ -8,7 +8,6 @@ is the Jacobian of the position on the focal plane with respect to the direction
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,32 +76,6 @@ class ImagePlane:
         """
         variance = self.diffusion**2 + self.jitter**2
         return square_transfer(kx, ky, self.pixel_size) * np.exp(-0.5 * variance * (kx * kx + ky * ky))
-
-
-#: Tells where stars are seen on their stamps [n, ny, nx]: places (x, y) from the centre of the middle pixel [pixels].
-Recenter = Callable[[np.ndarray], np.ndarray]
-
-
-@dataclass(frozen=True)
-class RenderedStars:
-    """What an engine makes of some stars.
-
-    Attributes
-    ----------
-    image : ndarray, shape [n_star, ny, nx]
-        Fraction of the light that reaches the focal plane in each pixel, float64; 0 where no light does.
-    lit_fraction : ndarray, shape [n_star, n_wave]
-        Lit fraction of the pupil.
-    reference_point : ndarray, shape [n_star, 3]
-        Point of the CCD at the star's place on the stamp, telescope frame [m].
-    offset : ndarray, shape [n_star, 2]
-        Place (x, y) of the reference point from the centre of the middle pixel [pixels].
-    """
-
-    image: np.ndarray
-    lit_fraction: np.ndarray
-    reference_point: np.ndarray
-    offset: np.ndarray
 
 
 def square_transfer(kx: np.ndarray, ky: np.ndarray, side: float) -> np.ndarray:

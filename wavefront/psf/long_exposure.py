@@ -27,15 +27,10 @@ import warp as wp
 
 from ...core.errors import ConfigError, DomainError
 from ...core.launch import launch
-from ...models.camera.focal_plane import FocalPlane
-from ...models.telescope import Telescope
-from ...raytrace.rays import field_direction
-from ..aberration import ResidualWavefront
-from ..atmosphere.atmosphere import Atmosphere
-from ..atmosphere.turbulence import diffraction_otf, structure_function
-from ..pupil_optics import PupilOptics, trace_pupils
+from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
+from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges
-from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length
+from .engine import Exposed, PsfEngine, PsfInputs, metric_of
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
 from .sample_packets import LANES, samples, shared
 
@@ -55,100 +50,53 @@ _BATCH, _BATCH_BYTES = 256, 1 << 24
 _TABLE_SIZE = 2048
 
 
-class LongExposureEngine:
-    """Renders stars as the mean over all turbulence shows them.
+class LongExposureEngine(PsfEngine):
+    """Mean over all turbulence.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
-    plane : ImagePlane
-        Stamp and detector.
-    dispersion : ndarray, shape [n_wave, 2]
-        Shift in field angle of each wavelength [rad].
-    focal_plane : FocalPlane, optional
-        CCD heights.
-    atmosphere : Atmosphere
-        Gives the Fried parameter and the outer scale; its screens are not made.
-    n_pupil : int, optional
-        About how many pupil points to trace.
-    projection : str
-        Meaning of the field angles.
-    aberration : ResidualWavefront, optional
-        Added to the traced wavefront.
-    threads : int, optional
-        Number of threads; no byte depends on it.
+    The atmosphere gives the Fried parameter and the outer scale; its screens are not made.
 
     Raises
     ------
     ConfigError
         If there is no atmosphere.
     DomainError
-        If ``n_pupil`` is too small, or so much is left of long baselines that this engine is not for them.
+        If ``n_pupil`` is too small, or the turbulence so weak that long baselines matter.
     """
 
-    def __init__(
-        self,
-        telescope: Telescope,
-        wavelengths: np.ndarray,
-        plane: ImagePlane,
-        *,
-        dispersion: np.ndarray,
-        focal_plane: FocalPlane | None = None,
-        atmosphere: Atmosphere | None = None,
-        n_pupil: int | None = None,
-        projection: str = "zemax",
-        aberration: ResidualWavefront | None = None,
-        threads: int | None = None,
-    ) -> None:
-        if atmosphere is None:
+    name = "long_exposure"
+    options = ("n_pupil",)
+    screens = ()
+
+    def __init__(self, inputs: PsfInputs) -> None:
+        if inputs.atmosphere is None:
             raise ConfigError(
                 "engine = 'long_exposure': expected an atmosphere, whose mean it takes ('wave' does without one)"
             )
-        self._telescope = telescope
-        self._wavelengths = np.asarray(wavelengths, dtype=np.float64)
-        self._plane = plane
-        self._dispersion = np.ascontiguousarray(dispersion, dtype=np.float64)
-        self._focal_plane = focal_plane
-        self._atmosphere = atmosphere
-        self._projection = projection
-        self._aberration = aberration
-        self._threads = threads
-        self._pupil = SpokePupil.fill(
-            telescope.pupil_diameter, telescope.pupil_obscuration, PUPIL_POINTS if n_pupil is None else n_pupil
-        )
-        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
-        #: Effective focal length on the axis [m].
-        self.focal_length = float(focal_length(center.jacobian)[0])
+        super().__init__(inputs)
+        self._r0, self._outer_scale = inputs.atmosphere.r0, inputs.atmosphere.outer_scale
+        n_pupil = PUPIL_POINTS if inputs.n_pupil is None else inputs.n_pupil
+        self._pupil = SpokePupil.fill(self._diameter, self._obscuration, n_pupil)
+        # Width of the pupil's ring.
+        self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
         #: Side of the periodic image [m].
-        self.period = GRID_MARGIN * plane.side
+        self.period = GRID_MARGIN * self._plane.side
         self._choose_frequencies()
         self._tabulate_filter()
         self._tabulate_pixels()
-
-    @property
-    def batch(self) -> int:
-        """Number of stars to render at a time."""
         star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points)
-        return max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
+        self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
     def _baselines(self) -> np.ndarray:
         """Return the baseline of one step of frequency at each wavelength [m], shape [n_wave]."""
         return self._wavelengths * self.focal_length / self.period
 
     def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
-        """Return what the atmosphere leaves of baselines [m] at each wavelength, shape [n_wave, ...]."""
-        atmosphere = self._atmosphere
-        structure = structure_function(baseline, atmosphere.r0, atmosphere.outer_scale)
-        wavenumber = (2.0 * math.pi / self._wavelengths).reshape(-1, *(1,) * baseline.ndim)
-        return np.exp(-0.5 * wavenumber**2 * structure)
+        """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""
+        return coherence(structure_function(baseline, self._r0, self._outer_scale), self._wavelengths[:, None])
 
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency worth adding up."""
-        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
-        width = 0.5 * diameter * (1.0 - obscuration)
+        width = self._width
         step = self._baselines()
         largest = math.ceil(width / step.min())
         count = np.arange(1, largest + 1)
@@ -160,7 +108,7 @@ class LongExposureEngine:
         if beyond.max() > _LARGEST_LEFT:
             raise DomainError(
                 f"engine = 'long_exposure': expected turbulence that leaves at most {_LARGEST_LEFT:g} of a baseline of"
-                f" {width:.3g} m, the width of the pupil's ring; r0 = {self._atmosphere.r0:.3g} m leaves"
+                f" {width:.3g} m, the width of the pupil's ring; r0 = {self._r0:.3g} m leaves"
                 f" {beyond.max():.2g} (use engine = 'wave')"
             )
         wanted = np.flatnonzero((left > _NEGLIGIBLE).any(axis=0))
@@ -169,13 +117,13 @@ class LongExposureEngine:
 
     def _tabulate_filter(self) -> None:
         """Tabulate what multiplies the strips and points of the pupil: the atmosphere, and what strips leave out."""
-        diameter, obscuration = self._telescope.pupil_diameter, self._telescope.pupil_obscuration
-        width = 0.5 * diameter * (1.0 - obscuration)
         # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
         baseline = np.linspace(0.0, 1.5 * self._reach * self._baselines().max(), _TABLE_SIZE)
         # Strips as wide as half the baseline overlap a little: to third order in the baseline, less than 1e-3.
-        ring = np.minimum(baseline, width)
-        overlap = diffraction_otf(ring, diameter, obscuration) / (1.0 - 2.0 * ring / (math.pi * width))
+        ring = np.minimum(baseline, self._width)
+        overlap = diffraction_otf(ring, self._diameter, self._obscuration) / (
+            1.0 - 2.0 * ring / (math.pi * self._width)
+        )
         table = self._turbulence(baseline) * overlap / len(self._wavelengths)
         self._filter = np.ascontiguousarray(table, dtype=np.float32)
         # The baseline of frequency k is wavelength / 2 pi |J^T k|.
@@ -202,46 +150,20 @@ class LongExposureEngine:
         columns[:, :, : plane.stamp_size] = np.stack([np.cos(angle.T), np.sin(angle.T)])
         self._pixel_columns = columns.reshape(2, n_row, across, LANES)
 
-    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
-        """Render one batch of stars.
-
-        Parameters
-        ----------
-        fields : ndarray, shape [n_star, 2]
-            Field angles [rad].
-        offsets : ndarray, shape [n_star, 2]
-            Places of the reference points from the centre of the middle pixel [pixels].
-        recenter : callable, optional
-            As :func:`~pachon.wavefront.psf.psf.make_psfs` takes it.
-
-        Returns
-        -------
-        RenderedStars
-        """
-        optics = trace_pupils(
-            self._telescope,
-            fields,
-            self._wavelengths,
-            self._pupil.points,
-            self._focal_plane,
-            self._projection,
-            self._threads,
-            aberration=self._aberration,
-        )
+    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        optics = self._trace(fields, self._pupil.points, self._threads)
         # Apertures cut every wavelength alike but for 3e-4 of the light at the very edge of the LSST's field.
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
-        direction = field_direction(optics.fields[:, 0], optics.fields[:, 1], self._projection)
+        direction = self._direction(optics.fields)
         edges = clear_edges(self._telescope, direction, self._pupil.unit, middle, self._threads)
         area = math.pi / self._pupil.n_spoke * (edges[..., 1] ** 2 - edges[..., 0] ** 2).sum(axis=1)
         spectrum = self._transform(optics, edges, area)
-        stamps = self._sample(spectrum, offsets)
-        if recenter is not None:
-            offsets = offsets - recenter(stamps)
-            stamps = self._sample(spectrum, offsets)
         inner, outer = self._pupil.radius[[0, -1]]
         lit_fraction = area / (math.pi * (outer**2 - inner**2))
-        return RenderedStars(
-            stamps, np.repeat(lit_fraction[:, None], len(self._wavelengths), axis=1), optics.reference, offsets
+        return Exposed(
+            lambda shift: self._sample(spectrum, offsets if shift is None else offsets - shift),
+            np.repeat(lit_fraction[:, None], len(self._wavelengths), axis=1),
+            optics.reference,
         )
 
     def _transform(self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray) -> np.ndarray:
@@ -277,7 +199,6 @@ class LongExposureEngine:
             ],
             threads=self._threads,
         )
-        metric = optics.jacobian @ np.swapaxes(optics.jacobian, 1, 2)
         along_x, along_y = (np.empty((n_star, n_point, n_packet, 2, LANES), dtype=np.float32) for _ in range(2))
         spectrum = np.empty((n_star, 4, n_row, n_packet, LANES), dtype=np.float32)
         launch(
@@ -291,7 +212,7 @@ class LongExposureEngine:
                 shared(lean, wp.float32),
                 shared(self._wavelengths.astype(np.float32), wp.float32),
                 shared(self._rows, wp.int32),
-                shared(metric.reshape(n_star, 4)[:, [0, 1, 3]].astype(np.float32), wp.float32),
+                shared(metric_of(optics.jacobian), wp.float32),
                 shared(self._filter, wp.float32),
                 shared(self._filter_steps, wp.float32),
                 shared(along_x, samples),

@@ -14,22 +14,17 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
-from ..pupil_optics import trace_pupils
-from .fast import FastPsfEngine
-from .image_plane import ImagePlane, Recenter, focal_length
-from .long_exposure import LongExposureEngine
-from .wave import WavePsfEngine
+from .engine import PsfInputs, Recenter, center_focal_length
+from .engines import ENGINES
+from .image_plane import ImagePlane
 
-ENGINES = ("fast", "wave", "long_exposure")
-#: Kinds of screens that an engine keeps of an atmosphere, as its ``screens`` names them.
-SCREENS = {"fast": ("slopes",), "wave": ("low", "high"), "long_exposure": ()}
-#: Value of :attr:`Psfs.flags` for a star none of whose light reaches the focal plane; its image is zero.
+#: Value of :attr:`Psfs.flags` for a dark star: none of its light reaches the focal plane, and its image is zero.
 DARK = 1
 
 
 @dataclass(frozen=True)
 class Psfs:
-    """Images of stars.
+    """Point spread functions of stars.
 
     Attributes
     ----------
@@ -42,8 +37,8 @@ class Psfs:
     wavelengths : ndarray, shape [n_wave]
         Vacuum wavelengths [m].
     reference_point : ndarray, shape [n_star, 3]
-        Where the chief ray of the middle wavelength meets the CCD, telescope frame [m]: the centre of pixel
-        ``[size // 2, size // 2]`` plus the star's offset.
+        Intersection of the chief ray of the middle wavelength with the CCD, telescope frame [m]. It lies at the centre
+        of pixel ``[size // 2, size // 2]`` plus the star's offset.
     offset : ndarray, shape [n_star, 2]
         Place (x, y) of that point from the centre of the middle pixel [pixels].
     lit_fraction : ndarray, shape [n_star, n_wave]
@@ -89,10 +84,10 @@ def make_psfs(
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Psfs:
-    """Make the point spread functions of stars, as pixels see them.
+    """Make the point spread functions of stars.
 
-    A star's image depends on the star and the exposure alone: no byte of it depends on the other stars of the call, on
-    the threads or on how the work is cut.
+    Each image is sampled by the pixels of the detector. It depends on the star and the exposure alone: not on the other
+    stars of the call, the number of threads or the batches.
 
     Parameters
     ----------
@@ -103,14 +98,15 @@ def make_psfs(
     wavelengths : array_like or Quantity, shape [n_wave]
         Vacuum wavelengths [m], of equal numbers of photons before the telescope.
     focal_plane : FocalPlane, optional
-        CCD heights; the nominal flat plane if not given.
+        CCD heights; the nominal flat plane by default.
     atmosphere : Atmosphere, optional
         The exposure; none outside the atmosphere.
     aberration : ResidualWavefront, optional
-        What active optics leaves uncorrected; none by default.
+        Wavefront error that active optics leaves; none by default.
     engine : {"fast", "wave", "long_exposure"}
-        Geometric optics with filters, Fourier optics (the truth, slow), or the mean over all turbulence (quickest, best
-        with many stars a call; it needs an atmosphere, of which it takes the Fried parameter and the outer scale only).
+        ``"fast"``: geometric optics with filters. ``"wave"``: Fourier optics, the slow reference engine.
+        ``"long_exposure"``: mean over all turbulence, the quickest for many stars per call. It needs an atmosphere, of
+        which it uses the Fried parameter and the outer scale only.
     stamp_size : int
         Pixels on a side of a stamp.
     pixel_size : float or Quantity
@@ -123,16 +119,14 @@ def make_psfs(
     offsets : array_like, shape [n_star, 2], optional
         Place of each star (x, y) from the centre of the middle pixel [pixels]; 0 by default.
     recenter : callable, optional
-        Tells where stars are seen on their stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns
-        places (x, y) from the centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more,
-        moved by so much that it is seen at the centre; that is exact, unlike a shift of the pixels, and costs little.
+        Centroids of stamps: given images [n, ny, nx] and the angle of a pixel [rad], it returns places (x, y) from the
+        centre of the middle pixel [pixels], shape [n, 2]. Each star is then drawn once more, with its centroid at the
+        centre. That is exact, unlike a shift of the pixels, and costs little.
     dispersion : array_like or Quantity, shape [n_wave, 2], optional
         Shift in field angle of each wavelength by the atmosphere [rad], such as
         :func:`~pachon.wavefront.atmosphere.refraction.dispersion_shift` gives.
-    n_pupil, oversampling : int, optional
-        About how many pupil points (fast and long_exposure), and cells of the fine grid to a pixel (fast).
-    padding, pupil_spacing : bool, float, optional
-        Wave engine: whether to keep all baselines, and the distance of pupil points [m].
+    n_pupil, oversampling, padding, pupil_spacing : optional
+        Options of some engines, as in :class:`~pachon.wavefront.psf.engine.PsfInputs`.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     threads : int, optional
@@ -147,7 +141,7 @@ def make_psfs(
     Raises
     ------
     ConfigError
-        If there is no such engine or projection, or the engine needs an atmosphere.
+        If the engine or the projection is unknown, or the engine needs an atmosphere or does not take an option.
     DomainError
         If an argument is outside its range or of the wrong shape, or a star falls between the CCDs.
     """
@@ -159,39 +153,38 @@ def make_psfs(
     if not lengths.size or not (np.isfinite(lengths) & (lengths > 0.0)).all():
         raise DomainError(f"wavelengths = {wavelengths!r}: expected one or more positive lengths in metres")
     places = np.zeros((len(angles), 2)) if offsets is None else _table(offsets, "offsets", len(angles))
-    shifts = np.zeros((len(lengths), 2))
-    if dispersion is not None:
-        shifts = _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
+    shifts = None if dispersion is None else _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
     plane = ImagePlane(
         stamp_size,
         float(metres(pixel_size, "pixel_size")),
         float(metres(diffusion, "diffusion")),
         _on_detector(jitter, telescope, lengths),
     )
-    maker: FastPsfEngine | WavePsfEngine | LongExposureEngine
-    common: dict[str, Any] = {
-        "dispersion": shifts,
-        "focal_plane": focal_plane,
-        "atmosphere": atmosphere,
-        "aberration": aberration,
-        "projection": projection,
-        "threads": threads,
-    }
-    if engine == "fast":
-        maker = FastPsfEngine(telescope, lengths, plane, n_pupil=n_pupil, oversampling=oversampling, **common)
-    elif engine == "long_exposure":
-        maker = LongExposureEngine(telescope, lengths, plane, n_pupil=n_pupil, **common)
-    else:
-        maker = WavePsfEngine(telescope, lengths, plane, padding=padding, pupil_spacing=pupil_spacing, **common)
-
+    maker = ENGINES[engine](
+        PsfInputs(
+            telescope,
+            lengths,
+            plane,
+            dispersion=shifts,
+            focal_plane=focal_plane,
+            atmosphere=atmosphere,
+            aberration=aberration,
+            projection=projection,
+            threads=threads,
+            n_pupil=n_pupil,
+            oversampling=oversampling,
+            padding=padding,
+            pupil_spacing=pupil_spacing,
+        )
+    )
     pixel_scale = plane.pixel_size / maker.focal_length
-    seen: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
+    centroids: Recenter | None = None if recenter is None else lambda images: recenter(images, pixel_scale)
     image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
     lit_fraction = np.empty((len(angles), len(lengths)))
     reference_point, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
     for first in range(0, len(angles), maker.batch):
         part = slice(first, min(first + maker.batch, len(angles)))
-        stars = maker.render(angles[part], places[part], seen)
+        stars = maker.render(angles[part], places[part], centroids)
         inside[part] = stars.image.sum(axis=(1, 2))
         image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
         lit_fraction[part], reference_point[part], offset[part] = (
@@ -215,14 +208,13 @@ def make_psfs(
 
 
 def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
-    """Return how far an angle [rad] moves images on the detector [m], at the centre of the field."""
+    """Return the displacement on the detector [m] of a jitter [rad], at the centre of the field."""
     angle = radians(jitter, "jitter")
     if angle.size != 1 or not (np.isfinite(angle) & (angle >= 0.0)).all():
         raise DomainError(f"jitter = {jitter!r}: expected an angle in radians from 0")
     if not angle.any():
         return 0.0
-    center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)))
-    return float(angle.item() * focal_length(center.jacobian)[0])
+    return float(angle.item() * center_focal_length(telescope, wavelengths))
 
 
 def _table(values: Any, name: str, count: int | None) -> np.ndarray:

@@ -1,4 +1,4 @@
-r"""The wave PSF engine: the truth that the fast engine is held to.
+r"""The wave PSF engine: the reference engine, by Fourier optics.
 
 The field on the focal plane at X from the reference point is the sum over the pupil of
 
@@ -26,8 +26,6 @@ machine or on a timing.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -37,13 +35,9 @@ import warp as wp
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.threads import thread_count
-from ...models.camera.focal_plane import FocalPlane
-from ...models.telescope import Telescope
-from ...raytrace.rays import field_direction
-from ..aberration import ResidualWavefront
-from ..atmosphere.atmosphere import Atmosphere
-from ..pupil_optics import PupilOptics, trace_pupils
-from .image_plane import ImagePlane, Recenter, RenderedStars, focal_length
+from ..atmosphere.spline import spline_weights
+from ..pupil_optics import PupilOptics
+from .engine import Exposed, PsfEngine, PsfInputs
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples, shared
 from .wave_kernels import add_squares, pupil_fields
@@ -59,71 +53,18 @@ LARGEST_SPACING_OPTICS = 0.04
 _NEGLIGIBLE = 1e-4
 
 
-class WavePsfEngine:
-    """Renders stars by Fourier optics.
+class WavePsfEngine(PsfEngine):
+    """Fourier optics, one star per thread."""
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
-    plane : ImagePlane
-        Stamp and detector.
-    focal_plane : FocalPlane, optional
-        CCD heights.
-    atmosphere : Atmosphere, optional
-        The exposure.
-    dispersion : ndarray, shape [n_wave, 2]
-        Shift in field angle of each wavelength [rad].
-    padding : bool, optional
-        Keep all baselines, up to the diameter of the pupil; by default where there is no atmosphere or next to no
-        charge diffusion.
-    pupil_spacing : float, optional
-        Distance of the pupil points [m]; by default so small that the image repeats itself outside the stamp only, and
-        at most :data:`LARGEST_SPACING`, or :data:`LARGEST_SPACING_OPTICS` without an atmosphere.
-    projection : str
-        Meaning of the field angles.
-    aberration : ResidualWavefront, optional
-        Added to the traced wavefront.
-    threads : int, optional
-        Number of threads, one star each; no byte depends on it.
-    """
+    name = "wave"
+    options = ("padding", "pupil_spacing")
+    screens = ("low", "high")
 
-    def __init__(
-        self,
-        telescope: Telescope,
-        wavelengths: np.ndarray,
-        plane: ImagePlane,
-        *,
-        dispersion: np.ndarray,
-        focal_plane: FocalPlane | None = None,
-        atmosphere: Atmosphere | None = None,
-        padding: bool | None = None,
-        pupil_spacing: float | None = None,
-        projection: str = "zemax",
-        aberration: ResidualWavefront | None = None,
-        threads: int | None = None,
-    ) -> None:
-        self._telescope = telescope
-        self._wavelengths = wavelengths
-        self._plane = plane
-        self._dispersion = dispersion
-        self._focal_plane = focal_plane
-        self._atmosphere = atmosphere
-        self._projection = projection
-        self._aberration = aberration
-        self._threads = threads
-        center = trace_pupils(telescope, np.zeros((1, 2)), wavelengths, np.zeros((1, 2)), threads=threads)
-        #: Effective focal length on the axis [m].
-        self.focal_length = float(focal_length(center.jacobian)[0])
-        self._lay_grid(padding, pupil_spacing)
+    def __init__(self, inputs: PsfInputs) -> None:
+        super().__init__(inputs)
+        self._lay_grid(inputs.padding, inputs.pupil_spacing)
         self._take_screens()
-
-    @property
-    def batch(self) -> int:
-        """Number of stars to render at a time."""
-        return thread_count(self._threads)
+        self.batch = thread_count(inputs.threads)
 
     def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
         if spacing is None:
@@ -135,9 +76,9 @@ class WavePsfEngine:
             k = 2.0 * math.pi * LONGEST_BASELINE / (float(self._wavelengths.max()) * self.focal_length)
             left = math.exp(-0.5 * (k * self._plane.diffusion) ** 2)
             padding = self._atmosphere is None or left > _NEGLIGIBLE
-        diameter = self._telescope.pupil_diameter
+        diameter = self._diameter
         longest = diameter if padding else LONGEST_BASELINE
-        self._lattice = PupilLattice.fill(diameter, self._telescope.pupil_obscuration, spacing)
+        self._lattice = PupilLattice.fill(diameter, self._obscuration, spacing)
         self._packets = -(-self._lattice.size // LANES)
         across = max(math.ceil((diameter + longest) / spacing), self._packets * LANES)
         # Multiples of 4 fill whole packets.
@@ -148,12 +89,11 @@ class WavePsfEngine:
         """Take the spline coefficients of the low and the high screens [m], and lay the lattice over them."""
         atmosphere = self._atmosphere
         if atmosphere is None:
-            self._screens = [np.zeros((1, 1), dtype=np.float32)] * 2
+            self._splines = [np.zeros((1, 1), dtype=np.float32)] * 2
             self._sides, self._steps = np.ones(2, dtype=np.int64), np.ones(2)
         else:
-            self._screens = [
-                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1)
-                for scale in ("low", "high")
+            self._splines = [
+                atmosphere.screens(scale, self._threads).reshape(atmosphere.layer_count, -1) for scale in self.screens
             ]
             self._sides = np.array([atmosphere.screen_size, atmosphere.fine_size])
             self._steps = self._lattice.spacing / np.array([atmosphere.screen_pixel, atmosphere.fine_pixel])
@@ -164,51 +104,28 @@ class WavePsfEngine:
     def _screen_arguments(self) -> tuple[list[Any], int]:
         """Return the screens as the kernel takes them, and the number of layers."""
         arguments: list[Any] = []
-        for screens, side, run in zip(self._screens, self._sides, self._runs, strict=True):
+        for screens, side, run in zip(self._splines, self._sides, self._runs, strict=True):
             arguments += [shared(screens, wp.float32), int(side), run]
         return arguments, 0 if self._atmosphere is None else self._atmosphere.layer_count
 
-    def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
-        """Render one batch of stars.
+    def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        optics, spectra = zip(*self._map(self._expose_star, fields), strict=True)
+        area = 0.25 * math.pi * self._diameter**2 * (1.0 - self._obscuration**2)
+        lit = np.stack([star.lit[0].sum(axis=1) * self._lattice.spacing**2 / area for star in optics])
 
-        Parameters
-        ----------
-        fields : ndarray, shape [n_star, 2]
-            Field angles [rad].
-        offsets : ndarray, shape [n_star, 2]
-            Places of the reference points from the centre of the middle pixel [pixels].
-        recenter : callable, optional
-            As :func:`~pachon.wavefront.psf.psf.make_psfs` takes it.
+        def draw(shift: np.ndarray | None) -> np.ndarray:
+            places = offsets if shift is None else offsets - shift
+            jacobians = [star.jacobian[0] for star in optics]
+            return np.stack(self._map(self._sample, spectra, jacobians, places))
 
-        Returns
-        -------
-        RenderedStars
-        """
-        with ThreadPoolExecutor(thread_count(self._threads)) as pool:
-            stars = list(pool.map(self._render_star, fields, offsets, [recenter] * len(fields)))
-        return RenderedStars(*(np.concatenate(parts) for parts in zip(*map(astuple, stars), strict=True)))
+        return Exposed(draw, lit, np.concatenate([star.reference for star in optics]))
 
-    def _render_star(self, field: np.ndarray, offset: np.ndarray, recenter: Recenter | None) -> RenderedStars:
-        optics = trace_pupils(
-            self._telescope,
-            field[None],
-            self._wavelengths,
-            self._lattice.points,
-            self._focal_plane,
-            self._projection,
-            threads=1,
-            aberration=self._aberration,
-        )
-        spectra = self._filtered(self._expose(field, optics), optics.jacobian[0])
-        image = self._sample(spectra, optics.jacobian[0], offset)
-        if recenter is not None:
-            offset = offset - recenter(image[None])[0]
-            image = self._sample(spectra, optics.jacobian[0], offset)
-        area = 0.25 * math.pi * self._telescope.pupil_diameter**2 * (1.0 - self._telescope.pupil_obscuration**2)
-        lit_fraction = optics.lit[0].sum(axis=1) * self._lattice.spacing**2 / area
-        return RenderedStars(image[None], lit_fraction[None], optics.reference, offset[None])
+    def _expose_star(self, field: np.ndarray) -> tuple[PupilOptics, np.ndarray]:
+        """Return the optics of a star and its spectra, the OTF times the transfer function of the detector."""
+        optics = self._trace(field[None], self._lattice.points, 1)
+        return optics, self._filtered(self._intensity(field, optics), optics.jacobian[0])
 
-    def _expose(self, field: np.ndarray, optics: PupilOptics) -> np.ndarray:
+    def _intensity(self, field: np.ndarray, optics: PupilOptics) -> np.ndarray:
         """Return the squared field on the focal plane, averaged over time, shape [n_wave, size, size].
 
         Scaled so that the means over the grid add up to 1 over the wavelengths.
@@ -257,8 +174,7 @@ class WavePsfEngine:
         atmosphere = self._atmosphere
         if atmosphere is None:
             return np.zeros((1, 2, 2))
-        direction = field_direction(field[0], field[1], self._projection)
-        corner = atmosphere.pupil_centers(direction, atmosphere.times) + self._lattice.origin
+        corner = atmosphere.pupil_centers(self._direction(field), atmosphere.times) + self._lattice.origin
         both = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
         return both.reshape(len(atmosphere.times), -1, 2)
 
@@ -269,11 +185,7 @@ class WavePsfEngine:
         whole = np.floor(start)
         along = (start - whole)[..., None] + steps[:, None, None] * np.arange(self._packets * LANES)
         sample = np.floor(along)
-        u = (along - sample).astype(np.float32)
-        v = 1.0 - u
-        weights = np.stack(
-            [v**3, 4.0 + u * u * (3.0 * u - 6.0), 4.0 + v * v * (3.0 * v - 6.0), u**3], axis=-1
-        ) * np.float32(1.0 / 6.0)
+        weights = spline_weights((along - sample).astype(np.float32))
         first = whole.astype(np.int32)
         sample = sample.astype(np.int32)
         # The spline's first tap is one sample before the point.

@@ -11,7 +11,8 @@ from astropy import units as u
 from pachon.core import memory
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.models.site import load_site
-from pachon.wavefront.atmosphere.atmosphere import SLOPE_LAG, Atmosphere
+from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 from pachon.wavefront.atmosphere.turbulence import path_variance, structure_function
 
 SMALL = {"screen_size": 512, "screen_length": 81.92, "fine_size": 512, "fine_pixel": 0.02, "exposure": 2.0}

@@ -13,7 +13,8 @@ from scipy.optimize import brentq
 
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.core.random_streams import stream
-from pachon.wavefront.atmosphere.screens import STENCILS, evaluate, phase_screen, slope_screen, stencil_gain
+from pachon.wavefront.atmosphere.screens import phase_screen, slope_screen
+from pachon.wavefront.atmosphere.spline import STENCILS, evaluate, stencil_gain
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm, path_spectrum, path_variance, structure_function
 
 R0, L0 = 0.16, 25.0

@@ -11,7 +11,6 @@ from pachon.core.errors import DomainError
 from pachon.wavefront.atmosphere.turbulence import (
     diffraction_otf,
     fried_parameter,
-    high_structure_function,
     long_exposure_fwhm,
     long_exposure_otf,
     path_spectrum,
@@ -72,30 +71,6 @@ def test_structure_function_is_smooth_where_its_two_forms_meet():
     # Seven points 1e-9 apart lie on a straight line to rounding.
     assert np.ptp(np.diff(values)) < 1e-13 * values[0]
     assert structure_function(0.0, R0, L0) == 0.0
-
-
-@pytest.mark.parametrize("separation", [0.02, 0.1, 0.5, 3.0])
-def test_high_structure_function_is_the_integral_above_the_cutoff(separation):
-    cutoff = 1.0 / R0
-    # Left out beyond 2e3 cycles/m: 1e-5 of the smallest.
-    expected = hankel(separation, cutoff / (2.0 * math.pi), 2e3)
-    np.testing.assert_allclose(high_structure_function(separation, R0, L0, cutoff), expected, rtol=1e-3)
-
-
-def test_high_structure_function_of_a_grid_equals_that_of_single_separations():
-    b = np.linspace(0.0, 1.5, 4000).reshape(40, 100)
-    grid = high_structure_function(b, R0, L0, 1.0 / R0)
-    single = [float(high_structure_function(v, R0, L0, 1.0 / R0)) for v in b.ravel()[::97]]
-    # In phase at 500 nm: interpolation of the band-limited part is good to 1e-6 rad^2.
-    np.testing.assert_allclose(
-        grid.ravel()[::97] * RADIANS_PER_METRE**2, np.array(single) * RADIANS_PER_METRE**2, rtol=1e-5, atol=1e-6
-    )
-    assert grid[0, 0] == 0.0
-
-
-def test_high_structure_function_joins_the_whole_at_a_vanishing_cutoff():
-    b = np.array([0.1, 1.0])
-    np.testing.assert_allclose(high_structure_function(b, R0, L0, 1e-6), structure_function(b, R0, L0), rtol=1e-9)
 
 
 def test_annular_transfer_function_is_the_overlap_of_two_pupils():
@@ -167,22 +142,6 @@ def test_against_galsim():
     assert profile.calculateFWHM(scale=0.005) == pytest.approx(width, rel=1e-4)  # GalSim interpolates its radial table
 
 
-def test_high_structure_function_against_galsim():
-    """GalSim's second kick is Kolmogorov with the soft edge k^4 / (k^4 + kcrit^4): a mean of ours over sharp edges."""
-    galsim = pytest.importorskip("galsim")
-    # Its kcrit is in cycles, and its separations are in metres, both per Fried parameter.
-    kcrit = 0.2
-    kick = galsim.SecondKick(lam=500.0, r0=R0, diam=8.36, kcrit=kcrit)
-    node, weight = np.polynomial.legendre.leggauss(400)
-    share = 0.5 * (node + 1.0)
-    edges = 2.0 * math.pi * kcrit / R0 * (share / (1.0 - share)) ** 0.25
-    for separation in (0.01, 0.1, 0.5, 2.0):
-        sharp = [float(high_structure_function(separation, R0, 1e6, edge)) for edge in edges]
-        ours = 0.5 * float(weight @ sharp) * RADIANS_PER_METRE**2
-        # The fourth root at the lower end limits the quadrature; GalSim's own integral is good to 1e-3 at worst.
-        assert kick._structure_function(separation / R0) == pytest.approx(ours, rel=2e-3)
-
-
 @pytest.mark.parametrize(
     ("call", "text"),
     [
@@ -190,7 +149,6 @@ def test_high_structure_function_against_galsim():
         (lambda: structure_function(1.0, R0, -25.0), "outer_scale = -25.0: expected a positive"),
         (lambda: path_spectrum(1.0, math.nan, L0), "r0 = nan"),
         (lambda: path_variance("wide", L0), "r0 = 'wide'"),
-        (lambda: high_structure_function(1.0, R0, L0, 0.0), "cutoff = 0.0"),
         (lambda: diffraction_otf(1.0, 0.0), "diameter = 0.0"),
         (lambda: diffraction_otf(1.0, 8.0, 1.0), "obscuration = 1.0"),
         (lambda: long_exposure_otf(1.0, -1.0, R0, L0), "wavelength = -1.0"),

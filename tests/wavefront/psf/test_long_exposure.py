@@ -17,8 +17,8 @@ from pachon.raytrace.rays import field_direction
 from pachon.wavefront.aberration import ResidualWavefront
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, long_exposure_fwhm, structure_function
-from pachon.wavefront.psf import long_exposure
 from pachon.wavefront.psf.clear_pupil import SpokePupil, clear_edges
+from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.psf.fast import FastPsfEngine
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.long_exposure import PUPIL_POINTS, LongExposureEngine
@@ -29,7 +29,6 @@ from pachon.wavefront.pupil_optics import fields_at, trace_pupils
 FOCAL_LENGTH = 10.31
 PLANE = ImagePlane(31, 10e-6, 4e-6)
 ONE_WAVE = np.array([620e-9])
-STILL = np.zeros((1, 2))
 R0, OUTER_SCALE = 0.16, 25.0
 
 
@@ -38,27 +37,10 @@ def air(seed=1, **options):
 
 
 def engine_for(telescope, wavelengths=ONE_WAVE, plane=PLANE, **options):
-    given = {"dispersion": np.zeros((len(wavelengths), 2)), "atmosphere": air(), "threads": 1}
-    return LongExposureEngine(telescope, wavelengths, plane, **(given | options))
-
-
-@pytest.fixture
-def open_pupil(polynomial_pupil, monkeypatch):
-    """Give the engine a pupil of polynomial path, clear all over, or from and to given radii on every spoke."""
-
-    def install(edges=None, **aberrations):
-        telescope = polynomial_pupil(**aberrations)
-
-        def clear(telescope, direction, unit, wavelength, threads=None):
-            outer = 0.5 * telescope.pupil_diameter
-            ends = (telescope.pupil_obscuration * outer, outer) if edges is None else edges
-            return np.broadcast_to(ends, (len(direction), len(unit), 2)).copy()
-
-        monkeypatch.setattr(long_exposure, "trace_pupils", telescope.trace)
-        monkeypatch.setattr(long_exposure, "clear_edges", clear)
-        return telescope
-
-    return install
+    options = {"atmosphere": air(), "threads": 1} | options
+    if isinstance(telescope, pachon.Telescope):
+        return LongExposureEngine(PsfInputs(telescope, wavelengths, plane, **options))
+    return LongExposureEngine(telescope.inputs(wavelengths, plane, **options))
 
 
 def moments(image):
@@ -160,8 +142,8 @@ def theory(plane, wavelength=620e-9, shift=(0.0, 0.0), margin=1.25, diameter=8.3
     return image_of(otf * ramp * plane.transfer(k, k[:, None]), k, plane)
 
 
-def test_perfect_optics_give_the_long_exposure_in_closed_form(open_pupil):
-    telescope = open_pupil()
+def test_perfect_optics_give_the_long_exposure_in_closed_form(polynomial_pupil):
+    telescope = polynomial_pupil()
     plane = ImagePlane(61, 5e-6, 1e-6)
     star = np.zeros((1, 2)), np.array([[0.3, -0.2]])
     shift = (1.5e-6, -1e-6)
@@ -175,9 +157,9 @@ def test_perfect_optics_give_the_long_exposure_in_closed_form(open_pupil):
     np.testing.assert_allclose(image, theory(plane, shift=shift, margin=4.0), atol=4e-4 * expected.max())
 
 
-def test_width_of_perfect_optics(open_pupil):
+def test_width_of_perfect_optics(polynomial_pupil):
     plane = ImagePlane(121, 2.5e-6, 0.0)
-    image = engine_for(open_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
+    image = engine_for(polynomial_pupil(), plane=plane).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     falling = image[60, 60:100]
     width = 2 * np.interp(-0.5 * image.max(), -falling, np.arange(40)) * 2.5e-6 / FOCAL_LENGTH
     expected = long_exposure_fwhm(620e-9, R0, OUTER_SCALE, diameter=8.36, obscuration=0.612)
@@ -186,11 +168,11 @@ def test_width_of_perfect_optics(open_pupil):
 
 
 @pytest.mark.parametrize("rim", [0.0, 0.15])
-def test_defocus_and_coma_against_brute_force_over_a_circle(open_pupil, rim):
+def test_defocus_and_coma_against_brute_force_over_a_circle(polynomial_pupil, rim):
     """Rims inside of the traced rings and a skewed Jacobian; the wavefront is known in closed form."""
     inner, outer = 4.18 * 0.612 + rim, 4.18 - 2 * rim
     jacobian = np.array([[10.3, 0.9], [-0.5, 10.8]])
-    telescope = open_pupil(edges=(inner, outer), defocus=1.5e-6, coma=0.6e-6, jacobian=jacobian)
+    telescope = polynomial_pupil(clear=(inner, outer), defocus=1.5e-6, coma=0.6e-6, jacobian=jacobian)
     stars = engine_for(telescope).render(np.array([[0.01, 0.0]]), np.zeros((1, 2)))
     assert stars.lit_fraction[0, 0] == pytest.approx((outer**2 - inner**2) / (4.18**2 * (1 - 0.612**2)), rel=1e-12)
 
@@ -231,14 +213,14 @@ def test_an_image_on_the_axis_is_round(lsst_r):
     np.testing.assert_allclose(moments(image)[0], 0.0, atol=1e-6)
 
 
-def test_mean_of_many_exposures_of_the_fast_engine(polynomial_pupil, open_pupil):
+def test_mean_of_many_exposures_of_the_fast_engine(polynomial_pupil):
     """Defocused and comatic, so that the optics share in the width and the shape."""
-    telescope = open_pupil(defocus=1.2e-6, coma=0.8e-6)
+    telescope = polynomial_pupil(defocus=1.2e-6, coma=0.8e-6)
     fields = np.stack(np.meshgrid([-0.02, 0.0, 0.02], [-0.02, 0.02]), axis=-1).reshape(-1, 2)
     total = np.zeros((31, 31))
     for seed in range(8):
         atmosphere = air(seed, exposure=15.0, time_step=0.15, cutoff=6.25, screen_size=2048, screen_length=327.68)
-        fast = FastPsfEngine(telescope, ONE_WAVE, PLANE, dispersion=STILL, atmosphere=atmosphere, threads=1)
+        fast = FastPsfEngine(telescope.inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
         total += fast.render(fields, np.zeros((6, 2))).image.sum(axis=0)
     image = engine_for(telescope).render(np.zeros((1, 2)), np.zeros((1, 2))).image[0]
     (e, size, center), (e_mean, size_mean, center_mean) = moments(image), moments(total)
@@ -301,13 +283,13 @@ def test_recentred_star_is_drawn_elsewhere(lsst_r):
 
 
 @pytest.mark.parametrize("tilt", [(3e-6, 0.0), (0.0, -2e-6)])
-def test_tilt_and_dispersion_move_the_image(open_pupil, tilt):
+def test_tilt_and_dispersion_move_the_image(polynomial_pupil, tilt):
     jacobian = np.array([[10.3, 0.5], [-0.4, 10.6]])
     dispersion = np.array([[1e-6, -2e-6]])
     star = np.zeros((1, 2)), np.array([[0.25, -0.4]])
-    moved = engine_for(open_pupil(tilt=tilt, jacobian=jacobian), dispersion=dispersion).render(*star).image
+    moved = engine_for(polynomial_pupil(tilt=tilt, jacobian=jacobian), dispersion=dispersion).render(*star).image
     shift = (jacobian @ (np.array(tilt) + dispersion[0]))[None] / 10e-6
-    plain = engine_for(open_pupil(jacobian=jacobian)).render(star[0], star[1] + shift).image
+    plain = engine_for(polynomial_pupil(jacobian=jacobian)).render(star[0], star[1] + shift).image
     np.testing.assert_allclose(moved, plain, atol=2e-6 * plain.max())
 
 

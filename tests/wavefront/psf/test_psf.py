@@ -1,4 +1,4 @@
-"""The public face of both engines: what it returns, that they agree, and what it refuses."""
+"""PSFs of all engines: shapes, agreement, and errors."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,8 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError
 from pachon.pipeline.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
-from pachon.wavefront.psf.psf import DARK, ENGINES, make_psfs
+from pachon.wavefront.psf.engines import ENGINES
+from pachon.wavefront.psf.psf import DARK, make_psfs
 from pachon.wavefront.pupil_optics import fields_at
 
 WAVELENGTHS = np.linspace(545e-9, 703e-9, 3)

@@ -1,0 +1,235 @@
+"""The phase screens of the layers of an atmosphere, made once and kept."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError, unknown_name
+from ...core.memory import require_bytes
+from ...core.random_streams import stream
+from .layers import Layers
+from .screens import phase_screen, slope_screen, working_bytes
+from .spline import evaluate
+from .turbulence import slope_variance
+
+#: Distance over which rays feel the slope of the low screens [m]: a gradient proper lets waves of a metre bend light
+#: more than they do where it interferes over baselines of some tenths of a metre.
+SLOPE_LAG = 0.2
+# Larger screens, of 17 GB and more, would fill the memory.
+_LARGEST_SIZE = 65536
+
+_cache_lock = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LayerScreens(Layers):
+    """Layers with their low and high screens; attributes as in :class:`.Atmosphere`."""
+
+    r0: float
+    outer_scale: float
+    cutoff: float
+    screen_size: int
+    screen_length: float
+    fine_size: int
+    fine_pixel: float
+    seed: int
+    epoch: int
+    fixed_modulus: bool = False
+    _cache: dict[str, np.ndarray] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def screen_pixel(self) -> float:
+        """Distance of the samples of a low screen [m]."""
+        return self.screen_length / self.screen_size
+
+    @property
+    def fine_length(self) -> float:
+        """Side of a high screen [m]."""
+        return self.fine_size * self.fine_pixel
+
+    def _check_cutoff(self) -> None:
+        """Refuse a cut-off that one of the two grids cannot hold."""
+        grids = {
+            "low": (self.screen_length, math.pi / self.screen_pixel),
+            "high": (self.fine_length, math.pi / self.fine_pixel),
+        }
+        for scale, (length, nyquist) in grids.items():
+            lowest = 2.0 * math.pi / length
+            if not lowest < self.cutoff < nyquist:
+                raise DomainError(
+                    f"cutoff = {self.cutoff:.6g} rad/m: expected between the lowest mode and the Nyquist limit of the"
+                    f" {scale} screens, {lowest:.4g} to {nyquist:.4g} rad/m"
+                )
+
+    def _band(self, scale: str) -> tuple[int, float, tuple[float, float]]:
+        """Return samples, side [m] and wavenumbers [rad/m] of one kind of screens."""
+        if scale == "high":
+            return self.fine_size, self.fine_length, (self.cutoff, math.inf)
+        return self.screen_size, self.screen_length, (0.0, self.cutoff)
+
+    def screen_bytes(self, scales: Iterable[str]) -> int:
+        """Return how much memory the kept screens of some scales take, and the making of the last of them."""
+        grids = [self._band(scale) for scale in scales]
+        kept = sum(4 * self.layer_count * size * size for size, _, _ in grids)
+        return kept + max((working_bytes(*grid) for grid in grids), default=0)
+
+    def low_screen(
+        self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the low screen of a layer: the modes at and below the cut-off.
+
+        Parameters
+        ----------
+        layer : int
+            Index of the layer.
+        stencil : str
+            How it will be read, one of :data:`.STENCILS`; the modes are the same for all.
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+        out : ndarray, optional
+            Where to write the screen: float32, shape [screen_size, screen_size].
+
+        Returns
+        -------
+        ndarray
+            Path [m], float32, shape [screen_size, screen_size], ``[y, x]``.
+        """
+        return phase_screen(**self._drawing(layer, "low"), stencil=stencil, threads=threads, out=out)
+
+    def high_screen(
+        self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the high screen of a layer: the modes above the cut-off.
+
+        Arguments are those of :meth:`low_screen`; the screen has shape [fine_size, fine_size].
+        """
+        return phase_screen(**self._drawing(layer, "high"), stencil=stencil, threads=threads, out=out)
+
+    def slope_unit(self, layer: int) -> float:
+        """Return the slope of one count of :meth:`slope_screen` [rad]: eight standard deviations fill 15 bits."""
+        variance = slope_variance(self.r0, self.outer_scale, self.cutoff, SLOPE_LAG) * float(self.weights[layer])
+        return max(8.0 * math.sqrt(variance) / 32767.0, 1e-30)
+
+    def slope_screen(self, layer: int, *, threads: int | None = None, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the slopes of the low screen of a layer over :data:`SLOPE_LAG`, packed.
+
+        Parameters
+        ----------
+        layer : int
+            Index of the layer.
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+        out : ndarray, optional
+            Where to write the slopes: int32, shape [screen_size, screen_size].
+
+        Returns
+        -------
+        ndarray
+            As :func:`~pachon.wavefront.atmosphere.screens.slope_screen` packs them, in counts of :meth:`slope_unit`.
+        """
+        return slope_screen(
+            **self._drawing(layer, "low"), unit=self.slope_unit(layer), lag=SLOPE_LAG, threads=threads, out=out
+        )
+
+    def _drawing(self, layer: int, scale: str) -> dict[str, Any]:
+        """Return what decides one screen."""
+        if not 0 <= layer < self.layer_count:
+            raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
+        size, length, band = self._band(scale)
+        return {
+            "generator": stream(self.seed, "atmosphere", self.epoch, layer, scale),
+            "size": size,
+            "length": length,
+            "r0": self.r0,
+            "outer_scale": self.outer_scale,
+            "band": band,
+            "weight": float(self.weights[layer]),
+            "fixed_modulus": self.fixed_modulus,
+        }
+
+    def screens(self, kind: str, threads: int | None = None) -> np.ndarray:
+        """Return the screens of all layers, made once and kept for whoever asks next.
+
+        Parameters
+        ----------
+        kind : {"slopes", "low", "high"}
+            Packed slopes of the low screens, for rays; the low or the high screens as spline coefficients, for waves.
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+
+        Returns
+        -------
+        ndarray
+            Shape [n_layer, size, size], not writable.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such kind.
+        DomainError
+            If they need more memory than there is.
+        """
+        kinds: dict[str, tuple[Callable[..., np.ndarray], Any]] = {
+            "slopes": (self.slope_screen, np.int32),
+            "low": (self.low_screen, np.float32),
+            "high": (self.high_screen, np.float32),
+        }
+        if kind not in kinds:
+            raise unknown_name("kind", kind, tuple(kinds))
+        make, dtype = kinds[kind]
+        size = self._band(kind)[0]
+        name = "fine_size" if kind == "high" else "screen_size"
+        with _cache_lock:
+            if kind not in self._cache:
+                require_bytes(self.screen_bytes([kind]), f"{name} = {size} in {self.layer_count} layers")
+                screens = np.empty((self.layer_count, size, size), dtype=dtype)
+                for layer in range(self.layer_count):
+                    make(layer, threads=threads, out=screens[layer])
+                screens.setflags(write=False)
+                self._cache[kind] = screens
+            return self._cache[kind]
+
+    def release(self) -> None:
+        """Forget the kept screens; they come back, byte for byte, when next asked for."""
+        with _cache_lock:
+            self._cache.clear()
+
+    def path(self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low") -> np.ndarray:
+        """Return the path through one screen at screen coordinates, by plain NumPy.
+
+        The screen is made anew at every call: this is the reference for the engines, not a tool for production.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Screen coordinates [m].
+        layer : int
+            Index of the layer.
+        scale : str
+            ``"low"`` or ``"high"``.
+
+        Returns
+        -------
+        ndarray
+            Path [m], float64, shape of ``x``.
+        """
+        scales = {"low": (self.low_screen, self.screen_pixel), "high": (self.high_screen, self.fine_pixel)}
+        if scale not in scales:
+            raise unknown_name("scale", scale, tuple(scales))
+        make, pixel = scales[scale]
+        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        return evaluate(make(layer), pixel, x, y)
+
+
+def screen_samples(value: int, name: str) -> int:
+    """Return the samples on a side of a screen, checked."""
+    if not (isinstance(value, int | np.integer) and 4 <= value <= _LARGEST_SIZE):
+        raise DomainError(f"{name} = {value!r}: expected a whole number of samples from 4 to {_LARGEST_SIZE}")
+    return int(value)
