@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 from typer.core import TyperGroup
@@ -23,12 +24,14 @@ class DefaultGroup(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the name of the default command before arguments that do not begin with that of another one."""
         first = args[0] if args else ""
-        if first not in (*self.commands, "--help") and not self._mistyped(first):
+        if first not in (*self.commands, "--help") and not self._is_mistyped(first):
             args = [self.default, *args]
         return super().parse_args(ctx, args)
 
-    def _mistyped(self, word: str) -> bool:
-        return not word.startswith("-") and bool(get_close_matches(word, list(self.commands), cutoff=0.6))
+    def _is_mistyped(self, word: str) -> bool:
+        path = Path(word)
+        may_be_file = word.startswith("-") or bool(path.suffix) or path.exists()
+        return not may_be_file and bool(get_close_matches(word, list(self.commands)))
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help of the group, with the options of the default command."""
