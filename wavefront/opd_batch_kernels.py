@@ -11,6 +11,7 @@ from ..core.launch import FORWARD_OPTIONS
 from ..raytrace.kernels.kernel_pair import kernel_pair
 from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes, lanes_sqrt
 from ..raytrace.kernels.pupil import launched
+from ..raytrace.kernels.sphere import sphere_distance
 from ..raytrace.kernels.surface import OK, ONE, ZERO
 from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
 
@@ -96,10 +97,7 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
         x = x - lanes(sphere[b, 0])
         y = y - lanes(sphere[b, 1])
         z = z - lanes(sphere[b, 2])
-        # Distance from here on to the sphere beyond the image: sqrt((q.d)^2 - |q|^2 + R^2) - q.d.
-        qd = wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
-        qq = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
-        ahead = lanes_sqrt(wp.cw_mul(qd, qd) - qq + lanes(radius * radius)) - qd
+        ahead, _along, _root = sphere_distance(x, y, z, u, v, w, radius)
         opd = lanes(sphere[b, 3]) - (path + indices[0, surfaces.kinds.shape[0] - 1] * ahead)
         for i in range(LANES):
             at = place[p][i]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import PrescriptionError
+from .bicubic import hermite, hermite_curvature, hermite_slope
 from .shape import Shape, Triple, coordinates
 
 #: A bicubic needs the slopes at the four corners of its cell, and so a node beyond each of them.
@@ -96,7 +97,7 @@ class GridSag(Shape):
         corners = np.stack([np.stack([self.nodes[j + b, i + a] for a in (0, 1)], -2) for b in (0, 1)], -3)
         found = []
         for nx, ny in derivatives:
-            wx, wy = hermite(px - i, nx), hermite(py - j, ny)
+            wx, wy = _weights(px - i, nx), _weights(py - j, ny)
             value = (
                 np.einsum("...ba,...a,...b", corners[..., 0], wx[0], wy[0])
                 + np.einsum("...ba,...a,...b", corners[..., 1], wx[1], wy[0])
@@ -152,17 +153,10 @@ class GridSag(Shape):
         return GridSag(self.x, self.y, values)
 
 
-def hermite(t: np.ndarray, derivative: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def _weights(t: np.ndarray, derivative: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the values and of the slopes at the two ends of a cell, each [..., 2], at 0 <= t <= 1."""
-    if derivative == 0:
-        up, start, end = t * t * (3 - 2 * t), t * (1 - t) ** 2, t * t * (t - 1)
-        down = 1 - up
-    elif derivative == 1:
-        up, start, end = 6 * t * (1 - t), (1 - t) * (1 - 3 * t), t * (3 * t - 2)
-        down = -up
-    else:
-        up, start, end = 6 - 12 * t, 6 * t - 4, 6 * t - 2
-        down = -up
+    up, start, end = (hermite, hermite_slope, hermite_curvature)[derivative](t, 1.0)
+    down = 1 - up if derivative == 0 else -up
     return np.stack([down, up], axis=-1), np.stack([start, end], axis=-1)
 
 

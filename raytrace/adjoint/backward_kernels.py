@@ -26,7 +26,7 @@ import warp as wp
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, lanes, lanes_sqrt
-from ..kernels.shape_derivatives import extra_derivatives
+from ..kernels.shape_derivatives import added_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
 from ..kernels.trace import (
     DEFORMED,
@@ -132,7 +132,7 @@ def backward_loop(special: bool) -> wp.Function:
             sx, sy, sxx, sxy, syy = sag_derivatives(surfaces, s, x, y)
             if wp.static(special):
                 if surfaces.kinds[s, DEFORMED] == 1:
-                    zx, zy, zxx, zxy, zyy = extra_derivatives(surfaces.deformations, s, x, y)
+                    zx, zy, zxx, zxy, zyy = added_derivatives(surfaces.deformations, s, x, y)
                     sx = sx + zx
                     sy = sy + zy
                     sxx = sxx + zxx

@@ -9,8 +9,9 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
-from ..kernels.packet import LANES, RayPackets, lane_flags, lanes, lanes_sqrt
+from ..kernels.packet import LANES, RayPackets, lane_flags, lanes
 from ..kernels.pupil import launched
+from ..kernels.sphere import sphere_distance
 from ..kernels.surface import OK, ONE, ZERO
 from ..kernels.trace import LOOPS, PackedSurfaces, statuses
 from .backward_kernels import BACKWARD_LOOPS
@@ -97,11 +98,7 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
             x = x - lanes(fields[f, 3])
             y = y - lanes(fields[f, 4])
             z = z - lanes(fields[f, 5])
-            # Beyond the image the sphere is at root - q.d, with root = sqrt((q.d)^2 - q.q + R^2).
-            along = wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
-            square = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
-            root = lanes_sqrt(wp.cw_mul(along, along) - square + lanes(radius * radius))
-            ahead = root - along
+            ahead, along, root = sphere_distance(x, y, z, u, v, w, radius)
             ratio = wp.cw_div(along, root) - lanes(ONE)
             ax = n * wp.cw_mul(weight, wp.cw_mul(ratio, u) - wp.cw_div(x, root))
             ay = n * wp.cw_mul(weight, wp.cw_mul(ratio, v) - wp.cw_div(y, root))

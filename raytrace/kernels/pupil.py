@@ -10,7 +10,8 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from .kernel_pair import kernel_pair
-from .packet import RayPackets, lane_flags, lanes, lanes_sqrt
+from .packet import RayPackets, lane_flags, lanes
+from .sphere import sphere_distance
 from .surface import ZERO
 from .trace import LOOPS, PackedSurfaces, statuses
 
@@ -86,10 +87,7 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
         along = wp.cw_div(nx * x + ny * y + nz * z, nx * u + ny * v + nz * w)
         displacement_x[b, p] = x - wp.cw_mul(along, u)
         displacement_y[b, p] = y - wp.cw_mul(along, v)
-        # Distance from here on to the sphere beyond the image: sqrt((q.d)^2 - |q|^2 + R^2) - q.d.
-        qd = wp.cw_mul(x, u) + wp.cw_mul(y, v) + wp.cw_mul(z, w)
-        qq = wp.cw_mul(x, x) + wp.cw_mul(y, y) + wp.cw_mul(z, z)
-        ahead = lanes_sqrt(wp.cw_mul(qd, qd) - qq + lanes(radius * radius)) - qd
+        ahead, _along, _root = sphere_distance(x, y, z, u, v, w, radius)
         path_out[b, p] = path + indices[row, n_surfaces - 1] * ahead
         status_out[b, p] = statuses(status)
 

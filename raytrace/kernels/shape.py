@@ -1,7 +1,7 @@
-"""What the surface of a shape has beyond a conic with even powers of the radius: polynomials, toroids, grids, sums.
+"""Sags beyond conics with even powers of the radius: polynomials, odd powers, biconics, toroids, grids.
 
-Each surface has a list of parts whose sags add up. The formulas are those of `models.shape_freeform`,
-`models.shape_grid` and `models.polar_polynomial`, here for packets of rays in the frame of the surface.
+Each surface has a list of parts whose sags add up, in the frame of the surface. The formulas are those of
+`models.shapes`, here for packets of rays.
 """
 
 from __future__ import annotations
@@ -9,22 +9,26 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from ...models.shapes import bicubic
 from .packet import LANES, lanes, lanes_sqrt
 from .surface import FAR, NEWTON_LIMIT, ONE, ZERO, polynomial
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: Lanes that a polynomial is worked out for at a time.
+#: Lanes for which a polynomial is evaluated at a time.
 BLOCK = 16
 block = wp.types.vector(BLOCK, wp.float64)
 
-#: Newton stops for a lane when its step [m] is below this. The slopes of the last evaluation then hold where the ray
-#: lands, and the step is above what rounding leaves of distances of tens of metres.
+#: Newton's method stops for a lane when its step [m] is below this. The slopes of the last evaluation then hold at the
+#: intersection, and the step is above the rounding of distances of tens of metres.
 DEFORMATION_STEP = wp.constant(wp.float64(2.0e-13))
 
 NAN = wp.constant(wp.float64(float("nan")))
 
-# Kinds of parts; in brackets the four whole numbers beside the kind, and the figures.
+hermite_weights = wp.func(bicubic.hermite)
+hermite_slopes = wp.func(bicubic.hermite_slope)
+
+# Kinds of parts; in brackets the whole numbers beside the kind, then the numbers.
 POLAR = wp.constant(0)  #: (offset, degree, highest m): two numbers for s^k (x + iy)^m, m and k running down
 ODD = wp.constant(1)  #: (offset, terms): coefficients of r^1, r^3, r^5...
 BICONIC = wp.constant(2)  #: (offset): curvatures along x, y; (1 + k) c^2 along x, y
@@ -36,10 +40,10 @@ GRID_HEAD = wp.constant(4)
 
 @wp.struct
 class PackedDeformations:
-    """The figures of a telescope's surfaces; see :mod:`pachon.raytrace.pack.shapes`.
+    """Departures of surfaces from conics with even powers; see :mod:`pachon.raytrace.pack.shapes`.
 
-    ``span`` [surface, 2]: first part of the surface, and the one after its last. ``parts`` [part, 4]: kind, and what
-    the kinds above say. ``numbers``: figures of all parts, one after the other.
+    ``span`` [surface, 2]: first part of the surface, and the one after its last. ``parts`` [part, 4]: kind, offset of
+    its numbers, two whole numbers. ``numbers``: numbers of all parts, one after the other.
     """
 
     span: wp.array2d(dtype=wp.int32)
@@ -135,19 +139,19 @@ def biconic_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes,
     w = lanes_sqrt(lanes(ONE) - px * xx - py * yy)
     value = wp.cw_div(cx * xx + cy * yy, lanes(ONE) + w)
     # From z = u / (1 + w): dz = (du - z dw) / (1 + w), dw = -(px x dx + py y dy) / w.
-    turn = wp.cw_div(value, w)
+    ratio = wp.cw_div(value, w)
     over = wp.cw_div(lanes(ONE), lanes(ONE) + w)
     two = wp.float64(2.0)
     return (
         value,
-        wp.cw_mul(wp.cw_mul(lanes(two * cx) + px * turn, over), x),
-        wp.cw_mul(wp.cw_mul(lanes(two * cy) + py * turn, over), y),
+        wp.cw_mul(wp.cw_mul(lanes(two * cx) + px * ratio, over), x),
+        wp.cw_mul(wp.cw_mul(lanes(two * cy) + py * ratio, over), y),
     )
 
 
 @wp.func
-def toroid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
-    """Sag and slopes of g + q x^2 / (1 + w), g(y) a conic, q = cx / (1 - cx g), w = sqrt(1 - q^2 x^2)."""
+def toroid_pieces(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
+    """Root b and sag g of the conic g(y), q, the root w, h = q x^2 / (1 + w), and dh/dq."""
     cx = numbers[offset]
     cy = numbers[offset + 1]
     py = numbers[offset + 2]
@@ -156,12 +160,37 @@ def toroid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, 
     b = lanes_sqrt(lanes(ONE) - py * yy)
     g = wp.cw_div(cy * yy, lanes(ONE) + b)
     q = wp.cw_div(lanes(cx), lanes(ONE) - cx * g)
-    qq = wp.cw_mul(q, q)
-    w = lanes_sqrt(lanes(ONE) - wp.cw_mul(qq, xx))
+    w = lanes_sqrt(lanes(ONE) - wp.cw_mul(wp.cw_mul(q, q), xx))
     h = wp.cw_div(wp.cw_mul(q, xx), lanes(ONE) + w)
     h_q = wp.cw_div(wp.float64(0.5) * (xx + wp.cw_mul(h, h)), w)
-    slope_y = wp.cw_mul(wp.cw_div(cy * y, b), lanes(ONE) + wp.cw_mul(h_q, qq))
+    return b, g, q, w, h, h_q
+
+
+@wp.func
+def toroid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
+    """Sag and slopes of g + q x^2 / (1 + w), g(y) a conic, q = cx / (1 - cx g), w = sqrt(1 - q^2 x^2)."""
+    b, g, q, w, h, h_q = toroid_pieces(numbers, offset, x, y)
+    slope_y = wp.cw_mul(wp.cw_div(numbers[offset + 1] * y, b), lanes(ONE) + wp.cw_mul(h_q, wp.cw_mul(q, q)))
     return g + h, wp.cw_div(wp.cw_mul(q, x), w), slope_y
+
+
+@wp.func
+def grid_cell(a: wp.float64, nodes: wp.int32):
+    """Cell in which a place lies, in units of cells; the outermost beyond them, and the first for a NaN."""
+    last = wp.float64(nodes - 1)
+    return wp.clamp(wp.int32(wp.where(a > ZERO, wp.min(a, last), ZERO)), 0, nodes - 2)
+
+
+@wp.func
+def cubic(numbers: wp.array(dtype=wp.float64), at: wp.int32, up: wp.float64, start: wp.float64, end: wp.float64):
+    """Cubic along x between a node and the next, given the weights at a place of the cell."""
+    return numbers[at] + up * (numbers[at + 4] - numbers[at]) + start * numbers[at + 1] + end * numbers[at + 5]
+
+
+@wp.func
+def cubic_change(numbers: wp.array(dtype=wp.float64), at: wp.int32, up: wp.float64, start: wp.float64, end: wp.float64):
+    """Slope or second derivative of the cubic, given those of the weights."""
+    return up * (numbers[at + 4] - numbers[at]) + start * numbers[at + 1] + end * numbers[at + 5]
 
 
 @wp.func
@@ -175,56 +204,31 @@ def grid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, nx: wp.int32
     slope_x = lanes(ZERO)
     slope_y = lanes(ZERO)
     outside = lanes(ZERO)
-    three = wp.float64(3.0)
-    six = wp.float64(6.0)
-    two = wp.float64(2.0)
-    last_x = wp.float64(nx - 1)
-    last_y = wp.float64(ny - 1)
     # A loop that the compiler does not unroll: the nodes are fetched lane by lane.
     for i in range(LANES + 0 * nx):
         a = px[i]
         b = py[i]
-        if a >= ZERO and a <= last_x and b >= ZERO and b <= last_y:
+        if a >= ZERO and a <= wp.float64(nx - 1) and b >= ZERO and b <= wp.float64(ny - 1):
             outside[i] = ZERO
         else:
             outside[i] = ONE
-        # A NaN becomes the first cell, and stays a NaN.
-        column = wp.clamp(wp.int32(wp.where(a > ZERO, wp.min(a, last_x), ZERO)), 0, nx - 2)
-        row = wp.clamp(wp.int32(wp.where(b > ZERO, wp.min(b, last_y), ZERO)), 0, ny - 2)
-        t = a - wp.float64(column)
-        r = b - wp.float64(row)
+        column = grid_cell(a, nx)
+        row = grid_cell(b, ny)
         low = offset + GRID_HEAD + 4 * (row * nx + column)
         high = low + 4 * nx
-        # Cubic Hermite weights: of the value (1 at the far end) and of the slopes at both ends, and their derivatives.
-        tu = t * t * (three - two * t)
-        ts = t * (ONE - t) * (ONE - t)
-        te = t * t * (t - ONE)
-        ru = r * r * (three - two * r)
-        rs = r * (ONE - r) * (ONE - r)
-        re = r * r * (r - ONE)
-        dtu = six * t * (ONE - t)
-        dts = (ONE - t) * (ONE - three * t)
-        dte = t * (three * t - two)
-        dru = six * r * (ONE - r)
-        drs = (ONE - r) * (ONE - three * r)
-        dre = r * (three * r - two)
+        tu, ts, te = hermite_weights(a - wp.float64(column), ONE)
+        dtu, dts, dte = hermite_slopes(a - wp.float64(column), ONE)
+        ru, rs, re = hermite_weights(b - wp.float64(row), ONE)
+        dru, drs, dre = hermite_slopes(b - wp.float64(row), ONE)
         # At the lower and upper side of the cell: the sag, its slope along x, and the same of its slope along y.
-        z0 = numbers[low]
-        z1 = numbers[high]
-        m0 = numbers[low + 2]
-        m1 = numbers[high + 2]
-        dz0 = numbers[low + 4] - z0
-        dz1 = numbers[high + 4] - z1
-        dm0 = numbers[low + 6] - m0
-        dm1 = numbers[high + 6] - m1
-        f0 = z0 + tu * dz0 + ts * numbers[low + 1] + te * numbers[low + 5]
-        f1 = z1 + tu * dz1 + ts * numbers[high + 1] + te * numbers[high + 5]
-        g0 = m0 + tu * dm0 + ts * numbers[low + 3] + te * numbers[low + 7]
-        g1 = m1 + tu * dm1 + ts * numbers[high + 3] + te * numbers[high + 7]
-        fx0 = dtu * dz0 + dts * numbers[low + 1] + dte * numbers[low + 5]
-        fx1 = dtu * dz1 + dts * numbers[high + 1] + dte * numbers[high + 5]
-        gx0 = dtu * dm0 + dts * numbers[low + 3] + dte * numbers[low + 7]
-        gx1 = dtu * dm1 + dts * numbers[high + 3] + dte * numbers[high + 7]
+        f0 = cubic(numbers, low, tu, ts, te)
+        f1 = cubic(numbers, high, tu, ts, te)
+        g0 = cubic(numbers, low + 2, tu, ts, te)
+        g1 = cubic(numbers, high + 2, tu, ts, te)
+        fx0 = cubic_change(numbers, low, dtu, dts, dte)
+        fx1 = cubic_change(numbers, high, dtu, dts, dte)
+        gx0 = cubic_change(numbers, low + 2, dtu, dts, dte)
+        gx1 = cubic_change(numbers, high + 2, dtu, dts, dte)
         value[i] = f0 + ru * (f1 - f0) + rs * g0 + re * g1
         slope_x[i] = rate_x * (fx0 + ru * (fx1 - fx0) + rs * gx0 + re * gx1)
         slope_y[i] = rate_y * (dru * (f1 - f0) + drs * g0 + dre * g1)
@@ -232,7 +236,7 @@ def grid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, nx: wp.int32
 
 
 @wp.func
-def extra_sag(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes):
+def added_sag(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes):
     """Sum of the parts of surface ``s``: sag [m], slopes along x and y, and whether a lane lies beyond a grid."""
     value = lanes(ZERO)
     slope_x = lanes(ZERO)
@@ -243,32 +247,23 @@ def extra_sag(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes)
         offset = deformations.parts[part, 1]
         a = deformations.parts[part, 2]
         b = deformations.parts[part, 3]
+        dz = lanes(ZERO)
+        dx = lanes(ZERO)
+        dy = lanes(ZERO)
         if kind == POLAR:
             dz, dx, dy = polar_sag(deformations.numbers, offset, a, b, x, y)
-            value = value + dz
-            slope_x = slope_x + dx
-            slope_y = slope_y + dy
         elif kind == ODD:
             dz, dx, dy = odd_sag(deformations.numbers, offset, a, x, y)
-            value = value + dz
-            slope_x = slope_x + dx
-            slope_y = slope_y + dy
         elif kind == BICONIC:
             dz, dx, dy = biconic_sag(deformations.numbers, offset, x, y)
-            value = value + dz
-            slope_x = slope_x + dx
-            slope_y = slope_y + dy
         elif kind == TOROID:
             dz, dx, dy = toroid_sag(deformations.numbers, offset, x, y)
-            value = value + dz
-            slope_x = slope_x + dx
-            slope_y = slope_y + dy
         elif kind == GRID:
             dz, dx, dy, beyond = grid_sag(deformations.numbers, offset, a, b, x, y)
-            value = value + dz
-            slope_x = slope_x + dx
-            slope_y = slope_y + dy
             outside = outside + beyond
+        value = value + dz
+        slope_x = slope_x + dx
+        slope_y = slope_y + dy
     return value, slope_x, slope_y, outside
 
 
@@ -289,10 +284,10 @@ def deformed_distance(
     start: lanes,
     screen: wp.int32,
 ):
-    """Distance to surface ``s`` with its figure by Newton's method from ``start``, for a screen that distance itself.
+    """Distance to surface ``s`` with its parts by Newton's method from ``start``; to a screen, ``start`` itself.
 
-    The implicit form is that of an asphere, with b = z - (a_4 r^4 + ...) - (the parts). Returned beside the distance:
-    sag and slopes of the parts where the ray lands, and which lanes did not converge. Beyond a grid the distance is a
+    The implicit form is that of an asphere, with b = z - (a_4 r^4 + ...) - (the parts). Returned with the distance:
+    sag and slopes of the parts at the intersection, and which lanes did not converge. Beyond a grid the distance is
     NaN.
     """
     # A ray beyond the first guess starts from the vertex plane.
@@ -310,7 +305,7 @@ def deformed_distance(
         py = y + wp.cw_mul(t, v)
         r2 = wp.cw_mul(px, px) + wp.cw_mul(py, py)
         outward = wp.cw_mul(px, u) + wp.cw_mul(py, v)
-        value, slope_x, slope_y, outside = extra_sag(deformations, s, px, py)
+        value, slope_x, slope_y, outside = added_sag(deformations, s, px, py)
         b = z + wp.cw_mul(t, w) - value
         along = w - wp.cw_mul(slope_x, u) - wp.cw_mul(slope_y, v)
         if terms > 0:
@@ -322,10 +317,10 @@ def deformed_distance(
         rate = wp.cw_mul(q, along) - c * outward
         step = wp.cw_div(g, rate)
         if screen == 1:
-            # The figure is a map on the plane, and moves no landing.
+            # The sag of a screen is a map on its plane: intersections stay where they are.
             step = ZERO * start
         for i in range(LANES):
-            # A lane that has converged stays as it is, whatever its neighbours still need.
+            # A lane that has converged stays as it is.
             on = running[i] > ZERO
             sag[i] = wp.where(on, value[i], sag[i])
             sag_x[i] = wp.where(on, slope_x[i], sag_x[i])

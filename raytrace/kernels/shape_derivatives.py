@@ -1,18 +1,35 @@
-"""First and second derivatives of the parts that `figure_kernels` adds up, for sweeps that follow how rays change."""
+"""First and second derivatives of the parts of surfaces, for the backward pass."""
 
 from __future__ import annotations
 
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from ...models.shapes import bicubic
 from .packet import LANES, lanes, lanes_sqrt
-from .shape import BICONIC, GRID, GRID_HEAD, ODD, POLAR, TOROID, PackedDeformations, biconic_sag, toroid_sag
+from .shape import (
+    BICONIC,
+    GRID,
+    GRID_HEAD,
+    ODD,
+    POLAR,
+    TOROID,
+    PackedDeformations,
+    biconic_sag,
+    cubic,
+    cubic_change,
+    grid_cell,
+    hermite_slopes,
+    hermite_weights,
+    toroid_pieces,
+)
 from .surface import ONE, TWO, ZERO
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-HALF = wp.constant(wp.float64(0.5))
 FOUR = wp.constant(wp.float64(4.0))
+
+hermite_curvatures = wp.func(bicubic.hermite_curvature)
 
 
 @wp.func
@@ -91,19 +108,19 @@ def odd_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, terms
     """Return derivatives x, y, xx, xy, yy of a_1 r + a_3 r^3 + ...; at r = 0 all are zero."""
     s = wp.cw_mul(x, x) + wp.cw_mul(y, y)
     slope = lanes(ZERO)
-    bend = lanes(ZERO)
+    change = lanes(ZERO)
     for j in range(terms):
         # p = sum n a_n r^(n - 1) and 2 dp/ds, n = 2 m + 1: the slope is p / r times x, y.
         m = terms - 1 - j
         a = numbers[offset + m] * wp.float64(2 * m + 1)
-        bend = wp.cw_mul(bend, s) + TWO * slope
+        change = wp.cw_mul(change, s) + TWO * slope
         slope = wp.cw_mul(slope, s) + lanes(a)
     r = lanes_sqrt(s)
     over = lanes()
     twist = lanes()
     for i in range(LANES):
         over[i] = wp.where(r[i] > ZERO, slope[i] / r[i], ZERO)
-        twist[i] = wp.where(r[i] > ZERO, (bend[i] - slope[i] / s[i]) / r[i], ZERO)
+        twist[i] = wp.where(r[i] > ZERO, (change[i] - slope[i] / s[i]) / r[i], ZERO)
     return (
         wp.cw_mul(over, x),
         wp.cw_mul(over, y),
@@ -140,28 +157,19 @@ def biconic_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x
 
 @wp.func
 def toroid_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x: lanes, y: lanes):
-    """Return derivatives x, y, xx, xy, yy of g + h(q, x), dq/dg = q^2, as in `models.shape_freeform.Toroid`."""
-    cx = numbers[offset]
+    """Return derivatives x, y, xx, xy, yy of g + h(q, x), dq/dg = q^2, as in `models.shapes.freeform.Toroid`."""
     cy = numbers[offset + 1]
-    py = numbers[offset + 2]
-    yy = wp.cw_mul(y, y)
     xx = wp.cw_mul(x, x)
-    b = lanes_sqrt(lanes(ONE) - py * yy)
-    g = wp.cw_div(cy * yy, lanes(ONE) + b)
+    b, _g, q, w, h, h_q = toroid_pieces(numbers, offset, x, y)
     g1 = wp.cw_div(cy * y, b)
     g2 = wp.cw_div(lanes(cy), wp.cw_mul(b, wp.cw_mul(b, b)))
-    q = wp.cw_div(lanes(cx), lanes(ONE) - cx * g)
     qq = wp.cw_mul(q, q)
-    w = lanes_sqrt(lanes(ONE) - wp.cw_mul(qq, xx))
-    h = wp.cw_div(wp.cw_mul(q, xx), lanes(ONE) + w)
-    h_q = wp.cw_div(HALF * (xx + wp.cw_mul(h, h)), w)
     h_qq = wp.cw_mul(h_q, wp.cw_div(wp.cw_mul(q, xx), wp.cw_mul(w, w)) + wp.cw_div(h, w))
-    _z, zx, zy = toroid_sag(numbers, offset, x, y)
     cube = wp.cw_mul(w, wp.cw_mul(w, w))
     grown = wp.cw_mul(h_qq, wp.cw_mul(qq, qq)) + TWO * wp.cw_mul(h_q, wp.cw_mul(q, qq))
     return (
-        zx,
-        zy,
+        wp.cw_div(wp.cw_mul(q, x), w),
+        wp.cw_mul(g1, lanes(ONE) + wp.cw_mul(h_q, qq)),
         wp.cw_div(q, cube),
         wp.cw_mul(wp.cw_div(x, cube), wp.cw_mul(qq, g1)),
         wp.cw_mul(g2, lanes(ONE) + wp.cw_mul(h_q, qq)) + wp.cw_mul(wp.cw_mul(g1, g1), grown),
@@ -182,37 +190,19 @@ def grid_derivatives(
     zxx = lanes(ZERO)
     zxy = lanes(ZERO)
     zyy = lanes(ZERO)
-    three = wp.float64(3.0)
-    six = wp.float64(6.0)
-    last_x = wp.float64(nx - 1)
-    last_y = wp.float64(ny - 1)
     # A loop that the compiler does not unroll: the nodes are fetched lane by lane.
     for i in range(LANES + 0 * nx):
-        a = px[i]
-        b = py[i]
-        column = wp.clamp(wp.int32(wp.where(a > ZERO, wp.min(a, last_x), ZERO)), 0, nx - 2)
-        row = wp.clamp(wp.int32(wp.where(b > ZERO, wp.min(b, last_y), ZERO)), 0, ny - 2)
-        t = a - wp.float64(column)
-        r = b - wp.float64(row)
+        column = grid_cell(px[i], nx)
+        row = grid_cell(py[i], ny)
         low = offset + GRID_HEAD + 4 * (row * nx + column)
-        ru = r * r * (three - TWO * r)
-        rs = r * (ONE - r) * (ONE - r)
-        re = r * r * (r - ONE)
-        dru = six * r * (ONE - r)
-        drs = (ONE - r) * (ONE - three * r)
-        dre = r * (three * r - TWO)
-        ddru = six - six * TWO * r
-        ddrs = six * r - FOUR
-        ddre = six * r - TWO
-        tu = t * t * (three - TWO * t)
-        ts = t * (ONE - t) * (ONE - t)
-        te = t * t * (t - ONE)
-        dtu = six * t * (ONE - t)
-        dts = (ONE - t) * (ONE - three * t)
-        dte = t * (three * t - TWO)
-        ddtu = six - six * TWO * t
-        ddts = six * t - FOUR
-        ddte = six * t - TWO
+        t = px[i] - wp.float64(column)
+        r = py[i] - wp.float64(row)
+        tu, ts, te = hermite_weights(t, ONE)
+        dtu, dts, dte = hermite_slopes(t, ONE)
+        ddtu, ddts, ddte = hermite_curvatures(t, ONE)
+        ru, rs, re = hermite_weights(r, ONE)
+        dru, drs, dre = hermite_slopes(r, ONE)
+        ddru, ddrs, ddre = hermite_curvatures(r, ONE)
         for side in range(2):
             at = low + 4 * nx * side
             # Weights along y, of the value and of the slope at this side, and their derivatives.
@@ -229,14 +219,12 @@ def grid_derivatives(
                 ds = drs
                 ddu = -ddru
                 dds = ddrs
-            step = numbers[at + 4] - numbers[at]
-            lift = numbers[at + 6] - numbers[at + 2]
-            f = numbers[at] + tu * step + ts * numbers[at + 1] + te * numbers[at + 5]
-            g = numbers[at + 2] + tu * lift + ts * numbers[at + 3] + te * numbers[at + 7]
-            fx = dtu * step + dts * numbers[at + 1] + dte * numbers[at + 5]
-            gx = dtu * lift + dts * numbers[at + 3] + dte * numbers[at + 7]
-            fxx = ddtu * step + ddts * numbers[at + 1] + ddte * numbers[at + 5]
-            gxx = ddtu * lift + ddts * numbers[at + 3] + ddte * numbers[at + 7]
+            f = cubic(numbers, at, tu, ts, te)
+            g = cubic(numbers, at + 2, tu, ts, te)
+            fx = cubic_change(numbers, at, dtu, dts, dte)
+            gx = cubic_change(numbers, at + 2, dtu, dts, dte)
+            fxx = cubic_change(numbers, at, ddtu, ddts, ddte)
+            gxx = cubic_change(numbers, at + 2, ddtu, ddts, ddte)
             zx[i] = zx[i] + rate_x * (wu * fx + ws * gx)
             zy[i] = zy[i] + rate_y * (du * f + ds * g)
             zxx[i] = zxx[i] + rate_x * rate_x * (wu * fxx + ws * gxx)
@@ -246,7 +234,7 @@ def grid_derivatives(
 
 
 @wp.func
-def extra_derivatives(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes):
+def added_derivatives(deformations: PackedDeformations, s: wp.int32, x: lanes, y: lanes):
     """Sum of the parts of surface ``s``: their slopes along x and y, and second derivatives xx, xy, yy [1/m]."""
     zx = lanes(ZERO)
     zy = lanes(ZERO)

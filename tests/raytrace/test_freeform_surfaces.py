@@ -19,7 +19,7 @@ from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import Telescope
 from pachon.raytrace.kernels.packet import lanes, to_packets
 from pachon.raytrace.kernels.shape import PackedDeformations
-from pachon.raytrace.kernels.shape_derivatives import extra_derivatives
+from pachon.raytrace.kernels.shape_derivatives import added_derivatives
 from pachon.raytrace.pack.shapes import pack_deformations, split_shape
 from pachon.raytrace.rays import Rays, RayStatus
 
@@ -213,7 +213,7 @@ def ask_derivatives(
     out: wp.array2d(dtype=lanes),
 ):
     p = first + wp.tid()
-    zx, zy, zxx, zxy, zyy = extra_derivatives(deformations, s, x[p], y[p])
+    zx, zy, zxx, zxy, zyy = added_derivatives(deformations, s, x[p], y[p])
     out[0, p] = zx
     out[1, p] = zy
     out[2, p] = zxx
