@@ -12,7 +12,7 @@ from ...core.errors import DomainError
 from ...core.launch import launch
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import clear_ring, pack_surfaces
-from ...raytrace.rays import Rays
+from ...raytrace.rays import parallel_rays
 from ...raytrace.trace import trace_packets
 from .clear_pupil_kernels import find_edges
 from .sample_packets import shared
@@ -119,15 +119,9 @@ def clear_edges(
     n_star, n_spoke = len(direction), len(unit)
     outer = 0.5 * telescope.pupil_diameter
     radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
-    point = np.empty((3, _EDGE_RINGS * n_spoke))
-    point[:2] = (radius[:, None, None] * unit).reshape(-1, 2).T
-    point[2] = telescope.stop_z
-    # Summed by hand: a matrix product may round otherwise for another number of stars.
-    along = sum(direction[:, axis, None] * point[axis] for axis in range(3)) + telescope.launch_distance
-    start = (point[:, None] - direction.T[:, :, None] * along).reshape(3, -1)
-    heading = np.repeat(direction.T, point.shape[1], axis=1)
-    n_ray, n_surface = start.shape[1], len(telescope.surfaces)
-    rays = Rays(start.T, heading.T, np.zeros(n_ray), wavelength)
+    points = (radius[:, None, None] * unit).reshape(-1, 2)
+    n_surface = len(telescope.surfaces)
+    rays = parallel_rays(telescope, direction, wavelength, points)
     places = trace_packets(telescope, rays, n_surface, threads=threads).end.position
     surfaces = pack_surfaces(telescope)
     edges = np.empty((n_star, n_spoke, 2))
