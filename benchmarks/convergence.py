@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 import pachon
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 ARCSEC = np.pi / 180 / 3600
 #: The engine's own defaults, and the finest values that a reference run takes.

@@ -45,10 +45,10 @@ from .raytrace.rays import launch_rays as launch_rays
 from .raytrace.trace import trace as trace
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
+from .wavefront.chief_rays import fields_at as fields_at
 from .wavefront.opd import wavefront_opd as wavefront_opd
-from .wavefront.opd_batch import wavefront_opds as wavefront_opds
+from .wavefront.opd import wavefront_opds as wavefront_opds
 from .wavefront.psf.psf import make_psfs as make_psfs
-from .wavefront.pupil_optics import fields_at as fields_at
 from .wavefront.pupil_sampling import PupilSampling as PupilSampling
 from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling
 from .wavefront.request import Request as Request

@@ -24,8 +24,8 @@ from ..raytrace.rays import field_direction
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
+from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
-from ..wavefront.pupil_optics import chief_rays
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .simulate.photometry import ARCSEC

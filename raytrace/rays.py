@@ -69,6 +69,35 @@ def field_direction(tx: Any, ty: Any, projection: str = "zemax") -> np.ndarray:
     return np.stack([-sx * down, -sy * down, down], axis=-1)
 
 
+def field_angles(slopes: np.ndarray, projection: str = "zemax") -> np.ndarray:
+    """Return the field angles [rad] of light with slopes (vx, vy)/abs(vz): the inverse of :func:`field_direction`.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape [n, 2]
+        Slopes of the light's own travel.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the angles returned.
+
+    Returns
+    -------
+    ndarray, shape [n, 2]
+
+    Raises
+    ------
+    ConfigError
+        If the projection is unknown.
+    """
+    if projection == "zemax":
+        return np.arctan(slopes)
+    if projection == "gnomonic":
+        return slopes
+    if projection == "postel":
+        slope = np.hypot(*slopes.T)[:, None]
+        return slopes * np.divide(np.arctan(slope), slope, out=np.ones_like(slope), where=slope > 0)
+    raise ConfigError(f"projection = {projection!r}: expected one of {', '.join(PROJECTIONS)}")
+
+
 @dataclass(frozen=True)
 class Rays:
     """Rays of one wavelength before the first surface, in the telescope frame.

@@ -11,7 +11,7 @@ from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, field_direction, launch_bundles
 from ..raytrace.trace import trace
-from .reference_sphere import distance_to_sphere
+from .reference_sphere import path_to_sphere
 
 #: Rays in one block of :func:`bundle_blocks`: 15 doubles each, so some 60 MB.
 RAYS_AT_ONCE = 1 << 19
@@ -92,11 +92,9 @@ class Bundles:
         """
         along = (defocus / self.chief_direction[:, 2:]) if defocus else 0.0
         center = self.chief_position + along * self.chief_direction
-        chief = self.chief_path + self.index * distance_to_sphere(
-            self.chief_position, self.chief_direction, center, radius
-        )
-        path = self.path + self.index * distance_to_sphere(self.position, self.direction, center[:, None], radius)
-        return chief[:, None] - path
+        chief = (self.chief_path, self.index, self.chief_position, self.chief_direction)
+        rays = (self.path, self.index, self.position, self.direction)
+        return path_to_sphere(*chief, center, radius)[:, None] - path_to_sphere(*rays, center[:, None], radius)
 
 
 def _at_height(position: np.ndarray, direction: np.ndarray, height: float) -> np.ndarray:

@@ -1,157 +1,42 @@
-"""Optical path difference of a telescope at one field point and wavelength."""
+"""Optical path differences over the entrance pupil, of one field point or of many."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import ConfigError, DomainError
-from ..core.units import metres, radians
+from ..core.units import metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import RayStatus, field_direction, launch_rays
+from ..raytrace.rays import RayStatus
 from ..raytrace.trace import trace
-from .reference_sphere import distance_to_sphere, reference_spheres
+from .chief_rays import reference_rays
+from .opd_map import OpdMap, OpdMaps
+from .opd_packets import OpdTracer
+from .pupil_sampling import CHIEF_RAY
+from .reference_sphere import path_to_sphere
+from .request import Request
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from .zernike import ZernikeFit
-
-
-@dataclass(frozen=True)
-class OpdMap:
-    """Optical path difference over the entrance pupil.
-
-    Attributes
-    ----------
-    value : ndarray
-        Path of the reference ray minus path of the ray [m], to the reference sphere; positive where the wavefront
-        leads. NaN where no light passes. Shape of the pupil coordinates.
-    x, y : ndarray
-        Entrance-pupil coordinates [m], same shape.
-    lit : ndarray of bool
-        Where light passes, same shape.
-    wavelength : float
-        Vacuum wavelength [m].
-    field : tuple of float
-        Field angles [rad].
-    center : ndarray, shape [3]
-        Centre of the reference sphere, telescope frame [m].
-    radius : float
-        Radius of the reference sphere [m].
-    exit_direction : ndarray, shape [..., 3]
-        Directions of the rays at the image, telescope frame; the first two are the exit-pupil coordinates that
-        diffraction knows.
-    landing : ndarray, shape [..., 3]
-        Where the rays meet the image surface, telescope frame [m].
-    """
-
-    value: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    lit: np.ndarray
-    wavelength: float
-    field: tuple[float, float]
-    center: np.ndarray
-    radius: float
-    exit_direction: np.ndarray
-    landing: np.ndarray
-
-    @property
-    def waves(self) -> np.ndarray:
-        """The map in waves at its own wavelength."""
-        return self.value / self.wavelength
-
-    @property
-    def rms(self) -> float:
-        """Root mean square over the lit points, piston removed [m]."""
-        return float(np.std(self.value[self.lit]))
-
-    @property
-    def peak_to_valley(self) -> float:
-        """Highest minus lowest value over the lit points [m]."""
-        return float(np.ptp(self.value[self.lit]))
-
-    @property
-    def without_tilt(self) -> np.ndarray:
-        """The map [m] less the piston and the tilts that fit its lit points best."""
-        if not self.lit.any():
-            raise DomainError(f"field = {self.field}: no light passes; expected a lit pupil")
-        plane = np.stack([np.ones_like(self.x), self.x, self.y], axis=-1)
-        terms, *_ = np.linalg.lstsq(plane[self.lit], self.value[self.lit], rcond=None)
-        return self.value - plane @ terms
-
-    def plot(self, zernikes: ZernikeFit | None = None, name: str = "") -> Figure:
-        """Draw the map, which must be on a square grid, with and without piston and tilt.
-
-        Parameters
-        ----------
-        zernikes : ZernikeFit, optional
-            Zernike terms to draw as bars below.
-        name : str
-            Name of the telescope, for the title.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-        """
-        from .opd_plot import opd_figure
-
-        return opd_figure(self, zernikes, name)
-
-
-def pupil_grid(diameter: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the centres of n x n cells that tile the square about the entrance pupil, [y, x] order [m]."""
-    if int(n) != n or n < 2:
-        raise DomainError(f"grid = {n!r}: expected a whole number of at least 2 points across the pupil")
-    u = ((np.arange(int(n)) + 0.5) / int(n) - 0.5) * diameter
-    x, y = np.meshgrid(u, u)
-    return x, y
-
-
-def pupil_points(
-    telescope: Telescope, pupil: tuple[Any, Any] | None, grid: int | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return entrance-pupil coordinates [m] as given, or those of a square grid, of 64 cells if neither is given.
-
-    Raises
-    ------
-    ConfigError
-        If both are given.
-    """
-    if pupil is not None and grid is not None:
-        raise ConfigError("pupil and grid are both given: expected one of them")
-    if pupil is None:
-        return pupil_grid(telescope.pupil_diameter, 64 if grid is None else grid)
-    x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
-    return x, y
-
-
-def sphere_radius_of(telescope: Telescope, sphere_radius: Any) -> float:
-    """Return the radius of the reference sphere [m]: the one given, or the telescope's own."""
-    if sphere_radius is None:
-        return telescope.reference_sphere_radius
-    radius = float(metres(sphere_radius, "sphere_radius"))
-    if not radius > 0:
-        raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
-    return radius
+#: Rays in one batch: enough that starting a batch does not count, and 0.2 s between two reports of progress.
+RAYS_AT_ONCE = 1 << 22
+_ADVICE = "; wavefront_opd can do without it, with reference='mean'"
 
 
 def wavefront_opd(
     telescope: Telescope,
-    field: tuple[Any, Any],
-    wavelength: Any,
-    pupil: tuple[Any, Any] | None = None,
+    field: ArrayLike,
+    wavelength: ArrayLike,
+    pupil: tuple[ArrayLike, ArrayLike] | None = None,
     projection: str = "zemax",
     reference: str = "chief",
     focal_plane: FocalPlane | None = None,
     *,
     grid: int | None = None,
-    sphere_radius: Any = None,
+    sphere_radius: ArrayLike | None = None,
     threads: int | None = None,
 ) -> OpdMap:
     """Return the optical path difference over the entrance pupil.
@@ -162,16 +47,14 @@ def wavefront_opd(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, projection, threads
+        As in :meth:`pachon.Request.of`.
     field : (tx, ty)
         Field angles [rad] or Quantities, in the stated projection; slopes of the light's own travel.
     wavelength : float or Quantity
         Vacuum wavelength [m].
     pupil : (px, py), optional
         Entrance-pupil coordinates [m], arrays of one shape.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
     reference : {"chief", "mean"}
         "chief": sphere and zero of the path at the chief ray. "mean": sphere about the mean landing point of the
         lit rays, zero at their mean path.
@@ -181,8 +64,6 @@ def wavefront_opd(
         In place of ``pupil``: cells across the pupil diameter of a square grid. 64 when neither is given.
     sphere_radius : float or Quantity, optional
         Radius of the reference sphere [m]; the telescope's own by default.
-    threads : int, optional
-        Number of threads; all processors by default.
 
     Returns
     -------
@@ -197,33 +78,138 @@ def wavefront_opd(
     """
     if reference not in ("chief", "mean"):
         raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
-    x, y = pupil_points(telescope, pupil, grid)
-    radius = sphere_radius_of(telescope, sphere_radius)
-    rays = launch_rays(telescope, field, wavelength, (x, y), projection)
-    angles = np.array([float(radians(field[0], "field x")), float(radians(field[1], "field y"))])
+    x, y = _pupil_points(telescope, pupil, grid)
+    radius = _sphere_radius(telescope, sphere_radius)
+    request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    if len(request.fields) != 1:
+        raise DomainError(f"field of shape {request.fields.shape}: expected two angles")
+    w, index = request.wavelength, refractive_indices(telescope, request.wavelength)[-2]
+    rays = request.launch(w, np.stack([x.ravel(), y.ravel()], axis=-1))
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
     lit = (end.status == RayStatus.OK) | (end.status == RayStatus.GAP)
     if reference == "chief":
-        direction = field_direction(angles[0], angles[1], projection)[None]
-        chief = reference_spheres(telescope, angles[None], direction, rays.wavelength, radius, focal_plane, threads)
-        center = chief.center[0]
+        centers, chief_path = _spheres(request, radius, focal_plane)
+        center = centers[0]
     else:
         if not lit.any():
             raise DomainError(f"field = {field!r}: no ray reaches the image")
         center = end.position[lit].mean(axis=0)
-    index = refractive_indices(telescope, rays.wavelength)[-2]
-    path = end.path_length + index * distance_to_sphere(end.position, end.direction, center, radius)
-    zero = chief.path[0] if reference == "chief" else path[lit].mean()
-    value = np.where(lit, zero - path, np.nan)
+    path = path_to_sphere(end.path_length, index, end.position, end.direction, center, radius)
+    zero = chief_path[0] if reference == "chief" else path[lit].mean()
     return OpdMap(
-        value=value.reshape(x.shape),
+        value=np.where(lit, zero - path, np.nan).reshape(x.shape),
         x=x,
         y=y,
         lit=lit.reshape(x.shape),
-        wavelength=rays.wavelength,
-        field=(float(angles[0]), float(angles[1])),
+        wavelength=w,
+        field=(float(request.fields[0, 0]), float(request.fields[0, 1])),
         center=center,
         radius=radius,
         exit_direction=end.direction.reshape(*x.shape, 3),
         landing=end.position.reshape(*x.shape, 3),
     )
+
+
+def wavefront_opds(
+    telescope: Telescope,
+    fields: ArrayLike,
+    wavelength: ArrayLike,
+    pupil: tuple[ArrayLike, ArrayLike] | None = None,
+    projection: str = "zemax",
+    focal_plane: FocalPlane | None = None,
+    *,
+    grid: int | None = None,
+    sphere_radius: ArrayLike | None = None,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> OpdMaps:
+    """Return the optical path difference over the entrance pupil of many field points.
+
+    The maps are those of :func:`wavefront_opd` with the chief ray as reference, but for rounding in the last bits. No
+    ray is kept, and light that the first aperture stops is traced no further; beside the maps themselves a batch takes
+    a few megabytes.
+
+    Parameters
+    ----------
+    telescope, wavelength, pupil, projection, focal_plane, grid, sphere_radius, threads
+        As in :func:`wavefront_opd`; the pupil points are the same for all fields.
+    fields : array_like or Quantity, shape [n_field, 2]
+        Field angles [rad], in the stated projection.
+    progress : callable, optional
+        Called after each batch with the number of fields done since the last call.
+
+    Returns
+    -------
+    OpdMaps
+
+    Raises
+    ------
+    ConfigError
+        If both ``pupil`` and ``grid`` are given, or the projection is unknown.
+    DomainError
+        If a field or the wavelength lies outside what the telescope covers, or a chief ray does not reach the image or
+        lands between the CCDs.
+    """
+    x, y = _pupil_points(telescope, pupil, grid)
+    radius = _sphere_radius(telescope, sphere_radius)
+    request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    centers, chief_path = _spheres(request, radius, focal_plane)
+    spheres = np.concatenate([centers, chief_path[:, None]], axis=1)
+    n_fields = len(request.fields)
+    value = np.full((n_fields, x.size), np.nan)
+    tracer = OpdTracer.of(telescope, request.wavelength, x.ravel(), y.ravel(), radius)
+    step = max(1, RAYS_AT_ONCE // max(1, x.size))
+    for first in range(0, n_fields, step):
+        part = slice(first, min(first + step, n_fields))
+        tracer.trace(request.directions[part], spheres[part], value[part], threads)
+        if progress is not None:
+            progress(part.stop - part.start)
+    return OpdMaps(
+        value=value.reshape(-1, *x.shape),
+        x=x,
+        y=y,
+        wavelength=request.wavelength,
+        radius=radius,
+        fields=request.fields,
+        centers=centers,
+    )
+
+
+def pupil_grid(diameter: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the centres of n x n cells that tile the square about the entrance pupil, [y, x] order [m]."""
+    if int(n) != n or n < 2:
+        raise DomainError(f"grid = {n!r}: expected a whole number of at least 2 points across the pupil")
+    u = ((np.arange(int(n)) + 0.5) / int(n) - 0.5) * diameter
+    x, y = np.meshgrid(u, u)
+    return x, y
+
+
+def _pupil_points(
+    telescope: Telescope, pupil: tuple[ArrayLike, ArrayLike] | None, grid: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return entrance-pupil coordinates [m] as given, or those of a square grid."""
+    if pupil is not None and grid is not None:
+        raise ConfigError("pupil and grid are both given: expected one of them")
+    if pupil is None:
+        return pupil_grid(telescope.pupil_diameter, 64 if grid is None else grid)
+    x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
+    return x, y
+
+
+def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> float:
+    if sphere_radius is None:
+        return telescope.reference_sphere_radius
+    radius = float(metres(sphere_radius, "sphere_radius"))
+    if not radius > 0:
+        raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
+    return radius
+
+
+def _spheres(request: Request, radius: float, focal_plane: FocalPlane | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres [n_field, 3] of the reference spheres and optical paths [n_field] of their chief rays [m]."""
+    telescope, w = request.telescope, request.wavelength
+    chief = reference_rays(
+        telescope, request.fields, request.directions, w, focal_plane, request.threads, advice=_ADVICE
+    )
+    center, index = np.array(chief.position), refractive_indices(telescope, w)[-2]
+    return center, path_to_sphere(chief.path_length, index, chief.position, chief.direction, center, radius)

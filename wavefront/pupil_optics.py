@@ -13,23 +13,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..core.errors import DomainError
 from ..core.launch import launch
-from ..core.units import field_label, metres, radians
+from ..core.units import metres, radians
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
 from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
-from ..raytrace.rays import RayStatus, field_direction, parallel_rays
-from ..raytrace.trace import trace
+from ..raytrace.rays import RayStatus, field_direction
 from .aberration import ResidualWavefront
-from .reference_sphere import distance_to_sphere
-
-#: Step of the central differences for the Jacobian [rad]: 20 arcsec, so that both rounding (1e-15 m / 1e-4) and the
-#: third-order distortion over it stay below 1e-8 of the focal length.
-JACOBIAN_STEP = 1.0e-4
+from .chief_rays import chief_rays, image_jacobians, reference_rays
+from .reference_sphere import path_to_sphere
 
 
 @dataclass(frozen=True)
@@ -65,69 +60,6 @@ class PupilOptics:
     reference: np.ndarray
     fields: np.ndarray
     wavelengths: np.ndarray
-
-
-def chief_rays(
-    telescope: Telescope,
-    directions: np.ndarray,
-    wavelength: float,
-    focal_plane: FocalPlane | None = None,
-    threads: int | None = None,
-) -> Any:
-    """Trace the rays through the centre of the entrance pupil in given directions; vignetting does not stop them."""
-    rays = parallel_rays(telescope, directions, wavelength, np.zeros((1, 2)))
-    return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
-
-
-def fields_at(
-    telescope: Telescope,
-    positions: Any,
-    wavelength: Any = None,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> np.ndarray:
-    """Return the field angles whose chief rays meet given points of the detector.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    positions : array_like, shape [n, 2]
-        Detector x and y [m], on the nominal flat surface.
-    wavelength : float, optional
-        Vacuum wavelength [m]; the telescope's default if not given.
-    projection : {"zemax", "gnomonic"}
-        Meaning of the angles returned.
-
-    Returns
-    -------
-    ndarray, shape [n, 2]
-        Field angles [rad].
-
-    Raises
-    ------
-    DomainError
-        If a point lies outside the field that the telescope covers.
-    """
-    target = np.atleast_2d(metres(positions, "positions"))
-    wavelength = telescope.default_wavelength if wavelength is None else float(metres(wavelength, "wavelength"))
-    step = JACOBIAN_STEP
-    probe = chief_rays(telescope, field_direction([0.0, step], [0.0, step], "gnomonic"), wavelength, threads=threads)
-    origin, corner = telescope.surfaces[-1].to_local(probe.position)[:, :2]
-    scale = (corner - origin) / step
-    slopes = (target - origin) / scale
-    # The scale on the axis is within a per cent everywhere, so each fixed-point step gains two digits or more.
-    for _ in range(12):
-        landed = chief_rays(
-            telescope, field_direction(slopes[:, 0], slopes[:, 1], "gnomonic"), wavelength, threads=threads
-        )
-        miss = target - telescope.surfaces[-1].to_local(landed.position)[:, :2]
-        if not np.isfinite(miss).all():
-            raise DomainError("positions: a point of the detector lies outside the field of the telescope")
-        slopes = slopes + miss / scale
-        if np.abs(miss).max(initial=0.0) < 1e-12:
-            break
-    return np.arctan(slopes) if projection == "zemax" else slopes
 
 
 def trace_pupils(
@@ -180,17 +112,11 @@ def trace_pupils(
     indices = np.array([refractive_indices(telescope, w) for w in wavelengths])
     middle = float(wavelengths[n_wave // 2])
 
-    chief = chief_rays(telescope, direction, middle, focal_plane, threads)
+    chief = reference_rays(telescope, fields, direction, middle, focal_plane, threads)
     reference = np.array(chief.position)
-    if not np.isfinite(reference).all():
-        bad = int(np.flatnonzero(~np.isfinite(reference).all(axis=1))[0])
-        raise DomainError(f"{field_label(fields[bad])}: the chief ray does not reach the detector")
     normal = np.zeros((n_star, 3))
     normal[:, 2] = 1.0
-    if focal_plane is not None:
-        if chief.ccd.min(initial=0) < 0:
-            bad = int(np.flatnonzero(chief.ccd < 0)[0])
-            raise DomainError(f"{field_label(fields[bad])}: the star lands between the CCDs")
+    if focal_plane is not None and chief.ccd is not None:
         on_detector = telescope.surfaces[-1].to_local(reference)
         offset = on_detector[:, :2] - focal_plane.camera.centers[chief.ccd]
         normal[:, :2] = -focal_plane.surfaces.gradient(chief.ccd, offset[:, 0], offset[:, 1])
@@ -201,10 +127,8 @@ def trace_pupils(
     chief_path = np.empty((n_star, n_wave))
     for w in range(n_wave):
         end = chief_rays(telescope, direction, float(wavelengths[w]), None, threads)
-        chief_path[:, w] = end.path_length + indices[w, -2] * distance_to_sphere(
-            end.position, end.direction, reference, radius
-        )
-
+        index = indices[w, -2]
+        chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference, radius)
     count = packet_count(n_pupil)
     bundles = n_star * n_wave
 
@@ -242,7 +166,7 @@ def trace_pupils(
         # The detector's own x and y; the third component, along its normal, is the tilt of a CCD times micrometres.
         offset = offset @ rotation[:2, :2]
     path = trimmed(out_path) - chief_path[:, :, None]
-    jacobian = _jacobians(telescope, direction, middle, threads)
+    jacobian = image_jacobians(telescope, direction, middle, threads)
     if aberration is not None:
         # The path is minus the OPD, and light moves by the Jacobian times the gradient of the path, as behind a screen.
         slopes = direction[:, :2] / -direction[:, 2:]
@@ -262,19 +186,3 @@ def trace_pupils(
         fields=fields,
         wavelengths=wavelengths,
     )
-
-
-def _jacobians(telescope: Telescope, direction: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
-    """d(position on the detector)/d(direction cosines), shape [n_star, 2, 2], by central differences."""
-    n = len(direction)
-    jacobian = np.empty((n, 2, 2))
-    for axis in range(2):
-        ends = []
-        for sign in (1.0, -1.0):
-            d = direction.copy()
-            d[:, axis] += sign * JACOBIAN_STEP
-            d[:, 2] = -np.sqrt(1.0 - d[:, 0] ** 2 - d[:, 1] ** 2)
-            end = chief_rays(telescope, d, wavelength, None, threads)
-            ends.append(telescope.surfaces[-1].to_local(end.position)[:, :2])
-        jacobian[:, :, axis] = (ends[0] - ends[1]) / (2 * JACOBIAN_STEP)
-    return jacobian

@@ -49,6 +49,10 @@ class PupilSampling:
         return len(self.weights)
 
 
+#: The centre of the pupil alone, for functions with pupil points of their own.
+CHIEF_RAY = PupilSampling(np.zeros((1, 2)), np.ones(1))
+
+
 def gauss_annulus(radius: float, obscuration: float, rings: int, spokes: int) -> PupilSampling:
     """Return Gauss quadrature on an annulus: Gauss-Legendre in the square of the radius, equal angles.
 

@@ -1,33 +1,12 @@
-"""Annular Zernike coefficients of an OPD map."""
+"""Fit of annular Zernikes to an OPD map."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from ..core.errors import DomainError
 from ..models.zernike_polynomials import annular_zernikes
-from .opd import OpdMap
-
-
-@dataclass(frozen=True)
-class ZernikeFit:
-    """Annular Zernike coefficients of an OPD map.
-
-    Attributes
-    ----------
-    coefficients : ndarray, shape [jmax]
-        Noll order from j = 1 [m]; orthonormal terms, so each is its own rms over the unvignetted annulus.
-    obscuration : float
-        Inner over outer radius of the annulus.
-    residual_rms : float
-        Root mean square of what the fit leaves [m].
-    """
-
-    coefficients: np.ndarray
-    obscuration: float
-    residual_rms: float
+from .opd_map import OpdMap, ZernikeFit
 
 
 def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int = 28) -> ZernikeFit:

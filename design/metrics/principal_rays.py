@@ -18,7 +18,7 @@ from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace
 from ...wavefront.bundles import trace_bundles
-from ...wavefront.pupil_optics import JACOBIAN_STEP
+from ...wavefront.chief_rays import JACOBIAN_STEP
 from ...wavefront.pupil_sampling import pupil_sampling
 from ...wavefront.request import field_points, wavelength_points
 

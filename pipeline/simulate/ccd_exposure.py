@@ -13,10 +13,10 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.ideal_telescope import without_aberration
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
+from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
-from ...wavefront.pupil_optics import fields_at
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
 from .photometry import ARCSEC, limiting_magnitude

@@ -12,8 +12,8 @@ from ...models.camera.camera import Camera
 from ...models.site import Site
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.layers import line_of_sight
+from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engines import ENGINES
-from ...wavefront.pupil_optics import fields_at
 from ..config import Configuration
 
 

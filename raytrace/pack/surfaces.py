@@ -77,6 +77,17 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
     return packed
 
 
+def leading_surfaces(packed: Any, count: int) -> Any:
+    """Return a :class:`PackedSurfaces` of the first surfaces alone, sharing all tables."""
+    struct: Any = PackedSurfaces
+    front = struct()
+    for name in struct.vars:
+        setattr(front, name, getattr(packed, name))
+    # Kernels pass as many surfaces as there are rows of kinds.
+    front.kinds = packed.kinds[:count]
+    return front
+
+
 def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
     """Return the index before the first surface and after each at one wavelength, shape [n_surface + 1].
 

@@ -9,7 +9,8 @@ from ...pipeline.measure.summary import ccd_figures
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...pipeline.simulate.photometry import ARCSEC
-from ...wavefront.pupil_optics import fields_at, trace_pupils
+from ...wavefront.chief_rays import fields_at
+from ...wavefront.pupil_optics import trace_pupils
 from .metric import Metric, MetricTable
 from .scene import Scene
 

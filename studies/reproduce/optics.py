@@ -17,8 +17,8 @@ from ...models.telescope import Telescope
 from ...pipeline.measure.shapes import measure_shapes
 from ...pipeline.report.focal_plane_plots import heights_figure
 from ...pipeline.simulate.photometry import ARCSEC
+from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs
-from ...wavefront.pupil_optics import fields_at
 from .drawing import budget_figure, encircled_energy_figure, field_whiskers_figure, layout_figure
 from .parts import Bench, EcsvData, Reproduced
 

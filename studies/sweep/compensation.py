@@ -11,7 +11,7 @@ from ...design.optimize.merit import SpotMerit
 from ...design.optimize.optimize import beams, optimize
 from ...design.parameters.changes import parse_change
 from ...pipeline.experiment import Experiment
-from ...wavefront.pupil_optics import fields_at
+from ...wavefront.chief_rays import fields_at
 
 # Places on each CCD at which spots count, in units of half its side: the centre, and where CCDs are few also the
 # middles of its quarters.

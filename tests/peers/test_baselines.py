@@ -14,7 +14,7 @@ import pachon
 from pachon.pipeline.measure.shapes import fwhm, measure_shapes
 from pachon.studies.baseline.baseline import bundled_baselines
 from pachon.studies.baseline.file import read_baseline
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 batoid = pytest.importorskip("batoid")
 galsim = pytest.importorskip("galsim")

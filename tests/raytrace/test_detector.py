@@ -10,7 +10,7 @@ from pachon.core.errors import DomainError
 from pachon.models.camera.camera import lsst_camera
 from pachon.models.media.medium import ConstantIndex
 from pachon.raytrace.rays import RayStatus
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.raytrace.rays import field_direction
+from pachon.wavefront.chief_rays import chief_rays
 from pachon.wavefront.opd import pupil_grid
-from pachon.wavefront.pupil_optics import chief_rays, field_direction
 
 ANGLES = np.deg2rad([0.2, 0.6, 1.0, 1.2, 1.4, 1.6, 1.75])
 

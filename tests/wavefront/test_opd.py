@@ -8,7 +8,7 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 ZEMAX = Path(__file__).parents[1] / "data" / "zemax"
 

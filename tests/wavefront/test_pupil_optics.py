@@ -6,7 +6,8 @@ import pytest
 import pachon
 from pachon.core.errors import DomainError
 from pachon.raytrace.rays import RayStatus
-from pachon.wavefront.pupil_optics import fields_at, trace_pupils
+from pachon.wavefront.chief_rays import fields_at
+from pachon.wavefront.pupil_optics import trace_pupils
 
 WAVELENGTHS = np.array([545e-9, 624e-9, 703e-9])
 
@@ -26,18 +27,6 @@ def positions():
 def optics(lsst_r, focal_plane, positions, annulus_points):
     pupil = np.stack(annulus_points(70, 3), axis=-1)
     return trace_pupils(lsst_r, fields_at(lsst_r, positions), WAVELENGTHS, pupil, focal_plane)
-
-
-def test_fields_at_inverts_the_chief_ray(lsst_r, positions):
-    for projection in ("zemax", "gnomonic"):
-        for field, position in zip(fields_at(lsst_r, positions, projection=projection), positions, strict=True):
-            rays = pachon.launch_rays(lsst_r, field, lsst_r.default_wavelength, ([0.0], [0.0]), projection)
-            assert np.abs(pachon.trace(lsst_r, rays).position[0, :2] - position).max() < 1e-12
-
-
-def test_fields_at_refuses_points_outside_the_field(lsst_r):
-    with pytest.raises(DomainError, match="outside the field"):
-        fields_at(lsst_r, [[3.0, 0.0]])
 
 
 def test_path_and_lit_are_those_of_the_opd(lsst_r, focal_plane, optics):

@@ -13,7 +13,7 @@ from pachon.design.parameters.parameters import apply, with_figures
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.zernike_polynomials import annular_zernikes
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.pupil_sampling import pupil_sampling
 from pachon.wavefront.zernike import fit_zernikes
 

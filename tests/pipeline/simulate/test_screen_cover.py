@@ -15,7 +15,7 @@ from pachon.pipeline.defaults import resolve
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.screen_cover import swept_lengths
 from pachon.raytrace.rays import field_direction
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 
 def swept(config):

@@ -7,7 +7,7 @@ from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import launch_rays
 from pachon.raytrace.trace import trace
 from pachon.studies.sweep.compensation import compensated
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 NAMES = ("Camera.dz_um", "Camera.rx_urad", "Camera.ry_urad")
 #: Corners and middle of the focal plane, so that tilts have a lever.

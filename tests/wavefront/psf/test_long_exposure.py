@@ -17,6 +17,7 @@ from pachon.raytrace.rays import field_direction
 from pachon.wavefront.aberration import ResidualWavefront
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.turbulence import diffraction_otf, long_exposure_fwhm, structure_function
+from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.clear_pupil import SpokePupil, clear_edges
 from pachon.wavefront.psf.engine import PsfInputs
 from pachon.wavefront.psf.fast import FastPsfEngine
@@ -24,7 +25,7 @@ from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.long_exposure import PUPIL_POINTS, LongExposureEngine
 from pachon.wavefront.psf.psf import DARK, make_psfs
 from pachon.wavefront.psf.pupil_lattice import PupilLattice
-from pachon.wavefront.pupil_optics import fields_at, trace_pupils
+from pachon.wavefront.pupil_optics import trace_pupils
 
 FOCAL_LENGTH = 10.31
 PLANE = ImagePlane(31, 10e-6, 4e-6)

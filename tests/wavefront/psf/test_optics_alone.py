@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.wavefront.pupil_optics import fields_at
+from pachon.wavefront.chief_rays import fields_at
 
 ARCSEC = np.deg2rad(1 / 3600)
 

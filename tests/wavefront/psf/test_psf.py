@@ -8,9 +8,9 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError
 from pachon.pipeline.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
+from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.psf.engines import ENGINES
 from pachon.wavefront.psf.psf import DARK, make_psfs
-from pachon.wavefront.pupil_optics import fields_at
 
 WAVELENGTHS = np.linspace(545e-9, 703e-9, 3)
 ARCSEC = np.pi / 180 / 3600

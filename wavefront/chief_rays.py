@@ -1,0 +1,201 @@
+"""Chief rays: reference points on the image surface, Jacobians of the image, and field angles of detector positions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.errors import DomainError
+from ..core.units import field_label, metres
+from ..models.camera.focal_plane import FocalPlane
+from ..models.telescope import Telescope
+from ..raytrace.rays import RayStatus, field_angles, field_direction, launch_bundles, parallel_rays
+from ..raytrace.trace import TraceResult, trace
+
+#: Step of the central differences for the Jacobian [rad]: 20 arcsec, so that both rounding (1e-15 m / 1e-4) and the
+#: third-order distortion over it stay below 1e-8 of the focal length.
+JACOBIAN_STEP = 1.0e-4
+#: Distance [m] from a wanted point of the detector at which a chief ray counts as found.
+_FOUND = 1e-12
+#: Steps of the iteration with the scale on the axis, and of Newton's method after it.
+_SCALE_STEPS, _NEWTON_STEPS = 12, 20
+
+
+def chief_rays(
+    telescope: Telescope,
+    directions: np.ndarray,
+    wavelength: float,
+    focal_plane: FocalPlane | None = None,
+    threads: int | None = None,
+) -> TraceResult:
+    """Trace parallel light through the centre of the entrance pupil; vignetting does not stop chief rays.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    directions : ndarray, shape [n, 3]
+        Unit vectors in which the light travels, telescope frame.
+    wavelength : float
+        Vacuum wavelength [m].
+    focal_plane : FocalPlane, optional
+        CCD surfaces; the nominal detector surface without it.
+    threads : int, optional
+        Number of threads; all processors by default.
+    """
+    rays = parallel_rays(telescope, directions, wavelength, np.zeros((1, 2)))
+    return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
+
+
+def reference_rays(
+    telescope: Telescope,
+    fields: np.ndarray,
+    directions: np.ndarray,
+    wavelength: float,
+    focal_plane: FocalPlane | None = None,
+    threads: int | None = None,
+    *,
+    advice: str = "",
+) -> TraceResult:
+    """Trace the chief rays whose landing points are reference points; the object may be at a finite distance.
+
+    Parameters
+    ----------
+    telescope, directions, wavelength, focal_plane, threads
+        As in :func:`chief_rays`.
+    fields : ndarray, shape [n, 2]
+        Field angles [rad], for error messages.
+    advice : str
+        Addition to the message about a lost chief ray.
+
+    Raises
+    ------
+    DomainError
+        If a chief ray does not reach the image, or lands between the CCDs.
+    """
+    rays = launch_bundles(telescope, directions, wavelength, np.zeros((1, 2)))
+    end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
+    lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
+    if lost.any():
+        raise DomainError(f"{field_label(fields[lost][0])}: the chief ray does not reach the image{advice}")
+    if end.ccd is not None and (end.ccd < 0).any():
+        name = field_label(fields[end.ccd < 0][0])
+        raise DomainError(f"{name}: the chief ray lands between the CCDs; expected a point on a CCD")
+    return end
+
+
+def image_jacobians(
+    telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None = None
+) -> np.ndarray:
+    """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences.
+
+    Parameters are those of :func:`chief_rays`.
+    """
+    jacobian = np.empty((len(directions), 2, 2))
+    for axis in range(2):
+        ends = []
+        for sign in (1.0, -1.0):
+            cosines = directions[:, :2].copy()
+            cosines[:, axis] += sign * JACOBIAN_STEP
+            ends.append(_landing(telescope, _downwards(cosines), wavelength, threads))
+        jacobian[:, :, axis] = (ends[0] - ends[1]) / (2 * JACOBIAN_STEP)
+    return jacobian
+
+
+def fields_at(
+    telescope: Telescope,
+    positions: ArrayLike,
+    wavelength: ArrayLike | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> np.ndarray:
+    """Return the field angles whose chief rays meet given points of the detector.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope.
+    positions : array_like or Quantity, shape [n, 2]
+        Detector x and y [m], on the nominal flat surface.
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's default if not given.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the angles returned.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Returns
+    -------
+    ndarray, shape [n, 2]
+        Field angles [rad].
+
+    Raises
+    ------
+    ConfigError
+        If the projection is unknown.
+    DomainError
+        If a point lies outside the field that the telescope covers, or its chief ray is not found.
+    """
+    target = np.atleast_2d(metres(positions, "positions"))
+    light = telescope.default_wavelength if wavelength is None else float(metres(wavelength, "wavelength"))
+    field_angles(np.zeros((1, 2)), projection)  # an unknown projection is an error before anything is traced
+    slopes = _by_axis_scale(telescope, target, light, threads)
+    if slopes is None:
+        slopes = _by_newton(telescope, target, light, threads)
+    return field_angles(slopes, projection)
+
+
+def _by_axis_scale(
+    telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None
+) -> np.ndarray | None:
+    """Return slopes found with the scales of x and y on the axis; None where that fails, as for a rotated detector."""
+    corners = np.array([0.0, JACOBIAN_STEP])
+    origin, corner = _landing(telescope, field_direction(corners, corners, "gnomonic"), wavelength, threads)
+    scale = (corner - origin) / JACOBIAN_STEP
+    if not scale.all():
+        return None
+    slopes = (target - origin) / scale
+    # The scale is within a per cent everywhere, so each step gains two digits or more.
+    for _ in range(_SCALE_STEPS):
+        light = field_direction(slopes[:, 0], slopes[:, 1], "gnomonic")
+        miss = target - _landing(telescope, light, wavelength, threads)
+        slopes = slopes + miss / scale
+        if not np.isfinite(miss).all():
+            return None
+        if np.abs(miss).max(initial=0.0) < _FOUND:
+            return slopes
+    return None
+
+
+def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
+    """Return slopes found from the axis by Newton's method, each with the Jacobian of its own chief ray."""
+    cosines = np.zeros_like(target)
+    for _ in range(_NEWTON_STEPS):
+        light = _downwards(cosines)
+        miss = target - _landing(telescope, light, wavelength, threads)
+        jacobian = image_jacobians(telescope, light, wavelength, threads)
+        if not (np.isfinite(miss).all() and np.isfinite(jacobian).all()):
+            raise DomainError("positions: a point of the detector lies outside the field of the telescope")
+        if np.abs(miss).max(initial=0.0) < _FOUND:
+            return cosines / -light[:, 2:]
+        if not np.linalg.det(jacobian).all():
+            break
+        cosines = cosines + np.linalg.solve(jacobian, miss[..., None])[..., 0]
+    x, y = target[np.argmax(np.abs(miss).max(axis=1))]
+    raise DomainError(
+        f"positions = ({x:.6g}, {y:.6g}) m: no chief ray that lands there was found; expected a telescope whose images "
+        "move steadily with the field angle"
+    )
+
+
+def _landing(telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
+    """Return where chief rays land on the detector [m], its own x and y, shape [n, 2]."""
+    end = chief_rays(telescope, directions, wavelength, threads=threads)
+    return telescope.surfaces[-1].to_local(end.position)[:, :2]
+
+
+def _downwards(cosines: np.ndarray) -> np.ndarray:
+    """Return the unit vectors towards the primary of given direction cosines x and y, shape [n, 3]."""
+    x, y = cosines.T
+    with np.errstate(invalid="ignore"):
+        return np.stack([x, y, -np.sqrt(1.0 - x**2 - y**2)], axis=-1)
