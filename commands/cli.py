@@ -12,13 +12,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
 from typer import Option
 
 from ..core.errors import PachonError
+from ..core.version import VERSION
 from . import baseline, design, diagnostics, reproduce, run, study, sweep, telescope
 from .inputs import InterruptedRunError
 
@@ -76,7 +76,7 @@ def _fail(text: str, status: int = 2) -> int:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"pachon {version('pachon')}")
+        print(f"pachon {VERSION}")
         raise typer.Exit
 
 

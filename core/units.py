@@ -1,4 +1,4 @@
-"""Accept plain SI numbers or astropy quantities at the public boundary."""
+"""Angles in radians, and conversion of numbers or astropy quantities to SI."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import numpy as np
 from astropy import units as u
 
 from .errors import DomainError
+
+#: One arcsecond, one arcminute [rad].
+ARCSEC = np.pi / 648000
+ARCMIN = 60.0 * ARCSEC
 
 
 def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import DomainError
+from ..core.units import ARCSEC
 from .surface import Interaction, Surface
 from .telescope import Telescope
-
-ARCSEC = np.pi / 648000
 
 
 @dataclass(frozen=True)

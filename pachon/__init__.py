@@ -4,7 +4,6 @@ The public names are listed in ``__init__.pyi``. Each is imported from its own m
 ``import pachon`` is quick.
 """
 
-from importlib.metadata import version as _version
 from pathlib import Path as _Path
 
 import lazy_loader as _lazy
@@ -14,5 +13,8 @@ _folder = _Path(__file__).parent
 if not (_folder / "models").is_dir():
     __path__.append(str(_folder.parent))
 
-__version__ = _version("pachon")
+from .core import version as _version  # noqa: E402 - found by the line above
+
+__version__ = _version.VERSION
+
 __getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -14,9 +14,9 @@ import numpy as np
 from astropy.io import fits
 
 from ..core.errors import ProductError, unknown_name
-from ..core.files import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from ..core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from ..core.units import ARCSEC
 from .psf_model.model import PsfModel
-from .simulate.photometry import ARCSEC
 
 
 class _Unit(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..core.errors import ConfigError, PachonError
 from ..core.progress import Reporter
+from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.height_budget import load_budget
@@ -28,7 +29,6 @@ from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .defaults import given, resolve
-from .simulate.photometry import ARCSEC
 
 
 @dataclass(frozen=True)

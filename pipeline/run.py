@@ -7,7 +7,6 @@ import platform
 import sys
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,11 @@ import trimesh
 from trimesh.exchange.gltf import export_glb
 
 from ..core.errors import DomainError
-from ..core.files import write_bytes, write_ecsv, write_json
+from ..core.files import write_bytes, write_json
+from ..core.products import write_ecsv
 from ..core.progress import Reporter
 from ..core.threads import thread_count
+from ..core.version import VERSION
 from .ccd_product import product_path, read_product, write_product
 from .config import Configuration
 from .experiment import Experiment
@@ -183,7 +184,7 @@ def _write_focal_plane(experiment: Experiment, folder: Path) -> None:
 def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:
     """Return what differs from run to run, and is kept out of every other product for that reason."""
     return {
-        "pachon": version("pachon"),
+        "pachon": VERSION,
         "seconds": reporter.seconds,
         "peak_memory_gib": _peak_memory() / 2**30,
         "threads": thread_count(threads),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 
 from ..core.errors import PachonError, ProductError
-from ..core.files import Stamp, write_bytes
+from ..core.files import write_bytes
+from ..core.products import Stamp
+from ..core.version import VERSION
 from .ccd_product import product_path, read_product
 from .config import Configuration, differences, load_configuration, to_yaml
 from .experiment import Experiment
@@ -52,7 +53,7 @@ def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     for left_over in folder.glob(".*.partial"):
         left_over.unlink(missing_ok=True)
     heading = (
-        f"pachon {version('pachon')}: all that decides this run.",
+        f"pachon {VERSION}: all that decides this run.",
         "The same bytes again: pachon run config.yaml --out OTHER",
     )
     write_bytes(path, to_yaml(experiment.config, heading).encode())
@@ -89,4 +90,4 @@ def _is_whole(path: Path, stamp: Stamp) -> bool:
 
 def stamp_of(experiment: Experiment) -> Stamp:
     """Return what the products of an experiment carry."""
-    return Stamp(version("pachon"), experiment.config_hash, experiment.config.seed)
+    return Stamp(experiment.config_hash, experiment.config.seed)

@@ -49,7 +49,7 @@ def psf(
     - `pachon psf lsst_v3.3_i --across-band 5 --field-deg 1.4 --fits psf.fits`
     - `pachon psf paul_baker --field-deg 0 --huygens --json`
     """
-    from ...core.files import image_hdu, write_fits
+    from ...core.products import image_hdu, write_fits
     from ...design.images.diffraction import fft_psf, huygens_psf
 
     if huygens and pupil_points is not None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
 
 from ...core.errors import ConfigError
-from ...core.files import table_hdu, write_ecsv, write_fits
+from ...core.products import table_hdu, write_ecsv, write_fits
+from ...core.version import CREATOR, VERSION
 from .sensitivity import Sensitivity
 
 
@@ -50,7 +50,7 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
                 "derivative of the term",
             )
         meta = {
-            "creator": f"pachon {version('pachon')}",
+            "creator": f"pachon {VERSION}",
             "telescope": result.telescope,
             "wavelength_m": result.wavelength,
             "obscuration": result.obscuration,
@@ -73,7 +73,7 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
     zernikes = fits.ImageHDU(result.zernikes, name="ZERNIKES")
     zernikes.header["BUNIT"] = "m"
     cards = [
-        ("CREATOR", f"pachon {version('pachon')}", "program and version"),
+        CREATOR,
         ("TELESCOP", result.telescope, "model"),
         ("WAVELEN", result.wavelength, "[m] vacuum wavelength"),
         ("OBSCURAT", result.obscuration, "inner over outer radius of the annulus"),

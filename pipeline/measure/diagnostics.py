@@ -17,7 +17,8 @@ import numpy as np
 from astropy.table import Table
 
 from ...core.errors import PachonError, ProductError
-from ...core.files import Stamp, described_table, make_folder, write_bytes, write_ecsv, write_json
+from ...core.files import make_folder, write_bytes, write_json
+from ...core.products import Stamp, described_table, write_ecsv
 from ..ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
 from ..experiment import Experiment
@@ -26,7 +27,7 @@ from ..report.statistics_plots import correlation_figure
 from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from .correlation import Correlation
 from .rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
-from .summary import LONG_RANGE, LONGEST_ARCMIN, correlations, patches, separation_bins
+from .summary import correlations, patches, separation_bins
 
 #: Residuals: at the stars, of stars left out, away from them.
 RESIDUALS = ("residual", "left_out", "away")
@@ -217,7 +218,7 @@ def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlatio
         figures |= _moments(products, kind)
     for kind, correlation in correlated.items():
         r = correlation.r_arcmin
-        inside = np.flatnonzero((r >= LONG_RANGE) & (r <= LONGEST_ARCMIN) & (correlation.n_pairs > 0))
+        inside = np.flatnonzero(correlation.within("long") & (correlation.n_pairs > 0))
         largest = inside[np.argmax(np.abs(correlation.xi_plus[inside]))] if len(inside) else None
         for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", correlation.error_plus)):
             figures[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])

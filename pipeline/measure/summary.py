@@ -7,20 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from ...core.units import ARCMIN, ARCSEC
 from ..ccd_product import CcdProduct, Stars
-from ..simulate.photometry import ARCSEC
-from .correlation import Correlation, jackknife_error, shear_correlation
+from .correlation import SEPARATION_RANGES, Correlation, shear_correlation
 
 #: What is correlated: truth and truth - model where no star is, observed and observed - model at the stars.
 CORRELATED = ("truth", "observed", "residual", "away")
 #: Pairs are counted from here on [arcmin].
 SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
-_ARCMIN = 60.0 * ARCSEC
-#: The paper's claim of a residual below 1e-7 is for separations from here on [arcmin],
-LONG_RANGE = 10.0
-#: and up to here [arcmin].
-LONGEST_ARCMIN = 180.0
 
 
 def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] = CORRELATED) -> dict[str, Correlation]:
@@ -58,8 +53,8 @@ def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
         [np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1
     )
     longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
-    bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * _ARCMIN))))
-    return {"min_sep": SHORTEST_ARCMIN * _ARCMIN, "max_sep": longest, "n_bins": bins}
+    bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * ARCMIN))))
+    return {"min_sep": SHORTEST_ARCMIN * ARCMIN, "max_sep": longest, "n_bins": bins}
 
 
 def ccd_figures(product: CcdProduct) -> dict[str, Any]:
@@ -88,7 +83,11 @@ def ccd_figures(product: CcdProduct) -> dict[str, Any]:
 
 
 def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, Any]:
-    """Return the figures of the whole run: of each CCD, of all, and the correlations."""
+    """Return the metrics of a run: of each CCD, of all together, and the correlations.
+
+    ``xi_plus_..._short`` is the mean of xi+ over pairs closer than 10 arcmin, ``xi_plus_..._long`` over those from 10
+    to 180 arcmin.
+    """
     each = {p.name: ccd_figures(p) for p in products}
     truth = [p.truth for p in products]
     observed = [p.observed for p in products]
@@ -118,10 +117,9 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
         "truth_variance_in_components": min(p.truth_model.explained for p in products),
     }
     for kind, correlation in correlated.items():
-        for name, (low, high) in {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, np.inf)}.items():
-            together[f"xi_plus_{kind}_{name}"] = mean_xi_plus(correlation, low, high)
-            left = left_mean_xi_plus(correlation, low, high)
-            together[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(left)) if len(left) else np.nan
+        for name in SEPARATION_RANGES:
+            together[f"xi_plus_{kind}_{name}"] = correlation.mean_xi_plus(name)
+            together[f"error_xi_plus_{kind}_{name}"] = correlation.error_mean_xi_plus(name)
     return {
         "all": together,
         "ccd": each,
@@ -137,24 +135,6 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
             for kind, c in correlated.items()
         },
     }
-
-
-def mean_xi_plus(correlation: Correlation, low: float, high: float) -> float:
-    """Return the mean of xi+ over the pairs with separations from low to high [arcmin]; NaN where there are none."""
-    return float(_over_pairs(correlation, low, high, correlation.n_pairs, correlation.xi_plus))
-
-
-def left_mean_xi_plus(correlation: Correlation, low: float, high: float) -> np.ndarray:
-    """Return :func:`mean_xi_plus` without each patch in turn, [n_patches], for its jackknife."""
-    return _over_pairs(correlation, low, high, correlation.left_pairs, correlation.left_plus)
-
-
-def _over_pairs(correlation: Correlation, low: float, high: float, pairs: np.ndarray, xi: np.ndarray) -> np.ndarray:
-    """Return the mean of xi [..., n_bins] over the pairs [..., n_bins] of a range [arcmin]."""
-    inside = (correlation.r_arcmin >= low) & (correlation.r_arcmin < high)
-    counts, values = pairs[..., inside], xi[..., inside]
-    with np.errstate(invalid="ignore"):
-        return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
 
 
 def _mean(values: np.ndarray) -> float:

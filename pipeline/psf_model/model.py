@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,8 +16,9 @@ import numpy as np
 from astropy.io import fits
 
 from ...core.errors import ConfigError, ProductError
-from ...core.files import read_fits, write_fits
+from ...core.products import read_fits, write_fits
 from ...core.threads import one_blas_thread
+from ...core.version import CREATOR
 from . import gaussian_process
 from .file import model_fields, model_hdus
 from .fit import fit_fields, weighted
@@ -344,7 +344,7 @@ class PsfModel:
         ProductError
             If it cannot be written.
         """
-        creator = ("CREATOR", f"pachon {version('pachon')}", "program and version")
+        creator = CREATOR
         write_fits(Path(path), self.to_hdus(name), None, [creator])
 
     @classmethod

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.units import ARCSEC
 from ...models.aperture import Annulus, Circle, Complement
 from ...models.first_order import first_order
 from ...models.io.prescription import bundled_names, load_telescope
@@ -18,7 +19,6 @@ from ...models.media.medium import ConstantIndex
 from ...models.shapes.shape import Rotational
 from ...models.surface import Surface
 from ...models.telescope import Telescope
-from ..simulate.photometry import ARCSEC
 
 #: Figures that only a centred telescope has.
 FIRST_ORDER_KEYS = (

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.colors import SymLogNorm
 
 from ...core.plotting import new_figure, png_bytes, styled
+from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct
-from ..simulate.photometry import ARCSEC
 from .focal_plane_axes import AWAY, OBSERVED, TRUTH
 from .tables import percent
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..measure.summary import CORRELATED, LONG_RANGE
+from ..measure.correlation import SEPARATION_RANGES
+from ..measure.summary import CORRELATED
 
 _NAMES = {
     "truth": "truth",
@@ -34,12 +35,13 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("rms e residual, where no star is (no noise)", _percent(figures["rms_residual_away"])),
         ("truth's variance in the components, worst CCD", percent(figures["truth_variance_in_components"])),
     ]
+    low, high = SEPARATION_RANGES["long"]
     for kind in CORRELATED:
         near, far = (
             f"{_power(figures[f'xi_plus_{kind}_{name}'])} ± {_power(figures[f'error_xi_plus_{kind}_{name}'])}"
             for name in ("short", "long")
         )
-        rows.append((f"ξ+ of {_NAMES[kind]}, below / beyond {LONG_RANGE:g}'", f"{near} / {far}"))
+        rows.append((f"ξ+ of {_NAMES[kind]}, below {low:g}' / {low:g}' to {high:g}'", f"{near} / {far}"))
     return rows
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.units import ARCSEC
 from ...models.camera.focal_plane import FocalPlane
 from ...models.ideal_telescope import without_aberration
 from ...models.telescope import Telescope
@@ -19,7 +20,7 @@ from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
-from .photometry import ARCSEC, limiting_magnitude
+from .photometry import limiting_magnitude
 from .star_field import StarField, make_star_field
 
 #: An observed star is drawn on a stamp so many pixels larger than the one kept: room to shift it onto a pixel's centre.

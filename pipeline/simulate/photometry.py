@@ -14,9 +14,8 @@ import numpy as np
 from scipy.special import erf
 
 from ...core.errors import DomainError, unknown_name
-from ...core.units import radians
+from ...core.units import ARCSEC, radians
 
-ARCSEC = np.pi / (180.0 * 3600.0)
 PIXEL_SCALE = 0.2 * ARCSEC
 """Angle of one LSST pixel [rad]."""
 READ_NOISE = 8.8

@@ -25,20 +25,17 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import ConfigError, unknown_name
-from ...core.files import write_bytes, write_ecsv, write_json
+from ...core.files import write_bytes, write_json
+from ...core.products import write_ecsv
 from ...core.progress import Reporter
 from ...models.site import load_site
 from ...pipeline.ccd_product import KINDS, CcdProduct
 from ...pipeline.config import Configuration, to_yaml, with_options
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.correlation import Correlation, jackknife_error
+from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
 from ...pipeline.measure.diagnostics import correlation_columns
 from ...pipeline.measure.summary import (
-    LONG_RANGE,
-    LONGEST_ARCMIN,
     correlations,
-    left_mean_xi_plus,
-    mean_xi_plus,
     run_figures,
 )
 from ...pipeline.memory import check_memory
@@ -69,8 +66,6 @@ _SWITCHES: dict[str, dict[str, Any]] = {
 #: turbulence with refraction, that all stars share the layer on the ground, charge diffusion, and the noise of the
 #: observed stars.
 CAUSES = tuple(_SWITCHES)
-#: Ranges of separation over which xi+ is averaged [arcmin].
-RANGES = {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, LONGEST_ARCMIN)}
 _RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
 _XI = ("truth", "observed", "residual", "away")
 
@@ -82,10 +77,10 @@ class Attribution:
     Attributes
     ----------
     figures : dict of str to dict
-        For ``full`` and for each cause that was off: rms of e and of its residuals, median FWHM, and xi+ of truth,
-        observed stars, residual at the stars and away from them, averaged over :data:`RANGES`; ``change_`` and a key
-        is what the cause does, the full case less this one, and ``error_`` and a key of xi+ its jackknife error over
-        the CCDs.
+        For ``full`` and for each cause that was off: rms of e and of its residuals, median FWHM, and the mean xi+ of
+        noise-free PSFs, observed stars, residual at the stars and away from them, over the short and the long
+        separations; ``change_`` and a key is the effect of the cause, the full case less this one, and ``error_`` and a
+        key of xi+ its jackknife error over the CCDs.
     correlations : dict of str to dict of str to Correlation
         Of each case.
     """
@@ -266,8 +261,8 @@ def _figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation])
     figures = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
     figures |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
     for kind in _XI:
-        for name, bounds in RANGES.items():
-            figures[f"xi_plus_{kind}_{name}"] = mean_xi_plus(correlated[kind], *bounds)
+        for name in SEPARATION_RANGES:
+            figures[f"xi_plus_{kind}_{name}"] = correlated[kind].mean_xi_plus(name)
     return figures
 
 
@@ -280,11 +275,13 @@ def _changes(
     """Return the full case less this one; the stars are the same, so what both have in common is in no error."""
     changes = {f"change_{key}": full[key] - case[key] for key in case}
     for kind in _XI:
-        for name, bounds in RANGES.items():
+        for name in SEPARATION_RANGES:
             one, other = with_all[kind], without[kind]
             error = np.nan
             if one.n_patches and one.n_patches == other.n_patches:
-                error = float(jackknife_error(left_mean_xi_plus(one, *bounds) - left_mean_xi_plus(other, *bounds)))
+                error = float(
+                    jackknife_error(one.leave_one_out_mean_xi_plus(name) - other.leave_one_out_mean_xi_plus(name))
+                )
             changes[f"error_xi_plus_{kind}_{name}"] = error
     return changes
 
@@ -294,6 +291,6 @@ def _meaning(key: str) -> str:
         if key.startswith(start):
             return words + _meaning(key.removeprefix(start))
     if key.startswith("xi_plus_"):
-        low, high = RANGES[key.rpartition("_")[2]]
+        low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
         return f"mean xi+ of {key.split('_')[2]}, {low:g} to {high:g} arcmin"
     return "median FWHM" if key == "fwhm_arcsec" else key.replace("_", " ") + ", one component"

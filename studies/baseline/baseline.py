@@ -10,13 +10,13 @@ import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...core.errors import ConfigError, PachonError
+from ...core.version import VERSION
 from ...design.parameters.changes import apply_changes
 from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
@@ -261,7 +261,7 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
         content["atmosphere"]["site"] = Path(content["atmosphere"]["site"]).name
         hashed = digest(content)
     return {
-        "pachon": version("pachon"),
+        "pachon": VERSION,
         "model_sha256": prescription_hash(telescope),
         "configuration_sha256": hashed,
     }

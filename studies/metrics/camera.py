@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.units import ARCSEC
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.measure.summary import ccd_figures
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places
 from ...pipeline.simulate.ccd_model import model_ccd
-from ...pipeline.simulate.photometry import ARCSEC
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.pupil_optics import trace_pupils
 from .metric import Metric, MetricTable

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError
+from ...core.units import ARCMIN
 from ...design.metrics.distortion import distortion
 from ...models.telescope import Telescope
 from ...pipeline.experiment import Experiment
@@ -15,14 +16,12 @@ from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from ...pipeline.measure.summary import SHORTEST_ARCMIN
 from ...pipeline.simulate.ccd_exposure import Exposed, expose_places, truth_places
-from ...pipeline.simulate.photometry import ARCSEC
 from ...wavefront.bundles import trace_bundles
 from .plan import Plan, make_plan
 
 # Change of a path by rounding, over the length of the path.
 _ROUNDING = 1e-13
 _CORRELATION_BINS = 15
-_ARCMIN = 60.0 * ARCSEC
 
 
 @dataclass(frozen=True)
@@ -117,8 +116,8 @@ class Scene:
     def correlation(self) -> Correlation:
         """Correlation of the ellipticities of the noise-free stars, over all CCDs."""
         fields, shapes = self.stars.fields, self.shapes
-        longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * _ARCMIN)
-        (x, y), shortest = fields.T, SHORTEST_ARCMIN * _ARCMIN
+        longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * ARCMIN)
+        (x, y), shortest = fields.T, SHORTEST_ARCMIN * ARCMIN
         return shear_correlation(
             x, y, shapes.e1, shapes.e2, min_sep=shortest, max_sep=longest, n_bins=_CORRELATION_BINS
         )

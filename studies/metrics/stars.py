@@ -11,12 +11,14 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
-from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN, correlations, mean_xi_plus, run_figures
+from ...pipeline.measure.correlation import SEPARATION_RANGES
+from ...pipeline.measure.summary import correlations, run_figures
 from ...pipeline.psf_model.polynomial import design_matrix
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
-from ...pipeline.simulate.photometry import ARCSEC, effective_fwhm
+from ...pipeline.simulate.photometry import effective_fwhm
 from ...wavefront.opd import wavefront_opd
 from ...wavefront.zernike import fit_zernikes
 from .metric import Metric, MetricTable
@@ -28,8 +30,6 @@ STARS = MetricTable()
 _RINGS = ((0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 1.8))
 #: Zernike terms of the wavefront, Noll.
 _ZERNIKES = range(4, 12)
-#: Ranges of separation over which xi+ is averaged [arcmin].
-RANGES = {"short": (0.0, LONG_RANGE), "long": (LONG_RANGE, LONGEST_ARCMIN)}
 # CCDs are neighbours where their centres are no farther apart than this, over the side of a CCD.
 _NEIGHBOUR = 1.08
 # Order of the fit of ellipticity within a CCD, for its value at the border.
@@ -90,7 +90,7 @@ def border_jump(scene: Scene) -> dict[str, float]:
 @STARS.group("xi_raw", Metric("xi_raw"))
 def correlation(scene: Scene) -> dict[str, float]:
     """Return the mean of xi+ over short and long separations."""
-    return {f"xi_raw_{name}": mean_xi_plus(scene.correlation, *bounds) for name, bounds in RANGES.items()}
+    return {f"xi_raw_{name}": scene.correlation.mean_xi_plus(name) for name in SEPARATION_RANGES}
 
 
 @STARS.group("xi_bins", Metric("xi_plus"), Metric("xi_minus"))
@@ -111,9 +111,9 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     found = correlations(products)
     together = run_figures(products, found)["all"]
     metrics = {
-        f"xi_{kind}_{name}": mean_xi_plus(found[kind], *bounds)
+        f"xi_{kind}_{name}": found[kind].mean_xi_plus(name)
         for kind in ("residual", "away")
-        for name, bounds in RANGES.items()
+        for name in SEPARATION_RANGES
     }
     return metrics | {key: float(together[key]) for key in ("rms_residual_at_stars", "rms_residual_away")}
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...core.files import write_bytes, write_ecsv, write_json
+from ...core.files import write_bytes, write_json
+from ...core.products import write_ecsv
+from ...core.version import VERSION
 from ...pipeline.config import Configuration, to_yaml
-from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN
+from ...pipeline.measure.correlation import SEPARATION_RANGES
 from ...pipeline.run_folder import CONFIG_NAME, stamp_of
 from .plan import INTERPOLATIONS
 from .plots import choices_figure, stars_figure
@@ -41,7 +42,7 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
     write_bytes(folder / "study_stars.png", stars_figure(result))
     write_bytes(folder / "study_choices.png", choices_figure(result))
     write_json(folder / "study.json", {**study_summary(result), **meta})
-    heading = (f"pachon {version('pachon')}: the configuration that the study is about.",)
+    heading = (f"pachon {VERSION}: the configuration that the study is about.",)
     write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
     return "study.ecsv", "study_stars.png", "study_choices.png", "study.json", CONFIG_NAME
 
@@ -94,6 +95,7 @@ def _meaning(key: str) -> str:
         "lost": "places whose model has no shape",
     }
     if key.startswith("xi_plus"):
-        span = f"below {LONG_RANGE:g}" if key.endswith("short") else f"{LONG_RANGE:g} to {LONGEST_ARCMIN:g}"
+        low, high = SEPARATION_RANGES["long"]
+        span = f"below {low:g}" if key.endswith("short") else f"{low:g} to {high:g}"
         return f"xi+ {span} arcmin, {where}"
     return next(f"{words}, {where}" for start, words in what.items() if key.startswith(start))

@@ -19,11 +19,11 @@ from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread
+from ...core.units import ARCMIN
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.correlation import jackknife_error, shear_correlation
+from ...pipeline.measure.correlation import SEPARATION_RANGES, jackknife_error, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
-from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN
 from ...pipeline.memory import check_memory
 from ...pipeline.psf_model.checks import snr_weights
 from ...pipeline.psf_model.model import CLIP_SIGMA, PsfModel
@@ -32,7 +32,6 @@ from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_observation import Observation, observe_ccd
 from ...pipeline.simulate.photometry import (
-    ARCSEC,
     effective_fwhm,
     instrument_noise,
     limiting_magnitude,
@@ -48,9 +47,10 @@ STUDY_CCDS = tuple(f"R{raft}_S11" for raft in ("02", "11", "13", "20", "22", "24
 #: Residuals: observed - model at the stars, truth - model where no star is.
 KINDS = ("at_stars", "away")
 # Two bins of equal width in the logarithm: 0.56' to 10', and 10' to 180'.
+_LOW, _HIGH = SEPARATION_RANGES["long"]
 _BINS: dict[str, Any] = {
-    "min_sep": LONG_RANGE**2 / LONGEST_ARCMIN * 60.0 * ARCSEC,
-    "max_sep": LONGEST_ARCMIN * 60.0 * ARCSEC,
+    "min_sep": _LOW**2 / _HIGH * ARCMIN,
+    "max_sep": _HIGH * ARCMIN,
     "n_bins": 2,
 }
 RANGES = ("short", "long")
@@ -385,7 +385,7 @@ def _correlations(fields: list[np.ndarray], residuals: list[np.ndarray]) -> tupl
     e = np.concatenate(residuals, axis=1)[:2]
     patch = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
     found = shear_correlation(x, y, *e, **_BINS, patch=patch)
-    return found.xi_plus, found.left_plus
+    return found.xi_plus, found.leave_one_out_plus
 
 
 def _figures(samples: Sequence[_Sample]) -> dict[str, float]:

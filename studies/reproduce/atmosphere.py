@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ...core.files import image_hdu, table_hdu
+from ...core.products import image_hdu, table_hdu
 from ...core.random_streams import stream
+from ...core.units import ARCMIN, ARCSEC
 from ...models.ideal_telescope import without_aberration
 from ...models.io.prescription import load_telescope
 from ...models.site import load_site
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import fwhm, measure_shapes
-from ...pipeline.simulate.photometry import ARCSEC
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.refraction import dispersion_shift
 from ...wavefront.atmosphere.turbulence import long_exposure_fwhm, path_variance
@@ -37,10 +37,9 @@ _SPECKLE_BLOCK = 5
 _EXPOSURES = (1.0, 5.0, 15.0, 60.0)
 _VISIT = 15.0
 _WAVELENGTH = 620e-9
-_ARCMIN = 60.0 * ARCSEC
 #: Half the side of a CCD on the sky [rad], and the weight of the moments [rad].
-_HALF_CCD, _WEIGHT = 6.8 * _ARCMIN, 0.7 * ARCSEC
-_PAIRS: dict[str, Any] = {"min_sep": 0.3 * _ARCMIN, "max_sep": 12.0 * _ARCMIN, "n_bins": 9}
+_HALF_CCD, _WEIGHT = 6.8 * ARCMIN, 0.7 * ARCSEC
+_PAIRS: dict[str, Any] = {"min_sep": 0.3 * ARCMIN, "max_sep": 12.0 * ARCMIN, "n_bins": 9}
 
 
 def dispersion(bench: Bench) -> Reproduced:
@@ -253,15 +252,15 @@ def ellipticity(bench: Bench) -> Reproduced:
         curve[f"error_{time:g}s"] = (error, "", "error of that mean, from the scatter of the exposures")
         curve[f"xi_minus_{time:g}s"] = (minus, "", "xi-, mean over the exposures")
     whisker = {
-        "x_arcmin": (fields[:, 0] / _ARCMIN, "arcmin", "field angle x"),
-        "y_arcmin": (fields[:, 1] / _ARCMIN, "arcmin", "field angle y"),
+        "x_arcmin": (fields[:, 0] / ARCMIN, "arcmin", "field angle x"),
+        "y_arcmin": (fields[:, 1] / ARCMIN, "arcmin", "field angle y"),
         "e1": (e.real, "", "ellipticity along x"),
         "e2": (e.imag, "", "ellipticity along x = y"),
     }
     correlated_stars = {
         "exposure": (np.repeat(np.arange(len(visits)), len(pairs)), "", "number of the exposure of 15 s"),
-        "x_arcmin": (np.tile(pairs[:, 0] / _ARCMIN, len(visits)), "arcmin", "field angle x"),
-        "y_arcmin": (np.tile(pairs[:, 1] / _ARCMIN, len(visits)), "arcmin", "field angle y"),
+        "x_arcmin": (np.tile(pairs[:, 0] / ARCMIN, len(visits)), "arcmin", "field angle x"),
+        "y_arcmin": (np.tile(pairs[:, 1] / ARCMIN, len(visits)), "arcmin", "field angle y"),
         "e1": (np.concatenate(visits).real, "", "ellipticity along x"),
         "e2": (np.concatenate(visits).imag, "", "ellipticity along x = y"),
     }
@@ -272,7 +271,7 @@ def ellipticity(bench: Bench) -> Reproduced:
     agrees = falls and measured["mean_e_15_s"] < 0.01 and 7e-6 < levels[2] < 6e-5
     told = ", ".join(f"{level:.0e}" for level in levels)
     return Reproduced(
-        {"": atmosphere_figure(fields / _ARCMIN, e, r, xi)},
+        {"": atmosphere_figure(fields / ARCMIN, e, r, xi)},
         {
             "": EcsvData(whisker, meta),
             "_stars": EcsvData(correlated_stars, meta),

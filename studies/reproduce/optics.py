@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
 from ...design.layout_parts import outer_radius, ray_paths, surface_section
 from ...models.camera.camera import Camera
@@ -16,7 +17,6 @@ from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...pipeline.measure.shapes import measure_shapes
 from ...pipeline.report.focal_plane_plots import heights_figure
-from ...pipeline.simulate.photometry import ARCSEC
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs
 from .drawing import budget_figure, encircled_energy_figure, field_whiskers_figure, layout_figure

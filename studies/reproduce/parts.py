@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ...core.files import Stamp, write_bytes, write_ecsv, write_fits
+from ...core.files import write_bytes
+from ...core.products import Stamp, write_ecsv, write_fits
 from ...core.progress import Reporter
+from ...core.version import VERSION
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
@@ -126,7 +127,7 @@ SCALES = {"small": SMALL, "paper": PAPER}
 
 @dataclass(frozen=True)
 class EcsvData:
-    """Numbers behind a figure, as a table: columns as :func:`~pachon.core.files.write_ecsv` takes them."""
+    """Numbers behind a figure, as a table: columns as :func:`~pachon.core.products.write_ecsv` takes them."""
 
     columns: Columns
     meta: dict[str, Any]
@@ -171,7 +172,7 @@ class Reproduced:
     def write(self, folder: Path, name: str, bench: Bench) -> list[str]:
         """Write pictures and data into a folder, each file whole or not at all; return the names of the files."""
         written = []
-        origin = {"figure": name, "scale": bench.scale.name, "seed": bench.seed, "pachon": version("pachon")}
+        origin = {"figure": name, "scale": bench.scale.name, "seed": bench.seed, "pachon": VERSION}
         for suffix, png in self.pictures.items():
             written.append(f"{name}{suffix}.png")
             write_bytes(folder / written[-1], png)
@@ -235,7 +236,7 @@ class Bench:
     @cached_property
     def stamp(self) -> Stamp:
         """What FITS files carry to say where they come from."""
-        return Stamp(version("pachon"), digest({**asdict(self.scale), "seed": self.seed}), self.seed)
+        return Stamp(digest({**asdict(self.scale), "seed": self.seed}), self.seed)
 
     @cached_property
     def configuration(self) -> Configuration:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core.files import image_hdu, table_hdu
+from ...core.products import image_hdu, table_hdu
 from ...pipeline.ccd_product import CcdProduct
-from ...pipeline.measure.summary import LONG_RANGE, LONGEST_ARCMIN, mean_xi_plus
 from ...pipeline.report.focal_plane_plots import whiskers_figure
 from ...pipeline.report.psf_plots import eigen_figure, spectrum_figure
 from ...pipeline.report.report import closest_middle_farthest
@@ -174,12 +173,12 @@ def correlation(bench: Bench) -> Reproduced:
         columns[f"xi_minus_{kind}"] = (c.xi_minus, "", "xi-")
         columns[f"error_{kind}"] = (c.error_plus, "", "error of xi+ by jackknife over the CCDs")
         columns[f"pairs_{kind}"] = (c.n_pairs, "", "pairs")
-    raw = mean_xi_plus(correlated["observed"], LONG_RANGE, LONGEST_ARCMIN)
-    at, away = (mean_xi_plus(correlated[k], LONG_RANGE, LONGEST_ARCMIN) for k in ("residual", "away"))
-    near = mean_xi_plus(correlated["away"], 0.0, LONG_RANGE)
+    raw = correlated["observed"].mean_xi_plus("long")
+    at, away = (correlated[k].mean_xi_plus("long") for k in ("residual", "away"))
+    near = correlated["away"].mean_xi_plus("short")
     every = len(made.products) == len(bench.camera)
     c = correlated["residual"]
-    inside = (c.r_arcmin >= LONG_RANGE) & (c.r_arcmin <= LONGEST_ARCMIN) & (c.n_pairs > 0)
+    inside = c.within("long") & (c.n_pairs > 0)
     worst = np.argmax(np.abs(c.xi_plus[inside]))
     largest, error = float(np.abs(c.xi_plus[inside][worst])), float(c.error_plus[inside][worst])
     reached = abs(at) < 1e-7 and 1e-5 < raw < 9e-5

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, unknown_name
 from ...core.files import make_folder, write_json
+from ...core.version import VERSION
 from . import atmosphere, optics, reconstruction
 from .parts import SCALES, Bench, Reproduced, Scale
 
@@ -147,7 +147,7 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
             "measured": result.measured,
             "files": files,
         }
-    summary = {"pachon": version("pachon"), "scale": bench.scale.name, "seed": bench.seed, "figures": made}
+    summary = {"pachon": VERSION, "scale": bench.scale.name, "seed": bench.seed, "figures": made}
     if len(made) == len(FIGURES):
         write_json(bench.folder / "summary.json", summary)
     return summary

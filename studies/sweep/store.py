@@ -11,11 +11,11 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, ProductError
+from ...core.version import VERSION
 from ...pipeline.config import differences
 from .file import SweepFile, read_sweep
 
@@ -152,7 +152,7 @@ class SweepStore:
             result.problem,
             result.seconds,
             result.worker,
-            version("pachon"),
+            VERSION,
         )
         with self._guarded(), self._connection:
             self._connection.execute("INSERT OR IGNORE INTO results VALUES (?, ?, ?, ?, ?, ?)", row)
@@ -182,7 +182,7 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
             connection.executescript(_TABLES)
             about = {
                 "format": str(FORMAT),
-                "pachon": version("pachon"),
+                "pachon": VERSION,
                 # The order of the parameters is that of the file, as people wrote it.
                 "sweep": json.dumps(sweep.model_dump(mode="json"), ensure_ascii=False, allow_nan=False),
                 "digest": sweep.digest,

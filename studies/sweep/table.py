@@ -12,7 +12,8 @@ import numpy as np
 from astropy.table import Table
 
 from ...core.errors import ConfigError, ProductError
-from ...core.files import described_table, write_bytes
+from ...core.files import write_bytes
+from ...core.products import described_table
 from ..metrics.stars import STARS
 from .store import SweepStore
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from importlib.metadata import version
 from importlib.util import find_spec
 from itertools import islice
 from multiprocessing import get_context
@@ -23,6 +22,7 @@ from uuid import uuid4
 
 from ...core.errors import ConfigError, ProductError
 from ...core.threads import thread_count
+from ...core.version import VERSION
 from .store import PointResult, SweepPoint
 
 #: Computes one point on so many threads.
@@ -276,7 +276,7 @@ def check_versions(client: Any) -> None:
     ConfigError
         If there is one, or a worker has no pachon.
     """
-    ours = version("pachon")
+    ours = VERSION
     for worker, theirs in client.run(_version, on_error="return").items():
         if not isinstance(theirs, str):
             raise ConfigError(f"worker {worker}: pachon cannot be imported there ({_first_line(theirs)})")
@@ -290,7 +290,7 @@ def worker_name() -> str:
 
 
 def _version() -> str:
-    return version("pachon")
+    return VERSION
 
 
 def _on_one_thread(measure: Measure, point: SweepPoint) -> PointResult:

@@ -8,7 +8,7 @@ from astropy.table import Table
 
 import pachon
 from pachon.commands.cli import main
-from pachon.core.files import read_fits
+from pachon.core.products import read_fits
 from pachon.design.optimize.sensitivity import sensitivity
 
 

@@ -10,9 +10,10 @@ from astropy.io import fits
 
 from pachon.core import files as products
 from pachon.core.errors import ProductError
-from pachon.core.files import Stamp, column, image_hdu, json_text, read_fits, table_hdu, write_bytes, write_fits
+from pachon.core.files import json_text, write_bytes
+from pachon.core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 
-STAMP = Stamp("1.2.3", "ab" * 32, 7)
+STAMP = Stamp("ab" * 32, 7, "1.2.3")
 
 
 def write_example(path, stamp=STAMP):
@@ -41,8 +42,8 @@ def test_a_product_reads_back_with_its_stamp_units_and_numbers(tmp_path):
     assert np.array_equal(hdus["STAMPS"].data, rng.normal(size=(2, 3, 4)).astype(np.float32))
     assert hdus[0].header["CCD"] == "R22_S11"
     assert STAMP.matches(hdus[0].header)
-    assert not Stamp("1.2.3", "cd" * 32, 7).matches(hdus[0].header)
-    assert not Stamp("1.2.4", "ab" * 32, 7).matches(hdus[0].header)
+    assert not Stamp("cd" * 32, 7, "1.2.3").matches(hdus[0].header)
+    assert not Stamp("ab" * 32, 7, "1.2.4").matches(hdus[0].header)
 
 
 def test_the_same_content_gives_the_same_bytes_and_standard_checksums(tmp_path):

@@ -7,22 +7,21 @@ from scipy.special import j0
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, UnknownNameError
+from pachon.core.units import ARCSEC
 from pachon.pipeline.ccd_product import KINDS
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.measure.correlation import shear_correlation
+from pachon.pipeline.measure.correlation import SEPARATION_RANGES, shear_correlation
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.measure.summary import correlations
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
-from pachon.pipeline.simulate.photometry import ARCSEC
 from pachon.pipeline.simulate.stamps import center_stamps
 from pachon.studies.attribution.attribution import (
     CAUSES,
     FULL,
     NOISE,
     OPTICS,
-    RANGES,
     attribute,
     attribution,
     causes_of,
@@ -82,7 +81,7 @@ def test_error_of_a_change_is_its_own_jackknife():
     left = [long_range(e, patch != k) - long_range(f, patch != k) for k in range(3)]
     expected = np.sqrt(2.0 / 3.0 * np.sum((left - np.mean(left)) ** 2))
     kinds = ("truth", "observed", "residual", "away")
-    keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in RANGES}
+    keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in SEPARATION_RANGES}
     one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, patch=patch, **bins)) for v in (e, f))
     changes = attribution._changes(keys, keys, one, other)
     assert changes["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order

@@ -7,13 +7,13 @@ from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
+from pachon.core.units import ARCMIN, ARCSEC
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.psf_model.polynomial import mapped
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, Exposed
 from pachon.pipeline.simulate.ccd_observation import Observation
-from pachon.pipeline.simulate.photometry import ARCSEC
 from pachon.pipeline.simulate.star_field import make_star_field
 from pachon.studies.psf_choice import study as psf_study
 from pachon.studies.psf_choice.plan import NOISE_FREE, Case, Plan, make_plan
@@ -156,7 +156,7 @@ def test_correlations_are_means_over_pairs():
     def long_range(chosen):
         r = np.concatenate([fields[i] for i in chosen])
         e = np.concatenate([residuals[i][0] + 1j * residuals[i][1] for i in chosen])
-        apart = np.hypot(*(r[:, None] - r).transpose(2, 0, 1)) > 10.0 * 60.0 * ARCSEC
+        apart = np.hypot(*(r[:, None] - r).transpose(2, 0, 1)) > 10.0 * ARCMIN
         return (e[:, None] * e.conj()).real[apart].mean()
 
     # TreeCorr keeps ellipticities in single precision.

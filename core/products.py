@@ -1,0 +1,183 @@
+"""FITS and ECSV products: stamped with their origin, and checked by checksum when read."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import Table
+from astropy.utils.exceptions import AstropyWarning
+
+from .errors import ProductError
+from .files import write_bytes
+from .version import VERSION
+
+#: Comment of CHECKSUM and DATASUM. astropy's default is the time of day, with which no two runs have the same bytes.
+_WHEN = "FITS checksum"
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """Origin of a product.
+
+    Attributes
+    ----------
+    config_hash : str
+        SHA-256 of the resolved configuration.
+    seed : int
+        Seed of the run.
+    version : str
+        Version of pachon.
+    """
+
+    config_hash: str
+    seed: int
+    version: str = VERSION
+
+    def cards(self) -> list[tuple[str, Any, str]]:
+        """Return the header cards."""
+        return [
+            ("CREATOR", f"pachon {self.version}", "program and version"),
+            ("CONFHASH", self.config_hash, ""),
+            ("SEED", self.seed, "seed of all random numbers"),
+        ]
+
+    def meta(self) -> dict[str, Any]:
+        """Return the entries of a table's header or a JSON file."""
+        return {"pachon": self.version, "config_hash": self.config_hash, "seed": self.seed}
+
+    def matches(self, header: fits.Header) -> bool:
+        """Return whether a header has this stamp."""
+        return all(header.get(key) == value for key, value, _ in self.cards())
+
+
+def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tuple[str, Any, str]]) -> None:
+    """Write a FITS product with checksums and the stamp in the primary header.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    hdus : list of ImageHDU and BinTableHDU
+        Extensions, each with a name.
+    stamp : Stamp or None
+        Where the product comes from; None where it comes from no run.
+    cards : list of (keyword, value, comment)
+        More for the primary header.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be written.
+    """
+    primary = fits.PrimaryHDU()
+    parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
+    for keyword, value, comment in [*(stamp.cards() if stamp else []), parts, *cards]:
+        primary.header[keyword] = (value, comment)
+    buffer = io.BytesIO()
+    everything = fits.HDUList([primary, *hdus])
+    for hdu in everything:
+        hdu.add_checksum(when=_WHEN)
+    everything.writeto(buffer, checksum=False)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_fits(path: Path) -> fits.HDUList:
+    """Read a FITS product into memory and check the checksum of every part.
+
+    Raises
+    ------
+    ProductError
+        If there is no such file, or it is no product of this program as it was written.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ProductError(f"cannot read {path}: {error.strerror}") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", AstropyWarning)
+        try:
+            hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
+            for hdu in hdus:
+                place = hdu.fileinfo()
+                if not _checksum_holds(data[place["hdrLoc"] : place["datLoc"] + place["datSpan"]]):
+                    raise ProductError(f"{path}: damaged ({hdu.name} does not match its checksum)")
+                hdu.data  # noqa: B018 - reads it now, within the checks
+            if len(hdus) != hdus[0].header["NPARTS"]:
+                raise ProductError(f"{path}: cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}")
+        except (AstropyWarning, OSError, ValueError, KeyError, TypeError, IndexError) as error:
+            raise ProductError(f"{path}: damaged or no FITS product ({' '.join(str(error).split())})") from None
+    return hdus
+
+
+def _checksum_holds(part: bytes) -> bool:
+    """Return whether the 32-bit ones'-complement sum of a header and its data is all ones (FITS standard 4.0, J.1)."""
+    if not part or len(part) % 4:
+        return False
+    total = int(np.frombuffer(part, dtype=">u4").sum(dtype=np.uint64))
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total == 0xFFFFFFFF
+
+
+def table_hdu(name: str, columns: dict[str, tuple[np.ndarray, str, str]]) -> fits.BinTableHDU:
+    """Return a FITS table.
+
+    Parameters
+    ----------
+    name : str
+        Name of the extension.
+    columns : dict of str to (values, unit, description)
+        Columns in order; the unit in FITS notation, empty for pure numbers.
+    """
+    table = fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name=key, array=values, format=_FORMATS[values.dtype.kind], unit=unit or None)
+            for key, (values, unit, _) in columns.items()
+        ],
+        name=name,
+    )
+    for index, (key, (_, _, description)) in enumerate(columns.items(), start=1):
+        table.header.comments[f"TTYPE{index}"] = description
+        table.header.set(f"TTYPE{index}", key, description)
+    return table
+
+
+_FORMATS = {"f": "D", "i": "J", "b": "L"}
+
+
+def image_hdu(name: str, image: np.ndarray, comment: str) -> fits.ImageHDU:
+    """Return a FITS image in single precision with a comment on what it holds."""
+    hdu = fits.ImageHDU(np.asarray(image, dtype=np.float32), name=name)
+    hdu.header["COMMENT"] = comment
+    return hdu
+
+
+def column(table: fits.BinTableHDU, name: str) -> np.ndarray:
+    """Return a column in the machine's own byte order."""
+    values = np.asarray(table.data[name])
+    return values.astype(values.dtype.newbyteorder("="))
+
+
+def write_ecsv(path: Path, columns: dict[str, tuple[np.ndarray, str, str]], meta: dict[str, Any]) -> None:
+    """Write an ECSV table, which people and astropy both read; the columns as in :func:`table_hdu`."""
+    text = io.StringIO()
+    described_table(columns, meta).write(text, format="ascii.ecsv")
+    write_bytes(path, text.getvalue().encode())
+
+
+def described_table(columns: dict[str, tuple[np.ndarray, str, str]], meta: dict[str, Any]) -> Table:
+    """Return an astropy table with units and descriptions; the columns as in :func:`table_hdu`."""
+    table = Table(meta=meta)
+    for key, (values, unit, description) in columns.items():
+        table[key] = values
+        table[key].description = description
+        if unit:
+            table[key].unit = u.Unit(unit)
+    return table
