@@ -146,7 +146,7 @@ def test_jackknife_is_delete_one_patch(cross):
         # Sums of up to 1e4 products in another order, xi about 1e-4, errors about 1e-5.
         np.testing.assert_allclose(getattr(c, f"error_{sign}"), expected, rtol=1e-9)
     np.testing.assert_allclose(c.leave_one_out_plus, [d.xi_plus for d in left], rtol=1e-9)
-    np.testing.assert_array_equal(c.left_pairs, [d.n_pairs for d in left])
+    np.testing.assert_array_equal(c.leave_one_out_pairs, [d.n_pairs for d in left])
     assert c.n_patches == 9
     assert left[0].n_patches == 0
     assert left[0].leave_one_out_plus.shape == (0, 8)
