@@ -110,6 +110,8 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
         experiment = Experiment.from_config(config)
     except PachonError as error:
         raise ProductError(f"{path}: no configuration that pachon run wrote ({error})") from None
+    if experiment.config != config:
+        raise ProductError(f"{path}: no configuration that pachon run wrote (defaults are not filled in)")
     stamp, names = stamp_of(experiment), config.ccds or ()
     if not any(product_path(folder, name).exists() for name in names):
         raise ProductError(f"{folder}: none of its {len(names)} CCDs is finished")
