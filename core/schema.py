@@ -8,11 +8,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+    create_model,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError, core_schema
 
 from .errors import ConfigError, PachonError
 from .yaml_reader import as_number
@@ -39,7 +49,8 @@ Switch = Annotated[bool, Field(strict=True)]
 class Section(BaseModel):
     """Immutable mapping of a file; unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # Built when first used: sections may hold one another.
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     @model_validator(mode="before")
     @classmethod
@@ -48,8 +59,13 @@ class Section(BaseModel):
             known = cls.keys()
             for key in content:
                 if key not in known:
-                    raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
+                    raise unknown_key(key, known)
+            cls.check(content)
         return content
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:
+        """Raise :func:`expected` or :func:`problem` for keys that exclude or need one another."""
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -90,6 +106,11 @@ def validated(
         raise _first_problem(problems, content, source, error) from None
 
 
+def unknown_key(key: str, known: list[str]) -> PydanticCustomError:
+    """Return the error of a validator of a section with an unknown key."""
+    return PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
+
+
 def expected(text: str, key: str = "") -> PydanticCustomError:
     """Return the error of a validator for a value that is not as expected.
 
@@ -98,9 +119,95 @@ def expected(text: str, key: str = "") -> PydanticCustomError:
     text : str
         Expected value.
     key : str
-        Key of the value, where the validator is that of a section.
+        Key of the value, where the validator is that of a section; a key that the section does not have is missing.
     """
     return PydanticCustomError("expected", "expected", {"expected": text, "key": key})
+
+
+def one_of(choices: Iterable[str], value: object) -> str:
+    """Return the expected value where it is one of several names, the nearest in parentheses."""
+    names = list(choices)
+    near = nearest(value, names, n=1)
+    return f"one of {', '.join(names)}" + (f" ({near})" if near else "")
+
+
+def either(content: Mapping[str, Any], key: str, others: Iterable[str]) -> None:
+    """Raise unless a section has one key, or else all of the others."""
+    for other in others:
+        if (key in content) == (other in content):
+            raise expected(f"{key} or {other}, not both", other)
+
+
+@dataclass(frozen=True, eq=False)
+class Tagged:
+    """Discriminated union of sections, as an annotation of their common base class.
+
+    Parameters
+    ----------
+    classes : mapping of str to type
+        Section of each kind.
+    kind : callable
+        Function from a mapping to its kind, one of the keys of `classes`; it raises :func:`expected`.
+    """
+
+    classes: Mapping[str, type[Section]]
+    kind: Callable[[dict[str, Any]], str]
+
+    @classmethod
+    def by_value(cls, key: str, classes: Mapping[str, type[Section]]) -> Tagged:
+        """Return the union of sections whose kind stands under a key."""
+
+        def kind(content: dict[str, Any]) -> str:
+            value = content.get(key)
+            if not isinstance(value, str) or value not in classes:
+                raise expected(one_of(classes, value), key)
+            return value
+
+        return cls(classes, kind)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        # Tags stand in the locations of errors; the brackets tell them from keys.
+        choices: Any = {f"<{kind}>": handler.generate_schema(section) for kind, section in self.classes.items()}
+        union = core_schema.tagged_union_schema(choices, discriminator=lambda content: f"<{self.kind(content)}>")
+        return core_schema.no_info_before_validator_function(self._check, union)
+
+    def _check(self, content: Any) -> Any:
+        if not isinstance(content, dict):
+            raise expected("a mapping of keys to values")
+        self.kind(content)
+        return content
+
+
+class Parameters(Section):
+    """Section whose values are the positional arguments of a constructor."""
+
+    make: ClassVar[Callable[..., Any]]
+    parameters: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def of(cls, make: Callable[..., Any], **fields: Any) -> type[Self]:
+        """Return the subclass for a constructor.
+
+        Parameters
+        ----------
+        make : callable
+            Constructor.
+        **fields : type or (type, default)
+            Types of the values by key, in the order of the arguments.
+        """
+        entries = {key: field if isinstance(field, tuple) else (field, ...) for key, field in fields.items()}
+        section = create_model(cls.__name__, __base__=cls, **entries)  # type: ignore[call-overload]
+        section.make, section.parameters = staticmethod(make), tuple(fields)
+        return section  # type: ignore[no-any-return]
+
+    def build(self) -> Any:
+        """Return the object that the section describes."""
+        return self.make(*(getattr(self, key) for key in self.parameters))
+
+
+def problem(text: str, key: str = "") -> PydanticCustomError:
+    """Return the error of a validator whose text stands right behind the path."""
+    return PydanticCustomError("problem", "problem", {"text": text, "key": key})
 
 
 def checked(convert: Callable[[Any], Any], text: str) -> BeforeValidator:
@@ -113,6 +220,10 @@ def checked(convert: Callable[[Any], Any], text: str) -> BeforeValidator:
         return found
 
     return BeforeValidator(convert_or_raise)
+
+
+#: Validator of an optional section: a key without a value is an error.
+mapping = checked(lambda value: value if isinstance(value, dict) else None, "a mapping of keys to values")
 
 
 def nearest(name: object, known: Iterable[str], n: int = 2) -> str:
@@ -164,6 +275,8 @@ def _first_problem(problems: ValidationError, content: Any, source: str, error: 
         key, known = limits["key"], limits["known"]
         hint = nearest(key, known) or f"expected one of {', '.join(known)}"
         return error(f"unknown key {path} = {_as_in(error, value[key])}: {hint}", file=source, key=path)
+    if kind == "problem":
+        return error(f"{path}{limits['text']}", file=source, key=path)
     if limits.get("key"):
         kind, value = ("expected", value[limits["key"]]) if limits["key"] in value else ("missing", None)
     if kind == "missing":
@@ -171,9 +284,7 @@ def _first_problem(problems: ValidationError, content: Any, source: str, error: 
     if kind == "expected":
         text = limits["expected"]
     elif kind == "literal_error":
-        choices = str(limits["expected"]).replace(" or ", ", ").replace("'", "")
-        near = nearest(value, choices.split(", "), n=1)
-        text = f"one of {choices}" + (f" ({near})" if near else "")
+        text = one_of(str(limits["expected"]).replace(" or ", ", ").replace("'", "").split(", "), value)
     elif kind in _LIMITS:
         name, word = _LIMITS[kind]
         text = f"a number {word} {limits[name]:g}"
@@ -190,8 +301,8 @@ def _as_in(error: type[PachonError], value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-#: Keys that tell the entries of a list apart in messages.
-_LABELS = ("name", "altitude", "shape")
+#: Keys that tell the entries of a list apart in messages, by the key of the list.
+_LABELS = {"layers": "altitude", "shape": "shape"}
 
 
 def dotted(location: Iterable[int | str], content: Any) -> str:
@@ -204,17 +315,16 @@ def dotted(location: Iterable[int | str], content: Any) -> str:
     content : object
         Content of the file, for the names of entries.
     """
-    path = ""
+    path = label = ""
     for part in location:
         if isinstance(part, str) and part.startswith("<"):
             continue
-        inner = _item(content, part)
+        content = _item(content, part)
         if isinstance(part, int):
-            labels = [inner[key] for key in _LABELS if key in inner] if isinstance(inner, Mapping) else []
-            path += f"[{labels[0] if labels else part}]"
+            path += f"[{content.get(label, part) if isinstance(content, Mapping) else part}]"
         else:
             path += f".{part}" if path else part
-        content = inner
+            label = _LABELS.get(part, "name")
     return path
 
 

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import PrescriptionError, unknown_name
-from ..core.yaml_reader import Section, read_yaml
+from ..core.errors import PrescriptionError
 
 #: How far the weights of a site may be from a sum of 1: published ones are rounded to three figures.
 WEIGHT_TOLERANCE = 5e-3
-
-DATA = Path(__file__).parent / "data"
-BUNDLED = ("cerro_pachon",)
-
-# The units a site file is in; stated in the file so that it can be read on its own.
-_UNITS = {"altitude": "m", "wind_speed": "m/s", "r0": "m", "outer_scale": "m"}
 
 
 @dataclass(frozen=True)
@@ -70,10 +60,10 @@ class Site:
     weather : Weather
         Air at the telescope.
     source, description : str
-        Where the figures come from, and what they are.
+        Source of the numbers, and remarks.
     wind_directions : tuple of float or None
-        Direction that the wind blows to in each layer, from +x towards +y of the telescope [rad]; None where it is
-        drawn from the seed of the atmosphere. All are by default.
+        Direction that the wind blows to in each layer, from +x towards +y of the telescope [rad]; None (the default)
+        where it is drawn from the seed of the atmosphere.
     """
 
     name: str
@@ -107,65 +97,3 @@ class Site:
         for key in ("r0", "outer_scale"):
             if not (np.isfinite(getattr(self, key)) and getattr(self, key) > 0):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected a positive number")
-
-
-def site_names() -> tuple[str, ...]:
-    """Return the names of the sites that come with the package."""
-    return BUNDLED
-
-
-def load_site(name_or_path: str | os.PathLike[str]) -> Site:
-    """Load a bundled site by name, or any site by the path of its ``.yaml`` file.
-
-    Raises
-    ------
-    UnknownNameError
-        If it is neither a bundled name nor a path.
-    PrescriptionError
-        If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
-    """
-    text = os.fspath(name_or_path)
-    if text in BUNDLED:
-        return _bundled(text)
-    path = Path(text)
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        raise unknown_name("site", text, BUNDLED)
-    return _read_site(read_yaml(path))
-
-
-@cache
-def _bundled(name: str) -> Site:
-    return _read_site(read_yaml(DATA / f"{name}.yaml"))
-
-
-def _read_site(top: Section) -> Site:
-    top.allow("name", "description", "source", "units", "r0", "outer_scale", "layers", "weather")
-    units = top.section("units")
-    units.allow(*_UNITS)
-    for key, unit in _UNITS.items():
-        units.choice(key, (unit,))
-    weather = top.section("weather")
-    weather.allow("pressure_mmhg", "temperature_c", "water_vapour_mmhg")
-    layers = top.sections("layers", "altitude")
-    for layer in layers:
-        layer.allow("altitude", "weight", "wind_speed", "wind_direction_deg")
-    try:
-        return Site(
-            name=top.text("name"),
-            description=top.text("description", ""),
-            source=top.text("source"),
-            altitudes=tuple(layer.number("altitude") for layer in layers),
-            weights=tuple(layer.number("weight") for layer in layers),
-            wind_speeds=tuple(layer.number("wind_speed") for layer in layers),
-            wind_directions=tuple(_direction(layer) for layer in layers),
-            r0=top.number("r0", positive=True),
-            outer_scale=top.number("outer_scale", positive=True),
-            weather=Weather(*(weather.number(k) for k in ("pressure_mmhg", "temperature_c", "water_vapour_mmhg"))),
-        )
-    except PrescriptionError as error:
-        raise top.placed(error) from None
-
-
-def _direction(layer: Section) -> float | None:
-    key = "wind_direction_deg"
-    return float(np.deg2rad(layer.number(key))) if key in layer else None

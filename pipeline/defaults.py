@@ -14,7 +14,8 @@ from ..core.errors import ConfigError
 from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera, load_camera
 from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
-from ..models.site import Site, load_site
+from ..models.io.site_file import load_site
+from ..models.site import Site
 from ..models.telescope import Telescope
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG

@@ -21,11 +21,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated, Any
 
-from ...core.errors import ConfigError, PachonError, PrescriptionError, unknown_name
-from ...core.yaml_reader import Section, read_yaml
+from pydantic import BeforeValidator, Field
+
+from ...core.errors import ConfigError, PrescriptionError, error_context, unknown_name
+from ...core.schema import Section, checked, expected, mapping, problem, validated
+from ...core.yaml_reader import as_number, read_mapping
 from ...models.io.grid_file import read_grid
 from ...models.io.prescription import DATA
+from ...models.io.yaml.values import Names, Number, PositiveNumber, Text, rows
 from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.modes import GridModes
 from ...models.shapes.shape import Shape
@@ -48,61 +53,87 @@ def load_degrees_of_freedom(name_or_path: str | os.PathLike[str]) -> DegreesOfFr
     text = os.fspath(name_or_path)
     if text not in BUNDLED and Path(text).suffix.lower() not in (".yaml", ".yml"):
         raise unknown_name("degrees of freedom", text, BUNDLED)
-    return _read(read_yaml(DATA / BUNDLED[text] if text in BUNDLED else Path(text)))
+    return _read(DATA / BUNDLED[text] if text in BUNDLED else Path(text))
 
 
-def _read(top: Section) -> DegreesOfFreedom:
-    top.allow("name", "description", "source", "figures", "degrees_of_freedom")
-    listed = top.section("figures", optional=True)
-    figures = tuple(_figure(name, listed.section(name)) for name in listed.keys())  # noqa: SIM118 - no mapping
-    freedoms = tuple(_freedom(one) for one in top.sections("degrees_of_freedom", "name"))
+def _weights(value: Any) -> Any:
+    if isinstance(value, dict) and value:
+        return value
+    if not isinstance(value, str) or not value.strip():
+        raise expected("an address, or addresses with the change of each by one of the degree of freedom")
+    return {value: 1.0}
+
+
+def _highest_term(value: Any) -> int | None:
+    number = as_number(value)
+    return int(number) if number is not None and number % 1 == 0 and 0 < number <= 500 else None
+
+
+def _without_dots(value: Any) -> Any:
+    for name in value if isinstance(value, dict) else ():
+        if "." in name:
+            raise problem(": expected a name without a dot", name)
+    return value
+
+
+class FreedomSection(Section):
+    """A degree of freedom."""
+
+    name: Text
+    unit: Text
+    of: Annotated[dict[str, Number], BeforeValidator(_weights)]
+
+
+class ZernikeSection(Section):
+    """Zernike polynomials up to a term."""
+
+    outer_radius: PositiveNumber
+    inner_radius: Number = 0.0
+    terms: Annotated[int, checked(_highest_term, "the highest Noll index, a whole number up to 500")]
+
+
+class DeformationSection(Section):
+    """Deformations of surfaces: Zernike polynomials, or grids of sag in FITS files by the name of the mode."""
+
+    surfaces: Names
+    zernike: Annotated[ZernikeSection | None, mapping] = None
+    grids: Annotated[dict[str, Text] | None, checked(lambda v: v or None, "names of modes with their FITS files")] = (
+        None
+    )
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        if ("zernike" in content) == ("grids" in content):
+            raise problem(": expected either zernike or grids")
+
+    def shape(self, folder: Path) -> Shape:
+        """Return the deformation; paths of files start from the folder."""
+        if self.zernike is not None:
+            with error_context(key="zernike"):
+                rims = self.zernike
+                return ZernikeSag((0.0,) * rims.terms, rims.outer_radius, rims.inner_radius)
+        with error_context(key="grids"):
+            return GridModes({mode: read_grid(folder / file) for mode, file in (self.grids or {}).items()})
+
+
+class DegreesOfFreedomFile(Section):
+    """A file of degrees of freedom."""
+
+    name: Text
+    description: Text = ""
+    source: Text = ""
+    figures: Annotated[dict[str, DeformationSection], BeforeValidator(_without_dots)] = Field(default_factory=dict)
+    degrees_of_freedom: Annotated[tuple[FreedomSection, ...], checked(rows, "a list of mappings, one a line")]
+
+
+def _read(path: Path) -> DegreesOfFreedom:
+    file = validated(DegreesOfFreedomFile, read_mapping(path), str(path), PrescriptionError)
+    freedoms = tuple(Freedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
+    figures = []
+    for name, section in file.figures.items():
+        with error_context(file=path, key=f"figures.{name}"):
+            figures.append(Figure(name, section.surfaces, section.shape(path.parent)))
     try:
-        return DegreesOfFreedom(
-            freedoms, figures, top.text("name"), top.text("description", ""), top.text("source", "")
-        )
+        return DegreesOfFreedom(freedoms, tuple(figures), file.name, file.description, file.source)
     except ConfigError as error:
-        raise PrescriptionError(str(error), file=top.source) from None
-
-
-def _freedom(section: Section) -> Freedom:
-    section.allow("name", "unit", "of")
-    if not isinstance(section.value("of"), dict):
-        return Freedom(section.text("name"), section.text("unit"), {section.text("of"): 1.0})
-    weights = section.section("of")
-    of = {address: weights.number(address) for address in weights.keys()}  # noqa: SIM118 - a Section is no mapping
-    if not of:
-        raise section.error("of", "an address, or addresses with what one does to each")
-    return Freedom(section.text("name"), section.text("unit"), of)
-
-
-def _figure(name: str, section: Section) -> Figure:
-    section.allow("surfaces", "zernike", "grids")
-    if ("zernike" in section) == ("grids" in section):
-        raise PrescriptionError(f"{section.source}: {section.place}: expected either zernike or grids")
-    if "." in name:
-        raise PrescriptionError(f"{section.source}: {section.place}: expected a name without a dot")
-    surfaces = section.names("surfaces")
-    shape: Shape
-    if "zernike" in section:
-        rims = section.section("zernike")
-        rims.allow("outer_radius", "inner_radius", "terms")
-        terms = rims.number("terms", positive=True)
-        if terms % 1 or terms > 500:
-            raise rims.error("terms", "the highest Noll index, a whole number up to 500")
-        try:
-            shape = ZernikeSag(
-                (0.0,) * int(terms), rims.number("outer_radius", positive=True), rims.number("inner_radius", 0.0)
-            )
-        except PrescriptionError as error:
-            raise rims.placed(error) from None
-        return Figure(name, surfaces, shape)
-    files = section.section("grids")
-    if not files.keys():
-        raise section.error("grids", "names of modes with their FITS files")
-    # A relative path is meant from where the file lies.
-    folder = Path(section.source).parent
-    grids = {mode: read_grid(folder / files.text(mode)) for mode in files.keys()}  # noqa: SIM118 - no mapping
-    try:
-        return Figure(name, surfaces, GridModes(grids))
-    except PachonError as error:
-        raise PrescriptionError(f"{section.place}.grids: {error}", file=section.source) from None
+        raise PrescriptionError(str(error), file=path) from None

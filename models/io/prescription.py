@@ -33,7 +33,6 @@ from functools import cache
 from pathlib import Path
 
 from ...core.errors import PrescriptionError, unknown_name
-from ...core.yaml_reader import read_yaml
 from ..telescope import Telescope
 from .codev.reader import read_codev
 from .glass_catalogue import GlassCatalogue
@@ -100,7 +99,7 @@ def load_telescope(
         return _bundled(text)
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
-        return read_telescope(read_yaml(path))
+        return read_telescope(path)
     if path.suffix.lower() == ".seq":
         return read_codev(path, lenient=lenient, glass_catalogues=glass_catalogues)
     if path.suffix.lower() == ".zmx":
@@ -113,7 +112,7 @@ def load_telescope(
 @cache
 def _bundled(name: str) -> Telescope:
     # A telescope never changes, so that one serves all who ask; a sweep asks for it at every point.
-    return read_telescope(read_yaml(DATA / f"{name}.yaml"))
+    return read_telescope(DATA / f"{name}.yaml")
 
 
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:

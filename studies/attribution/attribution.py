@@ -28,7 +28,7 @@ from ...core.errors import ConfigError, unknown_name
 from ...core.files import write_bytes, write_json
 from ...core.products import write_ecsv
 from ...core.progress import Reporter
-from ...models.site import load_site
+from ...models.io.site_file import load_site
 from ...pipeline.ccd_product import KINDS, CcdProduct
 from ...pipeline.config import Configuration, to_yaml, with_options
 from ...pipeline.experiment import Experiment

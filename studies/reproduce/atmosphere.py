@@ -13,7 +13,7 @@ from ...core.random_streams import stream
 from ...core.units import ARCMIN, ARCSEC
 from ...models.ideal_telescope import without_aberration
 from ...models.io.prescription import load_telescope
-from ...models.site import load_site
+from ...models.io.site_file import load_site
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...wavefront.atmosphere.atmosphere import Atmosphere

@@ -15,7 +15,7 @@ from pachon.commands import cli
 from pachon.commands.cli import main
 from pachon.models.io import prescription
 from pachon.models.io.prescription import bundled_names
-from pachon.models.site import DATA
+from pachon.models.io.site_file import DATA
 from pachon.pipeline import memory
 from pachon.pipeline import run as run_module
 

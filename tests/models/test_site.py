@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pachon.core.errors import PrescriptionError, UnknownNameError
-from pachon.models.site import DATA, load_site, site_names
+from pachon.models.io.site_file import DATA, load_site, site_names
 
 TEXT = (DATA / "cerro_pachon.yaml").read_text()
 DOCS = Path(__file__).parents[2] / "docs"

@@ -8,7 +8,7 @@ import pytest
 from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.io.prescription import load_telescope, save_telescope
-from pachon.models.site import DATA as SITES
+from pachon.models.io.site_file import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
 from pachon.pipeline.defaults import DEFAULT_CCDS
 from pachon.pipeline.experiment import Experiment

@@ -17,7 +17,7 @@ from pachon.commands.cli import main
 from pachon.design.images.encircled_energy import energy_curve
 from pachon.models.ideal_telescope import without_aberration
 from pachon.models.io.prescription import load_telescope
-from pachon.models.site import load_site
+from pachon.models.io.site_file import load_site
 from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
 from pachon.studies.reproduce import reproduce as module

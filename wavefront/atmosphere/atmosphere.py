@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.units import metres
-from ...models.site import Site, load_site
+from ...models.io.site_file import load_site
+from ...models.site import Site
 from .layer_screens import LayerScreens, screen_samples
 from .layers import check_drift, checked_layers, layer_random, line_of_sight
 from .refraction import require_zenith_angle

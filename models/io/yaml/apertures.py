@@ -1,7 +1,7 @@
-"""Clear apertures and obstructions in prescription files: from a section of YAML and back.
+"""Clear apertures and obstructions in prescription files: sections of YAML, and their text.
 
 A surface has ``circle: 0.4`` or ``annulus: [0.6, 4.1]``, with ``centre: [x, y]``, or any region under ``aperture``;
-what blocks light stands under ``obscuration``. A region is one of:
+regions that block light stand under ``obscuration``. A region is one of:
 
 ================================================================= ====================================================
 ``{circle: 0.4, centre: [0, 0]}``                                 disc of a radius
@@ -19,159 +19,163 @@ A mesh that blocks light is ``{name: top_end, file: top_end.stl, scale: 0.001, b
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from typing import Annotated, Any
 
-import numpy as np
-
-from ....core.errors import PrescriptionError
-from ....core.yaml_reader import Section
+from ....core.errors import error_context
+from ....core.schema import Parameters, Section, Tagged, checked, either, expected, problem
 from ...aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from ...obstruction import Obstruction
+from .values import (
+    Angle,
+    Flag,
+    Length,
+    OptionalFile,
+    OptionalLength,
+    OptionalNames,
+    OptionalPoint,
+    Point,
+    PositiveNumber,
+    Text,
+    array,
+    rows,
+)
 
-Convert = Callable[[float], float]
 
-#: Keys of a surface that say what it leaves clear.
-APERTURE_KEYS = ("circle", "annulus", "centre", "aperture", "obscuration")
-# The keys that a region of each kind has beside its own.
-_REGIONS: dict[str, tuple[str, ...]] = {
-    "circle": ("centre",),
-    "annulus": ("centre",),
-    "rectangle": ("centre", "angle"),
-    "polygon": (),
-    "vane": ("from", "angle", "both_ways"),
-    "union": (),
-    "intersection": (),
-    "complement": (),
+def _region_kind(content: dict[str, Any]) -> str:
+    kinds = [key for key in REGIONS if key in content]
+    if len(kinds) != 1:
+        raise problem(f" has {', '.join(content) or 'nothing'}: expected one of {', '.join(REGIONS)}")
+    return kinds[0]
+
+
+class RegionSection(Parameters):
+    """A region of the plane."""
+
+    def build(self) -> Aperture:
+        """Return the region; pairs of lengths are two arguments of its class."""
+        values = (getattr(self, key) for key in self.parameters)
+        return self.make(*(v for value in values for v in (value if isinstance(value, tuple) else (value,))))
+
+
+#: Sections of regions by the key that tells their kind.
+REGIONS: dict[str, type[RegionSection]] = {}
+Region = Annotated[RegionSection, Tagged(REGIONS, _region_kind)]
+OptionalRegion = Annotated[RegionSection | None, Tagged(REGIONS, _region_kind)]
+
+
+class PolygonSection(RegionSection):
+    """Polygon."""
+
+    polygon: Annotated[
+        tuple[Point, ...], checked(lambda v: v if isinstance(v, list) else None, "a list of corners [x, y]")
+    ]
+
+    def build(self) -> Polygon:
+        """Return the polygon."""
+        return Polygon(self.polygon)
+
+
+class PartsSection(RegionSection):
+    """Region made of others."""
+
+    def build(self) -> Aperture:
+        """Return the region; errors name the part."""
+        (key,) = self.parameters
+        sections = getattr(self, key)
+        parts = []
+        for number, section in enumerate(sections):
+            with error_context(key=f"{key}[{number}]"):
+                parts.append(section.build())
+        return self.make(tuple(parts))
+
+
+class ComplementSection(RegionSection):
+    """Complement of a region."""
+
+    complement: Region
+
+    def build(self) -> Complement:
+        """Return the region."""
+        with error_context(key="complement"):
+            return Complement(self.complement.build())
+
+
+_CENTRE, _ANGLE = (Point, (0.0, 0.0)), (Angle, 0.0)
+_PARTS = Annotated[tuple[Region, ...], checked(rows, "a list of mappings, one a line")]
+REGIONS |= {
+    "circle": RegionSection.of(Circle, circle=Length, centre=_CENTRE),
+    "annulus": RegionSection.of(Annulus, annulus=Point, centre=_CENTRE),
+    "rectangle": RegionSection.of(Rectangle, rectangle=Point, centre=_CENTRE, angle=_ANGLE),
+    "polygon": PolygonSection,
+    "vane": RegionSection.of(Vane, vane=Length, **{"from": _CENTRE}, angle=_ANGLE, both_ways=(Flag, False)),
+    "union": PartsSection.of(Union, union=_PARTS),
+    "intersection": PartsSection.of(Intersection, intersection=_PARTS),
+    "complement": ComplementSection,
 }
 
 
-def read_aperture(section: Section, length: Convert, angle: Convert) -> Aperture | None:
-    """Return the clear aperture that the keys of a surface describe; None where there are none.
+class ApertureKeys(Section):
+    """Keys of a surface for its clear aperture."""
 
-    Parameters
-    ----------
-    section : Section
-        The surface.
-    length, angle : callable
-        Conversions of the file's lengths and angles to SI.
+    circle: OptionalLength = None
+    annulus: OptionalPoint = None
+    centre: Point = (0.0, 0.0)
+    aperture: OptionalRegion = None
+    obscuration: OptionalRegion = None
 
-    Raises
-    ------
-    PrescriptionError
-        If the keys are malformed or contradict each other: file, key, value and what was expected.
-    """
-    shapes = [key for key in ("circle", "annulus", "aperture") if key in section]
-    if len(shapes) > 1:
-        raise section.error(shapes[0], f"{shapes[0]} or {shapes[1]}, not both")
-    if "centre" in section and not (set(shapes) & {"circle", "annulus"}):
-        raise section.error("centre", "a circle or an annulus beside it")
-    clear: Aperture | None = None
-    if shapes == ["aperture"]:
-        clear = _read_region(section.section("aperture"), length, angle)
-    elif shapes:
-        clear = _read_disc(section, shapes[0], length)
-    if "obscuration" in section:
-        outside = Complement(_read_region(section.section("obscuration"), length, angle))
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        super().check(content)
+        given = [key for key in ("circle", "annulus", "aperture") if key in content]
+        if len(given) > 1:
+            raise expected(f"{given[0]} or {given[1]}, not both", given[0])
+        if "centre" in content and not set(given) & {"circle", "annulus"}:
+            raise expected("a circle or an annulus beside it", "centre")
+
+    def clear_aperture(self) -> Aperture | None:
+        """Return the clear aperture; None where there is none."""
+        clear: Aperture | None = None
+        if self.circle is not None:
+            clear = Circle(self.circle, *self.centre)
+        elif self.annulus is not None:
+            clear = Annulus(*self.annulus, *self.centre)
+        elif self.aperture is not None:
+            with error_context(key="aperture"):
+                clear = self.aperture.build()
+        if self.obscuration is None:
+            return clear
+        with error_context(key="obscuration"):
+            outside = Complement(self.obscuration.build())
         return outside if clear is None else Intersection((clear, outside))
-    return clear
 
 
-def _read_region(section: Section, length: Convert, angle: Convert) -> Aperture:
-    kinds = [key for key in _REGIONS if key in section]
-    if len(kinds) != 1:
-        found = ", ".join(section.keys()) or "nothing"
-        raise PrescriptionError(f"{section.source}: {section.place} has {found}: expected one of {', '.join(_REGIONS)}")
-    kind = kinds[0]
-    section.allow(kind, *_REGIONS[kind])
-    try:
-        if kind in ("circle", "annulus"):
-            return _read_disc(section, kind, length)
-        if kind == "polygon":
-            return Polygon(_read_corners(section, length))
-        if kind == "complement":
-            return Complement(_read_region(section.section(kind), length, angle))
-        if kind in ("union", "intersection"):
-            parts = tuple(_read_region(part, length, angle) for part in section.sections(kind, kind))
-            return Union(parts) if kind == "union" else Intersection(parts)
-        turn = angle(section.number("angle", 0.0))
-        x, y = (length(v) for v in section.numbers("from" if kind == "vane" else "centre", 2, (0.0, 0.0)))
-        if kind == "rectangle":
-            width, height = (length(v) for v in section.numbers(kind, 2))
-            return Rectangle(width, height, x, y, turn)
-        return Vane(length(section.number(kind)), x, y, turn, _read_flag(section, "both_ways"))
-    except PrescriptionError as error:
-        raise section.placed(error) from None
+class ObstructionSection(Section):
+    """Mesh that blocks light, in a file or written out in base 64."""
 
+    name: Text
+    file: OptionalFile = None
+    scale: PositiveNumber = 1.0
+    triangles: Annotated[
+        Any, checked(array("<f4", (-1, 3, 3)), "nine single-precision numbers a triangle, in base 64")
+    ] = None
+    before: OptionalNames = None
 
-def _read_disc(section: Section, kind: str, length: Convert) -> Circle | Annulus:
-    x, y = (length(v) for v in section.numbers("centre", 2, (0.0, 0.0)))
-    if kind == "circle":
-        return Circle(length(section.number(kind)), x, y)
-    inner, outer = (length(v) for v in section.numbers(kind, 2))
-    return Annulus(inner, outer, x, y)
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        super().check(content)
+        either(content, "file", ("triangles",))
 
-
-def _read_corners(section: Section, length: Convert) -> tuple[tuple[float, float], ...]:
-    rows = section.value("polygon")
-    if not isinstance(rows, list):
-        raise section.error("polygon", "a list of corners [x, y]")
-    # A section of the corners by number lets each report itself.
-    corners = Section({str(i + 1): row for i, row in enumerate(rows)}, section.source, f"{section.place}.polygon")
-    found = []
-    for key in corners.keys():  # noqa: SIM118 - a Section is no mapping
-        x, y = (length(v) for v in corners.numbers(key, 2))
-        found.append((x, y))
-    return tuple(found)
-
-
-def _read_flag(section: Section, key: str) -> bool:
-    flag = section.value(key) if key in section else False
-    if not isinstance(flag, bool):
-        raise section.error(key, "true or false")
-    return flag
-
-
-def read_obstructions(top: Section) -> tuple[Obstruction, ...]:
-    """Return the meshes that the top level of a prescription file lists under ``obstructions``.
-
-    Raises
-    ------
-    PrescriptionError
-        If an entry is malformed, or its file is not a mesh.
-    """
-    if "obstructions" not in top:
-        return ()
-    found = []
-    for section in top.sections("obstructions", "name"):
-        section.allow("name", "file", "scale", "triangles", "before")
-        before = section.names("before") if "before" in section else None
-        try:
-            if "triangles" in section:
-                section.allow("name", "triangles", "before")
-                found.append(Obstruction(section.text("name"), _read_triangles(section), before))
-            else:
-                # A relative path is meant from where the prescription lies.
-                path = Path(section.source).parent / section.text("file")
-                scale = section.number("scale", 1.0, positive=True)
-                found.append(Obstruction.from_file(path, name=section.text("name"), scale=scale, before=before))
-        except PrescriptionError as error:
-            raise section.placed(error) from None
-    return tuple(found)
-
-
-def _read_triangles(section: Section) -> np.ndarray:
-    try:
-        content = base64.b64decode(section.text("triangles"), validate=True)
-        return np.frombuffer(content, dtype="<f4").reshape(-1, 3, 3)
-    except (binascii.Error, ValueError):
-        raise section.error("triangles", "nine single-precision numbers a triangle, in base 64") from None
+    def build(self) -> Obstruction:
+        """Return the obstruction."""
+        if self.file is None:
+            return Obstruction(self.name, self.triangles, self.before)
+        return Obstruction.from_file(self.file, name=self.name, scale=self.scale, before=self.before)
 
 
 def aperture_angles(aperture: Aperture | None) -> Iterator[float]:
-    """Yield the angles [rad] that a description of the aperture states."""
+    """Yield the angles [rad] in the section of an aperture."""
     if isinstance(aperture, (Rectangle, Vane)) and aperture.angle:
         yield aperture.angle
     elif isinstance(aperture, Complement):
@@ -184,12 +188,12 @@ def aperture_angles(aperture: Aperture | None) -> Iterator[float]:
 def aperture_items(
     aperture: Aperture | None, number: Callable[[float], str], listed: Callable[..., str], angle: Callable[[float], str]
 ) -> dict[str, str]:
-    """Return the keys and values, as text, that :func:`read_aperture` makes the same aperture of.
+    """Return the keys of a surface for its aperture, and their values as text.
 
     Parameters
     ----------
     aperture : Aperture or None
-        What to describe.
+        Clear aperture.
     number, listed, angle : callable
         Text of a number, of several, and of an angle [rad] in the unit of the file.
     """

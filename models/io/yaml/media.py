@@ -1,4 +1,4 @@
-"""Refractive media in prescription files: from a section of YAML and back.
+"""Refractive media in prescription files: sections of YAML, and their text.
 
 =================================================================== ==================================================
 ``{n: 1.5}``                                                        constant index
@@ -10,8 +10,8 @@
                                                                     ``catalogue: file.agf`` beside the prescription
 =================================================================== ==================================================
 
-``range`` and ``wavelengths`` are in the wavelength unit of the file. Figures relative to air carry the air that they
-are relative to, ``in_air: {air: ciddor, ...}``; ``shift: 1e-5`` adds to the index of any kind.
+``range`` and ``wavelengths`` are in the wavelength unit of the file. Indices relative to air carry that air,
+``in_air: {air: ciddor, ...}``; ``shift: 1e-5`` adds to the index of any kind.
 """
 
 from __future__ import annotations
@@ -19,97 +19,99 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from ....core.errors import PachonError, PrescriptionError
-from ....core.yaml_reader import Section
+from ....core.schema import Parameters, Tagged, mapping, unknown_key
 from ...media.air import Air
 from ...media.changed_index import ChangedIndex, with_index_change
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, RelativeToAir, Sellmeier
 from ...media.tabulated import TabulatedIndex
 from ..glass_catalogue import GlassCatalogue
+from .values import Band, Number, Numbers, OptionalFile, Text, Wavelengths
 
-#: Keys of air and the figures of it that they give.
+#: Keys of air, and its attributes.
 AIR_KEYS = {
     "pressure_pa": "pressure",
     "temperature_k": "temperature",
     "water_vapour_pa": "water_vapour",
     "co2_ppm": "co2_ppm",
 }
-#: Keys beside those of any kind: the air that the figures are relative to, and what is added to the index.
-WRAPPERS = ("in_air", "shift")
 
 
-def read_medium(section: Section, wavelength: Callable[[float], float]) -> Medium:
-    """Return the medium that a section describes.
+class MediumSection(Parameters):
+    """A medium of any kind; `shift` adds to its index."""
 
-    Parameters
-    ----------
-    section : Section
-        Its keys and values.
-    wavelength : callable
-        Conversion of the file's wavelengths to metres.
+    shift: Number = 0.0
 
-    Raises
-    ------
-    PrescriptionError
-        If the section is malformed: file, key, value and what was expected.
-    """
-    name = section.place.removeprefix("media.")
-    try:
-        medium: Any = replace(_read_figures(section, wavelength), name=name)
-        if "in_air" in section:
-            medium = RelativeToAir(medium, _read_air(section.section("in_air")), name)
-        return with_index_change(medium, section.number("shift", 0.0))
-    except PrescriptionError as error:
-        raise section.placed(error) from None
+    def medium(self, name: str) -> Medium:
+        """Return the medium under a name."""
+        return with_index_change(replace(self.build(), name=name), self.shift)
 
 
-def _read_figures(section: Section, wavelength: Callable[[float], float]) -> Any:
-    def limits() -> tuple[float, float]:
-        low, high = section.numbers("range", 2)
-        return wavelength(low), wavelength(high)
+class AirSection(MediumSection):
+    """Air; quantities that are left out are those of :class:`~pachon.models.media.air.Air`."""
 
-    if "n" in section:
-        section.allow("n", *WRAPPERS)
-        return ConstantIndex(section.number("n"))
-    if "formula" in section:
-        section.allow("formula", "coefficients", "range", *WRAPPERS)
-        return Dispersion(section.text("formula"), section.numbers("coefficients"), limits())
-    if "wavelengths" in section:
-        section.allow("wavelengths", "indices", "interpolation", *WRAPPERS)
-        w = tuple(wavelength(v) for v in section.numbers("wavelengths"))
-        return TabulatedIndex(w, section.numbers("indices"), section.text("interpolation", "monotone"))
-    if "air" in section:
-        return _read_air(section)
-    if "glass" in section:
-        section.allow("glass", "catalogue", *WRAPPERS)
-        return _read_glass(section)
-    section.allow("n", "B", "C", "range", "formula", "wavelengths", "air", "glass", *WRAPPERS)
-    return Sellmeier(section.numbers("B"), section.numbers("C"), limits())
+    air: Text = "ciddor"
+    pressure_pa: Number = 0.0
+    temperature_k: Number = 0.0
+    water_vapour_pa: Number = 0.0
+    co2_ppm: Number = 0.0
+
+    def build(self) -> Air:
+        """Return the air."""
+        given = {AIR_KEYS[key]: getattr(self, key) for key in AIR_KEYS if key in self.model_fields_set}
+        return Air(formula=self.air, **given)
 
 
-def _read_air(section: Section) -> Air:
-    section.allow("air", "shift", *AIR_KEYS)
-    figures: dict[str, Any] = {name: section.number(key) for key, name in AIR_KEYS.items() if key in section}
-    return Air(formula=section.text("air", "ciddor"), **figures)
+class GlassSection(MediumSection):
+    """A medium whose indices are relative to the air of `in_air`, or to vacuum."""
+
+    in_air: Annotated[AirSection | None, mapping] = None
+
+    def medium(self, name: str) -> Medium:
+        """Return the medium under a name."""
+        medium = replace(self.build(), name=name)
+        relative = medium if self.in_air is None else RelativeToAir(medium, self.in_air.build(), name)
+        return with_index_change(relative, self.shift)
 
 
-def _read_glass(section: Section) -> Medium:
-    catalogue = GlassCatalogue.bundled()
-    if "catalogue" in section:
-        # A relative path is meant from where the prescription lies.
-        catalogue = GlassCatalogue.read(Path(section.source).parent / section.text("catalogue"))
-    name = section.text("glass")
+def _glass(name: str, file: Path | None) -> Medium:
+    catalogue = GlassCatalogue.bundled() if file is None else GlassCatalogue.read(file)
     try:
         return catalogue[name]
     except PachonError as error:
-        raise section.error("glass", f"a glass of the catalogue ({error})") from None
+        problem = f"glass = {name!r}: expected a glass of the catalogue ({error})"
+        raise PrescriptionError(problem, key="glass") from None
+
+
+#: Sections of media by the key that tells their kind.
+MEDIA: dict[str, type[MediumSection]] = {
+    "n": GlassSection.of(ConstantIndex, n=Number),
+    "formula": GlassSection.of(Dispersion, formula=Text, coefficients=Numbers, range=Band),
+    "wavelengths": GlassSection.of(
+        TabulatedIndex, wavelengths=Wavelengths, indices=Numbers, interpolation=(Text, "monotone")
+    ),
+    "air": AirSection,
+    "glass": GlassSection.of(_glass, glass=Text, catalogue=(OptionalFile, None)),
+    "B": GlassSection.of(Sellmeier, B=Numbers, C=Numbers, range=Band),
+}
+
+
+def _kind(content: dict[str, Any]) -> str:
+    known = [*MEDIA, "C", "range", "in_air", "shift"]
+    for key in content:
+        if key not in known and not MEDIA.keys() & content.keys():
+            raise unknown_key(key, known)
+    return next((kind for kind in MEDIA if kind in content), "B")
+
+
+AnyMedium = Annotated[MediumSection, Tagged(MEDIA, _kind)]
 
 
 def medium_wavelengths(medium: Medium) -> tuple[float, ...]:
-    """Return the wavelengths [m] that a description of the medium states."""
+    """Return the wavelengths [m] in the section of a medium."""
     if isinstance(medium, RelativeToAir):
         return medium_wavelengths(medium.figures)
     if isinstance(medium, ChangedIndex):
@@ -122,19 +124,19 @@ def medium_wavelengths(medium: Medium) -> tuple[float, ...]:
 def medium_items(
     medium: Medium, number: Callable[[float], str], listed: Callable[..., str], waves: Callable[..., str]
 ) -> dict[str, str]:
-    """Return the keys and values, as text, that :func:`read_medium` makes the same medium of.
+    """Return the section of a medium, keys and values as text.
 
     Parameters
     ----------
     medium : Medium
-        What to describe.
+        Medium.
     number, listed, waves : callable
         Text of a number, of a list of numbers, and of a list of wavelengths [m] in the unit of the file.
 
     Raises
     ------
     PrescriptionError
-        If it is a kind of medium that files do not know.
+        If prescription files have no such kind of medium.
     """
     if isinstance(medium, ConstantIndex):
         return {"n": number(medium.n)}
@@ -144,8 +146,8 @@ def medium_items(
         coefficients, limits = listed(medium.coefficients), waves(medium.wavelength_range)
         return {"formula": medium.formula, "coefficients": coefficients, "range": limits}
     if isinstance(medium, TabulatedIndex):
-        figures = {"wavelengths": waves(medium.wavelengths), "indices": listed(medium.indices)}
-        return figures | {"interpolation": medium.interpolation}
+        table = {"wavelengths": waves(medium.wavelengths), "indices": listed(medium.indices)}
+        return table | {"interpolation": medium.interpolation}
     if isinstance(medium, Air):
         return {"air": medium.formula} | {key: number(getattr(medium, name)) for key, name in AIR_KEYS.items()}
     if isinstance(medium, RelativeToAir):

@@ -1,20 +1,41 @@
-"""Read a telescope from the sections of a prescription file; the format is described in `prescription`."""
+"""Read a telescope from a prescription file in YAML; the format is described in `prescription`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from decimal import Decimal
-from typing import cast
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from ....core.errors import PrescriptionError
-from ....core.yaml_reader import Section, as_number
+import numpy as np
+from pydantic import BeforeValidator, Field, create_model
+
+from ....core.errors import PrescriptionError, error_context
+from ....core.schema import Section, Tagged, checked, expected, one_of, validated
+from ....core.yaml_reader import read_mapping
 from ...media.medium import Medium
-from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
+from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
-from .apertures import APERTURE_KEYS, read_aperture, read_obstructions
-from .media import read_medium
-from .shapes import read_shape, shape_keys
+from .apertures import ApertureKeys, ObstructionSection
+from .media import AnyMedium
+from .shapes import SHAPES, ShapeSection, SumSection
+from .values import (
+    Band,
+    Length,
+    Names,
+    Number,
+    OptionalAngles,
+    OptionalBand,
+    OptionalPlace,
+    OptionalText,
+    PositiveAngle,
+    PositiveLength,
+    Rotation,
+    Text,
+    Units,
+    Wavelength,
+    names,
+    rows,
+)
 
 INTERACTIONS = {
     "mirror": Interaction.MIRROR,
@@ -25,157 +46,204 @@ INTERACTIONS = {
 }
 
 
-def _power_of_ten(exponent: int) -> Callable[[float], float]:
-    """Return a conversion that moves the decimal point of the figure as written: 0.545 um is the float 545e-9 m."""
-    return lambda v: float(Decimal(repr(v)).scaleb(exponent))
+class SurfaceKeys(ApertureKeys):
+    """Keys of a surface beside those of its shape."""
 
+    name: Text
+    type: Literal["mirror", "refract", "detector", "baffle", "phase"]
+    x: Length = 0.0
+    y: Length = 0.0
+    z: Length
+    tilt: OptionalAngles = None
+    rotation: Rotation = IDENTITY
+    medium: OptionalText = None
 
-LENGTHS = {"m": _power_of_ten(0), "mm": _power_of_ten(-3)}
-ANGLES: dict[str, Callable[[float], float]] = {"rad": _power_of_ten(0), "deg": math.radians}
-WAVELENGTHS = {"m": _power_of_ten(0), "um": _power_of_ten(-6), "nm": _power_of_ten(-9)}
+    @classmethod
+    def keys(cls) -> list[str]:
+        """Return the keys, those of every surface first."""
+        first = ["name", "type", "shape", *(key for key in SurfaceKeys.__annotations__ if key not in ("name", "type"))]
+        return list(dict.fromkeys([*first, *super().keys()]))
 
-HEADER = (
-    "name",
-    "description",
-    "source",
-    "version",
-    "units",
-    "stop",
-    "pupil",
-    "launch_distance",
-    "object_distance",
-    "reference_sphere_radius",
-    "field",
-    "wavelengths",
-    "camera",
-    "medium_before",
-    "media",
-    "groups",
-    "obstructions",
-    "surfaces",
-)
-SURFACE_KEYS = ("name", "type", "shape", "x", "y", "z", "tilt", "rotation", "medium", *APERTURE_KEYS)
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        super().check(content)
+        if content.get("type") == "refract" and "medium" not in content:
+            raise expected("a text", "medium")
+        if "tilt" in content and "rotation" in content:
+            raise expected("tilt or rotation, not both", "tilt")
 
-
-def read_telescope(top: Section) -> Telescope:
-    """Return the telescope that the top level of a prescription file describes."""
-    top.allow(*HEADER)
-    units = top.section("units")
-    units.allow("length", "angle", "wavelength")
-    length = LENGTHS[units.choice("length", tuple(LENGTHS))]
-    angle = ANGLES[units.choice("angle", tuple(ANGLES))]
-    wavelength = WAVELENGTHS[units.choice("wavelength", tuple(WAVELENGTHS))]
-    media = {"vacuum": VACUUM} | _read_media(top.section("media", optional=True), wavelength)
-    stop, pupil = top.section("stop"), top.section("pupil")
-    field, waves = top.section("field"), top.section("wavelengths")
-    stop.allow("z")
-    pupil.allow("diameter", "obscuration")
-    field.allow("radius", "limit")
-    waves.allow("range", "default", "band")
-    medium_before = _read_medium(top, "medium_before", media, VACUUM)
-    surfaces: list[Surface] = []
-    for section in top.sections("surfaces", "name"):
-        medium = surfaces[-1].medium_after if surfaces else medium_before
-        surfaces.append(_read_surface(section, media, medium, length, angle))
-    band = tuple(wavelength(v) for v in waves.numbers("band", 2)) if "band" in waves else None
-    groups, frames = _read_groups(top.section("groups", optional=True), length)
-    shortest, longest = (wavelength(v) for v in waves.numbers("range", 2))
-    try:
-        return Telescope(
-            name=top.text("name"),
-            description=top.text("description", ""),
-            source=top.text("source"),
-            version=top.text("version"),
-            surfaces=tuple(surfaces),
-            stop_z=length(stop.number("z")),
-            pupil_diameter=length(pupil.number("diameter", positive=True)),
-            pupil_obscuration=pupil.number("obscuration"),
-            launch_distance=length(top.number("launch_distance", positive=True)),
-            object_distance=length(top.number("object_distance")) if "object_distance" in top else math.inf,
-            reference_sphere_radius=length(top.number("reference_sphere_radius", positive=True)),
-            field_radius=angle(field.number("radius", positive=True)),
-            field_limit=angle(field.number("limit", positive=True)),
-            wavelength_range=(shortest, longest),
-            default_wavelength=wavelength(waves.number("default", positive=True)),
-            band=cast("tuple[float, float] | None", band),
-            medium_before=medium_before,
-            groups=groups,
-            group_frames=frames,
-            camera=top.text("camera") if "camera" in top else None,
-            obstructions=read_obstructions(top),
-        )
-    except PrescriptionError as error:
-        # Values of single keys carry their place already; what several keys say together does not.
-        raise top.placed(error) from None
-
-
-def _read_media(media: Section, wavelength: Callable[[float], float]) -> dict[str, Medium]:
-    found: dict[str, Medium] = {}
-    for name in media.keys():  # noqa: SIM118 - a Section is no mapping
-        if name == "vacuum":
-            raise media.error(name, "another name: vacuum is defined already, with index 1")
-        found[name] = read_medium(media.section(name), wavelength)
-    return found
-
-
-def _read_medium(section: Section, key: str, media: dict[str, Medium], default: Medium) -> Medium:
-    return media[section.choice(key, tuple(media))] if key in section else default
-
-
-def _read_groups(
-    section: Section, length: Callable[[float], float]
-) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[Vector, Matrix]]]:
-    groups, frames = {}, {}
-    for name in section.keys():  # noqa: SIM118 - a Section is no mapping
-        if isinstance(section.value(name), dict):
-            group = section.section(name)
-            group.allow("surfaces", "pivot", "rotation")
-            groups[name] = group.names("surfaces")
-            x, y, z = (length(v) for v in group.numbers("pivot", 3))
-            frames[name] = ((x, y, z), _read_matrix(group))
-        else:
-            groups[name] = section.names(name)
-    return groups, frames
-
-
-def _read_matrix(section: Section) -> Matrix:
-    if "rotation" not in section:
-        return IDENTITY
-    rows = section.value("rotation")
-    if not (isinstance(rows, list) and len(rows) == 3 and all(isinstance(r, list) and len(r) == 3 for r in rows)):
-        raise section.error("rotation", "three rows of three numbers")
-    numbers = [[as_number(v) for v in row] for row in rows]
-    if any(n is None for row in numbers for n in row):
-        raise section.error("rotation", "three rows of three numbers")
-    return cast(Matrix, tuple(tuple(row) for row in numbers))
-
-
-def _read_surface(
-    section: Section,
-    media: dict[str, Medium],
-    medium_before: Medium,
-    length: Callable[[float], float],
-    angle: Callable[[float], float],
-) -> Surface:
-    section.allow(*SURFACE_KEYS, *shape_keys(section))
-    interaction = INTERACTIONS[section.choice("type", tuple(INTERACTIONS))]
-    if interaction == Interaction.REFRACT:
-        section.text("medium")
-    if "tilt" in section and "rotation" in section:
-        raise section.error("tilt", "tilt or rotation, not both")
-    rotation = _read_matrix(section)
-    if "tilt" in section:
-        turned = rotation_matrix([angle(v) for v in section.numbers("tilt", 3)])
-        rotation = cast(Matrix, tuple(tuple(float(v) for v in row) for row in turned))
-    try:
+    def surface(self, media: dict[str, Medium], medium_before: Medium) -> Surface:
+        """Return the surface."""
+        assert isinstance(self, ShapeSection)
         return Surface(
-            name=section.text("name"),
-            interaction=interaction,
-            shape=read_shape(section, length),
-            vertex=(length(section.number("x", 0.0)), length(section.number("y", 0.0)), length(section.number("z"))),
-            medium_after=_read_medium(section, "medium", media, medium_before),
-            aperture=read_aperture(section, length, angle),
-            rotation=rotation,
+            name=self.name,
+            interaction=INTERACTIONS[self.type],
+            shape=self.build(),
+            vertex=(self.x, self.y, self.z),
+            medium_after=_chosen("medium", self.medium, media, medium_before),
+            aperture=self.clear_aperture(),
+            rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
         )
-    except PrescriptionError as error:
-        raise section.placed(error) from None
+
+
+def _surface_kind(content: dict[str, Any]) -> str:
+    return "sum" if isinstance(content.get("shape"), list) else _BY_SHAPE.kind(content)
+
+
+_SURFACES: dict[str, type[SurfaceKeys]] = {
+    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section))
+    for name, section in (SHAPES | {"sum": SumSection}).items()
+}
+_BY_SHAPE = Tagged.by_value("shape", {name: section for name, section in _SURFACES.items() if name != "sum"})
+
+
+class UnitsSection(Section):
+    """Units of the numbers in the file."""
+
+    length: Literal["m", "mm"]
+    angle: Literal["rad", "deg"]
+    wavelength: Literal["m", "um", "nm"]
+
+
+class StopSection(Section):
+    """Plane of the entrance pupil."""
+
+    z: Length
+
+
+class PupilSection(Section):
+    """Entrance pupil."""
+
+    diameter: PositiveLength
+    obscuration: Number
+
+
+class FieldSection(Section):
+    """Field of view."""
+
+    radius: PositiveAngle
+    limit: PositiveAngle
+
+
+class WavelengthsSection(Section):
+    """Wavelengths covered."""
+
+    range: Band
+    default: Wavelength
+    band: OptionalBand = None
+
+
+class GroupSection(Section):
+    """Surfaces that move together, and the frame of their motions; that of the first surface without a pivot."""
+
+    surfaces: Names
+    pivot: OptionalPlace
+    rotation: Rotation = IDENTITY
+
+
+def _group(value: Any) -> Any:
+    if isinstance(value, dict):
+        return value
+    if (surfaces := names(value)) is None:
+        raise expected("a list of names")
+    return GroupSection.model_construct(surfaces=surfaces, pivot=None)
+
+
+def _no_vacuum(media: Any) -> Any:
+    if isinstance(media, dict) and "vacuum" in media:
+        raise expected("another name: vacuum is defined already, with index 1", "vacuum")
+    return media
+
+
+class Prescription(Section):
+    """A prescription file."""
+
+    name: Text
+    description: Text = ""
+    source: Text
+    version: Text
+    units: UnitsSection
+    stop: StopSection
+    pupil: PupilSection
+    launch_distance: PositiveLength
+    object_distance: Length = math.inf
+    reference_sphere_radius: PositiveLength
+    field: FieldSection
+    wavelengths: WavelengthsSection
+    camera: OptionalText = None
+    medium_before: OptionalText = None
+    media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
+    groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
+    obstructions: Annotated[tuple[ObstructionSection, ...], checked(rows, "a list of mappings, one a line")] = ()
+    surfaces: Annotated[
+        tuple[Annotated[SurfaceKeys, Tagged(_SURFACES, _surface_kind)], ...],
+        checked(rows, "a list of mappings, one a line"),
+    ]
+
+    def telescope(self) -> Telescope:
+        """Return the telescope."""
+        media: dict[str, Medium] = {"vacuum": VACUUM}
+        for name, medium in self.media.items():
+            with error_context(key=f"media.{name}"):
+                media[name] = medium.medium(name)
+        medium_before = _chosen("medium_before", self.medium_before, media, VACUUM)
+        surfaces: list[Surface] = []
+        for section in self.surfaces:
+            with error_context(key=f"surfaces[{section.name}]"):
+                behind = surfaces[-1].medium_after if surfaces else medium_before
+                surfaces.append(section.surface(media, behind))
+        obstructions = []
+        for obstruction in self.obstructions:
+            with error_context(key=f"obstructions[{obstruction.name}]"):
+                obstructions.append(obstruction.build())
+        return Telescope(
+            name=self.name,
+            description=self.description,
+            source=self.source,
+            version=self.version,
+            surfaces=tuple(surfaces),
+            stop_z=self.stop.z,
+            pupil_diameter=self.pupil.diameter,
+            pupil_obscuration=self.pupil.obscuration,
+            launch_distance=self.launch_distance,
+            object_distance=self.object_distance,
+            reference_sphere_radius=self.reference_sphere_radius,
+            field_radius=self.field.radius,
+            field_limit=self.field.limit,
+            wavelength_range=self.wavelengths.range,
+            default_wavelength=self.wavelengths.default,
+            band=self.wavelengths.band,
+            medium_before=medium_before,
+            groups={name: group.surfaces for name, group in self.groups.items()},
+            group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},
+            camera=self.camera,
+            obstructions=tuple(obstructions),
+        )
+
+
+def read_telescope(path: Path) -> Telescope:
+    """Read a prescription file.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read, or is malformed: one line with file, key, value and expected value.
+    """
+    content = read_mapping(path)
+    units = Units.of(content.get("units"), path.parent)
+    prescription = validated(Prescription, content, str(path), PrescriptionError, units)
+    with error_context(file=path):
+        return prescription.telescope()
+
+
+def _chosen(key: str, name: str | None, media: dict[str, Medium], default: Medium) -> Medium:
+    if name is None:
+        return default
+    if name not in media:
+        raise PrescriptionError(f"{key} = {name!r}: expected {one_of(media, name)}", key=key)
+    return media[name]
+
+
+def _matrix(rows_of_floats: np.ndarray) -> Matrix:
+    a, b, c = (tuple(map(float, row)) for row in rows_of_floats)
+    return (a, b, c)  # type: ignore[return-value]

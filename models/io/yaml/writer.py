@@ -16,8 +16,9 @@ from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
 from .apertures import aperture_angles, aperture_items, obstruction_lines
 from .media import medium_items, medium_wavelengths
-from .reader import ANGLES, INTERACTIONS, WAVELENGTHS
+from .reader import INTERACTIONS
 from .shapes import shape_items
+from .values import ANGLES, WAVELENGTHS
 
 INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 

@@ -179,7 +179,7 @@ def test_a_mesh_is_flat_between_its_vertices_and_ends_at_its_rim():
         ("shape: grid, nodes_x: [0, 1, 2], nodes_y: [0, 1, 2, 3], values: [[1, 2], [1]]", "rows of one length"),
         (
             "shape: grid, nodes_x: [0, 1, 2, 3], nodes_y: [0, 1, 2, 3], values: [[0, 0, 0, .nan]]",
-            r"values.0 = .*expected a list of numbers",
+            r"values\[0\] = .*expected a list of numbers",
         ),
         ("shape: mesh, file: a.step", r"a.step: expected a mesh file that ends in .stl"),
         ("shape: mesh, file: a.stl", r"a.stl: no such file"),

@@ -9,7 +9,7 @@ import pytest
 from pachon.core.errors import ConfigError
 from pachon.models.camera.camera import load_camera
 from pachon.models.io.prescription import load_telescope
-from pachon.models.site import load_site
+from pachon.models.io.site_file import load_site
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.defaults import resolve
 from pachon.pipeline.experiment import Experiment

@@ -10,7 +10,7 @@ from astropy import units as u
 
 from pachon.core import memory
 from pachon.core.errors import DomainError, UnknownNameError
-from pachon.models.site import load_site
+from pachon.models.io.site_file import load_site
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 from pachon.wavefront.atmosphere.turbulence import path_variance, structure_function
