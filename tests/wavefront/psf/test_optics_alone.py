@@ -19,7 +19,9 @@ def ellipticity(lsst_r):
             focal_plane=focal_plane,
             engine="wave",
             pixel_size=2.5e-6,
-            stamp_size=61,
+            # 1.5 arcsec, five times the width of the weight; the image repeats itself after 1.6 arcsec.
+            stamp_size=31,
+            pupil_spacing=0.08,
             diffusion=0.0,
         )
         shape = pachon.measure_shapes(psf.image, psf.pixel_scale, weight_fwhm=0.3 * ARCSEC)
