@@ -22,7 +22,7 @@ from pachon.pipeline.ccd_product import product_path, read_product
 from pachon.pipeline.run_folder import stamp_of
 from pachon.studies.reproduce import reproduce as module
 from pachon.studies.reproduce.atmosphere import beginning
-from pachon.studies.reproduce.parts import PAPER, SMALL, Bench, Scale
+from pachon.studies.reproduce.bench import PAPER, SMALL, Bench, Scale
 from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected_minutes, reproduce
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.refraction import air_refractivity

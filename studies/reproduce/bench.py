@@ -1,0 +1,187 @@
+"""Scales of the reproduced figures, and the telescope, run and settings that they share."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ...core.products import Stamp
+from ...core.progress import Reporter
+from ...models.camera.camera import Camera
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...pipeline.ccd_product import CcdProduct, product_path, read_product
+from ...pipeline.config import Configuration, digest, with_options
+from ...pipeline.experiment import Experiment
+from ...pipeline.measure.correlation import Correlation
+from ...pipeline.measure.summary import correlations, run_figures
+from ...pipeline.run import run
+from ...pipeline.run_folder import finished_ccds, stamp_of
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Sizes of the figures: those of the paper, or enough for the same conclusions."""
+
+    name: str
+    #: Field radii of the encircled energy (Fig. 2).
+    field_points: int
+    #: Samples on a side of the screens of 1.3 km (Figs. 4, 6 and the run).
+    screen_size: int
+    #: Samples on a side of the screens of the speckles (Fig. 5), and their side [m].
+    speckle_screen: tuple[int, float]
+    #: Time step of the speckles [s], and spacing of their pupil points [m].
+    speckle_step: float
+    speckle_spacing: float
+    #: Stars on the CCD of Fig. 6a.
+    whisker_stars: int
+    #: Stars of each exposure, and exposures, that are correlated for Fig. 6b.
+    pair_stars: int
+    pair_seeds: int
+    #: Stars along the side of a CCD without an atmosphere (Fig. 8).
+    optics_grid: int
+    #: Spacing of the pupil points without an atmosphere [m] (Figs. 2 and 8).
+    optics_spacing: float
+    #: Borders between CCDs at which the jump of the ellipticity is measured (Fig. 8).
+    borders: int
+    #: CCDs of the run of Figs. 9 and 11 to 14, and noise-free and observed stars on each.
+    ccds: tuple[str, ...]
+    truth: int
+    observed: int
+    #: Time step of that run, and of Fig. 6 [s].
+    time_step: float
+
+
+#: The middle CCD of each raft, and its right-hand neighbour in the middle row: pairs from within a CCD to 3 degrees.
+_SOME_CCDS = tuple(f"R{row}{column}_S11" for row in range(5) for column in range(5) if {row, column} - {0, 4}) + tuple(
+    f"R2{column}_S12" for column in range(5)
+)
+
+SMALL = Scale(
+    name="small",
+    field_points=8,
+    screen_size=2048,
+    speckle_screen=(1024, 400.0),
+    speckle_step=0.1,
+    speckle_spacing=0.04,
+    whisker_stars=600,
+    pair_stars=200,
+    pair_seeds=3,
+    optics_grid=1,
+    optics_spacing=0.08,
+    borders=12,
+    ccds=_SOME_CCDS,
+    truth=60,
+    observed=40,
+    time_step=0.1,
+)
+PAPER = Scale(
+    name="paper",
+    field_points=36,
+    screen_size=8192,
+    speckle_screen=(4096, 650.0),
+    speckle_step=0.01,
+    speckle_spacing=0.02,
+    whisker_stars=4000,
+    pair_stars=400,
+    pair_seeds=20,
+    optics_grid=4,
+    optics_spacing=0.04,
+    borders=60,
+    ccds=("all",),
+    truth=800,
+    observed=40,
+    time_step=0.05,
+)
+SCALES = {"small": SMALL, "paper": PAPER}
+
+
+@dataclass(frozen=True)
+class PipelineRun:
+    """Run of the pipeline of Figs. 9 and 11 to 14: CCDs without noise-free stamps, correlations by kind, metrics."""
+
+    experiment: Experiment
+    products: list[CcdProduct]
+    correlated: dict[str, Correlation]
+    summary: dict[str, Any]
+
+
+@dataclass(eq=False)
+class Bench:
+    """Settings of the figures, and objects that they share, each made at its first use.
+
+    Attributes
+    ----------
+    scale : Scale
+        Sizes.
+    folder : Path
+        Folder of the figures; the run of the pipeline is in its sub-folder ``run``.
+    seed : int
+        Seed of all random numbers.
+    threads : int or None
+        Number of threads; results do not depend on it.
+    reporter : Reporter
+        Progress display; silent by default.
+    """
+
+    scale: Scale
+    folder: Path
+    seed: int = 1
+    threads: int | None = None
+    reporter: Reporter = field(default_factory=lambda: Reporter(quiet=True))
+
+    @cached_property
+    def stamp(self) -> Stamp:
+        """Origin, for the headers of FITS files."""
+        return Stamp(digest({**asdict(self.scale), "seed": self.seed}), self.seed)
+
+    @cached_property
+    def optics(self) -> Experiment:
+        """Same telescope and focal plane without an atmosphere."""
+        quiet = with_options(
+            Configuration(), ccds=("all",), seed=self.seed, atmosphere__enabled=False, wavelengths_nm=[624.0]
+        )
+        return Experiment.from_config(quiet)
+
+    @property
+    def telescope(self) -> Telescope:
+        """Telescope, r band."""
+        return self.optics.telescope
+
+    @property
+    def focal_plane(self) -> FocalPlane:
+        """CCD heights."""
+        return self.optics.focal_plane
+
+    @property
+    def camera(self) -> Camera:
+        """Camera."""
+        return self.focal_plane.camera
+
+    @property
+    def field_radius(self) -> float:
+        """Radius of the field of view on the detector [m]."""
+        return self.optics.field_radius_on_detector
+
+    @cached_property
+    def pipeline(self) -> PipelineRun:
+        """Run of the pipeline: read from its folder, after a run where CCDs are missing."""
+        folder = self.folder / "run"
+        options = {
+            "ccds": self.scale.ccds,
+            "seed": self.seed,
+            "stars__truth": self.scale.truth,
+            "stars__observed": self.scale.observed,
+            "atmosphere__screen_size": self.scale.screen_size,
+            "atmosphere__time_step_s": self.scale.time_step,
+        }
+        experiment = Experiment.from_config(with_options(Configuration(), **options))
+        names = experiment.config.ccds or ()
+        if len(finished_ccds(folder, experiment)) < len(names):
+            run(experiment.config, folder, resume=True, strict=True, threads=self.threads, reporter=self.reporter)
+        stamp = stamp_of(experiment)
+        products = [read_product(product_path(folder, name), stamp, truth_images=False) for name in names]
+        correlated = correlations(products)
+        return PipelineRun(experiment, products, correlated, run_figures(products, correlated))
