@@ -21,7 +21,7 @@ from pachon.studies.sweep.file import load_sweep
 from pachon.studies.sweep.point import PointMeasurement
 from pachon.studies.sweep.store import SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points
-from pachon.studies.sweep.workers import ProcessWorkers
+from pachon.studies.workers.workers import process_workers
 
 POINTS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
 EXAMPLE = Path(__file__).parents[1] / "studies" / "sweep" / "examples" / "table1.yaml"
@@ -33,7 +33,7 @@ def measure(processes: int, points, sweep, folder: Path) -> tuple[float, float]:
     store = folder / f"{processes}.sweep"
     store.unlink(missing_ok=True)
     create_store(store, sweep, points, {})
-    workers = ProcessWorkers(PointMeasurement(sweep, "."), processes, threads=processes)
+    workers = process_workers(PointMeasurement(sweep, "."), processes, threads=processes)
     start, warm, busy = 0.0, 0, 0.0
     with SweepStore(store) as opened:
         for result in workers.results(points):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +18,7 @@ from .tables import Rows
 
 if TYPE_CHECKING:
     from ..core.progress import Reporter
-    from ..studies.sweep.workers import Measure, Workers
+    from ..studies.sweep.sweep import MakeWorkers
 
 app = typer.Typer()
 sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
@@ -75,9 +75,7 @@ def sweep_run(
     _show(outcome, as_json, quiet)
 
 
-def _run(
-    path: Path, store: Path, resume: bool, maker: Callable[[Measure], Workers], reporter: Reporter
-) -> dict[str, Any]:
+def _run(path: Path, store: Path, resume: bool, maker: MakeWorkers, reporter: Reporter) -> dict[str, Any]:
     """Compute the points that are missing, write the report, and return the counts."""
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
@@ -95,23 +93,24 @@ def _run(
 
 @contextmanager
 def _workers(
-    processes: int | None, scheduler: str | None, dask_workers: int | None, threads: int | None, reporter: Reporter
-) -> Iterator[Callable[[Measure], Workers]]:
+    processes: int | None, scheduler: str | None, on_dask: int | None, threads: int | None, reporter: Reporter
+) -> Iterator[MakeWorkers]:
     """Yield the function that makes workers of the function that computes a point."""
-    if sum(option is not None for option in (processes, scheduler, dask_workers)) > 1:
+    if sum(option is not None for option in (processes, scheduler, on_dask)) > 1:
         raise ConfigError("--processes, --scheduler and --workers: expected one of them")
     from ..core.threads import thread_count
-    from ..studies.sweep.workers import DaskWorkers, ProcessWorkers, SerialWorker, dask_client, local_cluster
+    from ..studies.workers.dask_cluster import dask_client, dask_workers, local_cluster
+    from ..studies.workers.workers import process_workers, serial_worker
 
-    if scheduler is not None or dask_workers is not None:
-        with local_cluster(dask_workers, reporter.line) if scheduler is None else dask_client(scheduler) as client:
-            yield lambda measure: DaskWorkers(measure, client)
+    if scheduler is not None or on_dask is not None:
+        with local_cluster(on_dask, reporter.line) if scheduler is None else dask_client(scheduler) as client:
+            yield lambda measure: dask_workers(measure, client)
         return
     count = thread_count(threads) if processes is None else processes
     if count == 1:
-        yield lambda measure: SerialWorker(measure, threads)
+        yield lambda measure: serial_worker(measure, threads)
     else:
-        yield lambda measure: ProcessWorkers(measure, count, threads)
+        yield lambda measure: process_workers(measure, count, threads)
 
 
 def _example(name: str) -> Path:

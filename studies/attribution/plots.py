@@ -52,9 +52,7 @@ def attribution_figure(
         ):
             for case, each in correlations.items():
                 _draw_curve(axes, each[kind], colors[case], case)
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.set_xlabel("separation [arcmin]")
+            axes.set(xscale="log", yscale="log", xlabel="separation [arcmin]")
             axes.set_title(f"{title}; open: negative", loc="left")
             axes.grid(True, which="major", color="0.9", linewidth=0.6)
             axes.set_axisbelow(True)

@@ -102,8 +102,7 @@ def _flattery(axes: Axes, result: Study) -> None:
     quiet = [(order, replace(c, snr=NOISE_FREE)) for order, c in cases]
     _line(axes, result, quiet, "rms_e_away", TRUTH, "", "truth - model, stars without noise", _QUIET)
     _log_values(axes)
-    axes.set_xlabel("order of the polynomials")
-    axes.set_ylabel("rms of one component of e")
+    axes.set(xlabel="order of the polynomials", ylabel="rms of one component of e")
     axes.set_title(f"order: {base.stars} stars, {_HOW[base.interpolation][2]}", loc="left")
     axes.grid(True, which="major", color="0.9", linewidth=0.6)
 

@@ -160,11 +160,7 @@ def _atmosphere_plot(
         key = key_ellipticity(np.abs(e))
         scale = 0.5 / key
         draw_whiskers(left, whiskers(positions[:, 0], positions[:, 1], e.real, e.imag, scale), TRUTH, 0.7)
-        left.set_xlim(-edge, edge)
-        left.set_ylim(-edge, edge)
-        left.set_aspect("equal")
-        left.set_xlabel("x [arcmin]")
-        left.set_ylabel("y [arcmin]")
+        left.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", xlabel="x [arcmin]", ylabel="y [arcmin]")
         left.set_title(f"15 s, atmosphere alone: mean |e| {100 * np.abs(e).mean():.2f} %", loc="left")
         draw_key_whisker(left, key, scale, 1.0)
         for (time, (plus, error, minus)), color in zip(xi.items(), _COLORS, strict=True):
@@ -178,8 +174,7 @@ def _atmosphere_plot(
         right.set_yscale("symlog", linthresh=1e-5)
         right.set_xticks([0.3, 0.5, 1, 2, 5, 10], ["0.3", "0.5", "1", "2", "5", "10"])
         right.minorticks_off()
-        right.set_xlabel("separation [arcmin]")
-        right.set_ylabel("correlation of the ellipticity")
+        right.set(xlabel="separation [arcmin]", ylabel="correlation of the ellipticity")
         right.set_title("mean of the exposures, with the error of that mean", loc="left")
         figure.legend(*right.get_legend_handles_labels(), ncols=6, loc="outside lower right")
         return png_bytes(figure)

@@ -121,17 +121,16 @@ def _encircled_energy_plot(
         for color, (angle, curve) in zip(_COLORS, curves.items(), strict=False):
             left.plot(radius, 100.0 * curve, color=color, label=f"{angle:g}°")
         left.axhline(80.0, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
-        left.set_xlim(0.0, 0.4)
-        left.set_ylim(0.0, 102.0)
-        left.set_xlabel("radius [arcsec]")
-        left.set_ylabel("encircled energy [%]")
+        left.set(xlim=(0.0, 0.4), ylim=(0.0, 102.0), xlabel="radius [arcsec]", ylabel="encircled energy [%]")
         left.legend(title="field angle", loc="lower right")
         right.plot(field, radius80, "o-", color=OBSERVED, markersize=3.5)
         inner = float(radius80[field <= 1.4 + 1e-9].mean())
         right.axhspan(0.93 * inner, 1.07 * inner, color="0.92", zorder=0, label="±7 % of the mean to 1.4°")
-        right.set_ylim(0.0, 1.35 * float(radius80.max()))
-        right.set_xlabel("field angle [deg]")
-        right.set_ylabel("radius of 80 % of the light [arcsec]")
+        right.set(
+            ylim=(0.0, 1.35 * float(radius80.max())),
+            xlabel="field angle [deg]",
+            ylabel="radius of 80 % of the light [arcsec]",
+        )
         right.legend(loc="lower right")
         panels = list(np.atleast_1d(bottom.subplots(1, len(stamps))))
         for axes, (angle, stamp) in zip(panels, stamps.items(), strict=True):
@@ -144,8 +143,7 @@ def _encircled_energy_plot(
                 cmap="magma",
                 norm=LogNorm(1e-3, 1.0),
             )
-            axes.set_xlim(-0.3, 0.3)
-            axes.set_ylim(-0.3, 0.3)
+            axes.set(xlim=(-0.3, 0.3), ylim=(-0.3, 0.3))
             axes.set_title(f"{angle:g}°", fontsize=8)
             axes.set_xlabel("from the centroid [arcsec]")
         bar = bottom.colorbar(image, ax=panels, fraction=0.02, pad=0.01)

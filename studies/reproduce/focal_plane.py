@@ -136,7 +136,9 @@ def _budget_plot(rows: Sequence[str], values: Mapping[str, np.ndarray], units: S
                 )
         axes.set_yticks(place, [f"{row} [{unit}]" for row, unit in zip(rows, units, strict=True)])
         axes.invert_yaxis()
-        axes.set_xlim(0.0, 1.15 * max(float(v.max()) for v in values.values()))
-        axes.set_xlabel("peak to valley, in the unit of each row")
+        axes.set(
+            xlim=(0.0, 1.15 * max(float(v.max()) for v in values.values())),
+            xlabel="peak to valley, in the unit of each row",
+        )
         axes.legend(loc="lower right")
         return png_bytes(figure)

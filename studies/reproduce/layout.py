@@ -116,11 +116,13 @@ def _layout_plot(
         ):
             behind = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85}
             left.annotate(name, place, ha=ha, va="center", fontsize=8, bbox=behind)
-        left.set_xlim(-5.2, 5.2)
-        left.set_ylim(-1.2, _TOP)
-        left.set_aspect("equal")
-        left.set_xlabel("y [m]")
-        left.set_ylabel("z from the vertex of M1, towards the sky [m]")
+        left.set(
+            xlim=(-5.2, 5.2),
+            ylim=(-1.2, _TOP),
+            aspect="equal",
+            xlabel="y [m]",
+            ylabel="z from the vertex of M1, towards the sky [m]",
+        )
         left.set_title("section x = 0 with traced rays; light comes from above", loc="left")
         left.legend(loc="lower right", fontsize=7)
         draw_outlines(right, camera, range(len(camera)), "0.25", 0.6)

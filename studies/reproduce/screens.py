@@ -82,10 +82,12 @@ def _dispersion_plot(zenith: np.ndarray, spread: Mapping[str, np.ndarray]) -> by
         axes.axvline(45.0, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
         axes.axhline(0.3, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
         axes.annotate('0.3"', (59.5, 0.3), ha="right", va="bottom", fontsize=8, color="0.35")
-        axes.set_xlim(0.0, float(zenith.max()))
-        axes.set_ylim(0.0, None)
-        axes.set_xlabel("zenith angle [deg]")
-        axes.set_ylabel("dispersion between the band's edges [arcsec]")
+        axes.set(
+            xlim=(0.0, float(zenith.max())),
+            ylim=(0.0, None),
+            xlabel="zenith angle [deg]",
+            ylabel="dispersion between the band's edges [arcsec]",
+        )
         axes.legend(title="band", loc="upper left")
         return png_bytes(figure)
 

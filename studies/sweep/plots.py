@@ -1,4 +1,4 @@
-"""Pictures of a sweep: tornado charts, curves with their spread, maps of pairs, budgets and allowances."""
+"""Plots of a sweep: tornado charts, curves with their spread, maps of pairs, budgets and allowances."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from ...core.plotting import figure_of, new_figure, png_bytes, styled
 from .analysis import Allowance, Budget, Curve
@@ -17,27 +18,29 @@ _MARKS = ("#2f8f4e", "#e08a00", "#7a4fb5", "#3a3a3a")
 _PAIRS = 4
 
 
-def tornado_figure(curves: Mapping[str, Sequence[Curve]]) -> bytes:
-    """Draw how far each figure moves over the range of each parameter, a panel a figure, the largest on top.
-
-    Parameters
-    ----------
-    curves : mapping of str to sequence of Curve
-        Curves of each figure.
-    """
+def tornado_plot(curves: Mapping[str, Sequence[Curve]]) -> bytes:
+    """Draw the change of each metric over the range of each parameter, a panel a metric, the largest on top."""
     shown = {metric: [c for c in each if np.isfinite(c.change).any()] for metric, each in curves.items()}
     shown = {metric: each for metric, each in shown.items() if each}
     tallest = max(len(each) for each in shown.values())
     with styled():
-        columns = min(2, len(shown))
-        rows = -(-len(shown) // columns)
-        figure = new_figure(5.6 * columns, (1.15 + 0.36 * tallest) * rows)
-        panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
-        for axes, (metric, each) in zip(panels, shown.items(), strict=False):
+        figure, panels = _panels(len(shown), 2, 5.6, 1.15 + 0.36 * tallest)
+        for axes, (metric, each) in zip(panels.flat, shown.items(), strict=False):
             _draw_tornado(axes, metric, each)
-        for axes in panels[len(shown) :]:
-            axes.axis("off")
         return png_bytes(figure)
+
+
+def _panels(count: int, most: int, width: float, height: float, label: str = "") -> tuple[Figure, np.ndarray]:
+    """Return a figure with panels of a size [inch] in rows of at most so many; a label is that of a common y axis."""
+    columns = min(most, count)
+    rows = -(-count // columns)
+    figure = new_figure(width * columns, height * rows)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=bool(label))
+    for axes in panels.flat[count:]:
+        axes.axis("off")
+    for axes in panels[:, 0]:
+        axes.set_ylabel(label)
+    return figure, panels
 
 
 def _draw_tornado(axes: Axes, metric: str, curves: Sequence[Curve]) -> None:
@@ -70,14 +73,11 @@ def _draw_tornado(axes: Axes, metric: str, curves: Sequence[Curve]) -> None:
         axes.legend(loc="lower right")
 
 
-def curves_figure(curves: Sequence[Curve]) -> bytes:
-    """Draw one figure against each parameter, others nominal, with the spread over the replicas."""
+def curves_plot(curves: Sequence[Curve]) -> bytes:
+    """Draw one metric against each parameter, others nominal, with the spread over the replicas."""
     with styled():
-        columns = min(3, len(curves))
-        rows = -(-len(curves) // columns)
-        figure = new_figure(3.7 * columns, 2.9 * rows)
-        panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharey=True)).ravel()
-        for axes, curve in zip(panels, curves, strict=False):
+        figure, panels = _panels(len(curves), 3, 3.7, 2.9, curves[0].metric)
+        for axes, curve in zip(panels.flat, curves, strict=False):
             axes.plot(curve.value, curve.mean, "o-", color=_LOW, markersize=3.0, linewidth=1.2, label="mean")
             if np.isfinite(curve.spread).any():
                 low, high = curve.mean - curve.spread, curve.mean + curve.spread
@@ -88,16 +88,12 @@ def curves_figure(curves: Sequence[Curve]) -> bytes:
                 axes.axvline(value, color=_MARKS[i % len(_MARKS)], linewidth=1.0, linestyle="--", label=mark)
             axes.set_xlabel(curve.parameter)
             axes.grid(True, color="0.92", linewidth=0.6)
-        for axes in panels[len(curves) :]:
-            axes.axis("off")
-        for row in range(rows):
-            panels[row * columns].set_ylabel(curves[0].metric)
-        panels[0].legend(loc="best")
+        panels[0, 0].legend(loc="best")
         return png_bytes(figure)
 
 
-def pairs_figure(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
-    """Draw one figure over pairs of parameters, a point a point of the sweep."""
+def pairs_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
+    """Draw one metric over pairs of parameters, a dot a point of the sweep."""
     chosen = list(names)[:_PAIRS]
     values = table.metrics[metric]
     with styled():
@@ -122,46 +118,34 @@ def pairs_figure(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
         return png_bytes(figure)
 
 
-def scatter_figure(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
-    """Draw one figure against each parameter of a random design, with the median and the quartiles in slices."""
+def scatter_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
+    """Draw one metric against each parameter of a random design, with median and quartiles in slices."""
     with styled():
-        columns = min(3, len(names))
-        rows = -(-len(names) // columns)
-        figure = new_figure(3.7 * columns, 2.9 * rows)
-        panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False, sharey=True)).ravel()
+        figure, panels = _panels(len(names), 3, 3.7, 2.9, metric)
         values = table.metrics[metric]
-        for axes, name in zip(panels, names, strict=False):
+        for axes, name in zip(panels.flat, names, strict=False):
             x = table.parameters[name].astype(float)
             axes.plot(x, values, ".", color="0.65", markersize=2.5)
             edges = np.quantile(x, np.linspace(0.0, 1.0, 9))
             slices = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, 7)
-            middle = [np.median(x[slices == k]) for k in range(8) if (slices == k).any()]
-            quartiles = np.array(
-                [np.nanpercentile(values[slices == k], [25, 50, 75]) for k in range(8) if (slices == k).any()]
-            )
+            filled = [slices == k for k in range(8) if (slices == k).any()]
+            middle = [np.median(x[inside]) for inside in filled]
+            quartiles = np.array([np.nanpercentile(values[inside], [25, 50, 75]) for inside in filled])
             axes.plot(middle, quartiles[:, 1], "o-", color=_LOW, markersize=3.0, linewidth=1.2, label="median")
             axes.fill_between(
                 middle, quartiles[:, 0], quartiles[:, 2], color=_LOW, alpha=0.2, linewidth=0, label="quartiles"
             )
             axes.set_xlabel(name)
             axes.grid(True, color="0.92", linewidth=0.6)
-        for axes in panels[len(names) :]:
-            axes.axis("off")
-        for row in range(rows):
-            panels[row * columns].set_ylabel(metric)
-        panels[0].legend(loc="best")
+        panels[0, 0].legend(loc="best")
         return png_bytes(figure)
 
 
-def correlations_figure(found: Mapping[str, Mapping[str, tuple[float, float]]]) -> bytes:
-    """Draw the rank correlation of each figure with each parameter of a random design as a chart of bars."""
+def correlations_plot(found: Mapping[str, Mapping[str, tuple[float, float]]]) -> bytes:
+    """Draw the rank correlation of each metric with each parameter of a random design as bars."""
     with styled():
-        columns = min(2, len(found))
-        rows = -(-len(found) // columns)
-        tallest = max(len(each) for each in found.values())
-        figure = new_figure(5.2 * columns, (1.0 + 0.34 * tallest) * rows)
-        panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
-        for axes, (metric, each) in zip(panels, found.items(), strict=False):
+        figure, panels = _panels(len(found), 2, 5.2, 1.0 + 0.34 * max(map(len, found.values())))
+        for axes, (metric, each) in zip(panels.flat, found.items(), strict=False):
             ordered = sorted(each, key=lambda name: abs(each[name][0]))
             rho, error = np.array([each[name] for name in ordered]).T
             colors = [_HIGH if r > 0 else _LOW for r in rho]
@@ -171,18 +155,16 @@ def correlations_figure(found: Mapping[str, Mapping[str, tuple[float, float]]]) 
             axes.axvline(0.0, color="0.3", linewidth=0.8)
             axes.set_title(metric, loc="left")
             axes.set_xlabel("rank correlation with the parameter")
-        for axes in panels[len(found) :]:
-            axes.axis("off")
         return png_bytes(figure)
 
 
-def budget_figure(budgets: Sequence[Budget]) -> bytes:
-    """Draw how the effects of single causes add up, a column a named set of values, beside all of them at once."""
+def budget_plot(budgets: Sequence[Budget]) -> bytes:
+    """Draw the sum of single effects beside the effect of all causes together, for each mark."""
     names = list(dict.fromkeys(line.parameter for budget in budgets for line in budget.lines))
     with styled():
         figure = new_figure(2.4 + 2.3 * len(budgets), 4.2)
         axes = figure.subplots()
-        colors = figure_colors(len(names))
+        colors = _colors(len(names))
         for i, budget in enumerate(budgets):
             up, down = 0.0, 0.0
             for line in sorted(budget.lines, key=lambda n: names.index(n.parameter)):
@@ -202,15 +184,15 @@ def budget_figure(budgets: Sequence[Budget]) -> bytes:
         return png_bytes(figure)
 
 
-def figure_colors(count: int) -> list[str]:
-    """Return so many colours that are easy to tell apart."""
+def _colors(count: int) -> list[str]:
+    """Return distinct colours."""
     palette = ("#1f6fbf", "#e08a00", "#2f8f4e", "#c8322b", "#7a4fb5", "#8a6d3b", "#3aa6a6", "#b05a8c")
     return [palette[i % len(palette)] for i in range(count)]
 
 
-def allowance_figure(curves: Sequence[Curve], allowances: Sequence[Allowance], target: float) -> bytes:
-    """Draw the change of xi against the size of each term, in logarithms, and where it meets the target."""
-    colors = figure_colors(len(curves))
+def allowance_plot(curves: Sequence[Curve], allowances: Sequence[Allowance], target: float) -> bytes:
+    """Draw the change of xi against the size of each term in logarithms, and its intersection with the target."""
+    colors = _colors(len(curves))
     with styled():
         figure = new_figure(6.8, 4.4)
         axes = figure.subplots()
@@ -224,10 +206,12 @@ def allowance_figure(curves: Sequence[Curve], allowances: Sequence[Allowance], t
                 axes.plot([allowed.alone], [target], "D", color=color, markersize=5.5)
         axes.axhline(target, color="0.2", linewidth=1.0, linestyle="--", label=f"target {target:g}")
         axes.axhline(target / len(curves), color="0.55", linewidth=1.0, linestyle=":", label="an equal share")
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("distance from nominal, in the parameter's own unit")
-        axes.set_ylabel(f"change of {curves[0].metric}")
+        axes.set(
+            xscale="log",
+            yscale="log",
+            xlabel="distance from nominal, in the parameter's own unit",
+            ylabel=f"change of {curves[0].metric}",
+        )
         axes.grid(True, which="both", color="0.93", linewidth=0.5)
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         return png_bytes(figure)

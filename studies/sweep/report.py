@@ -10,7 +10,7 @@ import numpy as np
 from ...core.errors import ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...pipeline.report.page import Picture, render
-from . import plots as figures_sweep
+from . import plots
 from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary
 from .file import SweepFile
 from .store import SweepStore
@@ -75,7 +75,7 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
             "tornado",
             Picture(
                 "What matters most",
-                figures_sweep.tornado_figure(drawn),
+                plots.tornado_plot(drawn),
                 "How far each figure moves from its nominal value over the range of each parameter, others nominal: "
                 "blue below the nominal value of the parameter, red above. Upright strokes are the named values.",
             ),
@@ -83,13 +83,13 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
     ]
     for metric in list(drawn)[:_SHOWN]:
         shows = f"{metric} against each parameter, the others nominal; the band is the spread over the replicas."
-        picture = Picture(f"{metric}, one at a time", figures_sweep.curves_figure(drawn[metric]), shows)
+        picture = Picture(f"{metric}, one at a time", plots.curves_plot(drawn[metric]), shows)
         pictures.append((f"curves_{metric}", picture))
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
     for metric in (m for m in drawn if m.startswith("xi")):
         found = [b for mark in marks if (b := budget(table, sweep, metric, mark)) is not None]
         if found:
-            picture = Picture(f"Error budget of {metric}", figures_sweep.budget_figure(found), _budget_words(found))
+            picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_words(found))
             pictures.append((f"budget_{metric}", picture))
     if sweep.xi_target is not None:
         for metric in (m for m in drawn if m.startswith("xi")):
@@ -101,7 +101,7 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
             )
             picture = Picture(
                 f"What each term may be for {metric} below {sweep.xi_target:g}",
-                figures_sweep.allowance_figure(drawn[metric], allowed, sweep.xi_target),
+                plots.allowance_plot(drawn[metric], allowed, sweep.xi_target),
                 words or "No term reaches the target within twice its range.",
             )
             pictures.append((f"allowance_{metric}", picture))
@@ -134,7 +134,7 @@ def _random(table: SweepTable, numeric: list[str]) -> list[tuple[str, Picture]]:
             "ranks",
             Picture(
                 "What matters most",
-                figures_sweep.correlations_figure(ranks),
+                plots.correlations_plot(ranks),
                 "Spearman's rank correlation of each figure with each parameter, all of them varied at once.",
             ),
         )
@@ -142,12 +142,10 @@ def _random(table: SweepTable, numeric: list[str]) -> list[tuple[str, Picture]]:
     for metric in list(ranks)[:_SHOWN]:
         names = sorted(ranks[metric], key=lambda n: -abs(ranks[metric][n][0]))
         shows = f"{metric} of every point; the line joins the medians of eight slices, the band their quartiles."
-        pictures.append(
-            (f"scatter_{metric}", Picture(metric, figures_sweep.scatter_figure(table, metric, names), shows))
-        )
+        pictures.append((f"scatter_{metric}", Picture(metric, plots.scatter_plot(table, metric, names), shows)))
         if len(names) > 1:
             shows = f"{metric} over pairs of the parameters that it depends on most."
-            picture = Picture(f"{metric} over pairs", figures_sweep.pairs_figure(table, metric, names), shows)
+            picture = Picture(f"{metric} over pairs", plots.pairs_plot(table, metric, names), shows)
             pictures.append((f"pairs_{metric}", picture))
     return pictures
 

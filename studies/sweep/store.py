@@ -1,7 +1,7 @@
-"""The file of a sweep: SQLite in WAL mode, a row a point, each written once and whole.
+"""File of a sweep: SQLite in WAL mode, a row a point, each written once and whole.
 
-Figures are kept as JSON with as many digits as a double has, apart from how long they took and on which worker: two
-stores of one sweep hold the same figures, byte for byte, whoever computed them and however often it was interrupted.
+Metrics are JSON with all digits of a double, in a column apart from times and workers. Two stores of one sweep hold the
+same metrics, byte for byte, whatever the workers and interruptions.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,9 @@ from ...core.errors import ConfigError, ProductError
 from ...core.version import VERSION
 from ...pipeline.config import differences
 from .file import SweepFile, read_sweep
+from .record import PointResult, SweepPoint
 
-#: Of the tables; a store of another format is refused.
+#: Format of the tables; stores of other formats are refused.
 FORMAT = 1
 _TABLES = """
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -39,42 +39,8 @@ class DamagedStoreError(ProductError):
     """Store that SQLite cannot read."""
 
 
-@dataclass(frozen=True)
-class SweepPoint:
-    """A point to compute: its number, the values of its parameters, and the seed of its random numbers."""
-
-    number: int
-    parameters: dict[str, Any]
-    seed: int
-
-
-@dataclass(frozen=True)
-class PointResult:
-    """What one point came to.
-
-    Attributes
-    ----------
-    number : int
-        Number of the point.
-    metrics : dict of str to float, or None
-        Figures by name; None where the point could not be computed.
-    problem : str or None
-        One line that says why.
-    seconds : float
-        How long it took.
-    worker : str
-        Who computed it.
-    """
-
-    number: int
-    metrics: dict[str, float] | None
-    problem: str | None
-    seconds: float
-    worker: str
-
-
 class SweepStore:
-    """A sweep's file, open.
+    """Open file of a sweep.
 
     Parameters
     ----------
@@ -84,7 +50,7 @@ class SweepStore:
     Raises
     ------
     ProductError
-        If it is no sweep store, of another format, or damaged.
+        If it is no store of a sweep, of another format, or damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,13 +71,13 @@ class SweepStore:
         self.close()
 
     def close(self) -> None:
-        """Close the file; what the write-ahead log holds goes into it."""
+        """Close the file, with the content of the write-ahead log."""
         with self._guarded():
             self._connection.close()
 
     @property
     def sweep(self) -> SweepFile:
-        """The sweep that the store was made for."""
+        """Sweep of the store."""
         return read_sweep(json.loads(self.about["sweep"]), str(self.path))
 
     def points(self) -> list[SweepPoint]:
@@ -121,7 +87,7 @@ class SweepStore:
         return [SweepPoint(number, json.loads(parameters), seed) for number, parameters, seed in rows]
 
     def results(self) -> list[PointResult]:
-        """Return what has been computed, in the order of the points."""
+        """Return the results so far, in the order of the points."""
         with self._guarded():
             rows = self._connection.execute(
                 "SELECT number, metrics, problem, seconds, worker FROM results ORDER BY number"
@@ -129,22 +95,22 @@ class SweepStore:
         return [_result(*row) for row in rows]
 
     def finished(self) -> set[int]:
-        """Return the numbers of the points that have been computed."""
+        """Return the numbers of the points with results."""
         with self._guarded():
             return {number for (number,) in self._connection.execute("SELECT number FROM results")}
 
     def forget_problems(self) -> int:
-        """Drop the points that could not be computed, to compute them again; return how many there were."""
+        """Delete results of points that could not be computed, and return their number."""
         with self._guarded(), self._connection:
             return self._connection.execute("DELETE FROM results WHERE problem IS NOT NULL").rowcount
 
     def write(self, result: PointResult) -> None:
-        """Write one point, whole; one that is there already stays as it is.
+        """Write one result, whole; an earlier result of the point stays.
 
         Raises
         ------
         ProductError
-            If it cannot be written; what is there already stays.
+            If it cannot be written; earlier results stay.
         """
         row = (
             result.number,
@@ -166,7 +132,7 @@ class SweepStore:
 
 
 def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
-    """Make the file of a sweep with all its points and no results; under another name first, so never half of it.
+    """Create the file of a sweep with all its points and no results, whole or not at all.
 
     Raises
     ------
@@ -183,7 +149,7 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
             about = {
                 "format": str(FORMAT),
                 "pachon": VERSION,
-                # The order of the parameters is that of the file, as people wrote it.
+                # The order of the parameters is that of the sweep file.
                 "sweep": json.dumps(sweep.model_dump(mode="json"), ensure_ascii=False, allow_nan=False),
                 "digest": sweep.digest,
                 **extra,
@@ -209,13 +175,31 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
                 leftover.unlink(missing_ok=True)
 
 
+def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:
+    """Yield number, parameters and metrics (JSON) of every readable point of a damaged store."""
+    try:
+        connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    except sqlite3.Error:
+        return
+    try:
+        last = next(iter(connection.execute("SELECT max(number) FROM points")), (None,))[0]
+    except sqlite3.Error:
+        last = None
+    for number in range(0 if last is None else last + 1):
+        with suppress(sqlite3.Error):
+            yield from connection.execute(
+                "SELECT number, parameters, metrics FROM results JOIN points USING (number) WHERE number = ?", (number,)
+            )
+    connection.close()
+
+
 def check_same_sweep(store: SweepStore, sweep: SweepFile) -> None:
-    """Refuse to go on with another sweep than the store was made for.
+    """Refuse another sweep than that of the store.
 
     Raises
     ------
     ConfigError
-        If they differ: one line that names what differs.
+        If they differ: one line with the differences.
     """
     if store.about.get("digest") == sweep.digest:
         return
@@ -250,7 +234,7 @@ def _beside(path: Path) -> Sequence[Path]:
 
 
 def _problem(path: Path, error: sqlite3.Error) -> ProductError:
-    """Return SQLite's complaint as one line that says what to do."""
+    """Return an error of SQLite as one line with the remedy."""
     text = str(error)
     if "full" in text or "disk I/O" in text:
         return ProductError(f"cannot write {path}: {text}; what was computed before is kept, go on with --resume")

@@ -1,4 +1,4 @@
-"""A sweep from its file to its store: which points are missing, who computes them, and what is written when."""
+"""Computation of a sweep: its missing points, by workers, into its store."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from ...core.memory import available_bytes, readable
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...pipeline.config import Configuration
+from ..workers.workers import Measure, Workers, serial_worker
 from .design import design_points, point_count
 from .file import SweepFile
 from .point import PointMeasurement, check_sweep
-from .store import SweepPoint, SweepStore, check_same_sweep, create_store
-from .workers import Measure, SerialWorker, Workers
+from .record import PointResult, SweepPoint
+from .store import SweepStore, check_same_sweep, create_store
 
+#: Function that makes workers of the function that computes a point.
+MakeWorkers = Callable[[Measure[SweepPoint, PointResult]], Workers[SweepPoint, PointResult]]
 #: More points than this are a mistake: at a second each they would take a year.
 MOST_POINTS = 30_000_000
-# What a point takes in the store [bytes], and in memory while the design is made.
+# Size of a point in the store [bytes], and in memory while the design is made.
 _BYTES_ON_DISK, _BYTES_IN_MEMORY = 1500, 2500
 
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """What a sweep came to.
+    """Numbers of points of a sweep after a computation.
 
     Attributes
     ----------
     path : Path
         The store.
-    points : int
-        Points of the sweep.
-    kept, computed, failed : int
-        Points that were there before, that were computed now, and that could not be computed, of all.
+    points, kept, computed, failed : int
+        Points of the sweep, points computed before, points computed now, and points that could not be computed.
     """
 
     path: Path
@@ -51,28 +52,27 @@ def run_sweep(
     *,
     folder: Path | None = None,
     resume: bool = False,
-    workers: Callable[[Measure], Workers] = SerialWorker,
+    workers: MakeWorkers = serial_worker,
     reporter: Reporter | None = None,
 ) -> SweepOutcome:
-    """Compute the points of a sweep that its store does not hold yet.
+    """Compute the missing points of a sweep.
 
-    The figures of a point depend on the sweep's file alone: not on who computes them, in which order, or how often the
-    sweep was interrupted.
+    The metrics of a point depend on the sweep file alone, not on workers, order or interruptions.
 
     Parameters
     ----------
     sweep : SweepFile
-        What to compute.
+        The sweep.
     path : Path
         The store, a SQLite file.
     folder : Path, optional
         Folder that relative paths in the configuration start from; the current one by default.
     resume : bool
-        Go on with a store that is there; points that could not be computed are tried again.
+        Continue an existing store; points that could not be computed are tried again.
     workers : callable
-        Makes the workers from the function that computes a point.
+        Function that makes workers of the function that computes a point; by default this process.
     reporter : Reporter, optional
-        Who tells how far it is; nobody by default.
+        Progress display; silent by default.
 
     Raises
     ------
@@ -115,8 +115,8 @@ def run_sweep(
 def numbered_points(sweep: SweepFile, folder: Path) -> list[SweepPoint]:
     """Return the points of a sweep with their numbers and seeds.
 
-    All points of a replica share one seed, the first that of the configuration: random numbers are common, and what
-    differs between points is the doing of their parameters.
+    All points of a replica share one seed, the first that of the configuration. With common random numbers, differences
+    between points are effects of their parameters.
     """
     base = sweep.base if isinstance(sweep.base, dict) else {}
     first = base.get("seed", Configuration.model_fields["seed"].default)
@@ -130,12 +130,12 @@ def numbered_points(sweep: SweepFile, folder: Path) -> list[SweepPoint]:
 
 
 def check_room(sweep: SweepFile, path: Path) -> None:
-    """Refuse a sweep whose points fit neither memory nor disk, before anything is made.
+    """Refuse a sweep with more points than memory or disk can hold.
 
     Raises
     ------
     ConfigError
-        One line with what it would take and what there is.
+        One line with the required and the available space.
     """
     count = point_count(sweep) * sweep.design.replicas
     place = next(parent for parent in (path.resolve().parent, *path.resolve().parents) if parent.exists())

@@ -1,9 +1,9 @@
-"""The table of a sweep: a row a point, for people and other programs."""
+"""Table of a sweep, a row a point, and its export."""
 
 from __future__ import annotations
 
 import io
-import sqlite3
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from ...core.errors import ConfigError, ProductError
 from ...core.files import write_bytes
 from ...core.products import described_table
 from ..metrics.stars import STARS
-from .store import SweepStore
+from .store import SweepStore, readable_rows
 
 #: Formats of an export, by the ending of the file.
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
@@ -24,7 +24,7 @@ _UNITS = ("um", "nm", "mm", "m", "urad", "rad", "deg", "arcsec", "s")
 
 @dataclass(frozen=True)
 class SweepTable:
-    """Parameters and figures of the points that have been computed.
+    """Parameters and metrics of the computed points.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class SweepTable:
     parameters : dict of str to ndarray, shape [n]
         Values of each parameter.
     metrics : dict of str to ndarray, shape [n]
-        Figures; NaN where a point could not be computed.
+        Metrics; NaN where a point could not be computed.
     problem : ndarray of str, shape [n]
-        Why a point could not be computed; empty where it was.
+        Reason why a point could not be computed; else empty.
     seconds : ndarray, shape [n]
-        How long each took.
+        Time of each computation.
     """
 
     name: str
@@ -55,7 +55,7 @@ class SweepTable:
 
 
 def read_table(store: SweepStore) -> SweepTable:
-    """Return what a store holds, in the order of the points."""
+    """Return the table of a store, in the order of the points."""
     points = {p.number: p for p in store.points()}
     results = store.results()
     rows = [points[r.number] for r in results]
@@ -75,70 +75,54 @@ def read_table(store: SweepStore) -> SweepTable:
 
 
 def export_table(store: SweepStore, path: Path) -> int:
-    """Write the points of a store as ECSV, CSV, FITS or Parquet, and return how many there are.
+    """Write the points of a store as ECSV, CSV, FITS or Parquet, and return their number.
 
     Raises
     ------
     ConfigError
-        If the ending of the file names no format, or Parquet is asked for without the package ``pyarrow``.
+        If the ending of the file names no format, or ``pyarrow`` is not installed for Parquet.
     ProductError
         If the file cannot be written, or nothing has been computed.
     """
     table = read_table(store)
     if not len(table):
         raise ProductError(f"{store.path}: no point has been computed yet")
-    kind = FORMATS.get(path.suffix.lower())
-    if kind is None:
-        raise ConfigError(f"{path}: expected a file that ends in {', '.join(FORMATS)}")
+    kind = _format(path)
     meta = {"what": f"sweep {table.name}", "pachon": store.about["pachon"], "digest": store.about["digest"]}
     write_bytes(path, _encoded(_columns(table, meta), kind, path))
     return len(table)
 
 
 def salvage(path: Path, out: Path) -> int:
-    """Read what can be read of a damaged store, point by point, write it as a table, and return how many points.
+    """Write the readable points of a damaged store as a table, and return their number.
 
     Raises
     ------
+    ConfigError
+        If the ending of the file names no format.
     ProductError
         If nothing can be read.
     """
-    rows = list(_readable_rows(path))
+    rows = [
+        ({"number": number}, json.loads(parameters), json.loads(metrics or "{}"))
+        for number, parameters, metrics in readable_rows(path)
+    ]
     if not rows:
         raise ProductError(f"{path}: nothing can be read of it; was it a store of a sweep?")
-    import json
-
-    kind = FORMATS.get(out.suffix.lower())
-    if kind is None:
-        raise ConfigError(f"{out}: expected a file that ends in {', '.join(FORMATS)}")
-    figures = [(number, json.loads(parameters), json.loads(metrics or "{}")) for number, parameters, metrics in rows]
-    table = Table({"number": [number for number, _, _ in figures]}, meta={"what": f"saved from {path.name}"})
-    for part in (1, 2):
-        for name in dict.fromkeys(name for row in figures for name in row[part]):
-            values = [row[part].get(name) for row in figures]
+    kind = _format(out)
+    table = Table(meta={"what": f"saved from {path.name}"})
+    for part in range(3):
+        for name in dict.fromkeys(name for row in rows for name in row[part]):
+            values = [row[part].get(name) for row in rows]
             table[name] = [np.nan if v is None else v for v in values]
     write_bytes(out, _encoded(table, kind, out))
     return len(rows)
 
 
-def _readable_rows(path: Path) -> Any:
-    """Yield number, parameters and metrics of every point that a damaged file still gives."""
-    try:
-        connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
-    except sqlite3.Error:
-        return
-    try:
-        last = next(iter(connection.execute("SELECT max(number) FROM points")), (None,))[0]
-    except sqlite3.Error:
-        last = None
-    for number in range(0 if last is None else last + 1):
-        try:
-            yield from connection.execute(
-                "SELECT number, parameters, metrics FROM results JOIN points USING (number) WHERE number = ?", (number,)
-            )
-        except sqlite3.Error:
-            continue
-    connection.close()
+def _format(path: Path) -> str:
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError(f"{path}: expected a file that ends in {', '.join(FORMATS)}")
+    return FORMATS[path.suffix.lower()]
 
 
 def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
@@ -148,13 +132,13 @@ def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
     }
     columns |= {name: (_plain(values), _unit(name), "parameter") for name, values in table.parameters.items()}
     columns |= {name: (values, STARS.unit(name) or _unit(name), "metric") for name, values in table.metrics.items()}
-    columns["problem"] = (table.problem, "", "why it could not be computed")
-    columns["seconds"] = (table.seconds, "s", "how long it took")
+    columns["problem"] = (table.problem, "", "reason why it could not be computed")
+    columns["seconds"] = (table.seconds, "s", "time of the computation")
     return described_table(columns, meta)
 
 
 def _plain(values: np.ndarray) -> np.ndarray:
-    """Return a column as numbers or as text: a parameter that is left out at some points has no number there."""
+    """Return a column as numbers or as text; parameters without a value at a point become NaN or empty."""
     if values.dtype.kind != "O":
         return values
     if any(isinstance(v, str) for v in values):

@@ -22,6 +22,7 @@ from pachon.studies.sweep.file import load_sweep, read_sweep
 from pachon.studies.sweep.point import point_experiment
 from pachon.studies.sweep.store import SweepPoint, SweepStore
 from pachon.studies.sweep.sweep import check_room
+from pachon.studies.workers.dask_cluster import check_versions
 
 SWEEP = """
 name: small
@@ -238,7 +239,7 @@ def test_more_points_than_there_is_room_for_are_refused_before_starting(folder):
 
 def test_a_scheduler_that_does_not_answer_is_one_line(folder, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("pachon.studies.sweep.workers.CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr("pachon.studies.workers.dask_cluster.CONNECT_SECONDS", 1.0)
     assert main(["sweep", "small.yaml", "--scheduler", "tcp://127.0.0.1:9"]) == 2
     error = capsys.readouterr().err.strip()
     assert "--scheduler = tcp://127.0.0.1:9: no answer within 1 s" in error
@@ -251,15 +252,13 @@ def test_an_address_that_is_none_is_one_line(folder, capsys):
     assert "--scheduler = login1:8786: expected an address such as tcp://host:8786" in capsys.readouterr().err
 
 
-def test_workers_with_another_version_are_refused(monkeypatch):
-    from pachon.studies.sweep import workers as sweep_workers
-
+def test_workers_with_another_version_are_refused():
     class Client:
         def run(self, function, on_error):
             return {"tcp://a": "0.0.1"}
 
     with pytest.raises(ConfigError, match=r"worker tcp://a: has pachon 0\.0\.1, expected"):
-        sweep_workers.check_versions(Client())
+        check_versions(Client())
 
 
 def test_points_that_cannot_be_computed_are_reported_and_the_others_go_on(folder, capsys):
