@@ -20,7 +20,7 @@ EXAMPLES = [name for name, text in PAGES.items() if BLOCK.search(text) and name 
 
 
 def test_the_pages_that_users_begin_with_have_examples():
-    assert {"design_study.md", "design_figures.md", "derivatives.md"} <= set(EXAMPLES)
+    assert {"design_study.md", "design_metrics.md", "derivatives.md"} <= set(EXAMPLES)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -48,6 +48,13 @@ def test_the_zemax_page_runs_on_a_lens(tmp_path, monkeypatch):
 def test_pictures_and_links_are_there(name):
     for target in re.findall(r"\]\(([^)#:]+)\)", PAGES[name]):
         assert (DOCS / target).exists(), target
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_files_named_in_pages_exist(name):
+    folders = "tests|models|raytrace|wavefront|design|pipeline|studies|commands|core|benchmarks|docs"
+    for path in re.findall(rf"`(?:python |pytest (?:-m slow )?)?((?:{folders})/[\w./]+)", PAGES[name]):
+        assert (DOCS.parent / path).exists(), path
 
 
 def test_every_page_is_in_the_index():
