@@ -1,14 +1,14 @@
-r"""What active optics leaves uncorrected: a small random aberration of each exposure, on top of the traced one.
+r"""Residual aberration of active optics: a small random wavefront of each exposure, added to the traced one.
 
 Wavefront sensors in the four corners of the LSST's focal plane keep mirrors and camera in place, "within the <~ 0.2 um
 accuracy" of the reconstructed wavefront (Jee & Tyson 2011, sec. 2, after Manuel et al. 2010), with errors that are
-random from one exposure to the next (their sec. 6). The OPD that is left is taken as
+random from one exposure to the next (their sec. 6). The residual OPD is
 
 .. math:: W(p, \theta) = \sum_j (c_j + g_j \cdot \theta) Z_j(p),
 
-annular Zernikes of the entrance pupil whose coefficients are constant over the field but for a linear part: the first
-three terms of a double Zernike expansion. That is what shifted and tilted elements do to first order: a decentre brings
-coma that is constant over the field, a tilted camera defocus that is linear.
+annular Zernikes of the entrance pupil whose coefficients have a constant and a linear part over the field: the first
+three terms of a double Zernike expansion. To first order these are the effects of shifted and tilted elements: a
+decentre brings coma that is constant over the field, a tilted camera defocus that is linear.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from ..models.zernike_polynomials import annular_zernike_gradients, annular_zern
 
 #: Accuracy that Jee & Tyson (2011) quote for the LSST's active optics [m].
 PAPER_RMS = 0.2e-6
-#: Largest rms that can be drawn [m], ten times the paper's: beyond it a blur of 1.5 arcsec leaves the stamps.
+#: Largest rms that can be drawn [m], ten times the paper's: beyond it the blur of 1.5 arcsec extends beyond the stamps.
 LARGEST_RMS = 10.0 * PAPER_RMS
-#: Noll indices that are drawn by default: from defocus to the second spherical aberration. Tilt moves stars only.
+#: Noll indices drawn by default: from defocus to the second spherical aberration. Tilt only moves stars.
 DEFAULT_TERMS = tuple(range(4, 23))
-#: Part of the variance, averaged over the field, that is linear in the field angle. Four sensors at the corners of a
-#: square within the field, of equal and independent errors, give a plane with as much variance in its slopes as in
+#: Fraction of the variance, averaged over the field, that is linear in the field angle. Four sensors at the corners of
+#: a square within the field, of equal and independent errors, give a plane with as much variance in its slopes as in
 #: its mean.
-LINEAR_SHARE = 0.5
+LINEAR_FRACTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,28 +90,28 @@ class ResidualWavefront:
         epoch: int = 0,
         *,
         terms: Iterable[int] = DEFAULT_TERMS,
-        linear_share: float = LINEAR_SHARE,
+        linear_fraction: float = LINEAR_FRACTION,
     ) -> ResidualWavefront:
         """Draw the aberration of one exposure.
 
         Every term is Gaussian and independent of the others. Variances fall as n^(-11/3) with the radial degree n, as
-        those of the turbulence do (Noll 1976) that the wavefront sensors see in their own exposures; the paper says
-        how large the error is, not how it is spread over the terms.
+        those of turbulence do (Noll 1976), which limits the wavefront sensors in their own exposures. The paper gives
+        the size of the error, not its distribution over the terms.
 
         Parameters
         ----------
         telescope : Telescope
-            Gives the pupil and the radius of the field.
+            The telescope, whose pupil and field radius are taken.
         rms : float or Quantity
             Root mean square of the OPD over pupil, field of view and exposures [m], 0 to 2 um; 0.2 um in the paper.
         seed : int
             Seed of the run.
         epoch : int
-            Number of the exposure; each has its own aberration.
+            Number of the exposure; aberrations of exposures are independent.
         terms : iterable of int
             Noll indices to draw, from 4.
-        linear_share : float
-            Part of the variance that is linear over the field, 0 to 1; 0 gives every star the same aberration.
+        linear_fraction : float
+            Fraction of the variance that is linear over the field, 0 to 1; at 0 all stars have the same aberration.
 
         Returns
         -------
@@ -125,22 +125,22 @@ class ResidualWavefront:
         size = metres(rms, "rms")
         if size.size != 1 or not 0.0 <= size.item() <= LARGEST_RMS:
             raise DomainError(f"rms = {rms!r}: expected 0 to {LARGEST_RMS:g} m of wavefront error")
-        if not 0.0 <= linear_share <= 1.0:
-            raise DomainError(f"linear_share = {linear_share!r}: expected 0 to 1")
+        if not 0.0 <= linear_fraction <= 1.0:
+            raise DomainError(f"linear_fraction = {linear_fraction!r}: expected 0 to 1")
         for name, number in (("seed", seed), ("epoch", epoch)):
             if not (isinstance(number, int | np.integer) and number >= 0):
                 raise DomainError(f"{name} = {number!r}: expected a whole number from 0")
         chosen = sorted(set(terms))
         if not chosen or chosen[0] < 4:
-            raise DomainError(f"terms = {chosen}: expected Noll indices from 4 (piston and tilt are no aberration)")
+            raise DomainError(f"terms = {chosen}: expected Noll indices from 4 (piston and tilt are not drawn)")
         variance = np.array([float(noll_to_nm(j)[0]) ** (-11.0 / 3.0) for j in chosen])
         sigma = size.item() * np.sqrt(variance / variance.sum())
         # The mean square of a slope along x over a disc is a quarter of the square of its radius.
-        per_radian = math.sqrt(2.0 * linear_share) / telescope.field_radius
+        per_radian = math.sqrt(2.0 * linear_fraction) / telescope.field_radius
         coefficients, gradient = np.zeros(chosen[-1] - 3), np.zeros((chosen[-1] - 3, 2))
         for j, scale in zip(chosen, sigma, strict=True):
             normal = scale * stream(seed, "active optics", epoch, j).standard_normal(3)
-            coefficients[j - 4] = math.sqrt(1.0 - linear_share) * normal[0]
+            coefficients[j - 4] = math.sqrt(1.0 - linear_fraction) * normal[0]
             gradient[j - 4] = per_radian * normal[1:]
         return cls(coefficients, telescope.pupil_diameter, telescope.pupil_obscuration, gradient)
 
@@ -177,7 +177,7 @@ class ResidualWavefront:
         return _combined(self.at(slopes), np.moveaxis(basis, 1, -1))
 
     def _basis(self, terms: Any, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Return the terms, or what else is wanted of them, from j = 4 on."""
+        """Return the terms or their derivatives from j = 4 on."""
         radius = 0.5 * self.pupil_diameter
         return terms(3 + len(self.coefficients), np.divide(x, radius), np.divide(y, radius), self.pupil_obscuration)[3:]
 

@@ -106,6 +106,7 @@ def fields_at(
     telescope: Telescope,
     positions: ArrayLike,
     wavelength: ArrayLike | None = None,
+    *,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> np.ndarray:

@@ -31,12 +31,12 @@ def wavefront_opd(
     field: ArrayLike,
     wavelength: ArrayLike,
     pupil: tuple[ArrayLike, ArrayLike] | None = None,
-    projection: str = "zemax",
-    reference: str = "chief",
-    focal_plane: FocalPlane | None = None,
     *,
     grid: int | None = None,
+    reference: str = "chief",
     sphere_radius: ArrayLike | None = None,
+    focal_plane: FocalPlane | None = None,
+    projection: str = "zemax",
     threads: int | None = None,
 ) -> OpdMap:
     """Return the optical path difference over the entrance pupil.
@@ -55,15 +55,15 @@ def wavefront_opd(
         Vacuum wavelength [m].
     pupil : (px, py), optional
         Entrance-pupil coordinates [m], arrays of one shape.
+    grid : int, optional
+        In place of ``pupil``: cells across the pupil diameter of a square grid. 64 when neither is given.
     reference : {"chief", "mean"}
         "chief": sphere and zero of the path at the chief ray. "mean": sphere about the mean landing point of the
         lit rays, zero at their mean path.
-    focal_plane : FocalPlane, optional
-        CCD surfaces; the nominal detector surface without it.
-    grid : int, optional
-        In place of ``pupil``: cells across the pupil diameter of a square grid. 64 when neither is given.
     sphere_radius : float or Quantity, optional
         Radius of the reference sphere [m]; the telescope's own by default.
+    focal_plane : FocalPlane, optional
+        CCD surfaces; the nominal detector surface without it.
 
     Returns
     -------
@@ -115,11 +115,11 @@ def wavefront_opds(
     fields: ArrayLike,
     wavelength: ArrayLike,
     pupil: tuple[ArrayLike, ArrayLike] | None = None,
-    projection: str = "zemax",
-    focal_plane: FocalPlane | None = None,
     *,
     grid: int | None = None,
     sphere_radius: ArrayLike | None = None,
+    focal_plane: FocalPlane | None = None,
+    projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> OpdMaps:
@@ -131,7 +131,7 @@ def wavefront_opds(
 
     Parameters
     ----------
-    telescope, wavelength, pupil, projection, focal_plane, grid, sphere_radius, threads
+    telescope, wavelength, pupil, grid, sphere_radius, focal_plane, projection, threads
         As in :func:`wavefront_opd`; the pupil points are the same for all fields.
     fields : array_like or Quantity, shape [n_field, 2]
         Field angles [rad], in the stated projection.

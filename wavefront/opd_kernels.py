@@ -1,6 +1,6 @@
-"""The kernel that traces the pupil of many field points and keeps the optical path difference alone.
+"""Kernel that traces the pupil of many field points and keeps the optical path differences alone.
 
-A module of its own: with one caller of the surface loop in a module the compiler puts all of it in line.
+A module of its own: with one caller of the surface loop in a module the compiler inlines all of it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from ..raytrace.kernels.surface import OK, ONE, ZERO
 from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
-
-NAN = wp.constant(wp.float64(float("nan")))
 
 
 @kernel_pair
@@ -45,10 +43,10 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
     ):
         """Trace one packet of the pupil for one field point: item ``i`` of the work is field ``i // n_packets``.
 
-        ``place`` says which column of ``value`` belongs to each lane (-1: none). ``start`` [field, 3] is empty for
+        ``place`` is the column of ``value`` that belongs to each lane (-1: none). ``start`` [field, 3] is empty for
         light that comes from infinity along ``direction`` [field, 3], else the point that it comes from. ``sphere``
         [field, 4]: centre of the reference sphere, and optical path of its chief ray to it. ``value`` is that path less
-        the ray's, and stays as it was where the ray is not lit; it may be empty. ``lit`` [item] counts the lanes of the
+        the ray's; it is not written where the ray is not lit, and may be empty. ``lit`` [item] counts the lanes of the
         packet that are.
         """
         item = work[first + wp.tid()]
@@ -68,7 +66,7 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
             du = px - x
             dv = py - y
             dw = lanes(pupil_z) - z
-            # The plane of the pupil may lie behind the object: the light goes down all the same.
+            # The plane of the pupil may lie behind the object; the light still travels downwards.
             scale = -wp.sign(pupil_z - start[b, 2]) * lanes(ONE)
             scale = wp.cw_div(scale, lanes_sqrt(wp.cw_mul(du, du) + wp.cw_mul(dv, dv) + wp.cw_mul(dw, dw)))
             du = wp.cw_mul(scale, du)

@@ -1,17 +1,16 @@
-"""What the optics alone do to the light of many stars: per pupil point, where it lands and with what path.
+"""Pupil optics: landing points and optical paths of many stars through given points of the entrance pupil.
 
-This is the optical half of a PSF. All engines take it: the fast and the long-exposure one use where the rays land, the
-wave engine their path. It is traced on packets straight into the few numbers that are kept, so memory does not hold the
-rays.
+This is the optical part of every PSF. The fast and the long-exposure engine use the landing points, the wave engine the
+paths. The kernel keeps these few numbers alone, so memory does not hold the rays.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from ..core.launch import launch
 from ..core.units import metres, radians
@@ -29,7 +28,7 @@ from .reference_sphere import path_to_sphere
 
 @dataclass(frozen=True)
 class PupilOptics:
-    """The optics seen through given points of the entrance pupil.
+    """Landing points and optical paths through given points of the entrance pupil.
 
     Attributes
     ----------
@@ -43,8 +42,8 @@ class PupilOptics:
         Where light passes.
     jacobian : ndarray, shape [n_star, 2, 2]
         Change of position on the detector per change of the direction cosines of the incoming light [m/rad].
-    reference : ndarray, shape [n_star, 3]
-        Centre of the reference spheres: where the chief ray of the middle wavelength meets the CCD, telescope frame
+    reference_points : ndarray, shape [n_star, 3]
+        Centres of the reference spheres: where the chief ray of the middle wavelength meets the CCD, telescope frame
         [m]. All wavelengths share it, so lateral colour stays in path and displacement.
     fields : ndarray, shape [n_star, 2]
         Field angles [rad].
@@ -57,67 +56,57 @@ class PupilOptics:
     path: np.ndarray
     lit: np.ndarray
     jacobian: np.ndarray
-    reference: np.ndarray
+    reference_points: np.ndarray
     fields: np.ndarray
     wavelengths: np.ndarray
 
 
 def trace_pupils(
     telescope: Telescope,
-    fields: Any,
-    wavelengths: Any,
+    fields: ArrayLike,
+    wavelengths: ArrayLike,
     pupil: np.ndarray,
+    *,
     focal_plane: FocalPlane | None = None,
+    aberration: ResidualWavefront | None = None,
     projection: str = "zemax",
     threads: int | None = None,
-    aberration: ResidualWavefront | None = None,
 ) -> PupilOptics:
-    """Trace the same pupil points for many stars at several wavelengths, to the CCD under each star.
+    """Trace the same pupil points for many stars at several wavelengths to the CCD of each star.
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like, shape [n_star, 2]
-        Field angles [rad].
-    wavelengths : array_like, shape [n_wave]
-        Vacuum wavelengths [m]; the reference point belongs to the middle one.
+    telescope, fields, wavelengths, projection, threads
+        As in :meth:`pachon.Request.of`; the reference points belong to the middle wavelength.
     pupil : ndarray, shape [n_pupil, 2]
         Entrance-pupil coordinates [m].
     focal_plane : FocalPlane, optional
         CCD heights; each star's CCD is taken as its tangent plane at the reference point (over the blur of a star,
-        some 50 um, a potato chip of two cycles leaves it by less than 0.2 nm).
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads.
+        some 50 um, a potato chip of two cycles deviates from it by less than 0.2 nm).
     aberration : ResidualWavefront, optional
         Added to the traced wavefront; reference points and zero of the path stay those of the telescope without it.
-
-    Returns
-    -------
-    PupilOptics
 
     Raises
     ------
     DomainError
-        If a field or wavelength lies outside what the telescope covers, or a star falls between two CCDs.
+        If a field or wavelength lies outside what the telescope covers, the object is at a finite distance, or a chief
+        ray does not reach the image or lands between two CCDs.
     """
-    fields = np.atleast_2d(radians(fields, "fields"))
-    wavelengths = np.atleast_1d(metres(wavelengths, "wavelengths"))
+    stars = np.atleast_2d(radians(fields, "fields"))
+    waves = np.atleast_1d(metres(wavelengths, "wavelengths"))
     pupil = np.asarray(pupil, dtype=np.float64)
-    n_star, n_wave, n_pupil = len(fields), len(wavelengths), len(pupil)
-    telescope.check_field(fields[:, 0], fields[:, 1])
-    direction = field_direction(fields[:, 0], fields[:, 1], projection)
-    indices = np.array([refractive_indices(telescope, w) for w in wavelengths])
-    middle = float(wavelengths[n_wave // 2])
+    n_star, n_wave, n_pupil = len(stars), len(waves), len(pupil)
+    telescope.check_field(stars[:, 0], stars[:, 1])
+    direction = field_direction(stars[:, 0], stars[:, 1], projection)
+    indices = np.array([refractive_indices(telescope, w) for w in waves])
+    middle = float(waves[n_wave // 2])
 
-    chief = reference_rays(telescope, fields, direction, middle, focal_plane, threads)
-    reference = np.array(chief.position)
+    chief = reference_rays(telescope, stars, direction, middle, focal_plane, threads)
+    reference_points = np.array(chief.position)
     normal = np.zeros((n_star, 3))
     normal[:, 2] = 1.0
     if focal_plane is not None and chief.ccd is not None:
-        on_detector = telescope.surfaces[-1].to_local(reference)
+        on_detector = telescope.surfaces[-1].to_local(reference_points)
         offset = on_detector[:, :2] - focal_plane.camera.centers[chief.ccd]
         normal[:, :2] = -focal_plane.surfaces.gradient(chief.ccd, offset[:, 0], offset[:, 1])
     rotation = telescope.surfaces[-1].matrix
@@ -126,14 +115,13 @@ def trace_pupils(
     radius = telescope.reference_sphere_radius
     chief_path = np.empty((n_star, n_wave))
     for w in range(n_wave):
-        end = chief_rays(telescope, direction, float(wavelengths[w]), None, threads)
+        end = chief_rays(telescope, direction, float(waves[w]), None, threads)
         index = indices[w, -2]
-        chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference, radius)
-    count = packet_count(n_pupil)
-    bundles = n_star * n_wave
+        chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference_points, radius)
 
-    out_x, out_y, out_path = (wp.empty((bundles, count), dtype=lanes, device="cpu") for _ in range(3))
-    out_status = wp.empty((bundles, count), dtype=lane_flags, device="cpu")
+    count, bundles = packet_count(n_pupil), n_star * n_wave
+    kinds = (lanes, lanes, lanes, lane_flags)
+    out_x, out_y, out_path, out_status = (wp.empty((bundles, count), dtype=kind, device="cpu") for kind in kinds)
     packed = pack_surfaces(telescope)
     launch(
         trace_pupils_kernel.suited(packed),
@@ -147,13 +135,10 @@ def trace_pupils(
             warp_array(to_packets(pupil.T), lanes),
             float(telescope.stop_z),
             float(telescope.launch_distance),
-            warp_array(np.repeat(np.concatenate([reference, normal], axis=1), n_wave, axis=0)),
+            warp_array(np.repeat(np.concatenate([reference_points, normal], axis=1), n_wave, axis=0)),
             float(radius),
             ray_packets(),
-            out_x,
-            out_y,
-            out_path,
-            out_status,
+            *(out_x, out_y, out_path, out_status),
         ],
         threads=threads,
     )
@@ -168,21 +153,21 @@ def trace_pupils(
     path = trimmed(out_path) - chief_path[:, :, None]
     jacobian = image_jacobians(telescope, direction, middle, threads)
     if aberration is not None:
-        # The path is minus the OPD, and light moves by the Jacobian times the gradient of the path, as behind a screen.
+        # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
         slopes = direction[:, :2] / -direction[:, 2:]
         x, y = pupil.T
         path -= aberration.opd(x, y, slopes)[:, None]
         along_x, along_y = np.moveaxis(aberration.gradient(x, y, slopes), -1, 0)
         for axis in range(2):
-            moved = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
-            offset[..., axis] -= moved[:, None]
+            shift = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
+            offset[..., axis] -= shift[:, None]
     return PupilOptics(
         pupil=pupil,
         displacement=offset.astype(np.float32),
         path=path,
         lit=trimmed(out_status) == RayStatus.OK,
         jacobian=jacobian,
-        reference=reference,
-        fields=fields,
-        wavelengths=wavelengths,
+        reference_points=reference_points,
+        fields=stars,
+        wavelengths=waves,
     )

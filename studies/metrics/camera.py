@@ -36,7 +36,9 @@ def defocus(scene: Scene) -> dict[str, float]:
     ring = 0.5 * _RING * scene.telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     fields = fields_at(scene.telescope, plane.camera.centers, scene.middle, threads=scene.threads)
     with_heights, flat = (
-        trace_pupils(scene.telescope, fields, scene.middle, ring, p, threads=scene.threads).path[:, 0].mean(axis=1)
+        trace_pupils(scene.telescope, fields, scene.middle, ring, focal_plane=p, threads=scene.threads)
+        .path[:, 0]
+        .mean(axis=1)
         for p in (plane, None)
     )
     change = (flat - with_heights) * 1e9

@@ -83,7 +83,7 @@ class PolynomialPupil:
             path=same(path),
             lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
             jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
-            reference=np.zeros((len(fields), 3)),
+            reference_points=np.zeros((len(fields), 3)),
             fields=fields,
             wavelengths=wavelengths,
         )

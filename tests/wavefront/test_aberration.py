@@ -8,7 +8,7 @@ from astropy import units as u
 
 from pachon.core.errors import DomainError
 from pachon.models.zernike_polynomials import annular_zernikes
-from pachon.wavefront.aberration import LINEAR_SHARE, PAPER_RMS, ResidualWavefront
+from pachon.wavefront.aberration import LINEAR_FRACTION, PAPER_RMS, ResidualWavefront
 from pachon.wavefront.psf.psf import make_psfs
 from pachon.wavefront.pupil_optics import trace_pupils
 
@@ -153,17 +153,17 @@ def test_amplitudes_fall_with_the_degree_and_share_of_the_field(lsst_r):
     law = degrees ** (-11.0 / 3.0)
     # Variances of 2000 normal numbers: 3 %; 4 sigma, and 19 of them.
     np.testing.assert_allclose(total / total.sum(), law / law.sum(), rtol=0.15)
-    assert slopes.sum() / total.sum() == pytest.approx(LINEAR_SHARE, rel=0.06)
+    assert slopes.sum() / total.sum() == pytest.approx(LINEAR_FRACTION, rel=0.06)
     np.testing.assert_allclose(slopes.sum(axis=0), 0.25 * total.sum(), rtol=0.1)
 
 
-def test_linear_share_is_that_of_four_sensors_in_the_corners():
+def test_linear_fraction_is_that_of_four_sensors_in_the_corners():
     """Least squares of a plane through four readings of equal error: variances of its mean and of its slopes."""
     corners = np.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     covariance = np.linalg.inv((design := np.column_stack([np.ones(4), corners])).T @ design)
     # Mean squares of x and y over the disc: a quarter.
     linear = 0.25 * (covariance[1, 1] + covariance[2, 2])
-    assert linear / (linear + covariance[0, 0]) == pytest.approx(LINEAR_SHARE)
+    assert linear / (linear + covariance[0, 0]) == pytest.approx(LINEAR_FRACTION)
 
 
 def test_each_exposure_and_seed_has_its_own_and_terms_do_not_meddle(lsst_r):
@@ -179,7 +179,7 @@ def test_each_exposure_and_seed_has_its_own_and_terms_do_not_meddle(lsst_r):
     # The same normal numbers, scaled to the rms.
     ratio = first.coefficients[[0, 4]] / fewer.coefficients[[0, 4]]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
-    still = ResidualWavefront.draw(lsst_r, seed=5, epoch=2, linear_share=0.0)
+    still = ResidualWavefront.draw(lsst_r, seed=5, epoch=2, linear_fraction=0.0)
     assert not still.field_gradient.any()
     np.testing.assert_allclose(still.coefficients, np.sqrt(2.0) * first.coefficients, rtol=1e-12)
     assert not ResidualWavefront.draw(lsst_r, 0.0).coefficients.any()
@@ -206,7 +206,7 @@ def test_a_star_does_not_depend_on_its_neighbours(lsst_r, pupil):
         ({"epoch": 1.5}, "epoch = 1.5"),
         ({"terms": (2, 4)}, "terms = [2, 4]"),
         ({"terms": ()}, "terms = []"),
-        ({"linear_share": 1.5}, "linear_share = 1.5"),
+        ({"linear_fraction": 1.5}, "linear_fraction = 1.5"),
     ],
 )
 def test_bad_draws_are_named(lsst_r, options, named):

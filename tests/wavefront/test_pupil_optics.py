@@ -26,7 +26,7 @@ def positions():
 @pytest.fixture(scope="module")
 def optics(lsst_r, focal_plane, positions, annulus_points):
     pupil = np.stack(annulus_points(70, 3), axis=-1)
-    return trace_pupils(lsst_r, fields_at(lsst_r, positions), WAVELENGTHS, pupil, focal_plane)
+    return trace_pupils(lsst_r, fields_at(lsst_r, positions), WAVELENGTHS, pupil, focal_plane=focal_plane)
 
 
 def test_path_and_lit_are_those_of_the_opd(lsst_r, focal_plane, optics):
@@ -35,7 +35,7 @@ def test_path_and_lit_are_those_of_the_opd(lsst_r, focal_plane, optics):
         assert np.array_equal(opd.lit, optics.lit[star, 1])
         # Rounding of 30 m of path.
         assert np.abs(opd.value + optics.path[star, 1])[opd.lit].max() < 5e-14
-        assert np.abs(opd.center - optics.reference[star]).max() < 1e-15
+        assert np.abs(opd.center - optics.reference_points[star]).max() < 1e-15
 
 
 def test_displacement_is_the_landing_point_on_the_ccd(lsst_r, focal_plane, optics):
@@ -43,7 +43,7 @@ def test_displacement_is_the_landing_point_on_the_ccd(lsst_r, focal_plane, optic
         for wave, wavelength in enumerate(WAVELENGTHS):
             rays = pachon.launch_rays(lsst_r, field, wavelength, tuple(optics.pupil.T))
             end = pachon.trace(lsst_r, rays, focal_plane=focal_plane)
-            offset = (end.position - optics.reference[star])[:, :2]
+            offset = (end.position - optics.reference_points[star])[:, :2]
             ok = end.status == RayStatus.OK
             # Single precision of 50 um (3e-12 m), and the potato chip over 50 um (0.2 nm of height, 0.15 nm of x).
             assert np.abs(offset - optics.displacement[star, wave])[ok].max() < 2e-10
@@ -69,12 +69,14 @@ def test_lateral_colour_stays_in(optics):
 
 def test_the_set_of_stars_and_threads_change_no_byte(lsst_r, focal_plane, optics):
     for threads in (1, 3):
-        one = trace_pupils(lsst_r, optics.fields[2:3], WAVELENGTHS, optics.pupil, focal_plane, threads=threads)
-        for name in ("displacement", "path", "lit", "jacobian", "reference"):
+        one = trace_pupils(
+            lsst_r, optics.fields[2:3], WAVELENGTHS, optics.pupil, focal_plane=focal_plane, threads=threads
+        )
+        for name in ("displacement", "path", "lit", "jacobian", "reference_points"):
             assert np.array_equal(getattr(one, name)[0], getattr(optics, name)[2])
 
 
 def test_a_star_in_a_gap_is_refused(lsst_r, focal_plane, optics):
     field = fields_at(lsst_r, [[0.5 * 0.04225, 0.0]])
     with pytest.raises(DomainError, match=r"field = \(0\.117\d*, 0\) deg: .*between the CCDs"):
-        trace_pupils(lsst_r, np.concatenate([optics.fields, field]), WAVELENGTHS, optics.pupil, focal_plane)
+        trace_pupils(lsst_r, np.concatenate([optics.fields, field]), WAVELENGTHS, optics.pupil, focal_plane=focal_plane)

@@ -172,7 +172,7 @@ class FastPsfEngine(PsfEngine):
                 moved *= np.exp(ramp[:, 0] * self._kx).astype(np.complex64)[:, None, :]
             return self._stamps(moved, total)
 
-        return Exposed(draw, optics.lit.mean(axis=2), optics.reference)
+        return Exposed(draw, optics.lit.mean(axis=2), optics.reference_points)
 
     def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""

@@ -163,7 +163,7 @@ class LongExposureEngine(PsfEngine):
         return Exposed(
             lambda shift: self._sample(spectrum, offsets if shift is None else offsets - shift),
             np.repeat(lit_fraction[:, None], len(self._wavelengths), axis=1),
-            optics.reference,
+            optics.reference_points,
         )
 
     def _transform(self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray) -> np.ndarray:
