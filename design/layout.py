@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
 from ..models.surface import Interaction
 from ..models.telescope import Telescope
-from ..wavefront.request import field_points, wavelength_points
+from ..wavefront.request import Request
 from .drawing import field_text
 from .layout_parts import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
 
@@ -135,8 +136,8 @@ class Layout:
 
 def layout(
     telescope: Telescope,
-    fields: Any = None,
-    wavelength: Any = None,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     *,
     projection: str = "zemax",
     threads: int | None = None,
@@ -145,27 +146,15 @@ def layout(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; the axis and both edges of the field along y by default.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
-
-    Raises
-    ------
-    DomainError
-        If a field or the wavelength is out of range.
+    telescope, fields, wavelength, projection, threads
+        As in :meth:`pachon.Request.of`; by default fields are the axis and both edges of the field along y.
     """
     edge = telescope.field_radius
-    points = field_points(telescope, [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None else fields)
-    (w,) = wavelength_points(telescope, wavelength)
-    lenses = find_lenses(telescope, float(w))
-    reach = even_edges(telescope, lenses, drawn_radii(telescope, points, float(w), threads))
+    given = [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None else fields
+    request = Request.of(telescope, given, wavelength, projection=projection, threads=threads)
+    points, w = request.fields, request.wavelength
+    lenses = find_lenses(telescope, w)
+    reach = even_edges(telescope, lenses, drawn_radii(telescope, points, w, threads))
     profiles = {s.name: surface_section(s, reach[s.name]) for s in telescope.surfaces}
     heights = np.concatenate([p[:, 2] for p in profiles.values()])
     heights = np.concatenate([heights[np.isfinite(heights)], [o.height for o in telescope.obstructions]])
@@ -178,12 +167,12 @@ def layout(
     around = (rings * np.cos(angle)).ravel(), (rings * np.sin(angle)).ravel()
 
     def rays(pupil: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
-        return tuple(ray_paths(telescope, f, float(w), pupil, top, projection, threads) for f in points)
+        return tuple(ray_paths(telescope, f, w, pupil, top, projection, threads) for f in points)
 
     return Layout(
         telescope=telescope,
         fields=points,
-        wavelength=float(w),
+        wavelength=w,
         reach=reach,
         profiles=profiles,
         lenses=lenses,

@@ -1,130 +1,113 @@
 r"""Diffraction images (PSFs) of the telescope alone, by Fourier sums over the pupil and by Huygens' wavelets.
 
-Both sum the same plane waves (:mod:`~.wavelets`). :func:`fft_psf` has the direction cosines of its rays on
-a square lattice, so that the image is a Fourier sum, which is done as two products with matrices of phases (Soummer et
-al. 2007, Opt. Express 15, 15935). Its pixels need not be those of a fast Fourier transform: all wavelengths share one
-grid. The image repeats itself after wavelength / spacing. :func:`huygens_psf` sums over rays through any points of the
-entrance pupil, as they are traced, and repeats itself nowhere; it is the slower and the plainer of the two.
+Both sum the same plane waves (:mod:`~.wavelets`). In :func:`fft_psf` the direction cosines of the rays lie on a square
+lattice, so that the image is a Fourier sum: two products with matrices of phases (Soummer et al. 2007, Opt. Express 15,
+15935). Its pixels need not be those of a fast Fourier transform; all wavelengths share one grid. The image repeats
+itself after wavelength / spacing. :func:`huygens_psf` sums over rays through any points of the entrance pupil and
+repeats itself nowhere; it is slower and simpler.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
-from ...core.units import metres
+from ...core.units import field_label, metres
 from ...models.telescope import Telescope
-from ...wavefront.pupil_sampling import PupilSampling, square_annulus
-from ...wavefront.request import field_points, relative_weights, wavelength_points
-from ..metrics.principal_rays import principal_rays
-from ..metrics.spots import REFERENCES, spots
+from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
+from ...wavefront.request import Request, relative_weights
+from ..metrics.principal_rays import principal_rays_of
+from ..metrics.spots import REFERENCES, spot_diagram
 from .diffraction_psf import DiffractionPsf, pixel_axis
-from .wavelets import (
-    WaveletLattice,
-    Wavelets,
-    lattice_wavelets,
-    range_of_cosines,
-    spot_reach,
-    traced_wavelets,
-)
+from .wavelets import WaveletLattice, Wavelets, lattice_wavelets, range_of_cosines, spot_reach, traced_wavelets
 
-#: Pixels on a side where none are asked for, and pixels across wavelength times focal ratio.
+#: Default pixels on a side, and pixels across wavelength times focal ratio.
 _PIXELS, _PER_AIRY = 128, 5.0
-#: Smallest, and largest number of lattice points across the pupil that is chosen unasked.
+#: Smallest and largest default number of lattice points across the pupil.
 _FEWEST, _MOST = 128, 2048
-#: The pattern comes round after so many sides of the image.
+#: Period of the pattern in sides of the image.
 _PERIODS = 2.0
 #: Rays across the pupil for sums of Huygens' wavelets.
 _HUYGENS_ACROSS = 160
 #: Wavelets summed at once: two complex numbers for each and each column of the image.
 _AT_ONCE = 4096
-#: The peak is looked for at so many places across wavelength times focal ratio, at most so many in all along an axis,
-#: and at finer steps about the highest.
+#: Steps of the search for the peak across wavelength times focal ratio, the largest number of steps along an axis, and
+#: the number of finer ones about the highest.
 _PEAK, _MOST_PLACES, _FINE = 3.0, 192, 33
 
 
 def fft_psf(
     telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
     *,
-    wavelength_weights: Any = None,
+    wavelength_weights: ArrayLike | None = None,
     pixel: Any = None,
     pixels: int = _PIXELS,
-    pupil_points: int | None = None,
+    n_pupil: int | None = None,
     reference: str = "centroid",
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> DiffractionPsf:
-    """Make diffraction images by Fourier sums over a square lattice of direction cosines at the image.
+    """Make diffraction images by Fourier sums over a lattice of direction cosines.
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelengths : array_like or Quantity, shape [n_wave], optional
-        Vacuum wavelengths [m]; the telescope's own by default.
-    wavelength_weights : array_like, shape [n_wave], optional
-        Relative amounts of light in front of the telescope; equal by default.
+    telescope, fields, wavelengths, wavelength_weights, projection, threads
+        As in :meth:`pachon.Request.of`.
     pixel : float or Quantity, optional
         Distance of pixel centres on the detector [m]; by default a fifth of the smallest wavelength times focal
         ratio, or more where the spots are larger than the image would be.
     pixels : int
         Pixels on a side.
-    pupil_points : int, optional
-        Lattice points across the pupil; by default at least 128, and so many that the pattern comes round only after
-        twice the side of the image.
+    n_pupil : int, optional
+        Lattice points across the pupil; by default at least 128, and enough for a period of the pattern of twice the
+        side of the image.
     reference : {"centroid", "chief"}
-        What the images are centred on: the centroid of the rays, or the chief ray of the middle wavelength.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads for tracing; all processors by default.
+        Middle of the images: the centroid of the rays, or the chief ray of the middle wavelength.
     progress : callable, optional
-        Called with the number of images finished since the last call.
+        Called with the number of pairs of field and wavelength done since the last call.
 
     Raises
     ------
     ConfigError
-        If reference or projection is unknown.
+        If the reference is unknown.
     DomainError
-        If something is out of range, no light passes, or the lattice is too coarse for the spots or the image.
+        If a number is out of range, no light passes, or the lattice is too coarse for the spots or the image.
     """
-    plan = _Plan(telescope, fields, wavelengths, wavelength_weights, pixel, pixels, reference, projection, threads)
+    request = Request.of(
+        telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
+    )
+    plan = _Plan(request, pixel, pixels, reference)
     side = plan.pixel * plan.pixels
-    across = pupil_points
+    across = n_pupil
     if across is None:
-        # The pattern's period is so many times wavelength / (range of cosines).
+        # The period of the pattern is so many times wavelength / (range of cosines).
         needed = int(np.ceil(max(_PERIODS * side, side + plan.spread) / plan.wave_over_range))
         across = max(_FEWEST, needed)
         if across > _MOST:
             raise DomainError(
                 f"pixel = {plan.pixel * 1e6:.4g} um, pixels = {pixels}: the image would need {across} points "
-                f"across the pupil; expected at most {_MOST} (a smaller image, or pupil_points)"
+                f"across the pupil; expected at most {_MOST} (a smaller image, or n_pupil)"
             )
     elif int(across) != across or across < 8:
-        raise DomainError(f"pupil_points = {across!r}: expected a whole number of at least 8")
+        raise DomainError(f"n_pupil = {across!r}: expected a whole number of at least 8")
     period = across * plan.wave_over_range
     if period < side or period < plan.spread:
         what = f"an image of {side * 1e6:.4g} um and spots of {plan.spread * 1e6:.4g} um"
         raise DomainError(
-            f"pupil_points = {across}: the pattern comes round after {period * 1e6:.4g} um; "
-            f"expected more points for {what}"
-        )
-
-    def lattice(field: np.ndarray, wavelength: float, center: np.ndarray) -> WaveletLattice:
-        return lattice_wavelets(
-            telescope, field, wavelength, center, plan.range_of_cosines / across, projection=projection, threads=threads
+            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} um; expected more points for {what}"
         )
 
     def waves(field: np.ndarray, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
-        found = lattice(field, wavelength, center)
+        spacing = plan.range_of_cosines / across
+        found = lattice_wavelets(telescope, field, wavelength, center, spacing, projection=projection, threads=threads)
         return found.wavelets, lambda x, y: lattice_sum(found, x, y)
 
     return plan.image("fft", waves, int(across), progress)
@@ -132,13 +115,14 @@ def fft_psf(
 
 def huygens_psf(
     telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
     *,
-    wavelength_weights: Any = None,
+    wavelength_weights: ArrayLike | None = None,
     pixel: Any = None,
     pixels: int = _PIXELS,
-    sampling: PupilSampling | None = None,
+    sampling: str | PupilSampling = "square",
+    n_pupil: int | None = None,
     reference: str = "centroid",
     projection: str = "zemax",
     threads: int | None = None,
@@ -146,31 +130,34 @@ def huygens_psf(
 ) -> DiffractionPsf:
     """Make diffraction images by summing the plane wave of every ray at every pixel.
 
-    Parameters are those of :func:`fft_psf`, but for `sampling`, the points of the entrance pupil: by default the cells
-    of a square lattice, 160 across. Gauss quadrature (``gauss_annulus``) needs far fewer where nothing is vignetted.
-
-    Raises
-    ------
-    ConfigError
-        If reference or projection is unknown.
-    DomainError
-        If something is out of range, or no light passes.
+    Parameters and errors are those of :func:`fft_psf`, but for `sampling` and `n_pupil`, which are those of
+    :meth:`pachon.Request.of`: by default a square lattice, 160 across. Gauss quadrature needs far fewer points where
+    nothing is vignetted.
     """
-    plan = _Plan(telescope, fields, wavelengths, wavelength_weights, pixel, pixels, reference, projection, threads)
-    points = sampling or square_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, _HUYGENS_ACROSS)
+    request = Request.of(
+        telescope,
+        fields,
+        wavelengths,
+        wavelength_weights=wavelength_weights,
+        sampling=sampling,
+        n_pupil=_HUYGENS_ACROSS if n_pupil is None and sampling == "square" else n_pupil,
+        projection=projection,
+        threads=threads,
+    )
+    plan, pupil = _Plan(request, pixel, pixels, reference), request.pupil
 
     def waves(field: np.ndarray, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
-        found = traced_wavelets(telescope, field, wavelength, center, points, projection, threads)
+        found = traced_wavelets(telescope, field, wavelength, center, pupil, projection, threads)
         return found, lambda x, y: wavelet_sum(found, x, y)
 
-    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(points) / np.pi)), progress)
+    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(pupil) / np.pi)), progress)
 
 
 _Sum = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def lattice_sum(lattice: WaveletLattice, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the irradiance on a grid of places by a Fourier sum, part of the light per area [1/m^2].
+    """Return the irradiance on a grid of points by a Fourier sum, fraction of the light per area [1/m^2].
 
     Parameters
     ----------
@@ -190,9 +177,9 @@ def lattice_sum(lattice: WaveletLattice, x: np.ndarray, y: np.ndarray) -> np.nda
 
 
 def wavelet_sum(wavelets: Wavelets, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the irradiance on a grid of places by a sum over wavelets of any directions [1/m^2], shape [ny, nx].
+    """Return the irradiance on a grid of points by a sum over wavelets of any directions [1/m^2], shape [ny, nx].
 
-    The phase of a wavelet is a sum of one of the column and one of the row, so that the sum over the wavelets is a
+    The phase of a wavelet is the sum of a phase of the column and one of the row, so the sum over the wavelets is a
     product of two matrices.
     """
     turn = 2j * np.pi / wavelets.wavelength
@@ -207,41 +194,23 @@ def wavelet_sum(wavelets: Wavelets, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 class _Plan:
-    """What both kinds of sums need to know beforehand, and the way from irradiances to images."""
+    """Common inputs of both sums, and the reduction of irradiances to images."""
 
-    def __init__(
-        self,
-        telescope: Telescope,
-        fields: Any,
-        wavelengths: Any,
-        weights: Any,
-        pixel: Any,
-        pixels: int,
-        reference: str,
-        projection: str,
-        threads: int | None,
-    ) -> None:
+    def __init__(self, request: Request, pixel: Any, pixels: int, reference: str) -> None:
         if reference not in REFERENCES:
             raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
         if int(pixels) != pixels or not 3 <= pixels <= 4096:
             raise DomainError(f"pixels = {pixels!r}: expected a whole number from 3 to 4096")
-        self.telescope, self.pixels = telescope, int(pixels)
-        self.fields, self.waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-        self.shares = relative_weights(weights, len(self.waves))
-        self.spots = spots(
-            telescope, self.fields, self.waves, reference=reference, projection=projection, threads=threads
-        )
+        self.request, self.pixels = request, int(pixels)
+        # The middle of the images weighs all wavelengths alike.
+        alike, pupil = relative_weights(None, len(request.wavelengths)), pupil_sampling(request.telescope)
+        self.spots = spot_diagram(replace(request, weights=alike, pupil=pupil), reference)
         if not (self.spots.lit_fraction > 0).all():
-            dark = np.rad2deg(self.fields[self.spots.lit_fraction <= 0][0])
-            raise DomainError(f"field = ({dark[0]:.6g}, {dark[1]:.6g}) deg: no light passes; expected a lit pupil")
-        principal = principal_rays(
-            telescope, self.fields, self.waves[len(self.waves) // 2], projection=projection, threads=threads
-        )
-        self.plate_scale = principal.mean_plate_scale
-        self.airy_radius = 1.22 * self.waves[len(self.waves) // 2] * principal.mean_f_number
+            dark = request.fields[self.spots.lit_fraction <= 0][0]
+            raise DomainError(f"{field_label(dark)}: no light passes; expected a lit pupil")
         #: Range of direction cosines across the pupil: the largest of all fields and directions.
-        self.range_of_cosines = range_of_cosines(telescope, principal)
-        self.wave_over_range = float(self.waves.min()) / self.range_of_cosines
+        self.range_of_cosines = range_of_cosines(principal_rays_of(request))
+        self.wave_over_range = float(request.wavelengths.min()) / self.range_of_cosines
         #: Extent of the spots about the middle of the images [m].
         self.spread = 2.0 * spot_reach(self.spots)
         if pixel is None:
@@ -256,49 +225,48 @@ class _Plan:
         self,
         method: str,
         waves: Callable[[np.ndarray, float, np.ndarray], tuple[Wavelets, _Sum]],
-        pupil_points: int,
+        n_pupil: int,
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
+        """Return the images of all field points from a function that returns wavelets and their sum."""
         axis = pixel_axis(self.pixel, self.pixels)
-        images, light, strehl = [], [], []
-        for field, center in zip(self.fields, self.spots.reference, strict=True):
+        images, lit, strehl = [], [], []
+        for field, center in zip(self.request.fields, self.spots.reference_point, strict=True):
             found: list[tuple[float, Wavelets, _Sum]] = []
             total = np.zeros((self.pixels, self.pixels))
-            for wavelength, share in zip(self.waves, self.shares, strict=True):
+            for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):
                 wavelets, irradiance = waves(field, float(wavelength), center)
-                found.append((float(share), wavelets, irradiance))
-                total += share * irradiance(axis, axis)
+                found.append((float(weight), wavelets, irradiance))
+                total += weight * irradiance(axis, axis)
                 if progress is not None:
                     progress(1)
-            whole = sum(share * wavelets.light for share, wavelets, _ in found)
-            perfect = sum(share * wavelets.perfect_peak for share, wavelets, _ in found)
+            whole = sum(weight * wavelets.lit_fraction for weight, wavelets, _ in found)
+            perfect = sum(weight * wavelets.perfect_peak for weight, wavelets, _ in found)
             images.append(total * self.pixel**2 / whole)
-            light.append(whole)
+            lit.append(whole)
             strehl.append(self._peak(found, total) / perfect)
         return DiffractionPsf(
-            telescope=self.telescope.name,
+            request=self.request,
             method=method,
-            fields=self.fields,
-            wavelengths=self.waves,
             image=np.stack(images),
             pixel=self.pixel,
-            reference=self.spots.reference,
-            light=np.array(light),
+            reference_point=self.spots.reference_point,
+            lit_fraction=np.array(lit),
             strehl=np.array(strehl),
-            airy_radius=self.airy_radius,
-            plate_scale=self.plate_scale,
-            pupil_points=pupil_points,
+            airy_radius=self.spots.airy_radius,
+            plate_scale=self.spots.plate_scale,
+            n_pupil=n_pupil,
         )
 
     def _peak(self, found: Sequence[tuple[float, Wavelets, _Sum]], image: np.ndarray) -> float:
         """Return the highest irradiance of the image [1/m^2]."""
 
         def irradiance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-            return np.asarray(sum(share * at(x, y) for share, _, at in found))
+            return np.asarray(sum(weight * at(x, y) for weight, _, at in found))
 
         axis, step = pixel_axis(self.pixel, self.pixels), self.pixel
         if step > self.wave_over_range / _PEAK:
-            # Pixels too coarse to show it: look at more places.
+            # The pixels are too coarse for the peak.
             half = 0.5 * self.pixel * self.pixels
             axis = np.linspace(-half, half, min(int(2.0 * half / self.wave_over_range * _PEAK) + 2, _MOST_PLACES))
             step, image = float(axis[1] - axis[0]), irradiance(axis, axis)

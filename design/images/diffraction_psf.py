@@ -10,12 +10,13 @@ from scipy.ndimage import zoom
 
 from ...core.plotting import new_figure, styled
 from ..drawing import draw_circle, draw_scale_bar, field_colors, field_text, round_length
+from ..result import FieldResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Images are interpolated to so many times as many pixels for their widths.
+#: Widths are measured on images with so many times as many pixels, interpolated.
 _FINER = 4
 #: Decades below the brightest pixel that the plot shows.
 _DECADES = 4.0
@@ -24,50 +25,41 @@ _MOST = 5
 
 
 @dataclass(frozen=True)
-class DiffractionPsf:
+class DiffractionPsf(FieldResult):
     """Diffraction images of several field points, all wavelengths together.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
     method : {"fft", "huygens"}
-        How the images were made.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
+        Fourier sum or Huygens' wavelets.
     image : ndarray, shape [n_field, ny, nx]
-        Part of the light of the image that falls on each pixel, sampled at its centre; [y, x], y up. The sum falls
-        short of 1 by what falls beside.
+        Fraction of the light of the image on each pixel, sampled at its centre; [y, x], y up. The sum is less than 1 by
+        the light outside.
     pixel : float
         Distance of pixel centres [m].
-    reference : ndarray, shape [n_field, 2]
-        Detector coordinates [m] of the middle of the images.
-    light : ndarray, shape [n_field]
-        Part of the entrance pupil that is lit, mean over the wavelengths.
+    reference_point : ndarray, shape [n_field, 2]
+        Middle of the images on the detector [m].
+    lit_fraction : ndarray, shape [n_field]
+        Fraction of the entrance pupil that is lit, mean over the wavelengths.
     strehl : ndarray, shape [n_field]
-        Peak of the image over that of the same light with all wavefronts perfect and together.
+        Peak of the image over that of the same light with perfect wavefronts.
     airy_radius : ndarray, shape [n_field]
         Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m].
     plate_scale : ndarray, shape [n_field]
         Angle on the sky over length on the detector [rad/m].
-    pupil_points : int
+    n_pupil : int
         Points across the pupil.
     """
 
-    telescope: str
     method: str
-    fields: np.ndarray
-    wavelengths: np.ndarray
     image: np.ndarray
     pixel: float
-    reference: np.ndarray
-    light: np.ndarray
+    reference_point: np.ndarray
+    lit_fraction: np.ndarray
     strehl: np.ndarray
     airy_radius: np.ndarray
     plate_scale: np.ndarray
-    pupil_points: int
+    n_pupil: int
 
     @property
     def axis(self) -> np.ndarray:
@@ -76,19 +68,20 @@ class DiffractionPsf:
 
     @property
     def inside(self) -> np.ndarray:
-        """Part of the light that falls within each image, shape [n_field]."""
+        """Fraction of the light within each image, shape [n_field]."""
         return self.image.sum(axis=(1, 2))
 
     @property
     def centroid(self) -> np.ndarray:
         """Centroid of each image relative to its middle [m], x and y, shape [n_field, 2]."""
-        return np.stack([self.image.sum(axis=1) @ self.axis, self.image.sum(axis=2) @ self.axis], -1) / self._inside
+        x, y = self.image.sum(axis=1) @ self.axis, self.image.sum(axis=2) @ self.axis
+        return np.stack([x, y], axis=-1) / self.inside[:, None]
 
     @property
     def rms_radius(self) -> np.ndarray:
         """Root mean square distance of the light within each image from its centroid [m], shape [n_field].
 
-        The wings of a diffraction image fall off as the cube of the distance, so that it grows with the image.
+        It grows with the size of the image, as the wings fall off with the cube of the distance.
         """
         square = np.add.outer(self.axis**2, self.axis**2)
         mean = np.einsum("fyx,yx->f", self.image, square) / self.inside
@@ -96,27 +89,23 @@ class DiffractionPsf:
 
     @property
     def fwhm(self) -> np.ndarray:
-        """Diameter of a disc as large as the part of each image above half its peak [m], shape [n_field]."""
+        """Diameter of a disc with the area above half the peak of each image [m], shape [n_field]."""
         finer = zoom(self.image, (1, _FINER, _FINER), order=3, mode="nearest", grid_mode=True)
         above = (finer > 0.5 * finer.max(axis=(1, 2), keepdims=True)).sum(axis=(1, 2))
         return 2.0 * self.pixel / _FINER * np.sqrt(above / np.pi)
 
-    @property
-    def _inside(self) -> np.ndarray:
-        return self.inside[:, None]
-
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
+        """Return the results by name and unit; lists run over the fields."""
         arcsec = np.rad2deg(self.plate_scale) * 3600.0
         return {
             "telescope": self.telescope,
             "method": self.method,
             "wavelength_nm": self.wavelengths * 1e9,
-            "pupil_points": self.pupil_points,
+            "pupil_points": self.n_pupil,
             "pixel_um": self.pixel * 1e6,
             "pixels": self.image.shape[-1],
             "field_deg": np.rad2deg(self.fields),
-            "reference_mm": self.reference * 1e3,
+            "reference_mm": self.reference_point * 1e3,
             "strehl": self.strehl,
             "fwhm_um": self.fwhm * 1e6,
             "fwhm_arcsec": self.fwhm * arcsec,
@@ -124,7 +113,7 @@ class DiffractionPsf:
             "airy_radius_um": self.airy_radius * 1e6,
             "airy_radius_arcsec": self.airy_radius * arcsec,
             "light_inside": self.inside,
-            "lit_fraction": self.light,
+            "lit_fraction": self.lit_fraction,
             "plate_scale_arcsec_per_um": arcsec * 1e-6,
         }
 
@@ -149,9 +138,8 @@ class DiffractionPsf:
             _whiten(panels[0])
             key = above.colorbar(image, ax=list(panels), shrink=0.85, pad=0.015, aspect=30)
             key.set_label("light over that of\nthe brightest pixel")
-            waves = ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths)
             way = "Fourier sum" if self.method == "fft" else "Huygens' wavelets"
-            figure.suptitle(f"{self.telescope}: diffraction images, {waves} nm ({way})", fontsize=11)
+            figure.suptitle(f"{self.telescope}: diffraction images, {self._nanometres()} ({way})", fontsize=11)
             _draw_cuts(below.subplots(1, 2, sharey=True), self)
             return figure
 
@@ -177,7 +165,7 @@ def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
     axes.set(xticks=[], yticks=[])
     axes.set_title(field_text(psf.fields[i]), fontsize=9.5)
     fwhm = psf.fwhm[i]
-    lit = "" if psf.light[i] > 0.995 else f"lit {100 * psf.light[i]:.1f} % of the pupil"
+    lit = "" if psf.lit_fraction[i] > 0.995 else f"lit {100 * psf.lit_fraction[i]:.1f} % of the pupil"
     axes.set_xlabel(
         f'Strehl {psf.strehl[i]:.3g}\nFWHM {fwhm * 1e6:.3g} µm = {fwhm * _arcsec(psf, i):.2g}"\n{lit}', fontsize=7.5
     )

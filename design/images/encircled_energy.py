@@ -1,4 +1,4 @@
-"""Encircled energy: how much of a star's light falls within a circle, of rays alone or with diffraction."""
+"""Encircled energy: fraction of the light of a star within a circle, of rays alone or with diffraction."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import zoom
 
 from ...core.errors import ConfigError, DomainError
@@ -16,71 +17,63 @@ from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ..drawing import FEW, field_colors, field_text, second_scale
 from ..metrics.spots import SpotDiagram, spots
+from ..result import FieldResult
 from .diffraction import DiffractionPsf, fft_psf
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A pixel is cut into so many parts along each axis to find what of it is within a circle.
+#: Parts of a pixel along each axis, for the fraction of it within a circle.
 _PARTS = 4
-#: Diffraction images are interpolated to so many times as many pixels, which their band limit allows.
+#: Diffraction images are interpolated to so many times as many pixels along each axis; they are band-limited.
 _FINER = 3
-#: Radii of a curve where none are given.
+#: Default number of radii.
 _RADII = 301
-#: Pixels on a side of the images that curves with diffraction are taken from.
+#: Pixels on a side of the diffraction images.
 _PIXELS = 256
 KINDS = ("diffraction", "geometric")
 
 
 @dataclass(frozen=True)
-class EncircledEnergy:
+class EncircledEnergy(FieldResult):
     """Encircled energy of several field points, all wavelengths together.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
     kind : {"diffraction", "geometric"}
         With diffraction, or of rays alone.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
     radius : ndarray, shape [n_radius]
         Radii about the centroid of the rays, or the chief ray, from zero [m].
     fraction : ndarray, shape [n_field, n_radius]
-        Part of the light of the image within each.
+        Fraction of the light of the image within each radius.
     plate_scale : ndarray, shape [n_field]
         Angle on the sky over length on the detector [rad/m].
     """
 
-    telescope: str
     kind: str
-    fields: np.ndarray
-    wavelengths: np.ndarray
     radius: np.ndarray
     fraction: np.ndarray
     plate_scale: np.ndarray
 
-    def radius_holding(self, share: float) -> np.ndarray:
-        """Return the radius that holds a share of the light [m], shape [n_field]; NaN where the curve ends before."""
-        if not 0 < share < 1:
-            raise DomainError(f"share = {share!r}: expected a number between 0 and 1")
-        found = np.array([_crossing(row, self.radius, share) for row in self.fraction])
-        return np.where(self.fraction[:, -1] >= share, found, np.nan)
+    def radius_holding(self, fraction: float) -> np.ndarray:
+        """Return the radius that holds a fraction of the light [m], shape [n_field]; NaN beyond the curve."""
+        if not 0 < fraction < 1:
+            raise DomainError(f"fraction = {fraction!r}: expected a number between 0 and 1")
+        found = np.array([_crossing(row, self.radius, fraction) for row in self.fraction])
+        return np.where(self.fraction[:, -1] >= fraction, found, np.nan)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
+        """Return the results by name and unit; lists run over the fields."""
         arcsec = np.rad2deg(self.plate_scale) * 3600.0
-        shares = {f"ee{round(100 * share)}_radius": self.radius_holding(share) for share in (0.5, 0.8, 0.9)}
+        radii = {f"ee{round(100 * part)}_radius": self.radius_holding(part) for part in (0.5, 0.8, 0.9)}
         return {
             "telescope": self.telescope,
             "kind": self.kind,
             "wavelength_nm": self.wavelengths * 1e9,
             "field_deg": np.rad2deg(self.fields),
-            **{f"{name}_um": value * 1e6 for name, value in shares.items()},
-            **{f"{name}_arcsec": value * arcsec for name, value in shares.items()},
+            **{f"{name}_um": value * 1e6 for name, value in radii.items()},
+            **{f"{name}_arcsec": value * arcsec for name, value in radii.items()},
             "plate_scale_arcsec_per_um": arcsec * 1e-6,
             "radius_um": self.radius * 1e6,
             "fraction": self.fraction,
@@ -92,25 +85,24 @@ class EncircledEnergy:
             figure = new_figure(10.0, 4.2)
             left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
             _draw_curves(left, self)
-            _draw_shares(right, self)
+            _draw_radii(right, self)
             kind = "with diffraction" if self.kind == "diffraction" else "of rays alone"
-            waves = ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths)
-            figure.suptitle(f"{self.telescope}: encircled energy {kind}, {waves} nm", fontsize=11)
+            figure.suptitle(f"{self.telescope}: encircled energy {kind}, {self._nanometres()}", fontsize=11)
             return figure
 
 
 def encircled_energy(
     telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
     *,
     kind: str = "diffraction",
     radii: Any = None,
-    wavelength_weights: Any = None,
+    wavelength_weights: ArrayLike | None = None,
     reference: str = "centroid",
     sampling: str | PupilSampling = "spiral",
     pixels: int = _PIXELS,
-    pupil_points: int | None = None,
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -119,37 +111,30 @@ def encircled_energy(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelengths : array_like or Quantity, shape [n_wave], optional
-        Vacuum wavelengths [m]; the telescope's own by default.
+    telescope, fields, wavelengths, wavelength_weights, projection, threads
+        As in :meth:`pachon.Request.of`.
     kind : {"diffraction", "geometric"}
         From diffraction images (:func:`~pachon.design.images.diffraction.fft_psf`), or of the rays alone.
     radii : array_like or Quantity, shape [n_radius], optional
         Radii [m], ascending; by default from zero to the edge of the images, or beyond the farthest ray.
-    wavelength_weights : array_like, shape [n_wave], optional
-        Relative amounts of light; equal by default.
     reference : {"centroid", "chief"}
         Centre of the circles: the centroid of the rays, or the chief ray of the middle wavelength.
     sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Points of the pupil, for "geometric": on a spiral no two rays are alike, so that the curves are smooth.
-    pixels, pupil_points : int, optional
-        As for :func:`~pachon.design.images.diffraction.fft_psf`, for "diffraction".
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads for tracing; all processors by default.
+        Pupil points of "geometric"; on a spiral all radii differ, so that the curves are smooth.
+    pixels : int
+        Pixels on a side of the images of "diffraction".
+    n_pupil : int, optional
+        Number of pupil points, as in :func:`~pachon.design.images.diffraction.fft_psf` ("diffraction") or in
+        :meth:`pachon.Request.of` ("geometric").
     progress : callable, optional
-        Called with the number of images finished since the last call, for "diffraction".
+        Called with the number of pairs of field and wavelength done since the last call ("diffraction").
 
     Raises
     ------
     ConfigError
-        If kind, reference, sampling or projection is unknown.
+        If kind or reference is unknown.
     DomainError
-        If something is out of range, or no light passes.
+        If radii do not ascend, or no light passes.
     """
     if kind not in KINDS:
         raise ConfigError(f"kind = {kind!r}: expected one of {', '.join(KINDS)}")
@@ -158,33 +143,16 @@ def encircled_energy(
         given.ndim == 1 and np.isfinite(given).all() and (given >= 0).all() and (np.diff(given) > 0).all()
     ):
         raise DomainError(f"radii of shape {given.shape}: expected ascending lengths from 0, shape [n]")
-    if kind == "geometric":
-        return _geometric(
-            spots(
-                telescope,
-                fields,
-                wavelengths,
-                wavelength_weights=wavelength_weights,
-                sampling=sampling,
-                reference=reference,
-                projection=projection,
-                threads=threads,
-            ),
-            given,
-        )
-    psf = fft_psf(
-        telescope,
-        fields,
-        wavelengths,
+    common: dict[str, Any] = dict(
         wavelength_weights=wavelength_weights,
-        pixels=pixels,
-        pupil_points=pupil_points,
+        n_pupil=n_pupil,
         reference=reference,
         projection=projection,
         threads=threads,
-        progress=progress,
     )
-    return energy_of_psf(psf, given)
+    if kind == "geometric":
+        return _geometric(spots(telescope, fields, wavelengths, sampling=sampling, **common), given)
+    return energy_of_psf(fft_psf(telescope, fields, wavelengths, pixels=pixels, progress=progress, **common), given)
 
 
 def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:
@@ -206,23 +174,21 @@ def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> Encir
     radius = np.linspace(0.0, edge, _RADII) if radii is None else radii
     if radius[-1] > edge * (1 + 1e-9):
         raise DomainError(f"radii to {radius[-1] * 1e6:.6g} um: expected at most {edge * 1e6:.6g} um, the images' edge")
-    # The place of the middle pixel's centre among the finer ones.
+    # The centre of the middle pixel among the finer ones.
     middle = (psf.image.shape[-1] // 2 + 0.5) * _FINER - 0.5
     rows = []
     for image in psf.image:
-        # Pixels are samples at points: squares of even light would blur the image.
+        # Pixels are samples at points; squares of uniform light would blur the image.
         finer = zoom(image, _FINER, order=5, mode="nearest", grid_mode=True) / _FINER**2
         at, within = energy_curve(finer, center=(middle, middle), parts=1)
         rows.append(np.interp(radius, at * psf.pixel / _FINER, within))
-    return EncircledEnergy(
-        psf.telescope, "diffraction", psf.fields, psf.wavelengths, radius, np.stack(rows), psf.plate_scale
-    )
+    return EncircledEnergy(psf.request, "diffraction", radius, np.stack(rows), psf.plate_scale)
 
 
 def energy_curve(
     image: np.ndarray, center: tuple[float, float] | None = None, *, parts: int = _PARTS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the light within circles on an image, light being even within a pixel.
+    """Return the light within circles on an image, uniform within a pixel.
 
     Parameters
     ----------
@@ -231,7 +197,7 @@ def energy_curve(
     center : (x, y), optional
         Centre of the circles [pixels from the centre of the first one]; the centroid of the image by default.
     parts : int
-        Parts that a pixel is cut into along each axis.
+        Parts of a pixel along each axis.
 
     Returns
     -------
@@ -243,7 +209,7 @@ def energy_curve(
     Raises
     ------
     DomainError
-        If the image is not finite, or the centroid is asked for and there is no light.
+        If the image is not finite, or there is no light for a centroid.
     """
     light = np.asarray(image, dtype=np.float64)
     if light.ndim != 2 or not np.isfinite(light).all():
@@ -259,7 +225,7 @@ def energy_curve(
     squared = np.add.outer(along**2, across**2).ravel()
     order = np.argsort(squared, kind="stable")
     each = np.repeat(np.repeat(light / parts**2, parts, axis=0), parts, axis=1).ravel()[order]
-    # A part stands in the middle of its own light.
+    # Each part stands in the middle of its own light.
     within = np.cumsum(each) - 0.5 * each
     return np.concatenate([[0.0], np.sqrt(squared[order])]), np.concatenate([[0.0], within])
 
@@ -278,24 +244,16 @@ def _geometric(diagram: SpotDiagram, radii: np.ndarray | None) -> EncircledEnerg
         # A ray stands in the middle of the light that it carries.
         within = (np.cumsum(each) - 0.5 * each) / each.sum() if len(each) else np.zeros(0)
         rows.append(np.interp(radius, at[lit][order], within, left=0.0, right=1.0) if len(each) else np.nan * radius)
-    return EncircledEnergy(
-        diagram.telescope,
-        "geometric",
-        diagram.fields,
-        diagram.wavelengths,
-        radius,
-        np.stack(rows),
-        diagram.plate_scale,
-    )
+    return EncircledEnergy(diagram.request, "geometric", radius, np.stack(rows), diagram.plate_scale)
 
 
-def _crossing(fraction: np.ndarray, radius: np.ndarray, share: float) -> float:
-    """Return where a curve that does not fall reaches a share, straight between two points."""
-    k = int(np.argmax(fraction >= share))
+def _crossing(fraction: np.ndarray, radius: np.ndarray, wanted: float) -> float:
+    """Return where a rising curve reaches a fraction, linear between two points."""
+    k = int(np.argmax(fraction >= wanted))
     if k == 0:
         return float(radius[0])
     low, high = fraction[k - 1], fraction[k]
-    return float(radius[k - 1] + (share - low) / (high - low) * (radius[k] - radius[k - 1]))
+    return float(radius[k - 1] + (wanted - low) / (high - low) * (radius[k] - radius[k - 1]))
 
 
 def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
@@ -303,33 +261,33 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
     colors = field_colors(len(result.fields))
     for field, row, color in zip(result.fields, result.fraction, colors, strict=True):
         axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=field_text(field) if few else None)
-    for share in (0.5, 0.8):
-        axes.axhline(share, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
-        axes.annotate(f"{100 * share:.0f} %", (1.0, share), xycoords=("axes fraction", "data"), xytext=(-3, 2),
+    for part in (0.5, 0.8):
+        axes.axhline(part, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
+        axes.annotate(f"{100 * part:.0f} %", (1.0, part), xycoords=("axes fraction", "data"), xytext=(-3, 2),
                       textcoords="offset points", ha="right", fontsize=7.5, color="0.4")  # fmt: skip
-    # Where the light of every field has come in, the rest is a flat line.
+    # Beyond the light of every field the curves are flat.
     full = np.flatnonzero((result.fraction >= 0.985).all(axis=0))
     edge = result.radius[full[0]] if len(full) else result.radius[-1]
     axes.set(xlim=(0.0, max(edge, 0.25 * result.radius[-1]) * 1e6), ylim=(0.0, 1.02))
     axes.set_xlabel("radius about the centroid of the rays [µm]")
-    axes.set_ylabel("share of the light within")
+    axes.set_ylabel("fraction of the light within")
     axes.grid(True, color="0.92", linewidth=0.6)
     second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
     if few:
         axes.legend(loc="lower right")
 
 
-def _draw_shares(axes: Axes, result: EncircledEnergy) -> None:
-    away = np.rad2deg(np.linalg.norm(result.fields, axis=-1))
+def _draw_radii(axes: Axes, result: EncircledEnergy) -> None:
+    away = np.rad2deg(result.off_axis_angle)
     order = np.argsort(away, kind="stable")
     scale = np.rad2deg(result.plate_scale) * 3600.0
-    for share, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
-        radius = result.radius_holding(share) * scale
+    for part, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
+        radius = result.radius_holding(part) * scale
         axes.plot(
-            away[order], radius[order], "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * share:.0f} %"
+            away[order], radius[order], "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * part:.0f} %"
         )
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("distance from the axis [deg]")
-    axes.set_ylabel("radius that holds the share [arcsec]")
+    axes.set_ylabel("radius that holds the fraction [arcsec]")
     axes.grid(True, color="0.92", linewidth=0.6)
     axes.legend(loc="best", ncols=3)

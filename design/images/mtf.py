@@ -1,12 +1,12 @@
-r"""Modulation transfer: how much contrast of a sine pattern the telescope keeps, against its spatial frequency.
+r"""Modulation transfer function: contrast of a sinusoidal pattern in the image against spatial frequency.
 
 The optical transfer function is the autocorrelation of the pupil in direction cosines: at the frequency f it is the
 overlap of the wave in the pupil with itself, shifted by the wavelength times f. The lattices of all wavelengths
-(:mod:`~pachon.design.images.wavelets`) have spacings in proportion to the wavelength, so that they all give the same
-frequencies, and their transfer functions, which are complex, add up to that of all the light.
+(:mod:`~pachon.design.images.wavelets`) have spacings in proportion to the wavelength, so the frequencies are the same
+and the complex transfer functions add up to that of all the light.
 
-Tangential is modulation along the direction in which the image moves as the star goes away from the axis; sagittal is
-across it.
+Tangential modulation is along the direction in which the image of a star moves with its distance from the axis;
+sagittal modulation is across it.
 """
 
 from __future__ import annotations
@@ -17,45 +17,40 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.fft
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, new_figure, styled
 from ...models.telescope import Telescope
-from ...wavefront.request import field_points, relative_weights, wavelength_points
+from ...wavefront.request import Request
 from ..drawing import field_text, second_scale
-from ..metrics.principal_rays import PrincipalRays, principal_rays
-from ..metrics.spots import spots
+from ..metrics.principal_rays import PrincipalRays, principal_rays_of
+from ..metrics.spots import spot_diagram
+from ..result import FieldResult
 from .wavelets import lattice_wavelets, range_of_cosines, spot_reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_ACROSS = 256
 #: Panels in a row.
 _MOST = 3
 
 
 @dataclass(frozen=True)
-class Mtf:
+class Mtf(FieldResult):
     """Modulation transfer of several field points, all wavelengths together.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
     frequency : ndarray, shape [n_frequency]
         Spatial frequencies on the detector, from zero [cycles/m].
     tangential, sagittal : ndarray, shape [n_field, n_frequency]
         Modulation transfer, 1 at zero.
     tangential_limit, sagittal_limit : ndarray, shape [n_field, n_frequency]
-        The same of the same pupils, vignetting included, with perfect wavefronts.
+        Modulation transfer of the same pupils, vignetting included, with perfect wavefronts.
     geometric_tangential, geometric_sagittal : ndarray, shape [n_field, n_frequency]
-        The same of the rays alone, without diffraction.
+        Modulation transfer of the rays alone, without diffraction.
     f_number : ndarray, shape [n_field, 2]
         Focal ratios, tangential and sagittal; the cut-off is 1 / (wavelength f_number).
     plate_scale : ndarray, shape [n_field, 2]
@@ -64,9 +59,6 @@ class Mtf:
         Inner over outer diameter of the entrance pupil.
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelengths: np.ndarray
     frequency: np.ndarray
     tangential: np.ndarray
     sagittal: np.ndarray
@@ -80,24 +72,22 @@ class Mtf:
 
     @property
     def cutoff(self) -> np.ndarray:
-        """Frequencies beyond which the shortest wavelength leaves nothing [cycles/m], tangential and sagittal."""
+        """Cut-off frequencies of the shortest wavelength [cycles/m], tangential and sagittal, shape [n_field, 2]."""
         return 1.0 / (self.wavelengths.min() * self.f_number)
 
     def frequency_at(self, contrast: float) -> np.ndarray:
         """Return the lowest frequency at which the contrast falls to a value [cycles/m], shape [n_field, 2].
 
-        Tangential and sagittal; NaN where the contrast never falls so far.
+        Tangential and sagittal; NaN where the contrast stays above it.
         """
         if not 0 < contrast < 1:
             raise DomainError(f"contrast = {contrast!r}: expected a number between 0 and 1")
-        return np.stack([[_falls_to(row, self.frequency, contrast) for row in m] for m in self._both], axis=-1)
-
-    @property
-    def _both(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.tangential, self.sagittal
+        return np.stack(
+            [[_falls_to(row, self.frequency, contrast) for row in m] for m in (self.tangential, self.sagittal)], axis=-1
+        )
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; pairs are tangential, sagittal; lists run over the fields."""
+        """Return the results by name and unit; pairs are tangential, sagittal; lists run over the fields."""
         arcsec = np.rad2deg(self.plate_scale) * 3600.0
         half = self.frequency_at(0.5)
         return {
@@ -140,18 +130,17 @@ class Mtf:
                     axes.tick_params(labelbottom=True)
             handles, labels = panels[0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside lower center", ncols=3 if columns > 1 else 2)
-            waves = ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths)
-            figure.suptitle(f"{self.telescope}: modulation transfer, {waves} nm", fontsize=11)
+            figure.suptitle(f"{self.telescope}: modulation transfer, {self._nanometres()}", fontsize=11)
             return figure
 
 
 def mtf(
     telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
     *,
-    wavelength_weights: Any = None,
-    pupil_points: int = _ACROSS,
+    wavelength_weights: ArrayLike | None = None,
+    n_pupil: int = 256,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -160,52 +149,37 @@ def mtf(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelengths : array_like or Quantity, shape [n_wave], optional
-        Vacuum wavelengths [m]; the telescope's own by default.
-    wavelength_weights : array_like, shape [n_wave], optional
-        Relative amounts of light in front of the telescope; equal by default.
-    pupil_points : int
+    telescope, fields, wavelengths, wavelength_weights, projection, threads
+        As in :meth:`pachon.Request.of`.
+    n_pupil : int
         Lattice points across the pupil at the shortest wavelength, and so about the number of frequencies.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads for tracing; all processors by default.
     progress : callable, optional
-        Called with the number of images finished since the last call.
+        Called with the number of pairs of field and wavelength done since the last call.
 
     Raises
     ------
-    ConfigError
-        If the projection is unknown.
     DomainError
-        If something is out of range, no light passes, or the lattice is too coarse for the spots.
+        If no light passes, or the lattice is too coarse for the spots.
     """
-    if int(pupil_points) != pupil_points or pupil_points < 16:
-        raise DomainError(f"pupil_points = {pupil_points!r}: expected a whole number of at least 16")
-    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    shares = relative_weights(wavelength_weights, len(waves))
-    middle = waves[len(waves) // 2]
-    principal = principal_rays(telescope, points, middle, projection=projection, threads=threads)
-    diagram = spots(
-        telescope, points, waves, wavelength_weights=wavelength_weights, projection=projection, threads=threads
+    if int(n_pupil) != n_pupil or n_pupil < 16:
+        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 16")
+    request = Request.of(
+        telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
-    step = range_of_cosines(telescope, principal) / float(waves.min()) / int(pupil_points)
+    principal, diagram = principal_rays_of(request), spot_diagram(request)
+    step = range_of_cosines(principal) / float(request.wavelengths.min()) / int(n_pupil)
     reach = spot_reach(diagram)
     if 2.0 * reach * step > 1.0:
         raise DomainError(
-            f"pupil_points = {pupil_points}: too few for spots of {2e6 * reach:.4g} um; "
-            f"expected at least {int(np.ceil(2.0 * reach * step * pupil_points))}"
+            f"n_pupil = {n_pupil}: too few for spots of {2e6 * reach:.4g} um; "
+            f"expected at least {int(np.ceil(2.0 * reach * step * n_pupil))}"
         )
-    frequency = np.arange(int(pupil_points) + 1) * step
+    frequency = np.arange(int(n_pupil) + 1) * step
     angles = tangential_angle(telescope, principal)
-    shape = (2, len(points), len(frequency))
+    shape = (2, len(request.fields), len(frequency))
     transfer, perfect, rays = np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, complex)
-    for i, (field, center, angle) in enumerate(zip(points, diagram.reference, angles, strict=True)):
-        for wavelength, share in zip(waves, shares, strict=True):
+    for i, (field, center, angle) in enumerate(zip(request.fields, diagram.reference_point, angles, strict=True)):
+        for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             found = lattice_wavelets(
                 telescope,
                 field,
@@ -219,21 +193,19 @@ def mtf(
             for total, pupil in ((transfer, found.wavelets.field), (perfect, np.abs(found.wavelets.field))):
                 for axis in (0, 1):
                     overlap = _overlap(pupil if axis == 0 else pupil.T, len(frequency))
-                    # Where a rim leaves part of a cell, the square of the part is too little light.
-                    overlap[0] = found.wavelets.light * (found.spacing / wavelength) ** 2
-                    total[axis, i] += share * overlap
+                    # The square of the lit fraction of a cell on the rim is too little light.
+                    overlap[0] = found.wavelets.lit_fraction * (found.spacing / wavelength) ** 2
+                    total[axis, i] += weight * overlap
             if progress is not None:
                 progress(1)
         directions = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        place = np.where(diagram.weight[i][..., None] > 0, diagram.displacement[i], 0.0) @ directions.T
+        offset = np.where(diagram.weight[i][..., None] > 0, diagram.displacement[i], 0.0) @ directions.T
         for axis in (0, 1):
-            phase = np.exp(-2j * np.pi * np.multiply.outer(frequency, place[..., axis].ravel()))
+            phase = np.exp(-2j * np.pi * np.multiply.outer(frequency, offset[..., axis].ravel()))
             rays[axis, i] = phase @ diagram.weight[i].ravel()
     contrast, limit, geometric = (np.abs(v) / np.abs(v[..., :1]) for v in (transfer, perfect, rays))
     return Mtf(
-        telescope=telescope.name,
-        fields=points,
-        wavelengths=waves,
+        request=request,
         frequency=frequency,
         tangential=contrast[0],
         sagittal=contrast[1],
@@ -272,7 +244,7 @@ def annulus_mtf(frequency: np.ndarray, obscuration: float) -> np.ndarray:
 
 
 def _discs(shift: np.ndarray, large: float, small: float) -> np.ndarray:
-    """Return the area that two discs share whose centres are twice a shift apart."""
+    """Return the common area of two discs whose centres are twice a shift apart."""
     d = 2.0 * np.abs(shift)
     part = np.clip(d, max(large - small, 1e-300), large + small)
     a = np.arccos(np.clip((part**2 + large**2 - small**2) / (2.0 * part * large), -1.0, 1.0))

@@ -1,20 +1,19 @@
 r"""Wavelets: the plane waves, one for each ray, whose sum is the light on the detector.
 
-Near the image a ray stands for a plane wave. At the place X of the detector, counted from a reference point C, all of
-them add up to the field
+Near the image a ray stands for a plane wave. At the point X of the detector, relative to a reference point C, their sum
+is the field
 
 .. math:: U(X) = \frac{1}{\lambda} \sum_k a_k \, e^{-i k w_k} \, e^{i k X \cdot c_k},
 
-with the optical path difference :math:`w_k` at C (path of the chief ray minus path of the ray, so that a wave that
-leads has a positive one), and the cosines :math:`c_k` of the ray along the detector, less the chief ray's and times the
-refractive index there. The pattern is exact as long as rays meet the detector within some millimetres of C. A ray that
-carries the part :math:`e_k` of the light and fills the area :math:`\omega_k` of cosines has the amplitude
-:math:`a_k = \sqrt{e_k \omega_k}`; the integral of :math:`|U|^2` over the detector is then the light that the pupil lets
-through (Parseval).
+with the optical path difference :math:`w_k` at C (path of the chief ray minus path of the ray), and the direction
+cosines :math:`c_k` of the ray along the detector, relative to the chief ray and times the refractive index. The sum is
+exact as long as rays meet the detector within some millimetres of C. A ray that carries the fraction :math:`e_k` of the
+light and fills the area :math:`\omega_k` of cosines has the amplitude :math:`a_k = \sqrt{e_k \omega_k}`; the integral
+of :math:`|U|^2` over the detector is then the light that passes the pupil (Parseval).
 
-Rays may go through any points of the entrance pupil (Huygens), or be aimed so that their cosines lie on a square
-lattice (Fourier). The distances of the lattice say how the cosines are sampled exactly: no distortion of the pupil,
-no anamorphism and no skew of the exit pupil has to be put right afterwards.
+Rays may pass through any points of the entrance pupil (Huygens), or be aimed so that their cosines lie on a square
+lattice (Fourier). On the lattice the sampling of the cosines is exact: distortion, anamorphism and skew of the exit
+pupil need no correction.
 """
 
 from __future__ import annotations
@@ -25,46 +24,46 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...wavefront.bundles import Bundles, trace_bundles
 from ...wavefront.pupil_sampling import PupilSampling, ring_annulus
 from ..metrics.principal_rays import PrincipalRays
 from ..metrics.spots import SpotDiagram
 
-#: Degree of the polynomials that the search for aimed rays starts from; they give the Jacobian too.
+#: Degree of the polynomials that start the search for aimed rays and give the Jacobian.
 _DEGREE = 7
 #: Rings of rays that those polynomials are fitted to.
 _RINGS = 14
-#: Rays that are stopped are believed as long as they are no farther off a linear map than so many times what light is.
+#: Largest deviation of vignetted rays from a linear map, in units of that of lit rays, for the fit to include them.
 _ASTRAY = 2.0
-#: How far cosines may be off the lattice, in units of its spacing; phases at the edge of the image are off by pi times
-#: that at most.
+#: Tolerance of the cosines in units of the lattice spacing; phases at the edge of the image are off by pi times that.
 _AIM = 1e-4
 _MOST_TRACES = 8
-#: Cells that a rim crosses are cut into so many parts along each axis to find how much of them is lit.
+#: Parts of a cell along each axis where a rim crosses it, to find its lit fraction.
 _PARTS = 6
-#: Share of the light that images are made to hold, and how far beyond it they go.
+#: Fraction of the light that images hold by default, and their margin beyond it.
 _HELD, _BEYOND = 0.99, 1.1
 #: Range of direction cosines below which there is no focus.
 _PARALLEL = 1e-7
-#: Step of the derivative of the cosines by the place in the pupil, over the pupil's radius.
+#: Step of the derivative of the cosines with respect to the pupil point, over the radius of the pupil.
 _STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class Wavelets:
-    """Plane waves that make the image of one field point at one wavelength.
+    """Plane waves of the image of one field point at one wavelength.
 
     Attributes
     ----------
     cosine : ndarray, shape [..., 2]
-        Direction cosines along the detector, less the chief ray's, times the refractive index.
+        Direction cosines along the detector, relative to the chief ray, times the refractive index.
     opd : ndarray, shape [...]
         Path of the chief ray minus path of the ray [m], at the reference point.
     amplitude : ndarray, shape [...]
         Amplitudes `a`; zero where no light passes.
-    light : float
-        Part of the entrance pupil that is lit.
+    lit_fraction : float
+        Fraction of the entrance pupil that is lit.
     wavelength : float
         Vacuum wavelength [m].
     """
@@ -72,7 +71,7 @@ class Wavelets:
     cosine: np.ndarray
     opd: np.ndarray
     amplitude: np.ndarray
-    light: float
+    lit_fraction: float
     wavelength: float
 
     @property
@@ -82,7 +81,7 @@ class Wavelets:
 
     @property
     def perfect_peak(self) -> float:
-        """Irradiance at the peak if all wavelets were in phase, part of the light that enters per area [1/m^2]."""
+        """Irradiance at the peak with all wavelets in phase, fraction of the entering light per area [1/m^2]."""
         return float((self.amplitude.sum() / self.wavelength) ** 2)
 
 
@@ -97,7 +96,7 @@ class WaveletLattice:
     steps : ndarray, shape [n]
         Cosines along either axis of the lattice.
     spacing : float
-        Distance of lattice points.
+        Spacing of the lattice.
     """
 
     wavelets: Wavelets
@@ -147,7 +146,7 @@ def traced_wavelets(
         cosine=np.where(lit[:, None], here, 0.0),
         opd=np.where(lit, opd[: len(points)], 0.0),
         amplitude=amplitude,
-        light=float(sampling.weights[lit].sum()),
+        lit_fraction=float(sampling.weights[lit].sum()),
         wavelength=wavelength,
     )
 
@@ -165,8 +164,7 @@ def lattice_wavelets(
 ) -> WaveletLattice:
     """Return the wavelets of rays that are aimed at a square lattice of direction cosines on the detector.
 
-    What a rim leaves of a cell of the lattice is found from more rays there, and the amplitude of the cell goes down
-    with it.
+    Cells that a rim crosses are traced with more rays, for their lit fraction; their amplitude is in proportion to it.
 
     Parameters
     ----------
@@ -179,7 +177,7 @@ def lattice_wavelets(
     center : ndarray, shape [2]
         Reference point, x and y of the detector [m].
     spacing : float
-        Distance of the lattice points: the pattern repeats itself after wavelength / spacing.
+        Spacing of the lattice: the pattern repeats itself after wavelength / spacing.
     angle : float
         Angle from the x axis of the detector to the first axis of the lattice [rad].
     projection : str
@@ -193,12 +191,12 @@ def lattice_wavelets(
         If no light passes, or no ray has some of the directions: the map of the pupil to the image is not one to one.
     """
     radius = 0.5 * telescope.pupil_diameter
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
     def rays(points: np.ndarray) -> tuple[Bundles, np.ndarray, np.ndarray]:
         bundle = trace_bundles(telescope, field[None], wavelength, points, projection, threads)
         opd, cosine = _at_reference(telescope, bundle, center)
-        return bundle, opd, cosine @ turn
+        return bundle, opd, cosine @ rotation
 
     guess = _InverseMap(telescope, rays)
     n = 2 * int(np.ceil(guess.reach / spacing)) + 3
@@ -216,13 +214,13 @@ def lattice_wavelets(
         off = targets - cosine
         known = np.isfinite(off).all(axis=1)
         if not (lit & known).any():
-            raise DomainError(f"field = {_degrees(field)} deg: no light passes; expected a lit pupil")
+            raise DomainError(f"{field_label(field)}: no light passes; expected a lit pupil")
         if np.abs(off[lit & known]).max() <= _AIM * spacing:
             break
         points = points + np.einsum("nij,nj->ni", jacobian, np.where(known[:, None], off, 0.0))
     else:
         raise DomainError(
-            f"field = {_degrees(field)} deg: rays could not be aimed at all directions; expected a pupil that the "
+            f"{field_label(field)}: rays could not be aimed at all directions; expected a pupil that the "
             "telescope maps one to one on its image (huygens_psf does without)"
         )
     cover = _coverage(telescope, rays, points, jacobian, lit, near, n, spacing)
@@ -232,14 +230,14 @@ def lattice_wavelets(
     amplitude, path = np.zeros((2, n * n))
     amplitude[near] = cover * np.sqrt(energy) * spacing
     path[near] = np.where(np.isfinite(opd), opd, 0.0)
-    grid = np.stack(np.meshgrid(steps, steps), axis=-1) @ turn.T
-    # Cells on the rim are known to a few per cent each, and so may add up to a little more than the whole.
-    light = min(float((cover * energy).sum()), 1.0)
-    wavelets = Wavelets(grid, path.reshape(n, n), amplitude.reshape(n, n), light, wavelength)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1) @ rotation.T
+    # The lit fractions of cells on the rim are uncertain by a few per cent each; their sum may exceed the whole.
+    lit_fraction = min(float((cover * energy).sum()), 1.0)
+    wavelets = Wavelets(grid, path.reshape(n, n), amplitude.reshape(n, n), lit_fraction, wavelength)
     return WaveletLattice(wavelets, steps, spacing)
 
 
-def range_of_cosines(telescope: Telescope, principal: PrincipalRays) -> float:
+def range_of_cosines(principal: PrincipalRays) -> float:
     """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio.
 
     Raises
@@ -250,30 +248,30 @@ def range_of_cosines(telescope: Telescope, principal: PrincipalRays) -> float:
     found = float((1.0 / principal.f_number).max())
     if not _PARALLEL < found < np.inf:
         raise DomainError(
-            f"{telescope.name}: focal ratio {1.0 / max(found, 1e-300):.3g}; expected one that makes an image"
+            f"{principal.telescope}: focal ratio {1.0 / max(found, 1e-300):.3g}; expected one that makes an image"
         )
     return found
 
 
 def spot_reach(diagram: SpotDiagram) -> float:
-    """Return the radius about the middles of spots that holds nearly all their light, of the largest [m]."""
+    """Return the radius that holds nearly all light of the largest of several spots [m]."""
     reach = 0.0
     for distance, weight in zip(np.linalg.norm(diagram.displacement, axis=-1), diagram.weight, strict=True):
         lit = weight > 0
         if lit.any():
             order = np.argsort(distance[lit], kind="stable")
             held = np.cumsum(weight[lit][order])
-            # A few stray rays may land anywhere; a lattice that had to hold them would have no end.
+            # A few stray rays may land anywhere; a lattice for all of them would have no end.
             reach = max(reach, float(distance[lit][order][np.searchsorted(held, _HELD * held[-1])]))
     return _BEYOND * reach
 
 
-#: Traces rays through points of the pupil: to bundles, path differences and cosines along the lattice.
+#: Function that traces pupil points: bundles, path differences and cosines along the lattice.
 _Trace = Callable[[np.ndarray], tuple[Bundles, np.ndarray, np.ndarray]]
 
 
 class _InverseMap:
-    """Polynomials that give the point of the entrance pupil whose ray has given cosines."""
+    """Polynomials for the point of the entrance pupil whose ray has given cosines."""
 
     def __init__(self, telescope: Telescope, rays: _Trace) -> None:
         radius = 0.5 * telescope.pupil_diameter
@@ -283,7 +281,7 @@ class _InverseMap:
         lit = bundle.lit[0] & np.isfinite(cosine[:, 0])
         if lit.sum() < 3:
             raise DomainError(f"{telescope.name}: {int(lit.sum())} of {len(lit)} rays arrive; expected a lit pupil")
-        # Rays that are stopped may go astray, and would spoil the polynomials where light passes.
+        # Vignetted rays may go astray and spoil the polynomials where light passes.
         linear = np.column_stack([np.ones(len(cosine)), cosine])
         slope = np.linalg.lstsq(linear[lit], points[lit], rcond=None)[0]
         off = np.linalg.norm(linear @ slope - points, axis=-1)
@@ -299,7 +297,7 @@ class _InverseMap:
         i, j = np.nonzero(np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE)
         self._coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
         self._coefficients[i, j] = np.linalg.lstsq(first[:, i] * second[:, j], points, rcond=None)[0]
-        #: Change of the point in the pupil with the cosines, about [m].
+        #: Change of the pupil point with the cosines, about [m].
         self.metres_per_cosine = float(np.linalg.norm(slope[1:], 2))
 
     def pupil(self, steps: np.ndarray) -> np.ndarray:
@@ -332,7 +330,7 @@ def _coverage(
     n: int,
     spacing: float,
 ) -> np.ndarray:
-    """Return how much of each cell is lit: cells whose neighbours differ are looked at with more rays."""
+    """Return the lit fraction of each cell, from more rays where neighbours differ."""
     whole = np.zeros(n * n, dtype=np.int8)
     whole[near] = lit
     square = np.pad(whole.reshape(n, n), 1)
@@ -376,7 +374,3 @@ def _in_annulus(telescope: Telescope, points: np.ndarray) -> np.ndarray:
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _degrees(field: np.ndarray) -> str:
-    return "({:.6g}, {:.6g})".format(*np.rad2deg(field))

@@ -1,23 +1,22 @@
-"""Distortion: where stars land, against a picture of the sky that is only scaled.
-
-The picture is the gnomonic one: positions on the detector go as the slopes of the light, ``r = f tan(theta)``.
-"""
+"""Distortion: landing points of stars against a scaled gnomonic picture of the sky, ``r = f tan(theta)``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
+from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.rays import field_direction
 from ...wavefront.bundles import RAYS_AT_ONCE, trace_bundles
-from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
-from .spots import REFERENCES, spots
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
+from ..result import FieldResult
+from .spots import REFERENCES, spot_diagram
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,39 +24,30 @@ if TYPE_CHECKING:
 
 #: Points across the field of view where none are given.
 _ACROSS = 21
-#: Step of the slopes that the scale on the axis is taken from.
+#: Step of the slopes for the scale on the axis.
 _NEAR_AXIS = 1e-4
 
 
 @dataclass(frozen=True)
-class Distortion:
+class Distortion(FieldResult):
     """Landing points against a scaled picture of the sky.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
     reference : {"chief", "centroid"}
-        What stands for a star: where its chief ray lands, or the centroid of its light.
+        Position of a star: landing point of its chief ray, or centroid of its light.
     position : ndarray, shape [n_field, 2]
         Landing points [m], x and y of the detector.
     predicted : ndarray, shape [n_field, 2]
-        The scaled picture that fits them best: turned, shifted and if need be mirrored, but not distorted [m].
+        Best-fitting picture [m]: scaled, rotated, shifted and mirrored where necessary, but not distorted.
     center : ndarray, shape [2]
-        Where that picture has the axis [m].
+        Position of the axis in that picture [m].
     focal_length : float
-        Its scale, length on the detector over slope of the light [m/rad].
+        Scale of the picture, length on the detector over slope of the light [m/rad].
     axis_focal_length : float
         Scale at the axis itself [m/rad].
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelength: float
     reference: str
     position: np.ndarray
     predicted: np.ndarray
@@ -77,7 +67,7 @@ class Distortion:
 
     @property
     def percent_of_axis_scale(self) -> np.ndarray:
-        """Distortion against the scale at the axis, as lens designers quote it [percent]; NaN on the axis."""
+        """Distortion against the scale at the axis, the usual one of lens design [percent]; NaN on the axis."""
         return self._percent(self.axis_focal_length / self.focal_length)
 
     def _percent(self, scale: float) -> np.ndarray:
@@ -88,7 +78,7 @@ class Distortion:
             return np.where(away, 100.0 * (radial / (scale * length**2) - 1.0), np.nan)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
+        """Return the results by name and unit; lists run over the fields."""
         shift = np.linalg.norm(self.shift, axis=-1)
         return {
             "telescope": self.telescope,
@@ -108,7 +98,7 @@ class Distortion:
         }
 
     def plot(self) -> Figure:
-        """Draw the distorted picture, exaggerated, and the distortion in percent against the distance from the axis."""
+        """Draw the shifts, exaggerated, and the distortion [percent] against the distance from the axis."""
         with styled():
             figure = new_figure(11.0, 5.2)
             picture, curve = figure.subplots(1, 2)
@@ -124,11 +114,12 @@ class Distortion:
 
 def distortion(
     telescope: Telescope,
-    fields: Any = None,
-    wavelength: Any = None,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     *,
     reference: str = "chief",
     sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> Distortion:
@@ -136,53 +127,43 @@ def distortion(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad], at least three that do not lie on a line; a square lattice in the field of view by default.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
+    telescope, fields, wavelength, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`, but for the fields: at least three that do not lie on a line; a square lattice
+        in the field of view by default. Only centroids depend on the pupil points.
     reference : {"chief", "centroid"}
-        What stands for a star.
-    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Points of the pupil, where centroids are asked for.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+        Position of a star: landing point of its chief ray, or centroid of its light.
 
     Raises
     ------
     ConfigError
-        If reference, sampling or projection is unknown.
+        If the reference is unknown.
     DomainError
-        If fields or wavelength are out of range, too few, or a star does not reach the detector.
+        If there are too few fields, or a star does not reach the detector.
     """
     if reference not in REFERENCES:
         raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
-    points = field_lattice(telescope, _ACROSS) if fields is None else field_points(telescope, fields)
-    (w,) = wavelength_points(telescope, wavelength)
-    light = field_direction(points[:, 0], points[:, 1], projection)
-    slopes = light[:, :2] / -light[:, 2:]
-    if len(points) < 3 or np.linalg.matrix_rank(slopes - slopes.mean(axis=0), tol=1e-9) < 2:
-        raise DomainError(f"fields of shape {points.shape}: expected at least three points that are not on a line")
-    position = _landing(
-        telescope, points, float(w), reference, pupil_sampling(telescope, sampling), projection, threads
+    points = field_lattice(telescope, _ACROSS) if fields is None else fields
+    request = Request.of(
+        telescope, points, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     )
+    slopes = request.slopes
+    if len(slopes) < 3 or np.linalg.matrix_rank(slopes - slopes.mean(axis=0), tol=1e-9) < 2:
+        expected = "expected at least three points that are not on a line"
+        raise DomainError(f"fields of shape {request.fields.shape}: {expected}")
+    position = _landing(request, reference)
     if not np.isfinite(position).all():
-        lost = np.rad2deg(points[~np.isfinite(position).all(axis=1)][0])
-        raise DomainError(f"field = ({lost[0]:.6g}, {lost[1]:.6g}) deg: no light reaches the detector")
-    scale, turn, offset = _similarity(slopes, position)
+        lost = request.fields[~np.isfinite(position).all(axis=1)][0]
+        raise DomainError(f"{field_label(lost)}: no light reaches the detector")
+    scale, rotation, offset = _similarity(slopes, position)
     near = _NEAR_AXIS * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    ends = trace_bundles(telescope, near, float(w), np.zeros((1, 2)), "gnomonic", threads).chief_landing()
+    chief = trace_bundles(telescope, near, request.wavelength, np.zeros((1, 2)), "gnomonic", threads)
+    ends = chief.chief_landing()
     jacobian = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * _NEAR_AXIS)
     return Distortion(
-        telescope=telescope.name,
-        fields=points,
-        wavelength=float(w),
+        request=request,
         reference=reference,
         position=position,
-        predicted=scale * slopes @ turn.T + offset,
+        predicted=scale * slopes @ rotation.T + offset,
         center=offset,
         focal_length=scale,
         axis_focal_length=float(np.sqrt(np.abs(np.linalg.det(jacobian)))),
@@ -206,34 +187,25 @@ def field_lattice(telescope: Telescope, across: int) -> np.ndarray:
     return np.stack([x[inside], y[inside]], axis=-1)
 
 
-def _landing(
-    telescope: Telescope,
-    fields: np.ndarray,
-    wavelength: float,
-    reference: str,
-    pupil: PupilSampling,
-    projection: str,
-    threads: int | None,
-) -> np.ndarray:
-    if reference == "centroid":
-        step = max(1, RAYS_AT_ONCE // len(pupil))
-        parts = (fields[first : first + step] for first in range(0, len(fields), step))
-        options: dict[str, Any] = dict(sampling=pupil, projection=projection, threads=threads)
-        return np.concatenate([spots(telescope, part, wavelength, **options).reference for part in parts])
-    return trace_bundles(telescope, fields, wavelength, np.zeros((1, 2)), projection, threads).chief_landing()
+def _landing(request: Request, reference: str) -> np.ndarray:
+    if reference == "chief":
+        return request.bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
+    step = max(1, RAYS_AT_ONCE // len(request.pupil))
+    parts = (request.fields[first : first + step] for first in range(0, len(request.fields), step))
+    return np.concatenate([spot_diagram(replace(request, fields=part)).reference_point for part in parts])
 
 
 def _similarity(slopes: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the scale, the rotation or reflection [2, 2] and the offset that carry slopes to positions best.
+    """Return scale, rotation or reflection [2, 2] and offset of the best map from slopes to positions.
 
     Least squares after Schoenemann (1966, Psychometrika 31, 1).
     """
     mean_slope, mean_position = slopes.mean(axis=0), position.mean(axis=0)
     a, b = slopes - mean_slope, position - mean_position
     left, strengths, right = np.linalg.svd(b.T @ a)
-    turn = left @ right
+    rotation = left @ right
     scale = float(strengths.sum() / (a**2).sum())
-    return scale, turn, mean_position - scale * turn @ mean_slope
+    return scale, rotation, mean_position - scale * rotation @ mean_slope
 
 
 def _draw_picture(axes: Axes, result: Distortion) -> None:
@@ -272,7 +244,7 @@ def _neighbours(fields: np.ndarray) -> np.ndarray:
 
 
 def _draw_percent(axes: Axes, result: Distortion) -> None:
-    radius = np.rad2deg(np.linalg.norm(result.fields, axis=-1))
+    radius = np.rad2deg(result.off_axis_angle)
     order = np.argsort(radius)
     axes.axhline(0.0, color="0.6", linewidth=0.7)
     for percent, color, label in (

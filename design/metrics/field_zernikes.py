@@ -1,8 +1,8 @@
 """Annular Zernikes of the wavefront over the field of view, and double Zernikes.
 
-A double Zernike expansion is one in the pupil times one in the field, ``W(p, f) = sum a_kj Z_k(f) Z_j(p)``: annular
-Zernikes of the pupil (obscuration stated) and Zernikes of the full disc of the field, both in Noll's order and of mean
-square one. So ``a_kj`` is in metres, and the squares of all add up to the mean square wavefront over pupil and field.
+A double Zernike expansion has terms in the pupil times terms in the field, ``W(p, f) = sum a_kj Z_k(f) Z_j(p)``:
+annular Zernikes of the pupil and Zernikes of the full disc of the field, both in Noll's order and of mean square one.
+So ``a_kj`` is in metres, and the squares of all sum up to the mean square wavefront over pupil and field.
 """
 
 from __future__ import annotations
@@ -11,52 +11,45 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
-from ...core.units import radians
+from ...core.units import field_label, radians
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.bundles import RAYS_AT_ONCE
 from ...wavefront.pupil_optics import trace_pupils
-from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus, pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus
+from ...wavefront.request import Request
 from ..drawing import FEW, draw_field_map, field_colors, field_text, spread_in_field
+from ..result import FieldResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 PUPILS = ("full", "lit")
-#: Maps of single terms in one picture.
+#: Maps of single terms in one plot.
 _MAPS = 8
 
 
 @dataclass(frozen=True)
-class FieldZernikes:
+class FieldZernikes(FieldResult):
     """Annular Zernike coefficients of the wavefront at several field points.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
     coefficients : ndarray, shape [n_field, jmax]
         Noll order from j = 1 [m]; orthonormal terms in entrance-pupil coordinates, so each is its own rms.
     residual_rms : ndarray, shape [n_field]
-        Root mean square of what the terms leave, over the points that were fitted [m].
+        Root mean square of the wavefront minus the terms, over the fitted points [m].
     obscuration : float
         Inner over outer radius of the annulus.
     pupil : {"full", "lit"}
-        What was fitted: the whole annulus, vignetted or not, or only where light passes.
+        Fitted points: the whole annulus, vignetted or not, or only where light passes.
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelength: float
     coefficients: np.ndarray
     residual_rms: np.ndarray
     obscuration: float
@@ -64,11 +57,11 @@ class FieldZernikes:
 
     @property
     def rms(self) -> np.ndarray:
-        """Root mean square wavefront of the terms but piston and tilt [m], shape [n_field]."""
+        """Root mean square of the terms without piston and tilt [m], shape [n_field]."""
         return np.sqrt((self.coefficients[:, 3:] ** 2).sum(axis=1))
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; rows are fields, columns Noll indices from 1."""
+        """Return the results by name and unit; rows are fields, columns Noll indices from 1."""
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
@@ -81,7 +74,7 @@ class FieldZernikes:
         }
 
     def plot(self) -> Figure:
-        """Draw the terms as bars for each field; for many fields their rms over the field, and maps of the largest."""
+        """Draw the terms of each field as bars; for many fields their rms over the field, and maps of the largest."""
         j = np.arange(4, self.coefficients.shape[1] + 1)
         values = self.coefficients[:, 3:] * 1e9
         with_maps = spread_in_field(self.fields) and len(j) > 0
@@ -122,11 +115,11 @@ class DoubleZernikes:
     coefficients : ndarray, shape [kmax, jmax]
         Coefficients [m]; rows are Noll indices of the field from k = 1, columns those of the pupil from j = 1.
     field_radius : float
-        Radius of the field's disc [rad].
+        Radius of the disc of the field [rad].
     at_nodes : FieldZernikes
-        The pupil's coefficients at the nodes of the field quadrature, which the fit is made from.
+        Pupil coefficients at the nodes of the field quadrature.
     residual_rms : ndarray, shape [jmax]
-        Root mean square over the field of what the field's terms leave of each pupil coefficient [m].
+        Root mean square over the field of each pupil coefficient minus the field terms [m].
     """
 
     coefficients: np.ndarray
@@ -135,12 +128,12 @@ class DoubleZernikes:
     residual_rms: np.ndarray
 
     def at(self, fields: Any) -> np.ndarray:
-        """Return the pupil's coefficients that the expansion gives at field angles [rad], shape [n_field, jmax] [m]."""
+        """Return the pupil coefficients [m] of the expansion at field angles [rad], shape [n_field, jmax]."""
         x, y = np.atleast_2d(np.asarray(fields, dtype=np.float64)).T / self.field_radius
         return annular_zernikes(len(self.coefficients), x, y).T @ self.coefficients
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; rows are field terms, columns pupil terms, both from 1."""
+        """Return the results by name and unit; rows are field terms, columns pupil terms, both from 1."""
         nodes = self.at_nodes
         return {
             "telescope": nodes.telescope,
@@ -154,7 +147,7 @@ class DoubleZernikes:
         }
 
     def plot(self) -> Figure:
-        """Draw the table of coefficients as a picture, and the sizes of the pupil's terms."""
+        """Draw the matrix of coefficients and the sizes of the pupil terms."""
         from matplotlib.colors import SymLogNorm
 
         nm = self.coefficients[:, 3:] * 1e9
@@ -172,9 +165,7 @@ class DoubleZernikes:
             table.set_ylabel("Noll index in the field")
             figure_of(table).colorbar(image, ax=table, fraction=0.03, pad=0.01).set_label("coefficient [nm]")
             bars.bar(j, np.sqrt((nm**2).sum(axis=0)), 0.75, color=BLUE, label="rms over the field")
-            bars.plot(
-                j, self.residual_rms[3:] * 1e9, "_", color=ORANGE, markersize=9, label="left by the field's terms"
-            )
+            bars.plot(j, self.residual_rms[3:] * 1e9, "_", color=ORANGE, markersize=9, label="left by the field terms")
             bars.set_ylabel("size of the term [nm]")
             bars.legend(loc="upper right")
             name_terms(bars, j)
@@ -189,12 +180,13 @@ class DoubleZernikes:
 
 def wavefront_zernikes(
     telescope: Telescope,
-    fields: Any = None,
-    wavelength: Any = None,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     *,
     jmax: int = 28,
     pupil: str = "full",
     sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> FieldZernikes:
@@ -204,42 +196,31 @@ def wavefront_zernikes(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
+    telescope, fields, wavelength, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`.
     jmax : int
         Highest Noll index.
     pupil : {"full", "lit"}
         "full": project on the whole annulus, clear apertures ignored. The terms stay orthogonal, so a coefficient does
-        not depend on `jmax`, and it varies smoothly over the field. "lit": fit where light passes, as a measured
-        wavefront is.
-    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Points of the pupil, whose weights the fit takes.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+        not depend on `jmax`, and it varies smoothly over the field. "lit": fit where light passes, as for a measured
+        wavefront.
 
     Raises
     ------
     ConfigError
-        If pupil, sampling or projection is unknown.
+        If pupil is unknown.
     DomainError
-        If fields or wavelength are out of range, there are fewer points than terms, or rays of the full annulus do not
-        reach the detector.
+        If there are fewer points than terms, or rays of the full annulus do not reach the detector.
     """
     if pupil not in PUPILS:
         raise ConfigError(f"pupil = {pupil!r}: expected one of {', '.join(PUPILS)}")
-    points = field_points(telescope, fields)
-    (w,) = wavelength_points(telescope, wavelength)
-    sample = pupil_sampling(telescope, sampling)
+    request = Request.of(
+        telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+    )
+    points, sample, w = request.fields, request.pupil, request.wavelength
     if int(jmax) != jmax or not 1 <= jmax <= len(sample):
         raise DomainError(f"jmax = {jmax!r}: expected a whole number from 1 to the {len(sample)} points of the pupil")
-    unit = sample.points / (0.5 * telescope.pupil_diameter)
-    terms = annular_zernikes(int(jmax), unit[:, 0], unit[:, 1], telescope.pupil_obscuration).T
+    terms = annular_zernikes(int(jmax), *request.unit_pupil.T, telescope.pupil_obscuration).T
     coefficients, residual = np.empty((len(points), int(jmax))), np.empty(len(points))
     step = max(1, RAYS_AT_ONCE // len(sample))
     for first in range(0, len(points), step):
@@ -248,54 +229,41 @@ def wavefront_zernikes(
         value = -optics.path[:, 0]
         used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
         coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, points[part], pupil)
-    return FieldZernikes(
-        telescope=telescope.name,
-        fields=points,
-        wavelength=float(w),
-        coefficients=coefficients,
-        residual_rms=residual,
-        obscuration=telescope.pupil_obscuration,
-        pupil=pupil,
-    )
+    return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil)
 
 
 def double_zernikes(
     telescope: Telescope,
-    wavelength: Any = None,
+    wavelength: ArrayLike | None = None,
     *,
     jmax: int = 28,
     kmax: int = 22,
     rings: int = 8,
-    field_radius: Any = None,
+    field_radius: ArrayLike | None = None,
     pupil: str = "full",
     sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> DoubleZernikes:
-    """Expand the wavefront in Zernikes of pupil and field, by Gauss quadrature over the field of view.
+    """Expand the wavefront in Zernikes of pupil and field.
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
-    jmax, kmax : int
-        Highest Noll index in the pupil and in the field.
+    telescope, wavelength, jmax, pupil, sampling, n_pupil, projection, threads
+        As in :func:`wavefront_zernikes`.
+    kmax : int
+        Highest Noll index in the field.
     rings : int
-        Rings of the field quadrature, each of ``4 rings`` points: what varies over the field up to degree ``2 rings``
-        comes out exactly.
+        Rings of the Gauss quadrature over the field, each of ``4 rings`` points: variations over the field up to degree
+        ``2 rings`` come out exactly.
     field_radius : float or Quantity, optional
-        Radius of the field's disc [rad]; that of the field of view by default.
-    pupil, sampling, projection, threads
-        As for :func:`wavefront_zernikes`.
+        Radius of the disc of the field [rad]; that of the field of view by default.
 
     Raises
     ------
-    ConfigError
-        If pupil, sampling or projection is unknown.
     DomainError
-        If the wavelength or the disc is out of range, or there are too few points for the terms.
+        If the disc is out of range, or there are too few points for the terms.
     """
     radius = telescope.field_radius if field_radius is None else float(radians(field_radius, "field_radius"))
     if not (np.isfinite(radius) and radius > 0):
@@ -310,6 +278,7 @@ def double_zernikes(
         jmax=jmax,
         pupil=pupil,
         sampling=sampling,
+        n_pupil=n_pupil,
         projection=projection,
         threads=threads,
     )
@@ -328,8 +297,7 @@ def _fit(
     jmax = terms.shape[1]
     short = used.sum(axis=1) < (len(weights) if pupil == "full" else jmax)
     if short.any():
-        field = np.rad2deg(fields[short][0])
-        what = f"field = ({field[0]:.6g}, {field[1]:.6g}) deg"
+        what = field_label(fields[short][0])
         if pupil == "full":
             raise DomainError(f"{what}: rays of the annulus miss the detector; pupil='lit' leaves them out")
         raise DomainError(f"{what}: {int(used[short][0].sum())} pupil points are lit; expected at least {jmax}")
@@ -340,7 +308,7 @@ def _fit(
         orthogonal, triangle = np.linalg.qr(terms * root[:, None])
         size = np.abs(np.diag(triangle))
         if size.min() < 1e-9 * size.max():
-            raise DomainError(f"jmax = {jmax}: the {len(weights)} points of the pupil do not tell so many terms apart")
+            raise DomainError(f"jmax = {jmax}: the {len(weights)} points of the pupil cannot separate so many terms")
         coefficients[everything] = np.linalg.solve(triangle, (value[everything] * root @ orthogonal).T).T
     for i in np.flatnonzero(~everything):
         lit = used[i]

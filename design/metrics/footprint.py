@@ -1,4 +1,4 @@
-"""Footprints: the patch of a surface that the light of a field point fills, beside the surface's clear aperture."""
+"""Footprints: patches of the surfaces that the light of field points fills, with their clear apertures."""
 
 from __future__ import annotations
 
@@ -7,25 +7,27 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.plotting import RED, styled
 from ...models.surface import Surface
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus, field_direction, launch_bundles
+from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
-from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, field_text, panel_grid
+from ..result import FieldResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Points of an outline, and how far inside the annulus they lie, in units of its radius: a ray through the very rim is
-#: blocked or not by rounding.
+#: Points of an outline, and their distance from the rims of the annulus in units of its radius: rounding decides
+#: whether a ray through the very rim is blocked.
 _RIM, _INSIDE = 181, 1e-6
-#: Points across the picture of a clear aperture.
+#: Points across the image of a clear aperture.
 _ACROSS = 700
 
 
@@ -38,18 +40,18 @@ class SurfaceFootprint:
     surface : Surface
         The surface.
     outlines : ndarray, shape [n_field, 2, n_rim, 2]
-        Where the outer and the inner rim of the entrance pupil lie on the surface [m], blocked or not. The inner rim
-        is NaN where there is no obscuration.
+        Outer and inner rim of the entrance pupil on the surface [m], blocked or not. The inner rim is NaN where there
+        is no obscuration.
     outline_arriving : ndarray of bool, shape [n_field, 2, n_rim]
         Rays of the rims that no earlier surface has blocked.
     position : ndarray, shape [n_field, n_pupil, 2]
-        Where the rays meet the surface [m].
+        Intersections of the rays with the surface [m].
     arriving : ndarray of bool, shape [n_field, n_pupil]
         Rays that no earlier surface has blocked.
     passing : ndarray of bool, shape [n_field, n_pupil]
-        Those of them that this surface lets pass.
+        Arriving rays that pass the aperture of this surface.
     weights : ndarray, shape [n_pupil]
-        What each ray stands for; they sum to 1.
+        Fraction of the pupil for each ray; they sum to 1.
     """
 
     surface: Surface
@@ -62,7 +64,7 @@ class SurfaceFootprint:
 
     @property
     def blocked_fraction(self) -> np.ndarray:
-        """Part of the pupil that this surface is the first to block, shape [n_field]."""
+        """Fraction of the pupil that this surface is the first to block, shape [n_field]."""
         return (self.arriving & ~self.passing) @ self.weights
 
     @property
@@ -73,35 +75,26 @@ class SurfaceFootprint:
         return np.where(largest >= 0, largest, np.nan)
 
     def arriving_points(self) -> np.ndarray:
-        """Return where the rays that arrive, rims included, meet the surface [m]: [n_field, n, 2], NaN for others."""
+        """Return the intersections of arriving rays, rims included [m], shape [n_field, n, 2]; NaN for others."""
         points = np.concatenate([self.outlines.reshape(len(self.outlines), -1, 2), self.position], axis=1)
         arriving = np.concatenate([self.outline_arriving.reshape(len(self.outlines), -1), self.arriving], axis=1)
         return np.where(arriving[..., None], points, np.nan)
 
 
 @dataclass(frozen=True)
-class Footprint:
+class Footprint(FieldResult):
     """Footprints of several field points on several surfaces.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
     surfaces : tuple of SurfaceFootprint
-        One for each surface asked for.
+        One for each surface.
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelength: float
     surfaces: tuple[SurfaceFootprint, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
+        """Return the results by name and unit; lists run over the fields."""
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
@@ -137,10 +130,11 @@ class Footprint:
 def footprint(
     telescope: Telescope,
     surfaces: str | Sequence[str] | None = None,
-    fields: Any = None,
-    wavelength: Any = None,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     *,
     sampling: str | PupilSampling = "rings",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> Footprint:
@@ -148,63 +142,53 @@ def footprint(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, fields, wavelength, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`.
     surfaces : str or sequence of str, optional
         Names of surfaces; all of them by default.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
-    sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Points of the pupil whose rays tell what is blocked.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
 
     Raises
     ------
     UnknownNameError
         If no surface has such a name.
     DomainError
-        If no surface is named, or fields or wavelength are out of range.
+        If no surface is named.
     """
     names = [surfaces] if isinstance(surfaces, str) else list(telescope.surface_names if surfaces is None else surfaces)
     if not names:
         raise DomainError("surfaces = []: expected the name of a surface at least")
     wanted = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
-    points = field_points(telescope, fields)
-    (w,) = wavelength_points(telescope, wavelength)
-    pupil = pupil_sampling(telescope, sampling)
+    request = Request.of(
+        telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+    )
+    n_field = len(request.fields)
     angle = np.linspace(0.0, 2.0 * np.pi, _RIM)
     circle = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     hole = telescope.pupil_obscuration + _INSIDE if telescope.pupil_obscuration else np.nan
-    everything = np.concatenate([(1.0 - _INSIDE) * circle, hole * circle, pupil.points])
-    directions = field_direction(points[:, 0], points[:, 1], projection)
-    results = trace(telescope, launch_bundles(telescope, directions, float(w), everything), "all", threads=threads)
+    everything = np.concatenate([(1.0 - _INSIDE) * circle, hole * circle, request.pupil.points])
+    results = trace(telescope, request.launch(request.wavelength, everything), "all", threads=threads)
     footprints = []
     for i in wanted:
         surface = telescope.surfaces[i]
-        position = surface.to_local(results[i].position).reshape(len(points), -1, 3)[:, :, :2]
+        position = surface.to_local(results[i].position).reshape(n_field, -1, 3)[:, :, :2]
         before = results[i - 1].status if i else np.zeros_like(results[i].status)
-        arriving, passing = ((s == RayStatus.OK).reshape(len(points), -1) for s in (before, results[i].status))
+        arriving, passing = ((s == RayStatus.OK).reshape(n_field, -1) for s in (before, results[i].status))
         footprints.append(
             SurfaceFootprint(
                 surface=surface,
-                outlines=position[:, : 2 * _RIM].reshape(len(points), 2, _RIM, 2),
-                outline_arriving=(arriving[:, : 2 * _RIM]).reshape(len(points), 2, _RIM),
+                outlines=position[:, : 2 * _RIM].reshape(n_field, 2, _RIM, 2),
+                outline_arriving=arriving[:, : 2 * _RIM].reshape(n_field, 2, _RIM),
                 position=position[:, 2 * _RIM :],
                 arriving=arriving[:, 2 * _RIM :],
                 passing=passing[:, 2 * _RIM :],
-                weights=pupil.weights,
+                weights=request.pupil.weights,
             )
         )
-    return Footprint(telescope.name, points, float(w), tuple(footprints))
+    return Footprint(request, tuple(footprints))
 
 
 def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return middle and half-width [m] of a picture: about the vertex, unless light keeps far away from it."""
+    """Return centre and half-width [m] of a panel: about the vertex, unless light stays far away from it."""
     low, high = points.min(axis=0), points.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
     if np.linalg.norm(middle) > 2.0 * half:
@@ -235,7 +219,7 @@ def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Any], na
             axes.plot(*lit.T, color=color, linewidth=1.2, label=name if k == 0 else None)
         light = footprint.position[i, footprint.arriving[i]]
         if len(light) and np.ptp(light, axis=0).max() < 0.02 * half:
-            # A focus would not be seen without.
+            # A focus is too small for its outline.
             axes.plot(*light.mean(axis=0) * 1e3, ".", color=color, markersize=3.0)
         blocked = footprint.arriving[i] & ~footprint.passing[i]
         axes.plot(*footprint.position[i, blocked].T * 1e3, ".", color=RED, markersize=1.6, markeredgewidth=0.0)

@@ -1,8 +1,8 @@
-"""Ghost paths: light that two surfaces reflect on its way, as telescopes whose surfaces stand in the order of that way.
+"""Ghost paths: light that two surfaces reflect, as telescopes with the surfaces in the order of the light.
 
 A surface that transmits light also reflects a little of it, and so does the detector. Light that is reflected at a
-surface, goes back, and is reflected again at an earlier one, comes to the detector out of focus. As a list of surfaces
-in the order in which the light meets them this is a telescope like any other, and the normal trace serves.
+surface, goes back, and is reflected again at an earlier one, arrives at the detector out of focus. The list of surfaces
+in the order in which the light meets them is a telescope like any other, for the ordinary trace.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from ...raytrace.trace import trace
 
 @dataclass(frozen=True)
 class GhostPath:
-    """One way with two reflections.
+    """One path with two reflections.
 
     Attributes
     ----------
     first, second : str
-        Surfaces that reflect the light, in that order: the second stands before the first in the telescope.
+        Reflecting surfaces in the order of the light: the second stands before the first in the telescope.
     telescope : Telescope
-        The surfaces in the order of the way; those that light meets for a second and third time have "#2" and "#3"
-        behind their names.
+        The surfaces in the order of the light; "#2" and "#3" are added to the names of those that it meets again.
     source : tuple of int
-        Which surface of the real telescope each of them is.
+        Index of each of them in the real telescope.
     reflecting : tuple of bool
-        Which of them reflect the light though they are no mirrors.
+        Whether each of them reflects the light without being a mirror.
     """
 
     first: str
@@ -45,10 +44,9 @@ class GhostPath:
 
 
 def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
-    """Return the pairs (first, second) of surfaces, by their places, that can make a ghost.
+    """Return the pairs (first, second) of indices of surfaces that can make a ghost.
 
-    The first reflects light that goes towards the detector: a lens surface or the detector. The second, a lens surface
-    before it, sends it there again.
+    The first is a lens surface or the detector, the second a lens surface before it.
     """
     lenses = [i for i, s in enumerate(telescope.surfaces) if s.interaction == Interaction.REFRACT]
     last = len(telescope.surfaces) - 1
@@ -57,19 +55,19 @@ def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
 
 
 def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
-    """Return the way of light that is reflected at two surfaces.
+    """Return the path of light that is reflected at two surfaces.
 
     Parameters
     ----------
     telescope : Telescope
         The telescope.
     first, second : int
-        Places of the surfaces, ``second < first``; the first may be the detector.
+        Indices of the surfaces, ``second < first``; the first may be the detector.
 
     Raises
     ------
     DomainError
-        If a place does not exist, the surfaces are the wrong way round, or one of them is a mirror or transmits all.
+        If a surface does not exist, their order is wrong, or one of them is a mirror or transmits all.
     """
     surfaces = telescope.surfaces
     if not 0 <= second < first < len(surfaces):
@@ -80,21 +78,21 @@ def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
         if surfaces[place].interaction not in (Interaction.REFRACT, Interaction.DETECTOR):
             raise DomainError(f"surface {surfaces[place].name!r}: expected a lens surface or the detector for a ghost")
     before = [telescope.medium_before, *(s.medium_after for s in surfaces)]
-    seen: dict[int, int] = {}
-    way: list[Surface] = []
+    times: dict[int, int] = {}
+    path: list[Surface] = []
     source: list[int] = []
 
     def meet(place: int, *, reflect: bool = False, back: bool = False) -> None:
-        seen[place] = seen.get(place, 0) + 1
-        name = surfaces[place].name + (f"#{seen[place]}" if seen[place] > 1 else "")
+        times[place] = times.get(place, 0) + 1
+        name = surfaces[place].name + (f"#{times[place]}" if times[place] > 1 else "")
         step = replace(surfaces[place], name=name)
         if reflect:
-            # Light stays in the medium from which it comes: in front of the first, behind the second.
+            # Light stays in its medium: in front of the first surface, behind the second.
             medium = before[place] if place == first else before[place + 1]
             step = replace(step, interaction=Interaction.MIRROR, medium_after=medium)
         elif back:
             step = replace(step, medium_after=before[place])
-        way.append(step)
+        path.append(step)
         source.append(place)
 
     for place in range(first):
@@ -105,12 +103,12 @@ def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
     meet(second, reflect=True)
     for place in range(second + 1, len(surfaces)):
         meet(place)
-    reflecting = np.zeros(len(way), dtype=bool)
+    reflecting = np.zeros(len(path), dtype=bool)
     reflecting[[first, 2 * first - second]] = True
     return GhostPath(
         first=surfaces[first].name,
         second=surfaces[second].name,
-        telescope=replace(telescope, surfaces=tuple(way), groups={}, group_frames={}),
+        telescope=replace(telescope, surfaces=tuple(path), groups={}, group_frames={}),
         source=tuple(source),
         reflecting=tuple(bool(v) for v in reflecting),
     )
@@ -129,7 +127,7 @@ def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.
     Returns
     -------
     ndarray
-        Part of the light, mean of both polarisations; 1 where all is reflected.
+        Mean of both polarisations; 1 at total reflection.
     """
     cosine = np.abs(np.asarray(cosine, dtype=np.float64))
     square = 1.0 - (before / after) ** 2 * (1.0 - cosine**2)
@@ -140,7 +138,7 @@ def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.
 
 
 class Coatings:
-    """Reflectivity of every surface that is no mirror."""
+    """Reflectivity of every surface that is not a mirror."""
 
     def __init__(self, telescope: Telescope, given: float | Mapping[str, float] | None, detector: float) -> None:
         lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT]
@@ -160,7 +158,7 @@ class Coatings:
         self._fixed = {i: table[s.name] for i, s in enumerate(telescope.surfaces) if s.name in table}
 
     def at(self, place: int, cosine: np.ndarray, before: float, after: float) -> np.ndarray:
-        """Return the reflectivity for light on its way from one index into another."""
+        """Return the reflectivity for light from one refractive index to another."""
         if place in self._fixed:
             return np.full_like(cosine, self._fixed[place])
         return fresnel_reflectivity(cosine, before, after)
@@ -168,7 +166,7 @@ class Coatings:
 
 @dataclass(frozen=True)
 class GhostLight:
-    """Rays of one way on the detector: places and directions in its own frame, and the light they bring."""
+    """Rays of one path on the detector: positions and directions in its own frame, and their light."""
 
     path: GhostPath
     position: np.ndarray
@@ -177,7 +175,7 @@ class GhostLight:
 
 
 def follow(path: GhostPath, start: Rays, coatings: Coatings, threads: int | None) -> GhostLight:
-    """Trace rays along one way, and what each surface leaves of their light."""
+    """Trace rays along one path, with the light that each surface reflects or transmits."""
     telescope = path.telescope
     met = trace(telescope, start, "all", threads=threads)
     index = refractive_indices(telescope, start.wavelength)
@@ -186,15 +184,14 @@ def follow(path: GhostPath, start: Rays, coatings: Coatings, threads: int | None
     for k, (surface, place) in enumerate(zip(telescope.surfaces, path.source, strict=True)):
         going = met[k].direction
         if path.reflecting[k]:
-            # A mirror turns a ray by twice the cosine of incidence along the normal.
+            # A mirror changes a direction by twice the cosine of incidence along the normal.
             cosine = 0.5 * np.linalg.norm(going - coming, axis=-1)
-            # The medium on the other side is met on the other ways through this surface.
             weight *= coatings.at(place, cosine, index[k], _other_index(path, k, index))
         elif surface.interaction == Interaction.REFRACT:
             normal = index[k + 1] * going - index[k] * coming
             length = np.linalg.norm(normal, axis=-1)
             with np.errstate(invalid="ignore", divide="ignore"):
-                # Between media of equal index there is no normal to be had, and nothing is reflected.
+                # Between media of equal index the normal is undefined, and nothing is reflected.
                 cosine = np.where(length > 1e-12, (coming * normal).sum(axis=-1) / length, 1.0)
             weight *= 1.0 - coatings.at(place, cosine, index[k], index[k + 1])
         coming = going
@@ -206,10 +203,9 @@ def follow(path: GhostPath, start: Rays, coatings: Coatings, threads: int | None
 
 
 def _other_index(path: GhostPath, k: int, index: np.ndarray) -> float:
-    """Return the index behind a surface that reflects: the way crosses the second one beforehand, the first later."""
+    """Return the index behind a reflecting surface, from where the path crosses that surface."""
     place = path.source[k]
     for other, met in enumerate(path.source):
         if met == place and other != k:
-            # Of the two media there, the other one than that in which the light is reflected.
             return float(index[other + 1] if other > k else index[other])
     return float(index[k])

@@ -1,45 +1,43 @@
-"""Ghosts: light reflected twice inside the optics, and how bright it is on the detector beside the star itself.
+"""Ghosts: light reflected twice inside the optics, and its irradiance on the detector.
 
-Every pair of lens surfaces, and every lens surface with the detector, makes a ghost of its own
-(:mod:`~.ghost_paths`). Reflectivities are Fresnel's for bare glass at the angle of each ray, mean of both
-polarisations, or those of coatings.
+Every pair of lens surfaces, and every lens surface with the detector, makes a ghost of its own (:mod:`~.ghost_paths`).
+Reflectivities are Fresnel's for bare glass at the angle of each ray, mean of both polarisations, or those of coatings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from ...core.errors import DomainError
 from ...core.plotting import RED, new_figure, styled
+from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.rays import launch_rays
-from ...wavefront.bundles import trace_bundles
-from ...wavefront.pupil_sampling import spiral_annulus
-from ...wavefront.request import field_points, wavelength_points
+from ...wavefront.request import Request
 from ..drawing import draw_circle, field_text
+from ..result import FieldResult
 from .ghost_paths import Coatings, GhostLight, GhostPath, follow, ghost_pairs, ghost_path
-from .principal_rays import principal_rays
+from .principal_rays import principal_rays_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_RAYS = 40000
-#: Rays in each cell that the irradiance of a ghost is taken from, on average.
+#: Rays in each cell of the irradiance of a ghost, on average.
 _RAYS_PER_CELL = 40
-#: Share of a ghost's light that its place and size are taken from.
+#: Fraction of the light of a ghost within the circle that its position and size are measured in.
 _CORE = 0.98
 #: Cells across the map of all ghosts.
 _MAP = 160
 #: Field of the star where none is given, over the radius of the field of view.
 _FIELD = 0.5
 DETECTOR_REFLECTIVITY = 0.15
-#: Ghosts that are drawn by themselves, and decades of irradiance that the map shows.
+#: Ghosts with a panel of their own, and decades of irradiance of the map.
 _ALONE, _DECADES = 8, 4.0
 
 
@@ -50,22 +48,21 @@ class Ghost:
     Attributes
     ----------
     first, second : str
-        The surfaces that reflect it, in that order.
+        The reflecting surfaces, in that order.
     flux : float
-        Its light, over that of the star's own image.
+        Light of the ghost over that of the direct image.
     peak : float
-        Largest irradiance, over the light of the star's own image [1/m^2].
+        Largest irradiance over the light of the direct image [1/m^2].
     centroid : ndarray, shape [2]
-        Middle of its light, x and y of the detector [m]; stray rays, the outermost 2 % of the light, left out here and
-        below.
+        Centroid, x and y of the detector [m]; without stray rays, the outermost 2 % of the light, here and below.
     diameter : float
-        Diameter of the circle about that middle that holds its rays [m].
+        Diameter of the circle about the centroid that holds the rays [m].
     focus : float
-        Height above the detector at which it is smallest [m]; NaN where its rays are parallel.
+        Height above the detector at which the ghost is smallest [m]; NaN where its rays are parallel.
     irradiance : ndarray, shape [n, n]
-        Irradiance over the light of the star's own image [1/m^2], [y, x].
+        Irradiance over the light of the direct image [1/m^2], [y, x].
     edges : ndarray, shape [2, n + 1]
-        Edges of its cells along x and along y [m].
+        Edges of the cells along x and along y [m].
     """
 
     first: str
@@ -80,36 +77,27 @@ class Ghost:
 
 
 @dataclass(frozen=True)
-class Ghosts:
+class Ghosts(FieldResult):
     """All ghosts of a star that two reflections make, the brightest irradiance first.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    field : ndarray, shape [2]
-        Field angles of the star [rad].
-    wavelength : float
-        Vacuum wavelength [m].
     detector_reflectivity : float
-        Part of the light that the detector reflects.
+        Fraction of the light that the detector reflects.
     ghosts : tuple of Ghost
         The ghosts.
     star : ndarray, shape [2]
-        Where the star's own image is, x and y of the detector [m].
+        Position of the direct image, x and y of the detector [m].
     irradiance : ndarray, shape [n, n]
-        Irradiance of all ghosts together over the light of the star's own image [1/m^2], [y, x].
+        Irradiance of all ghosts together over the light of the direct image [1/m^2], [y, x].
     edges : ndarray, shape [n + 1]
-        Edges of its cells along either axis [m].
+        Edges of the cells along either axis [m].
     image_radius : float
-        Distance of the edge of the field of view from its middle, on the detector [m].
+        Radius of the field of view on the detector [m].
     plate_scale : float
         Angle on the sky over length on the detector at the star [rad/m].
     """
 
-    telescope: str
-    field: np.ndarray
-    wavelength: float
     detector_reflectivity: float
     ghosts: tuple[Ghost, ...]
     star: np.ndarray
@@ -119,19 +107,24 @@ class Ghosts:
     plate_scale: float
 
     @property
+    def field(self) -> np.ndarray:
+        """Field angles of the star [rad], shape [2]."""
+        return self.fields[0]
+
+    @property
     def flux(self) -> float:
-        """Light of all ghosts together over that of the star's own image."""
+        """Light of all ghosts together over that of the direct image."""
         return sum(g.flux for g in self.ghosts)
 
     @property
     def magnitudes(self) -> np.ndarray:
-        """Peak irradiance of each ghost in magnitudes per square arc second, the star's own magnitude being 0."""
+        """Peak irradiance of each ghost in magnitudes per square arc second, for a star of magnitude 0."""
         square_arcsec = (np.deg2rad(1.0 / 3600.0) / self.plate_scale) ** 2
         with np.errstate(divide="ignore"):
             return -2.5 * np.log10(np.array([g.peak for g in self.ghosts]) * square_arcsec)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the ghosts, the brightest first."""
+        """Return the results by name and unit; lists run over the ghosts, the brightest first."""
         return {
             "telescope": self.telescope,
             "field_deg": np.rad2deg(self.field),
@@ -150,7 +143,7 @@ class Ghosts:
         }
 
     def plot(self) -> Figure:
-        """Draw the irradiance of all ghosts on the detector, and the brightest of them in order."""
+        """Draw the irradiance of all ghosts on the detector, and the brightest one by one."""
         with styled():
             figure = new_figure(11.6, 5.3)
             parts: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.12])
@@ -173,12 +166,12 @@ class Ghosts:
 
 def ghosts(
     telescope: Telescope,
-    field: Any = None,
-    wavelength: Any = None,
+    field: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     *,
     reflectivity: float | Mapping[str, float] | None = None,
     detector_reflectivity: float = DETECTOR_REFLECTIVITY,
-    rays: int = _RAYS,
+    n_pupil: int = 40000,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -187,51 +180,48 @@ def ghosts(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, wavelength, projection, threads
+        As in :meth:`pachon.Request.of`.
     field : (tx, ty), optional
         Field angles of the star [rad] or Quantities; half-way to the edge of the field along +y by default.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
     reflectivity : float or mapping of str to float, optional
-        Reflectivity of the lens surfaces at every angle, one for all or by name; where none is given that of bare
-        glass.
+        Reflectivity of the lens surfaces at every angle, one for all or by name; bare glass by default.
     detector_reflectivity : float
-        Part of the light that the detector reflects.
-    rays : int
-        Rays of the star in the entrance pupil.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+        Fraction of the light that the detector reflects.
+    n_pupil : int
+        Rays of the star in the entrance pupil, at least 400.
     progress : callable, optional
-        Called with the number of ghosts traced since the last call.
+        Called with the number of pairs of surfaces done since the last call.
 
     Raises
     ------
     UnknownNameError
         If a reflectivity is given for a surface that does not exist.
     DomainError
-        If something is out of range, no surface can make a ghost, or the star itself does not reach the detector.
+        If a number is out of range, no surface can make a ghost, or the star itself does not reach the detector.
     """
-    if int(rays) != rays or rays < 400:
-        raise DomainError(f"rays = {rays!r}: expected a whole number of at least 400")
-    (point,) = field_points(telescope, [0.0, _FIELD * telescope.field_radius] if field is None else [field])
-    (w,) = wavelength_points(telescope, wavelength)
+    if int(n_pupil) != n_pupil or n_pupil < 400:
+        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 400")
+    request = Request.of(
+        telescope,
+        [0.0, _FIELD * telescope.field_radius] if field is None else [field],
+        wavelength,
+        sampling="spiral",
+        n_pupil=int(n_pupil),
+        projection=projection,
+        threads=threads,
+    )
     coatings = Coatings(telescope, reflectivity, detector_reflectivity)
     pairs = ghost_pairs(telescope)
     if not pairs:
         raise DomainError(
             f"{telescope.name}: expected at least one lens surface and another, or a detector, for ghosts"
         )
-    pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, int(rays)).points
-    start = launch_rays(telescope, (point[0], point[1]), w, (pupil[:, 0], pupil[:, 1]), projection)
+    start = request.launch(request.wavelength)
     nothing = GhostPath("", "", telescope, tuple(range(len(telescope.surfaces))), (False,) * len(telescope.surfaces))
     image = follow(nothing, start, coatings, threads)
     if not image.weight.sum() > 0:
-        raise DomainError(
-            f"field = ({_degrees(point)}) deg: the star does not reach the detector; expected a lit pupil"
-        )
+        raise DomainError(f"{field_label(request.fields[0])}: the star does not reach the detector")
     direct = float(image.weight.sum())
     star = np.average(image.position, axis=0, weights=image.weight)
     landings = []
@@ -239,16 +229,10 @@ def ghosts(
         landings.append(follow(ghost_path(telescope, first, second), start, coatings, threads))
         if progress is not None:
             progress(1)
-    rim = trace_bundles(
-        telescope,
-        telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]),
-        float(w),
-        np.zeros((1, 2)),
-        projection,
-        threads,
-    ).chief_landing()
+    edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
+    rim = replace(request, fields=edge).bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
     found = [_measure(landing, direct) for landing in landings if landing.weight.sum() > 0]
-    # Where no ray from the edge of the field arrives, the map shows the ghosts whole.
+    # Where no ray from the edge of the field arrives, the map covers whole ghosts.
     radius = float(np.nanmax(np.linalg.norm(rim, axis=-1), initial=0.0)) or max(
         (g.diameter for g in found), default=1.0
     )
@@ -256,23 +240,20 @@ def ghosts(
     together = np.zeros((_MAP, _MAP))
     for landing in landings:
         together += _irradiance(landing, edges, edges) / direct
-    scale = principal_rays(telescope, point[None], w, projection=projection, threads=threads).mean_plate_scale
     return Ghosts(
-        telescope=telescope.name,
-        field=point,
-        wavelength=float(w),
+        request=request,
         detector_reflectivity=float(detector_reflectivity),
         ghosts=tuple(sorted(found, key=lambda g: (-g.peak, g.first, g.second))),
         star=star,
         irradiance=together,
         edges=edges,
         image_radius=radius,
-        plate_scale=float(scale[0]),
+        plate_scale=float(principal_rays_of(request).mean_plate_scale[0]),
     )
 
 
 def _measure(landing: GhostLight, direct: float) -> Ghost:
-    # Rays that graze the detector may land anywhere: what counts is where most of the light is.
+    # Rays that graze the detector may land anywhere; position and size are those of most of the light.
     around = np.median(landing.position, axis=0)
     core = _within(landing.position - around, landing.weight, _CORE)
     weight, position, direction = landing.weight[core], landing.position[core], landing.direction[core]
@@ -289,7 +270,7 @@ def _measure(landing: GhostLight, direct: float) -> Ghost:
         first=landing.path.first,
         second=landing.path.second,
         flux=float(landing.weight.sum()) / direct,
-        # Of nine cells together, for a cell alone has a tenth too many or too few rays.
+        # Mean over nine cells: the number of rays in a single one is uncertain by a tenth and more.
         peak=float(uniform_filter(irradiance, 3, mode="constant").max()),
         centroid=centroid,
         diameter=2.0 * float(np.linalg.norm(off, axis=-1).max()),
@@ -299,22 +280,18 @@ def _measure(landing: GhostLight, direct: float) -> Ghost:
     )
 
 
-def _within(off: np.ndarray, weight: np.ndarray, share: float) -> np.ndarray:
-    """Return which rays lie in the circle about the origin that holds a share of the light."""
+def _within(off: np.ndarray, weight: np.ndarray, fraction: float) -> np.ndarray:
+    """Return which rays lie in the circle about the origin that holds a fraction of the light."""
     distance = np.linalg.norm(off, axis=-1)
     order = np.argsort(distance, kind="stable")
     held = np.cumsum(weight[order])
-    return distance <= distance[order][np.searchsorted(held, share * held[-1])]
+    return distance <= distance[order][np.searchsorted(held, fraction * held[-1])]
 
 
 def _irradiance(landing: GhostLight, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the light per area in cells of given edges, [y, x]."""
     light, _, _ = np.histogram2d(landing.position[:, 1], landing.position[:, 0], bins=[y, x], weights=landing.weight)
     return light / np.outer(np.diff(y), np.diff(x))
-
-
-def _degrees(field: np.ndarray) -> str:
-    return "{:.6g}, {:.6g}".format(*np.rad2deg(field))
 
 
 def _draw_map(axes: Axes, result: Ghosts) -> None:

@@ -1,4 +1,4 @@
-"""Spot diagrams: where the rays of a star land on the detector, and the sizes that follow."""
+"""Spot diagrams: landing points of rays on the detector, and sizes of the spots."""
 
 from __future__ import annotations
 
@@ -22,62 +22,54 @@ from ..drawing import (
     round_length,
     wavelength_colors,
 )
-from .principal_rays import principal_rays
+from ..result import FieldResult
+from .principal_rays import principal_rays_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 REFERENCES = ("centroid", "chief")
-#: The frame reaches no farther than so many times the radius of 80 % of the rays: stray rays would hide the spots.
+#: Half-width of the frame at most, in radii of 80 % of the rays: stray rays would hide the spots.
 _FARTHEST = 5.0
-#: Dots in one panel beyond which every second, third... ray is left out of the picture.
+#: Dots in one panel beyond which only every second, third... ray is drawn.
 _DOTS = 6000
 
 
 @dataclass(frozen=True)
-class SpotDiagram:
+class SpotDiagram(FieldResult):
     """Spots of several field points, all wavelengths together.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
     displacement : ndarray, shape [n_field, n_wave, n_pupil, 2]
-        Landing points relative to `reference` [m], x and y of the detector; NaN where a ray does not arrive.
+        Landing points relative to `reference_point` [m], x and y of the detector; NaN where a ray does not arrive.
     weight : ndarray, shape [n_field, n_wave, n_pupil]
-        What each ray contributes to the light of its field, area of the pupil times weight of the wavelength; zero
-        where it is vignetted. The sum over a field is the part of the pupil that is lit.
-    reference : ndarray, shape [n_field, 2]
-        Detector coordinates [m] that the displacements start from: the centroid of the light, or where the chief ray of
-        the middle wavelength lands.
+        Contribution of each ray to the light of its field: area of the pupil times weight of the wavelength, zero where
+        the ray is vignetted. The sum over a field is the lit fraction of the pupil.
+    reference_point : ndarray, shape [n_field, 2]
+        Origin of the displacements on the detector [m]: centroid of the light, or landing point of the chief ray at the
+        middle wavelength.
     plate_scale : ndarray, shape [n_field]
         Angle on the sky over length on the detector at each field [rad/m].
     airy_radius : ndarray, shape [n_field]
         Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m].
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelengths: np.ndarray
     displacement: np.ndarray
     weight: np.ndarray
-    reference: np.ndarray
+    reference_point: np.ndarray
     plate_scale: np.ndarray
     airy_radius: np.ndarray
 
     @property
     def lit_fraction(self) -> np.ndarray:
-        """Part of the entrance pupil that is lit, shape [n_field]."""
+        """Fraction of the entrance pupil that is lit, shape [n_field]."""
         return self.weight.sum(axis=(1, 2))
 
     @property
     def centroid(self) -> np.ndarray:
-        """Centroid of the light relative to `reference` [m], shape [n_field, 2]."""
+        """Centroid of the light relative to `reference_point` [m], shape [n_field, 2]."""
         return self._mean(self.displacement)
 
     @property
@@ -97,25 +89,25 @@ class SpotDiagram:
         largest = radius.max(axis=(1, 2))
         return np.where(largest >= 0, largest, np.nan)
 
-    def radius_holding(self, share: float = 0.8) -> np.ndarray:
-        """Return the radius about the centroid that holds a share of the rays [m], shape [n_field].
+    def radius_holding(self, fraction: float = 0.8) -> np.ndarray:
+        """Return the radius about the centroid that holds a fraction of the rays [m], shape [n_field].
 
-        Geometric: diffraction is left out. The rays in the order of their radii are taken to stand in the middle of the
-        light that they carry, those of one radius together, and the radius is interpolated between two of them.
+        Diffraction is left out. In the order of their radii, rays stand in the middle of the light that they carry,
+        those of equal radius together; between them the radius is interpolated.
         """
-        if not 0 < share < 1:
-            raise DomainError(f"share = {share!r}: expected a number between 0 and 1")
+        if not 0 < fraction < 1:
+            raise DomainError(f"fraction = {fraction!r}: expected a number between 0 and 1")
         radii = np.linalg.norm(self._centered(), axis=-1).reshape(len(self.fields), -1)
         weights = self.weight.reshape(len(self.fields), -1)
         found = np.full(len(self.fields), np.nan)
         for i, (radius, weight) in enumerate(zip(radii, weights, strict=True)):
             order = np.argsort(radius[weight > 0], kind="stable")
             if len(order):
-                found[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], share)
+                found[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], fraction)
         return found
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
+        """Return the results by name and unit; lists run over the fields."""
         arcsec = np.rad2deg(self.plate_scale) * 3600.0
         sizes = {
             "rms_radius": self.rms_radius,
@@ -128,7 +120,7 @@ class SpotDiagram:
             "wavelength_nm": self.wavelengths * 1e9,
             "rays_per_field": int(np.prod(self.weight.shape[1:])),
             "field_deg": np.rad2deg(self.fields),
-            "reference_mm": self.reference * 1e3,
+            "reference_mm": self.reference_point * 1e3,
             "centroid_um": self.centroid * 1e6,
             "rms_xy_um": self.rms_xy * 1e6,
             **{f"{name}_um": value * 1e6 for name, value in sizes.items()},
@@ -139,13 +131,13 @@ class SpotDiagram:
 
     def plot(self) -> Figure:
         """Draw a panel for each field, all on one scale, with the Airy disc and a scale bar."""
-        share = self.radius_holding(0.8)
-        light = np.nanmax(self.geometric_radius, initial=0.0), _FARTHEST * np.nanmax(share, initial=0.0)
+        radius = self.radius_holding(0.8)
+        light = np.nanmax(self.geometric_radius, initial=0.0), _FARTHEST * np.nanmax(radius, initial=0.0)
         half = 1.08e6 * max(float(min(light)), float(np.nanmax(self.airy_radius, initial=1e-9)))
         with styled():
             figure, panels = panel_grid(len(self.fields), 2.5, 3.0)
             for i, axes in enumerate(panels):
-                _draw_spot(axes, self, i, half, share[i])
+                _draw_spot(axes, self, i, half, radius[i])
             bar = round_length(0.7 * half)
             arcsec = bar * 1e-6 * float(np.rad2deg(self.plate_scale[0])) * 3600.0
             draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcsec:.3g}"')
@@ -194,9 +186,7 @@ def spots(
     Raises
     ------
     ConfigError
-        If sampling, reference or projection is unknown.
-    DomainError
-        If fields or wavelengths lie outside what the telescope covers, or the weights do not match.
+        If the reference is unknown.
     """
     if reference not in REFERENCES:
         raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
@@ -210,35 +200,39 @@ def spots(
         projection=projection,
         threads=threads,
     )
+    return spot_diagram(request, reference)
+
+
+def spot_diagram(request: Request, reference: str = "centroid") -> SpotDiagram:
+    """Return the spot diagram of a request."""
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
-    principal = principal_rays(telescope, request.fields, request.middle, projection=projection, threads=threads)
+    principal = principal_rays_of(request)
     chief = bundles[len(bundles) // 2].chief_landing()
     lit = np.stack([b.lit for b in bundles], axis=1)
     diagram = SpotDiagram(
-        telescope=telescope.name,
-        fields=request.fields,
-        wavelengths=request.wavelengths,
+        request=request,
         displacement=np.stack([b.landing() for b in bundles], axis=1) - chief[:, None, None],
         weight=np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0),
-        reference=chief,
+        reference_point=chief,
         plate_scale=principal.mean_plate_scale,
         airy_radius=1.22 * request.middle * principal.mean_f_number,
     )
     if reference == "chief":
         return diagram
     centroid = diagram.centroid
-    return replace(diagram, displacement=diagram.displacement - centroid[:, None, None], reference=chief + centroid)
+    moved = diagram.displacement - centroid[:, None, None]
+    return replace(diagram, displacement=moved, reference_point=chief + centroid)
 
 
-def _weighted_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """Return where ascending values pass a share of their weights; equal ones, but for rounding, count as one."""
+def _weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> float:
+    """Return where ascending values pass a fraction of their weights; values equal but for rounding count as one."""
     starts = np.flatnonzero(np.diff(values, prepend=-np.inf) > 1e-9 * values[-1])
     held = np.add.reduceat(weights, starts)
     middle = (np.cumsum(held) - 0.5 * held) / held.sum()
-    return float(np.interp(share, middle, values[starts]))
+    return float(np.interp(fraction, middle, values[starts]))
 
 
-def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, share: float) -> None:
+def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: float) -> None:
     centered = (spots.displacement[i] - spots.centroid[i]) * 1e6
     names = [f"{w * 1e9:.4g} nm" for w in spots.wavelengths]
     colors = wavelength_colors(len(names)) if len(names) > 1 else [BLUE]
@@ -247,11 +241,11 @@ def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, share: float
         lit = np.flatnonzero(weight > 0)[::step]
         axes.plot(*xy[lit].T, ".", markersize=1.6, markeredgewidth=0.0, color=color, alpha=0.7, label=name)
     draw_circle(axes, spots.airy_radius[i] * 1e6, color="black", style="-", label="Airy disc")
-    draw_circle(axes, share * 1e6, color=RED, style=(0, (4, 2)), label="80 % of the rays")
+    draw_circle(axes, radius * 1e6, color=RED, style=(0, (4, 2)), label="80 % of the rays")
     bare_frame(axes, half)
     scale = float(np.rad2deg(spots.plate_scale[i])) * 3600.0
     rms = spots.rms_radius[i]
-    text = f'rms {rms * 1e6:.3g} µm = {rms * scale:.3g}"\n80 % {share * 1e6:.3g} µm = {share * scale:.3g}"'
+    text = f'rms {rms * 1e6:.3g} µm = {rms * scale:.3g}"\n80 % {radius * 1e6:.3g} µm = {radius * scale:.3g}"'
     if not np.isfinite(rms):
         text = "no light arrives"
     elif spots.lit_fraction[i] < 0.995:

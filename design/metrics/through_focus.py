@@ -1,8 +1,8 @@
-"""Spots and wavefronts against the height of the detector, and where focus is best.
+"""Spots and wavefronts against the height of the detector, and the height of best focus.
 
-Behind the last surface rays are straight, so one trace gives the figures at every height: landing points move in
-proportion to it, and the mean square radius is a parabola in it, whose minimum is known without a search. The wavefront
-is measured anew at each height, on a sphere about where the chief ray meets the detector there.
+Behind the last surface rays are straight, so one trace serves all heights: landing points move in proportion to the
+height, and the mean square radius is a parabola in it, whose minimum is known without a search. The wavefront refers at
+each height to a sphere about the landing point of the chief ray there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, field_text
-from .principal_rays import principal_rays
+from ..result import FieldResult
+from .principal_rays import principal_rays_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,39 +33,30 @@ _HEIGHTS = 61
 
 
 @dataclass(frozen=True)
-class ThroughFocus:
+class ThroughFocus(FieldResult):
     """Image quality against the height of the detector.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
     defocus : ndarray, shape [n_height]
-        Heights of the detector above its place [m], along its own z axis.
+        Heights above the nominal detector [m], along its own z axis.
     rms_radius : ndarray, shape [n_field, n_height]
         Root mean square radius of the spots about their centroids, all wavelengths together [m].
     rms_wavefront : ndarray, shape [n_field, n_height]
         Root mean square of the wavefront without piston and tilt, in quadrature over the wavelengths [m].
     strehl : ndarray, shape [n_field, n_height]
-        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, tilt taken off; mean over the
-        wavelengths. The Strehl ratio where that is the brightest point, so for small aberrations.
+        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, tilt removed; mean over the
+        wavelengths. It is the Strehl ratio where that is the brightest point, so for small aberrations.
     best_spot : ndarray, shape [n_field]
         Height of the smallest rms radius of each field [m].
     best_wavefront : ndarray, shape [n_field]
         Height of the smallest rms wavefront of each field [m]; NaN where it lies outside the heights.
     best_common : float
-        The height at which the mean square radius of all fields is smallest [m].
+        Height of the smallest mean square radius of all fields [m].
     smallest_radius : ndarray, shape [n_field]
         Root mean square radius at `best_spot` [m].
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelengths: np.ndarray
     defocus: np.ndarray
     rms_radius: np.ndarray
     rms_wavefront: np.ndarray
@@ -75,7 +67,7 @@ class ThroughFocus:
     smallest_radius: np.ndarray
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; rows are fields, columns heights of the detector."""
+        """Return the results by name and unit; rows are fields, columns heights of the detector."""
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
@@ -136,13 +128,13 @@ def through_focus(
     fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`.
     defocus : array_like or Quantity, shape [n_height], optional
-        Heights of the detector above its place [m], ascending; by default about the common best focus, as far as the
-        spots grow to about three times their size.
+        Heights above the nominal detector [m], ascending; by default about the common best focus, to where the spots
+        are about three times as large.
 
     Raises
     ------
     DomainError
-        If fields, wavelengths or heights are out of range, or a field gets no light.
+        If heights do not ascend, or no light of a field reaches the detector.
     """
     request = Request.of(
         telescope,
@@ -161,7 +153,7 @@ def through_focus(
     common = float(-total[1] / (2.0 * total[2]))
     smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
     if defocus is None:
-        principal = principal_rays(telescope, request.fields, request.middle, projection=projection, threads=threads)
+        principal = principal_rays_of(request)
         blur = max(float(smallest.max()), float((request.wavelengths.mean() * principal.mean_f_number).max()))
         reach = float(np.abs(best - common).max()) + 3.0 * blur / float(np.sqrt(square[:, 2].min()))
         heights = common + reach * np.linspace(-1.0, 1.0, _HEIGHTS)
@@ -171,9 +163,7 @@ def through_focus(
             raise DomainError(f"defocus = {defocus!r}: expected ascending heights of the detector in metres")
     wavefront, strehl = _wavefronts(request, bundles, heights)
     return ThroughFocus(
-        telescope=telescope.name,
-        fields=request.fields,
-        wavelengths=request.wavelengths,
+        request=request,
         defocus=heights,
         rms_radius=np.sqrt(np.maximum(np.polynomial.polynomial.polyval(heights, square.T), 0.0)),
         rms_wavefront=wavefront,
@@ -213,7 +203,7 @@ def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -
     radius, weights = request.telescope.reference_sphere_radius, request.pupil.weights
     plane = np.stack([np.ones(len(weights)), *request.unit_pupil.T], axis=-1)
     square, strehl = np.zeros((2, len(bundles[0].chief_path), len(heights)))
-    for bundle, share in zip(bundles, request.weights, strict=True):
+    for bundle, fraction in zip(bundles, request.weights, strict=True):
         for i, lit in enumerate(bundle.lit):
             if not lit.any():
                 continue
@@ -224,9 +214,9 @@ def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -
                 value = bundle.one(i).opd(radius, float(height))[0, lit]
                 scaled = value * np.sqrt(weight)
                 rest = scaled - basis @ (basis.T @ scaled)
-                square[i, k] += share * (rest**2).sum()
+                square[i, k] += fraction * (rest**2).sum()
                 phase = 2.0 * np.pi / bundle.wavelength * rest / np.sqrt(weight)
-                strehl[i, k] += share * np.abs((weight * np.exp(1j * phase)).sum()) ** 2
+                strehl[i, k] += fraction * np.abs((weight * np.exp(1j * phase)).sum()) ** 2
     return np.sqrt(square), strehl
 
 
@@ -242,16 +232,14 @@ def _lowest(x: np.ndarray, y: np.ndarray) -> float:
 def _draw_curves(axes: Axes, result: ThroughFocus, values: np.ndarray, best: np.ndarray) -> None:
     heights = result.defocus * 1e6
     few = len(result.fields) <= FEW
-    for row, field, color, height in zip(
-        values, result.fields, field_colors(len(result.fields)), best * 1e6, strict=True
-    ):
+    colors = field_colors(len(result.fields))
+    for row, field, color, height in zip(values, result.fields, colors, best * 1e6, strict=True):
         axes.plot(heights, row, color=color, linewidth=1.4, label=field_text(field) if few else None)
         if heights[0] <= height <= heights[-1]:
             axes.plot(height, np.interp(height, heights, row), "o", color=color, markersize=4.0)
     axes.axvline(0.0, color="0.6", linewidth=0.7)
-    axes.axvline(
-        result.best_common * 1e6, color="0.3", linewidth=0.9, linestyle=(0, (4, 3)), label="best for all together"
-    )
+    common = result.best_common * 1e6
+    axes.axvline(common, color="0.3", linewidth=0.9, linestyle=(0, (4, 3)), label="best for all together")
     axes.set_xlim(heights[0], heights[-1])
-    axes.set_xlabel("height of the detector above its place [µm]")
+    axes.set_xlabel("height above the nominal detector [µm]")
     axes.grid(True, color="0.92", linewidth=0.6)

@@ -1,20 +1,20 @@
-"""Vignetting: how much of the entrance pupil lights the detector, against field."""
+"""Vignetting: fraction of the entrance pupil whose light reaches the detector, against field."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_of, new_figure, styled
 from ...models.telescope import Telescope
-from ...wavefront.bundles import bundle_blocks
-from ...wavefront.pupil_sampling import spiral_annulus
-from ...wavefront.request import field_points, wavelength_points
+from ...wavefront.request import Request
 from ..drawing import draw_field_map, spread_in_field
+from ..result import FieldResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,40 +25,31 @@ _RINGS, _SPOKES = 14, 24
 
 
 @dataclass(frozen=True)
-class Vignetting:
-    """Part of the entrance pupil that lights the detector.
+class Vignetting(FieldResult):
+    """Fraction of the entrance pupil whose light reaches the detector.
 
     Attributes
     ----------
-    telescope : str
-        Name of the telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
-    fraction : ndarray, shape [n_field]
-        Part of the area of the entrance pupil, the annulus of its diameter and obscuration, through which light reaches
-        the detector. The light of a field also goes with the cosine of its angle, which is not in here.
+    lit_fraction : ndarray, shape [n_field]
+        Fraction of the area of the entrance pupil, the annulus of its diameter and obscuration, whose light reaches the
+        detector. The cosine of the field angle, with which the light of a field also goes, is not in it.
     error : ndarray, shape [n_field]
-        Estimate of the standard error of `fraction`, which the finite number of rays leaves.
+        Estimated standard error of `lit_fraction` from the finite number of rays.
     axis_fraction : float
-        The same on the axis.
+        Lit fraction on the axis.
     """
 
-    telescope: str
-    fields: np.ndarray
-    wavelength: float
-    fraction: np.ndarray
+    lit_fraction: np.ndarray
     error: np.ndarray
     axis_fraction: float
 
     @property
     def relative(self) -> np.ndarray:
         """Light relative to the axis, shape [n_field]."""
-        return self.fraction / self.axis_fraction
+        return self.lit_fraction / self.axis_fraction
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the fields."""
+        """Return the results by name and unit; lists run over the fields."""
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
@@ -66,8 +57,8 @@ class Vignetting:
             "smallest_relative": float(self.relative.min()),
             "largest_error": float(self.error.max()),
             "field_deg": np.rad2deg(self.fields),
-            "radius_deg": np.rad2deg(np.linalg.norm(self.fields, axis=-1)),
-            "fraction": self.fraction,
+            "radius_deg": np.rad2deg(self.off_axis_angle),
+            "fraction": self.lit_fraction,
             "error": self.error,
             "relative": self.relative,
         }
@@ -91,64 +82,56 @@ class Vignetting:
 
 def vignetting(
     telescope: Telescope,
-    fields: Any = None,
-    wavelength: Any = None,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
     *,
-    rays: int = 16384,
+    n_pupil: int = 16384,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Vignetting:
-    """Trace the part of the entrance pupil that is lit, field by field.
+    """Trace the lit fraction of the entrance pupil, field by field.
 
-    Points of equal weight fill the annulus of the pupil. Every fourth of them is a sampling of its own, and half the
-    standard deviation of the four estimates is the error that is given.
+    Points of equal weight fill the annulus of the pupil. Every fourth of them is a sampling of its own; half the
+    standard deviation of the four estimates is the error.
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; rings and spokes over the field of view by default.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's own by default.
-    rays : int
-        Rays of each field.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+    telescope, fields, wavelength, projection, threads
+        As in :meth:`pachon.Request.of`; by default fields lie on rings and spokes over the field of view.
+    n_pupil : int
+        Rays of each field, at least 16.
     progress : callable, optional
-        Told, now and then, how many fields more are done; the axis counts as one.
+        Called with the number of fields done since the last call; the axis counts as one.
 
     Raises
     ------
     DomainError
-        If fields, wavelength or the number of rays are out of range, or no light reaches the detector on the axis.
+        If the number of rays is out of range, or no light reaches the detector on the axis.
     """
-    if int(rays) != rays or rays < 16:
-        raise DomainError(f"rays = {rays!r}: expected a whole number of at least 16")
-    points = field_disc(telescope) if fields is None else field_points(telescope, fields)
-    (w,) = wavelength_points(telescope, wavelength)
-    # A multiple of four, so that the four parts are as large as each other.
-    pupil = spiral_annulus(0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, 4 * (int(rays) // 4)).points
-    everywhere = np.concatenate([np.zeros((1, 2)), points])
-    quarters = np.empty((len(everywhere), 4))
-    for some, bundles in bundle_blocks(telescope, everywhere, float(w), pupil, projection, threads):
+    if int(n_pupil) != n_pupil or n_pupil < 16:
+        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 16")
+    # A multiple of four, so that the four parts are equally large.
+    count = 4 * (int(n_pupil) // 4)
+    request = Request.of(
+        telescope,
+        field_disc(telescope) if fields is None else fields,
+        wavelength,
+        sampling="spiral",
+        n_pupil=count,
+        projection=projection,
+        threads=threads,
+    )
+    everywhere = replace(request, fields=np.concatenate([np.zeros((1, 2)), request.fields]))
+    quarters = np.empty((len(everywhere.fields), 4))
+    for some, bundles in everywhere.blocks(request.wavelength):
         quarters[some] = bundles.lit.reshape(len(bundles.lit), -1, 4).mean(axis=1)
         if progress is not None:
             progress(some.stop - some.start)
     fraction = quarters.mean(axis=1)
     if not fraction[0] > 0:
         raise DomainError(f"telescope {telescope.name}: expected one with light on the axis; all of it is vignetted")
-    return Vignetting(
-        telescope=telescope.name,
-        fields=points,
-        wavelength=float(w),
-        fraction=fraction[1:],
-        error=0.5 * quarters[1:].std(axis=1, ddof=1),
-        axis_fraction=float(fraction[0]),
-    )
+    return Vignetting(request, fraction[1:], 0.5 * quarters[1:].std(axis=1, ddof=1), float(fraction[0]))
 
 
 def field_disc(telescope: Telescope, rings: int = _RINGS, spokes: int = _SPOKES) -> np.ndarray:
@@ -160,7 +143,7 @@ def field_disc(telescope: Telescope, rings: int = _RINGS, spokes: int = _SPOKES)
 
 
 def _draw_profile(axes: Axes, result: Vignetting) -> None:
-    radius = np.rad2deg(np.linalg.norm(result.fields, axis=-1))
+    radius = np.rad2deg(result.off_axis_angle)
     percent = 100.0 * result.relative
     axes.errorbar(
         radius,
