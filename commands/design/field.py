@@ -66,9 +66,9 @@ def vignetting(
     fields: Any = field_disc(given.telescope) if given.fields is None else given.fields
     where = given.telescope, fields, given.wavelength
     if rays * (len(fields) + 1) < _MANY_RAYS:
-        return Outcome(compute(*where, rays=rays, **given.how), _vignetting_rows)
+        return Outcome(compute(*where, n_pupil=rays, **given.how), _vignetting_rows)
     with given.stage("vignetting", len(fields) + 1) as progress:
-        return Outcome(compute(*where, rays=rays, progress=progress, **given.how), _vignetting_rows)
+        return Outcome(compute(*where, n_pupil=rays, progress=progress, **given.how), _vignetting_rows)
 
 
 def _vignetting_rows(result: Any) -> Rows:

@@ -60,7 +60,7 @@ def psf(
         if huygens:
             result = huygens_psf(*where, progress=progress, **how)
         else:
-            result = fft_psf(*where, pupil_points=pupil_points, progress=progress, **how)
+            result = fft_psf(*where, n_pupil=pupil_points, progress=progress, **how)
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -102,7 +102,7 @@ def ee(
     kind, total = ("geometric", None) if geometric else ("diffraction", given.images)
     where = given.telescope, given.fields, given.wavelengths
     with given.stage("encircled energy", total) as progress:
-        how = dict(pixels=pixels, pupil_points=pupil_points, **given.how)
+        how = dict(pixels=pixels, n_pupil=None if geometric else pupil_points, **given.how)
         return encircled_energy(*where, kind=kind, progress=progress, **how)
 
 
@@ -129,7 +129,7 @@ def mtf(
 
     where = given.telescope, given.fields, given.wavelengths
     with given.stage("modulation transfer", given.images) as progress:
-        return compute(*where, pupil_points=pupil_points, progress=progress, **given.how)
+        return compute(*where, n_pupil=pupil_points, progress=progress, **given.how)
 
 
 @design_command(
@@ -179,7 +179,7 @@ def ghosts(
     how: dict[str, Any] = dict(reflectivity=_reflectivities(reflectivity or []), **given.how)
     field = None if given.fields is None else given.fields[0]
     with given.stage("ghosts", max(len(ghost_pairs(given.telescope)), 1)) as progress:
-        how |= dict(detector_reflectivity=detector_reflectivity, rays=rays, progress=progress)
+        how |= dict(detector_reflectivity=detector_reflectivity, n_pupil=rays, progress=progress)
         return Outcome(compute(given.telescope, field, given.wavelength, **how))
 
 

@@ -220,7 +220,8 @@ def wavefront_zernikes(
     points, sample, w = request.fields, request.pupil, request.wavelength
     if int(jmax) != jmax or not 1 <= jmax <= len(sample):
         raise DomainError(f"jmax = {jmax!r}: expected a whole number from 1 to the {len(sample)} points of the pupil")
-    terms = annular_zernikes(int(jmax), *request.unit_pupil.T, telescope.pupil_obscuration).T
+    x, y = request.unit_pupil.T
+    terms = annular_zernikes(int(jmax), x, y, telescope.pupil_obscuration).T
     coefficients, residual = np.empty((len(points), int(jmax))), np.empty(len(points))
     step = max(1, RAYS_AT_ONCE // len(sample))
     for first in range(0, len(points), step):

@@ -202,9 +202,10 @@ def ghosts(
     """
     if int(n_pupil) != n_pupil or n_pupil < 400:
         raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 400")
+    where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
     request = Request.of(
         telescope,
-        [0.0, _FIELD * telescope.field_radius] if field is None else [field],
+        where,
         wavelength,
         sampling="spiral",
         n_pupil=int(n_pupil),

@@ -81,7 +81,7 @@ def ee80(scene: Scene) -> dict[str, float]:
         scene.fields,
         scene.middle,
         pixels=_EE_PIXELS,
-        pupil_points=_EE_POINTS,
+        n_pupil=_EE_POINTS,
         threads=scene.threads,
     )
     radii = energy.radius_holding(0.8) * 1e6
@@ -127,10 +127,10 @@ def distortion(scene: Scene) -> dict[str, float]:
 @OPTICS.group("vignetting", Metric("vignetting lit fraction", "", "edge", one_digit(1.5 / _VIGNETTING_RAYS)))
 def lit_fraction(scene: Scene) -> dict[str, float]:
     """Return the fraction of the pupil that lights the detector at the middle wavelength."""
-    found = vignetting(scene.telescope, scene.fields, scene.middle, rays=_VIGNETTING_RAYS, threads=scene.threads)
+    found = vignetting(scene.telescope, scene.fields, scene.middle, n_pupil=_VIGNETTING_RAYS, threads=scene.threads)
     return {
         f"vignetting lit fraction field {_pair(place)}": float(value)
-        for value, place in zip(found.fraction, scene.plan.fields_deg, strict=True)
+        for value, place in zip(found.lit_fraction, scene.plan.fields_deg, strict=True)
     }
 
 

@@ -47,7 +47,7 @@ def test_fourier_images_by_moments(angle):
     field = np.deg2rad(angle)
     theirs = batoid.fftPSF(optic, *field, 750e-9, projection="zemax", nx=128, pad_factor=4)
     x, y = coordinates(theirs)
-    ours = fft_psf(telescope, [field], 750e-9, pixel=0.2e-6, pixels=192, pupil_points=256, reference="chief")
+    ours = fft_psf(telescope, [field], 750e-9, pixel=0.2e-6, pixels=192, n_pupil=256, reference="chief")
 
     def moments(x, y, light):
         # Weighted as a shape would be, so that the wings, which differ by aliases, do not count.

@@ -37,7 +37,7 @@ def test_pixels_are_squares_of_even_light():
 def test_a_perfect_pupil(paraboloid, obscuration):
     telescope = paraboloid(f_number=50.0, obscuration=obscuration)
     radii = 50.0 * WAVE * np.array([0.5, 1.0, 2.0, 4.0, 8.0])
-    found = encircled_energy(telescope, [[0.0, 0.0]], WAVE, radii=radii, pupil_points=300).fraction[0]
+    found = encircled_energy(telescope, [[0.0, 0.0]], WAVE, radii=radii, n_pupil=300).fraction[0]
     # The pattern of an annulus (Born & Wolf, sec. 8.6.2), integrated over circles.
     e = obscuration
     v = np.linspace(1e-9, 30.0, 6001)
@@ -86,7 +86,7 @@ def test_what_cannot_be_had_is_an_error(lsst_r, paraboloid):
     for radii in ([-1e-6, 1e-6], [2e-6, 1e-6], [math.nan]):
         with pytest.raises(DomainError, match="ascending lengths"):
             encircled_energy(lsst_r, radii=radii)
-    with pytest.raises(DomainError, match="share = 1"):
+    with pytest.raises(DomainError, match="fraction = 1"):
         encircled_energy(lsst_r, [[0.0, 0.0]], kind="geometric").radius_holding(1)
     with pytest.raises(DomainError, match="image of shape"):
         energy_curve(np.full((3, 3), np.nan))

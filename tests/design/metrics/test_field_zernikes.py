@@ -110,7 +110,7 @@ def test_bad_input_is_refused(lsst_r, paraboloid):
     with pytest.raises(DomainError, match="field_radius = -1"):
         double_zernikes(lsst_r, field_radius=-1)
     ring = PupilSampling(np.stack([np.cos(np.arange(40)), np.sin(np.arange(40))], axis=-1) * 3.5, np.ones(40))
-    with pytest.raises(DomainError, match="jmax = 11: the 40 points of the pupil do not tell so many terms apart"):
+    with pytest.raises(DomainError, match="jmax = 11: the 40 points of the pupil cannot separate so many terms"):
         wavefront_zernikes(lsst_r, jmax=11, sampling=ring)
     narrow = paraboloid(2.0, 20.0, aperture=Circle(0.003))
     with pytest.raises(DomainError, match=r"field = \(0, 0\) deg: 12 pupil points are lit; expected at least 28"):

@@ -87,7 +87,7 @@ def test_ghosts_by_the_detector(with_plate):
 
 
 def test_the_maps_hold_the_light(lsst_r):
-    found = ghosts(lsst_r, rays=4000)
+    found = ghosts(lsst_r, n_pupil=4000)
     cell = np.diff(found.edges)[0] ** 2
     sharp = [g for g in found.ghosts if g.diameter < 0.1]
     for ghost in sharp:
@@ -144,8 +144,8 @@ def test_what_cannot_be_had_is_an_error(lsst_r, with_plate, paraboloid):
         ghosts(lsst_r, reflectivity={"L3_exxit": 0.01})
     with pytest.raises(DomainError, match=r"reflectivity of front = 1\.5"):
         ghosts(with_plate, reflectivity=1.5)
-    with pytest.raises(DomainError, match="rays = 10"):
-        ghosts(with_plate, rays=10)
+    with pytest.raises(DomainError, match="n_pupil = 10"):
+        ghosts(with_plate, n_pupil=10)
     with pytest.raises(DomainError, match="expected 0 <= second < first"):
         ghost_path(with_plate, 1, 2)
     with pytest.raises(DomainError, match="'mirror': expected a lens surface"):

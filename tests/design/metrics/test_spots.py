@@ -64,7 +64,7 @@ def test_an_ellipsoid_images_one_focus_on_the_other(paraboloid):
     result = spots(telescope, [[0.0, 0.0], [0.0, angle]], reference="chief")
     # Rounding; and the chief ray, reflected at the vertex, lands at the distance of the near focus times its slope.
     assert result.rms_radius[0] < 1e-14
-    assert np.linalg.norm(result.reference[1]) == pytest.approx(near * np.tan(angle), rel=1e-12)
+    assert np.linalg.norm(result.reference_point[1]) == pytest.approx(near * np.tan(angle), rel=1e-12)
     assert result.airy_radius[0] == pytest.approx(1.22 * 5e-7 * 2.0, rel=0.02)
     with pytest.raises(DomainError, match="object at 4 m: expected an object at infinity"):
         wavefront_zernikes(telescope)
@@ -78,8 +78,8 @@ def test_coma_of_a_slow_paraboloid_has_third_order_size(paraboloid):
     size = focal_length * angle / (16 * f_number**2)
     assert result.rms_radius[0] == pytest.approx(size * np.sqrt(2 / 3), rel=1e-3)
     assert np.abs(result.centroid[0]) == pytest.approx([0.0, size], rel=1e-3, abs=1e-15)
-    assert result.reference[0, 0] == pytest.approx(0.0, abs=1e-15)
-    assert abs(result.reference[0, 1]) == pytest.approx(focal_length * angle, rel=1e-9)
+    assert result.reference_point[0, 0] == pytest.approx(0.0, abs=1e-15)
+    assert abs(result.reference_point[0, 1]) == pytest.approx(focal_length * angle, rel=1e-9)
 
 
 def test_brute_force_moments_of_vignetted_polychromatic_spots(lsst_r):
@@ -98,7 +98,7 @@ def test_brute_force_moments_of_vignetted_polychromatic_spots(lsst_r):
     centroid = weights @ points / weights.sum()
     square = weights @ ((points - centroid) ** 2).sum(axis=1) / weights.sum()
     assert result.lit_fraction[0] == pytest.approx(weights.sum(), rel=1e-12)
-    assert result.reference[0] == pytest.approx(centroid, abs=1e-15)
+    assert result.reference_point[0] == pytest.approx(centroid, abs=1e-15)
     assert result.rms_radius[0] == pytest.approx(np.sqrt(square), rel=1e-9)
     assert result.geometric_radius[0] == pytest.approx(np.linalg.norm(points - centroid, axis=1).max(), rel=1e-9)
 
@@ -118,7 +118,7 @@ def test_spots_are_those_of_batoid(lsst_r):
         x, y = rays.x[lit], rays.y[lit]
         # Rounding of 20 m of path.
         assert result.rms_radius[i] == pytest.approx(np.hypot(x.std(), y.std()), abs=1e-13)
-        assert (result.reference + result.centroid)[i] == pytest.approx([x.mean(), y.mean()], abs=1e-13)
+        assert (result.reference_point + result.centroid)[i] == pytest.approx([x.mean(), y.mean()], abs=1e-13)
 
 
 def test_the_lsst_is_as_sharp_as_designed(lsst_r):
@@ -178,6 +178,6 @@ def test_bad_input_is_refused(lsst_r):
         spots(lsst_r, None, [5e-7, 6e-7], wavelength_weights=[1.0])
     with pytest.raises(DomainError, match="wavelength = 2000 nm"):
         spots(lsst_r, None, [2e-6])
-    with pytest.raises(DomainError, match="share = 1"):
+    with pytest.raises(DomainError, match="fraction = 1"):
         spots(lsst_r).radius_holding(1)
     assert field_points(lsst_r, (0.0, 0.01)).shape == (1, 2)
