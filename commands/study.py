@@ -95,7 +95,7 @@ def _show(result: Study) -> None:
         cases += [best for how in ("equal", "softened") if (best := result.best_order(stars, how))]
     rows = []
     for case in dict.fromkeys(cases):
-        if (found := result.figures.get(case)) is not None:
+        if (found := result.metrics.get(case)) is not None:
             rows.append((f"{case.stars} stars, {case}", *(f"{found[key]:.1e}" for key in _COLUMNS)))
     Rows(("model", *_COLUMNS.values()), rows, _CAPTION).show()
     if result.problems:
@@ -103,10 +103,10 @@ def _show(result: Study) -> None:
     if chosen is None:
         console.print(f"no way to model {plan.base.stars} stars could be fitted")
         return
-    error = result.figures[chosen]["error_rms_e_away"]
+    error = result.metrics[chosen]["error_rms_e_away"]
     console.print(
         f"recommended for {plan.base.stars} stars of S/N {plan.base.snr:g} and more: {chosen}; residual of e at "
-        f"holdout positions {result.figures[chosen]['rms_e_away']:.2e} ± {error:.0e}",
+        f"holdout positions {result.metrics[chosen]['rms_e_away']:.2e} ± {error:.0e}",
         highlight=False,
     )
 

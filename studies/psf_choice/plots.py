@@ -29,7 +29,7 @@ _ROOF = 4.0
 _QUIET = (0, (1, 1.5))
 
 
-def stars_figure(result: Study) -> bytes:
+def stars_plot(result: Study) -> bytes:
     """Draw the residual of e where no star is against the number of stars, a line for each order.
 
     A panel for each weighting; dashed: what noise alone should leave of such a fit; dotted: stars without noise.
@@ -57,7 +57,7 @@ def stars_figure(result: Study) -> bytes:
         return png_bytes(figure)
 
 
-def choices_figure(result: Study) -> bytes:
+def choices_plot(result: Study) -> bytes:
     """Draw what is gained by other choices: order, components, basis, interpolation, S/N, and what CCDs share."""
     plan, base = result.plan, result.plan.base
     with styled():
@@ -178,7 +178,7 @@ def _line(
     linestyle: Any = "-",
 ) -> None:
     """Draw a figure of cases against something, those that could be fitted; negative values open."""
-    rows = [(x, found) for x, case in cases if (found := result.figures.get(case.settled())) is not None]
+    rows = [(x, found) for x, case in cases if (found := result.metrics.get(case.settled())) is not None]
     points = np.array([(x, found[key], found.get(f"error_{key}", np.nan)) for x, found in rows]).reshape(-1, 3)
     # A perfect fit leaves rounding alone, which has no place on the scale.
     x, value, error = points[np.isfinite(points[:, 1]) & (np.abs(points[:, 1]) > 1e-12)].T
@@ -214,7 +214,7 @@ def _log_values(axes: Axes) -> None:
 
 
 def _roof(axes: Axes, result: Study) -> None:
-    base = result.figures.get(result.plan.base)
+    base = result.metrics.get(result.plan.base)
     low, high = axes.get_ylim()
     if base is not None:
         axes.set_ylim(low, min(high, _ROOF * base["rms_e_away"]))

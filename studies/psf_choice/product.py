@@ -1,4 +1,4 @@
-"""What a study of PSF models leaves in its folder: table, figures, pictures, configuration."""
+"""Files of a study of PSF models: table, metrics, plots, configuration."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from ...pipeline.config import Configuration, to_yaml
 from ...pipeline.measure.correlation import SEPARATION_RANGES
 from ...pipeline.run_folder import CONFIG_NAME, stamp_of
 from .plan import INTERPOLATIONS
-from .plots import choices_figure, stars_figure
+from .plots import choices_plot, stars_plot
 from .study import Study, study_experiment
 
 
 def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str, ...]:
-    """Write table, figures, pictures and configuration, and return the names of the files.
+    """Write table, metrics, plots and configuration, and return the names of the files.
 
     Parameters
     ----------
     result : Study
-        What to write.
+        The study.
     folder : Path
-        Where; it exists.
+        Existing folder.
     config : Configuration
-        Resolved configuration that the study is about.
+        Configuration of the study.
 
     Raises
     ------
@@ -39,8 +39,8 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
     stamp = stamp_of(study_experiment(config, result.plan))
     meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed, "draws": result.plan.draws}
     write_ecsv(folder / "study.ecsv", study_columns(result), {"what": "PSF models against the truth", **meta})
-    write_bytes(folder / "study_stars.png", stars_figure(result))
-    write_bytes(folder / "study_choices.png", choices_figure(result))
+    write_bytes(folder / "study_stars.png", stars_plot(result))
+    write_bytes(folder / "study_choices.png", choices_plot(result))
     write_json(folder / "study.json", {**study_summary(result), **meta})
     heading = (f"pachon {VERSION}: the configuration that the study is about.",)
     write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
@@ -48,24 +48,24 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
 
 
 def study_summary(result: Study) -> dict[str, Any]:
-    """Return what a study came to: its base, what it recommends, the best order of each number of stars."""
+    """Return the base, the recommended case, and the best order for each number of stars."""
     plan, chosen = result.plan, result.recommended()
     orders = {
         how: {str(n): best.order for n in plan.stars if (best := result.best_order(n, how))}
         for how in INTERPOLATIONS[:-1]
     }
     return {
-        "base": {**vars(plan.base), "figures": result.figures.get(plan.base)},
-        "recommended": None if chosen is None else {**vars(chosen), "figures": result.figures[chosen]},
+        "base": {**vars(plan.base), "figures": result.metrics.get(plan.base)},
+        "recommended": None if chosen is None else {**vars(chosen), "figures": result.metrics[chosen]},
         "best_order": orders,
-        "fitted": len(result.figures),
+        "fitted": len(result.metrics),
         "not_fitted": {f"{case.stars} stars, S/N {case.snr:g}, {case}": why for case, why in result.problems.items()},
     }
 
 
 def study_columns(result: Study) -> dict[str, tuple[np.ndarray, str, str]]:
-    """Return a table with a row for each case, those that could not be fitted included, as ECSV columns."""
-    cases = [*result.figures, *result.problems]
+    """Return the columns of the table, a row for each case, those without a fit included."""
+    cases = [*result.metrics, *result.problems]
     about = {
         "stars": "stars of a CCD",
         "snr": "S/N of the faintest star; infinite without noise",
@@ -75,8 +75,8 @@ def study_columns(result: Study) -> dict[str, tuple[np.ndarray, str, str]]:
         "components": "of the basis; 0: all pixels",
     }
     columns = {key: (np.array([getattr(c, key) for c in cases]), "", what) for key, what in about.items()}
-    for key in next(iter(result.figures.values()), {}):
-        values: list[Mapping[str, float]] = [result.figures.get(case, {}) for case in cases]
+    for key in next(iter(result.metrics.values()), {}):
+        values: list[Mapping[str, float]] = [result.metrics.get(case, {}) for case in cases]
         columns[key] = (np.array([v.get(key, np.nan) for v in values]), "", _meaning(key))
     problems = np.array([result.problems.get(case, "") for case in cases])
     columns["problem"] = (problems, "", "why it could not be fitted")

@@ -7,6 +7,7 @@ from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError
+from pachon.core.progress import Reporter
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import Experiment
@@ -15,9 +16,10 @@ from pachon.pipeline.psf_model.polynomial import mapped
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, Exposed
 from pachon.pipeline.simulate.ccd_observation import Observation
 from pachon.pipeline.simulate.star_field import make_star_field
-from pachon.studies.psf_choice import study as psf_study
 from pachon.studies.psf_choice.plan import NOISE_FREE, Case, Plan, make_plan
-from pachon.studies.psf_choice.study import Study, StudyCcd, fit, noise_law, observe, study
+from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals, noise_law, residual_correlations
+from pachon.studies.psf_choice.stars import SimulatedCcd, fit, observe, simulate
+from pachon.studies.psf_choice.study import Study, study, study_experiment
 
 SCALE = 0.2 * ARCSEC
 
@@ -45,7 +47,7 @@ def _planted(name, degree, n_stars, n_truth, half=0.02):
     exposure = CcdExposure(name, places, exposed(places.truth, 31), exposed(places.observed, 41))
     stamps, nothing = images(places.observed, 31), np.zeros(n_stars, dtype=int)
     truth, shapes = (measure_shapes(i, SCALE, 0.7 * ARCSEC) for i in (exposure.truth.image, stamps))
-    return StudyCcd(exposure, truth, Observation((0.0, 0.0), stamps, shapes, nothing, nothing == 0))
+    return SimulatedCcd(exposure, truth, Observation((0.0, 0.0), stamps, shapes, nothing, nothing == 0))
 
 
 def _figures(experiment, case, ccds, draws):
@@ -53,8 +55,8 @@ def _figures(experiment, case, ccds, draws):
     for draw in range(draws):
         seen = [observe(experiment, ccd, case.snr, draw) for ccd in ccds]
         models = [fit(case, *pair) for pair in zip(ccds, seen, strict=True)]
-        samples.append(psf_study._sample(experiment, case, ccds, seen, models))
-    return psf_study._figures(samples)
+        samples.append(measure_residuals(experiment, case, ccds, seen, models))
+    return case_metrics(samples)
 
 
 @pytest.fixture(scope="module")
@@ -133,8 +135,8 @@ def test_noise_law_against_fits_of_noise():
 def test_stars_are_nested_and_noise_is_common(experiment):
     ccd = _planted("R22_S11", 2, 24, 10)
     seen, again, other = (observe(experiment, ccd, 30.0, draw) for draw in (0, 0, 1))
-    np.testing.assert_array_equal(seen.seen.images, again.seen.images)
-    assert np.abs(seen.seen.images - other.seen.images).max() > 1e-3
+    np.testing.assert_array_equal(seen.observation.images, again.observation.images)
+    assert np.abs(seen.observation.images - other.observation.images).max() > 1e-3
     np.testing.assert_array_equal(seen.snr, other.snr)
     for n in (6, 12, 24):
         model = fit(Case(n, 30.0, components=4, order=1), ccd, seen)
@@ -151,7 +153,7 @@ def test_correlations_are_means_over_pairs():
     centers = np.array([[0.0, 0.0], [0.02, 0.0], [0.0, 0.03]])
     fields = [c + rng.uniform(0.0, 0.002, (12, 2)) for c in centers]  # CCDs of 7', 70' and more apart
     residuals = [rng.normal(0.0, 0.01, (3, 12)) for _ in centers]
-    xi, left = psf_study._correlations(fields, residuals)
+    xi, left = residual_correlations(fields, residuals)
 
     def long_range(chosen):
         r = np.concatenate([fields[i] for i in chosen])
@@ -208,25 +210,25 @@ def small(tiny):
 
 def test_every_case_has_figures_or_a_problem(small):
     plan, result = small
-    assert {*result.figures, *result.problems} == set(plan.cases())
-    assert not set(result.figures) & set(result.problems)
+    assert {*result.metrics, *result.problems} == set(plan.cases())
+    assert not set(result.metrics) & set(result.problems)
     for case, problem in result.problems.items():
         assert case.terms > case.stars
         assert "10 polynomial terms need as many stars, 6 given" in problem
     assert len(result.problems) == 4
-    for case, found in result.figures.items():
+    for case, found in result.metrics.items():
         assert np.isfinite(found["rms_e_away"]), case
         assert np.isnan(found["noise_law_away"]) == (case.interpolation == "gp")
 
 
 def test_a_case_is_what_its_parts_give(small, tiny):
     plan, result = small
-    experiment = psf_study.study_experiment(tiny(), plan)
-    ccds = psf_study._simulate(experiment, 2, psf_study.Reporter(quiet=True))  # and two threads change nothing
+    experiment = study_experiment(tiny(), plan)
+    ccds = simulate(experiment, 2, Reporter(quiet=True))  # and two threads change nothing
     for case in (plan.base, replace(plan.base, stars=6, interpolation="snr"), replace(plan.base, basis="pixels")):
         # Principal components of one fit are truncated, by rounding those of a fit of fewer.
         for key, value in _figures(experiment, case.settled(), ccds, 2).items():
-            assert result.figures[case.settled()][key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
+            assert result.metrics[case.settled()][key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
 
 
 def test_stars_with_defects_are_refused(tiny):
@@ -262,9 +264,9 @@ def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
     for name in ("study_choices.png", "study_stars.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     # One CCD has no correlations and no errors over CCDs, but all the rest. The written configuration is the study's.
-    monkeypatch.setattr("pachon.studies.psf_choice.product.choices_figure", lambda *_: b"")
+    monkeypatch.setattr("pachon.studies.psf_choice.product.choices_plot", lambda *_: b"")
     assert load_configuration(out / "config.yaml").stars.observed == 12
-    monkeypatch.setattr("pachon.studies.psf_choice.product.stars_figure", lambda *_: b"")
+    monkeypatch.setattr("pachon.studies.psf_choice.product.stars_plot", lambda *_: b"")
     alone = [*command, "--ccds", "R22_S11", "--stars", "12", "--orders", "1", "--out", str(tmp_path / "alone")]
     assert main([*alone, "--quiet", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["base"]["figures"]
@@ -289,7 +291,7 @@ def test_bad_input_is_one_line(settings_file, tmp_path, capsys, arguments, parts
     def never(*_, **__):
         raise ConfigError("simulated")
 
-    monkeypatch.setattr(psf_study, "study", never)
+    monkeypatch.setattr("pachon.studies.psf_choice.study.study", never)
     assert main(["study", str(settings_file), "-o", str(tmp_path / "out"), *arguments]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -307,4 +309,4 @@ def test_a_model_without_shapes_is_a_problem(experiment):
     model = fit(case, ccd, seen)
     dark = replace(model, mean=np.zeros_like(model.mean), components=np.zeros_like(model.components))
     with pytest.raises(DomainError, match="CCD R22_S11: the model has no shape anywhere"):
-        psf_study._sample(experiment, case, [ccd], [seen], [dark])
+        measure_residuals(experiment, case, [ccd], [seen], [dark])

@@ -1,0 +1,178 @@
+"""Residuals of PSF models at the stars and at holdout positions, and their metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...core.threads import one_blas_thread
+from ...core.units import ARCMIN
+from ...pipeline.experiment import Experiment
+from ...pipeline.measure.correlation import SEPARATION_RANGES, jackknife_error, shear_correlation
+from ...pipeline.measure.shapes import Shapes, measure_shapes
+from ...pipeline.psf_model.model import PsfModel
+from ...pipeline.psf_model.polynomial import Extent, design_matrix
+from .plan import Case
+from .stars import ObservedCcd, SimulatedCcd, used_stars
+
+#: Residuals: observed - model at the stars, and noise-free PSF - model at the holdout positions.
+KINDS = ("at_stars", "away")
+# Two bins of equal width in the logarithm: 0.56' to 10', and 10' to 180'.
+_LOW, _HIGH = SEPARATION_RANGES["long"]
+_BINS: dict[str, Any] = {
+    "min_sep": _LOW**2 / _HIGH * ARCMIN,
+    "max_sep": _HIGH * ARCMIN,
+    "n_bins": 2,
+}
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of one case and one draw of the noise, at the stars and at the holdout positions.
+
+    Attributes
+    ----------
+    square : ndarray, shape [n_ccd, 2, 2]
+        Mean squares of one component of e, and of the relative size, for each of :data:`KINDS`.
+    mean : ndarray, shape [n_ccd, 2, 2]
+        Means of e1 and e2.
+    law : ndarray, shape [n_ccd, 2]
+        Mean squares of e by :func:`noise_law`.
+    xi, xi_left : ndarray, shape [2, 2] and [2, n_ccd, 2]
+        xi+ of short and long separations, of all CCDs and without each.
+    lost : int
+        Holdout positions at which the model has no shape.
+    """
+
+    square: np.ndarray
+    mean: np.ndarray
+    law: np.ndarray
+    xi: np.ndarray
+    xi_left: np.ndarray
+    lost: int
+
+
+def measure_residuals(
+    experiment: Experiment,
+    case: Case,
+    ccds: Sequence[SimulatedCcd],
+    observed: Sequence[ObservedCcd],
+    models: Sequence[PsfModel],
+) -> Residuals:
+    """Measure the residuals of the models of all CCDs."""
+    residuals: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    fields: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    law = np.full((len(ccds), 2), np.nan)
+    for i, (ccd, stars, whole) in enumerate(zip(ccds, observed, models, strict=True)):
+        model = whole.truncated(min(case.components, whole.n_components)) if case.basis == "pca" else whole
+        used = used_stars(case, stars)
+        exposure, places = ccd.exposure, ccd.exposure.places
+        jobs = (
+            (
+                places.observed[used],
+                Shapes(*(v[used] for v in vars(stars.observation.shapes).values())),
+                exposure.observed,
+                used,
+            ),
+            (places.truth, ccd.holdout, exposure.truth, np.ones(len(places.truth), dtype=bool)),
+        )
+        for k, (at, shapes, exposed, chosen) in enumerate(jobs):
+            found = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
+            if not found.usable.any():
+                raise DomainError(f"CCD {exposure.name}: the model has no shape anywhere")
+            residuals[k].append(np.stack([shapes.e1 - found.e1, shapes.e2 - found.e2, shapes.size / found.size - 1.0]))
+            fields[k].append(exposed.fields[chosen])
+        if case.interpolation != "gp":
+            law[i] = noise_law(
+                places.observed[used], places.truth, stars.variance[used], model.weights, case.order, model.extent
+            )
+    correlated = [residual_correlations(*pair) for pair in zip(fields, residuals, strict=True)]
+    return Residuals(
+        square=np.stack(
+            [[[np.nanmean(r[:2] ** 2), np.nanmean(r[2] ** 2)] for r in kind] for kind in residuals], axis=1
+        ),
+        mean=np.stack([[np.nanmean(r[:2], axis=1) for r in kind] for kind in residuals], axis=1),
+        law=law,
+        xi=np.stack([c[0] for c in correlated]),
+        xi_left=np.stack([c[1] for c in correlated]),
+        lost=sum(int(np.isnan(r[0]).sum()) for r in residuals[1]),
+    )
+
+
+def residual_correlations(fields: list[np.ndarray], residuals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return xi+ of residuals below and beyond 10', [2], and without each CCD, [n_ccd, 2]; NaN of one CCD."""
+    if len(fields) < 2:
+        return np.full(2, np.nan), np.full((1, 2), np.nan)
+    x, y = np.concatenate(fields).T
+    e = np.concatenate(residuals, axis=1)[:2]
+    patch = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
+    found = shear_correlation(x, y, *e, **_BINS, patch=patch)
+    return found.xi_plus, found.leave_one_out_plus
+
+
+def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
+    """Return the metrics of a case from its draws; see :class:`~pachon.studies.psf_choice.study.Study`."""
+    square, mean, law, xi, left = (
+        np.stack([getattr(s, key) for s in samples]) for key in ("square", "mean", "law", "xi", "xi_left")
+    )
+    result: dict[str, float] = {}
+
+    def root(name: str, squares: np.ndarray) -> None:
+        # Mean squares [n_draw, n_ccd]: the draws of a CCD share its PSF, so the CCDs give the error.
+        each = squares.mean(axis=0)
+        result[name] = value = float(np.sqrt(each.mean()))
+        error = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else np.nan
+        result[f"error_{name}"] = float(0.5 * error / value) if value > 0.0 else np.nan
+
+    for k, kind in enumerate(KINDS):
+        root(f"rms_e_{kind}", square[:, :, k, 0])
+        root(f"rms_size_{kind}", square[:, :, k, 1])
+        root(f"mean_e_{kind}", (mean[:, :, k] ** 2).mean(axis=-1))
+        result[f"noise_law_{kind}"] = float(np.sqrt(law[:, :, k].mean()))
+        for b, name in enumerate(SEPARATION_RANGES):
+            result[f"xi_plus_{kind}_{name}"] = float(xi[:, k, b].mean())
+            result[f"error_xi_plus_{kind}_{name}"] = float(jackknife_error(left[:, k, :, b].mean(axis=0)))
+    result["lost"] = float(sum(s.lost for s in samples))
+    return result
+
+
+def noise_law(
+    stars: np.ndarray,
+    places: np.ndarray,
+    variance: np.ndarray,
+    weights: np.ndarray | None,
+    order: int,
+    extent: Extent,
+) -> tuple[float, float]:
+    r"""Return the mean square residual of a polynomial fit by noise, at its stars and elsewhere.
+
+    With the terms t at a position, T at the stars and weights W, the fit to values y is a y with
+    a = t (T' W T)^-1 T' W. Independent noise causes the mean square :math:`\sum_j a_j^2 \sigma_j^2` there, and
+    :math:`\sum_j (\delta_{ij} - a_j)^2 \sigma_j^2` of observed - model at star i. For equal noise and weights the mean
+    of the latter is exactly 1 - p/n of the noise for p terms and n stars. Model - noise-free PSF has p/n at the stars,
+    and about that elsewhere, more in gaps between the stars.
+
+    Parameters
+    ----------
+    stars, places : array
+        Positions, [n, 2] and [m, 2].
+    variance : array
+        Variance of the noise of each star, [n].
+    weights : array or None
+        Weights of the stars, [n].
+    order : int
+        Order of the polynomial.
+    extent : tuple of float
+        Domain of the polynomial.
+    """
+    root = np.ones(len(stars)) if weights is None else np.sqrt(weights)
+    terms = design_matrix(stars, extent, order)
+    with one_blas_thread():
+        solve = np.linalg.pinv(terms * root[:, None]) * root
+        at_stars = np.eye(len(stars)) - terms @ solve
+        holdout = design_matrix(places, extent, order) @ solve
+        return float((at_stars**2 @ variance).mean()), float((holdout**2 @ variance).mean())

@@ -1,0 +1,136 @@
+"""Stars of the study of PSF models: noise-free, with noise, and the models fitted to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.progress import Reporter
+from ...core.random_streams import stream
+from ...pipeline.experiment import Experiment
+from ...pipeline.measure.shapes import Shapes, measure_shapes
+from ...pipeline.psf_model.checks import snr_weights
+from ...pipeline.psf_model.model import CLIP_SIGMA, PsfModel
+from ...pipeline.simulate.ccd_exposure import CcdExposure
+from ...pipeline.simulate.ccd_loop import simulate_ccds
+from ...pipeline.simulate.ccd_observation import Observation, observe_ccd
+from ...pipeline.simulate.photometry import (
+    effective_fwhm,
+    instrument_noise,
+    limiting_magnitude,
+    signal_to_noise,
+    sky_electrons_per_pixel,
+)
+from ...pipeline.simulate.stamps import observe_stamps
+from ...pipeline.simulate.star_field import make_star_field
+from .plan import NOISE_FREE, Case
+
+
+@dataclass(frozen=True)
+class SimulatedCcd:
+    """Stars of a CCD.
+
+    Attributes
+    ----------
+    exposure : CcdExposure
+        Noise-free stars.
+    holdout : Shapes
+        Shapes of the PSFs at the holdout positions.
+    noise_free : Observation
+        Stars to be observed, without noise.
+    """
+
+    exposure: CcdExposure
+    holdout: Shapes
+    noise_free: Observation
+
+
+@dataclass(frozen=True)
+class ObservedCcd:
+    """Stars of a CCD with noise: the observation, and S/N and variance of one component of e of each star."""
+
+    observation: Observation
+    snr: np.ndarray
+    variance: np.ndarray
+
+
+def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) -> list[SimulatedCcd]:
+    """Return the noise-free stars of all CCDs."""
+
+    def measured(exposure: CcdExposure) -> SimulatedCcd:
+        truth = measure_shapes(exposure.truth.image, exposure.truth.pixel_scale, experiment.weight_fwhm)
+        return SimulatedCcd(exposure, truth, _look_at(experiment, exposure, exposure.observed.image))
+
+    with experiment.screens(threads, reporter):
+        simulated = simulate_ccds(experiment, measured, title="stars", threads=threads, reporter=reporter)
+    return list(simulated.results.values())
+
+
+def _look_at(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) -> Observation:
+    """Centre and measure images of the stars of a CCD, noise included."""
+    scale = exposure.observed.pixel_scale
+    return observe_ccd(experiment, exposure.name, images, scale, exposure.places.electrons, noisy=False)
+
+
+def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int) -> ObservedCcd:
+    """Return the stars of a CCD with noise.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Settings.
+    ccd : SimulatedCcd
+        The stars.
+    snr_min : float
+        Signal-to-noise ratio of the faintest star where the lit fraction is least; infinite for no noise.
+    draw : int
+        Number of the draw of the noise.
+    """
+    exposed, places, name = ccd.exposure.observed, ccd.exposure.places, ccd.exposure.name
+    n_stars = len(exposed.image)
+    if snr_min == NOISE_FREE:
+        return ObservedCcd(ccd.noise_free, np.full(n_stars, np.inf), np.zeros(n_stars))
+    seed, light = experiment.config.seed, exposed.light
+    width = effective_fwhm(ccd.exposure.truth.image, ccd.exposure.truth.pixel_scale)
+    faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
+    # The same stars in the same order; the limit alone changes.
+    stars = make_star_field(
+        name, places.bounds, 0, n_stars, seed, fwhm=width, band=places.band, exposure=places.exposure, faint=faint
+    )
+    sky = sky_electrons_per_pixel(places.band, places.exposure, exposed.pixel_scale)
+    rng = stream(seed, "study", "noise", name, draw)
+    images = observe_stamps(exposed.image, stars.electrons * light, sky, instrument_noise(places.exposure), rng)
+    found = _look_at(experiment, ccd.exposure, images)
+    snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
+    # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.
+    noise = np.stack([found.shapes.e1 - ccd.noise_free.shapes.e1, found.shapes.e2 - ccd.noise_free.shapes.e2])
+    return ObservedCcd(found, snr, np.mean((noise * snr)[:, found.used] ** 2) / snr**2)
+
+
+def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
+    """Fit the PSF model of a case to the first stars of a CCD.
+
+    Raises
+    ------
+    PachonError
+        If it cannot be fitted.
+    """
+    used = used_stars(case, observed)
+    return PsfModel.fit(
+        observed.observation.images[used],
+        ccd.exposure.places.observed[used],
+        basis=case.basis,  # type: ignore[arg-type]
+        interpolation="gp" if case.interpolation == "gp" else "polynomial",
+        weights=None if case.interpolation == "gp" else snr_weights(case.interpolation, observed.snr[used]),
+        # A star that is not usable costs one principal component.
+        n_components=min(case.components, used.sum() - 1) if case.basis == "pca" else case.components or None,
+        order=case.order,
+        extent=ccd.exposure.places.bounds,
+        clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers
+    )
+
+
+def used_stars(case: Case, observed: ObservedCcd) -> np.ndarray:
+    """Return which stars a case fits: the first ones, where usable."""
+    return observed.observation.used & (np.arange(len(observed.snr)) < case.stars)
