@@ -14,15 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from .errors import ProductError
+from .errors import PachonError, ProductError
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
     """Write a file under a temporary name, flush it to the disk and rename it.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    data : bytes
+        Its content.
+    error : type
+        Class of the error.
 
     Raises
     ------
-    ProductError
+    PachonError
         If it cannot be written: one line with the path and the system's reason. Nothing is left behind then.
     """
     partial = path.with_name(f".{path.name}.partial")
@@ -37,8 +46,8 @@ def write_bytes(path: Path, data: bytes) -> None:
             with suppress(OSError):
                 partial.unlink()
             raise
-    except OSError as error:
-        raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
+    except OSError as problem:
+        raise error(f"cannot write {path}: {problem.strerror or problem}") from None
 
 
 def make_folder(folder: Path) -> None:

@@ -140,7 +140,7 @@ def either(content: Mapping[str, Any], key: str, others: Iterable[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Tagged:
-    """Discriminated union of sections, as an annotation of their common base class.
+    """Discriminated union of sections, as an annotation.
 
     Parameters
     ----------
@@ -148,10 +148,13 @@ class Tagged:
         Section of each kind.
     kind : callable
         Function from a mapping to its kind, one of the keys of `classes`; it raises :func:`expected`.
+    built : bool
+        Whether the value is the object that a section builds, or the section itself.
     """
 
     classes: Mapping[str, type[Section]]
     kind: Callable[[dict[str, Any]], str]
+    built: bool = True
 
     @classmethod
     def by_value(cls, key: str, classes: Mapping[str, type[Section]]) -> Tagged:
@@ -168,7 +171,9 @@ class Tagged:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         # Tags stand in the locations of errors; the brackets tell them from keys.
         choices: Any = {f"<{kind}>": handler.generate_schema(section) for kind, section in self.classes.items()}
-        union = core_schema.tagged_union_schema(choices, discriminator=lambda content: f"<{self.kind(content)}>")
+        union: Any = core_schema.tagged_union_schema(choices, discriminator=lambda content: f"<{self.kind(content)}>")
+        if self.built:
+            union = core_schema.no_info_after_validator_function(_build, union)
         return core_schema.no_info_before_validator_function(self._check, union)
 
     def _check(self, content: Any) -> Any:
@@ -176,6 +181,13 @@ class Tagged:
             raise expected("a mapping of keys to values")
         self.kind(content)
         return content
+
+
+def _build(section: Parameters) -> Any:
+    try:
+        return section.build()
+    except PachonError as error:
+        raise problem(f": {error}" if error.file else f".{error}") from None
 
 
 class Parameters(Section):
@@ -196,9 +208,9 @@ class Parameters(Section):
             Types of the values by key, in the order of the arguments.
         """
         entries = {key: field if isinstance(field, tuple) else (field, ...) for key, field in fields.items()}
-        section = create_model(cls.__name__, __base__=cls, **entries)  # type: ignore[call-overload]
+        section = create_model(cls.__name__, __base__=cls, **entries)
         section.make, section.parameters = staticmethod(make), tuple(fields)
-        return section  # type: ignore[no-any-return]
+        return section
 
     def build(self) -> Any:
         """Return the object that the section describes."""

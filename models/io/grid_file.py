@@ -1,12 +1,13 @@
-"""Grids of sag in FITS files: measured figures and bending modes.
+"""Grids of sag in FITS files: measured deformations and bending modes.
 
-The first image of two dimensions is taken, its rows along y. Its header says where the nodes are, as for any map:
+The first image of two dimensions is taken, its rows along y. The nodes follow from its header, as for any map:
 ``x = CRVAL1 + (i - CRPIX1) CDELT1`` for column i = 1, 2, ... in CUNIT1, the same with 2 for the rows, and BUNIT, the
 unit of the sag. Units are metres where a card is missing.
 """
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from astropy import units as u
 from astropy.io import fits
 
 from ...core.errors import PrescriptionError, error_context
+from ...core.files import write_bytes
 from ..shapes.grid import GridSag
 
 
@@ -62,14 +64,9 @@ def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
         header[f"CDELT{number}"] = step
         header[f"CUNIT{number}"] = "m"
     header["BUNIT"] = ("m", "sag")
-    target = Path(path)
-    scratch = target.with_name(target.name + ".part")
-    try:
-        fits.PrimaryHDU(np.asarray(grid.values), header).writeto(scratch, overwrite=True, checksum=True)
-        scratch.replace(target)
-    except OSError as error:
-        scratch.unlink(missing_ok=True)
-        raise PrescriptionError(f"cannot be written ({error.strerror or error})", file=target) from None
+    buffer = io.BytesIO()
+    fits.PrimaryHDU(np.asarray(grid.values), header).writeto(buffer, checksum=True)
+    write_bytes(Path(path), buffer.getvalue(), PrescriptionError)
 
 
 def _axis(header: Any, number: int, size: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 A file has a header and a table of surfaces in the order that light meets them::
 
     name: my_telescope
-    source: where the figures come from
+    source: where the numbers come from
     version: "1"
     units: {length: m, angle: deg, wavelength: um}
     stop: {z: 0.44}
@@ -26,13 +26,13 @@ Telescope frame: origin at the primary's vertex, +z towards the sky; a positive 
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
 from ...core.errors import PrescriptionError, unknown_name
+from ...core.files import write_bytes
 from ..telescope import Telescope
 from .codev.reader import read_codev
 from .glass_catalogue import GlassCatalogue
@@ -92,7 +92,7 @@ def load_telescope(
     UnknownNameError
         If it is neither a bundled name nor a path.
     PrescriptionError
-        If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
+        If the file cannot be read, or is malformed: one line with file, key, value and expected value.
     """
     text = os.fspath(name_or_path)
     if text in BUNDLED:
@@ -111,7 +111,7 @@ def load_telescope(
 
 @cache
 def _bundled(name: str) -> Telescope:
-    # A telescope never changes, so that one serves all who ask; a sweep asks for it at every point.
+    # Telescopes are immutable, and a sweep loads the same at every point.
     return read_telescope(DATA / f"{name}.yaml")
 
 
@@ -124,7 +124,7 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     telescope : Telescope
-        What to write.
+        Prescription to write.
     path : str or path
         File to write; it is replaced as a whole, or left as it was.
 
@@ -137,18 +137,7 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
     if target.suffix.lower() == ".zmx":
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
-            _write_text(catalogue_path(target), glasses)
-        _write_text(target, lens)
+            write_bytes(catalogue_path(target), glasses.encode(), PrescriptionError)
+        write_bytes(target, lens.encode(), PrescriptionError)
     else:
-        _write_text(target, telescope_to_yaml(telescope))
-
-
-def _write_text(target: Path, text: str) -> None:
-    scratch = target.with_name(target.name + ".part")
-    try:
-        scratch.write_text(text, encoding="utf-8")
-        scratch.replace(target)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
-        raise PrescriptionError(f"{target}: cannot be written ({error.strerror})") from None
+        write_bytes(target, telescope_to_yaml(telescope).encode(), PrescriptionError)

@@ -23,7 +23,6 @@ import json
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
-from ....core.errors import error_context
 from ....core.schema import Parameters, Section, Tagged, checked, either, expected, problem
 from ...aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from ...obstruction import Obstruction
@@ -60,59 +59,22 @@ class RegionSection(Parameters):
 
 
 #: Sections of regions by the key that tells their kind.
-REGIONS: dict[str, type[RegionSection]] = {}
-Region = Annotated[RegionSection, Tagged(REGIONS, _region_kind)]
-OptionalRegion = Annotated[RegionSection | None, Tagged(REGIONS, _region_kind)]
-
-
-class PolygonSection(RegionSection):
-    """Polygon."""
-
-    polygon: Annotated[
-        tuple[Point, ...], checked(lambda v: v if isinstance(v, list) else None, "a list of corners [x, y]")
-    ]
-
-    def build(self) -> Polygon:
-        """Return the polygon."""
-        return Polygon(self.polygon)
-
-
-class PartsSection(RegionSection):
-    """Region made of others."""
-
-    def build(self) -> Aperture:
-        """Return the region; errors name the part."""
-        (key,) = self.parameters
-        sections = getattr(self, key)
-        parts = []
-        for number, section in enumerate(sections):
-            with error_context(key=f"{key}[{number}]"):
-                parts.append(section.build())
-        return self.make(tuple(parts))
-
-
-class ComplementSection(RegionSection):
-    """Complement of a region."""
-
-    complement: Region
-
-    def build(self) -> Complement:
-        """Return the region."""
-        with error_context(key="complement"):
-            return Complement(self.complement.build())
-
-
+REGIONS: dict[str, type[Parameters]] = {}
+_REGION = Tagged(REGIONS, _region_kind)
+_PARTS = Annotated[tuple[Annotated[Any, _REGION], ...], checked(rows, "a list of mappings, one a line")]
+_CORNERS = Annotated[
+    tuple[Point, ...], checked(lambda v: v if isinstance(v, list) else None, "a list of corners [x, y]")
+]
 _CENTRE, _ANGLE = (Point, (0.0, 0.0)), (Angle, 0.0)
-_PARTS = Annotated[tuple[Region, ...], checked(rows, "a list of mappings, one a line")]
 REGIONS |= {
     "circle": RegionSection.of(Circle, circle=Length, centre=_CENTRE),
     "annulus": RegionSection.of(Annulus, annulus=Point, centre=_CENTRE),
     "rectangle": RegionSection.of(Rectangle, rectangle=Point, centre=_CENTRE, angle=_ANGLE),
-    "polygon": PolygonSection,
+    "polygon": Parameters.of(Polygon, polygon=_CORNERS),
     "vane": RegionSection.of(Vane, vane=Length, **{"from": _CENTRE}, angle=_ANGLE, both_ways=(Flag, False)),
-    "union": PartsSection.of(Union, union=_PARTS),
-    "intersection": PartsSection.of(Intersection, intersection=_PARTS),
-    "complement": ComplementSection,
+    "union": Parameters.of(Union, union=_PARTS),
+    "intersection": Parameters.of(Intersection, intersection=_PARTS),
+    "complement": Parameters.of(Complement, complement=Annotated[Any, _REGION]),
 }
 
 
@@ -122,8 +84,8 @@ class ApertureKeys(Section):
     circle: OptionalLength = None
     annulus: OptionalPoint = None
     centre: Point = (0.0, 0.0)
-    aperture: OptionalRegion = None
-    obscuration: OptionalRegion = None
+    aperture: Annotated[Aperture | None, _REGION] = None
+    obscuration: Annotated[Aperture | None, _REGION] = None
 
     @classmethod
     def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
@@ -136,22 +98,18 @@ class ApertureKeys(Section):
 
     def clear_aperture(self) -> Aperture | None:
         """Return the clear aperture; None where there is none."""
-        clear: Aperture | None = None
+        clear = self.aperture
         if self.circle is not None:
             clear = Circle(self.circle, *self.centre)
         elif self.annulus is not None:
             clear = Annulus(*self.annulus, *self.centre)
-        elif self.aperture is not None:
-            with error_context(key="aperture"):
-                clear = self.aperture.build()
         if self.obscuration is None:
             return clear
-        with error_context(key="obscuration"):
-            outside = Complement(self.obscuration.build())
+        outside = Complement(self.obscuration)
         return outside if clear is None else Intersection((clear, outside))
 
 
-class ObstructionSection(Section):
+class ObstructionSection(Parameters):
     """Mesh that blocks light, in a file or written out in base 64."""
 
     name: Text

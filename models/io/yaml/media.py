@@ -107,7 +107,7 @@ def _kind(content: dict[str, Any]) -> str:
     return next((kind for kind in MEDIA if kind in content), "B")
 
 
-AnyMedium = Annotated[MediumSection, Tagged(MEDIA, _kind)]
+AnyMedium = Annotated[MediumSection, Tagged(MEDIA, _kind, built=False)]
 
 
 def medium_wavelengths(medium: Medium) -> tuple[float, ...]:

@@ -13,6 +13,7 @@ from ....core.errors import PrescriptionError, error_context
 from ....core.schema import Section, Tagged, checked, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
 from ...media.medium import Medium
+from ...obstruction import Obstruction
 from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from .apertures import ApertureKeys, ObstructionSection
@@ -91,7 +92,7 @@ def _surface_kind(content: dict[str, Any]) -> str:
 
 
 _SURFACES: dict[str, type[SurfaceKeys]] = {
-    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section))
+    name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section))  # type: ignore[arg-type]
     for name, section in (SHAPES | {"sum": SumSection}).items()
 }
 _BY_SHAPE = Tagged.by_value("shape", {name: section for name, section in _SURFACES.items() if name != "sum"})
@@ -155,6 +156,11 @@ def _no_vacuum(media: Any) -> Any:
     return media
 
 
+_ROWS = checked(rows, "a list of mappings, one a line")
+_SURFACE = Tagged(_SURFACES, _surface_kind, built=False)
+_OBSTRUCTION = Tagged({"mesh": ObstructionSection}, lambda content: "mesh")
+
+
 class Prescription(Section):
     """A prescription file."""
 
@@ -174,11 +180,8 @@ class Prescription(Section):
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
     groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
-    obstructions: Annotated[tuple[ObstructionSection, ...], checked(rows, "a list of mappings, one a line")] = ()
-    surfaces: Annotated[
-        tuple[Annotated[SurfaceKeys, Tagged(_SURFACES, _surface_kind)], ...],
-        checked(rows, "a list of mappings, one a line"),
-    ]
+    obstructions: Annotated[tuple[Annotated[Obstruction, _OBSTRUCTION], ...], _ROWS] = ()
+    surfaces: Annotated[tuple[Annotated[SurfaceKeys, _SURFACE], ...], _ROWS]
 
     def telescope(self) -> Telescope:
         """Return the telescope."""
@@ -192,10 +195,6 @@ class Prescription(Section):
             with error_context(key=f"surfaces[{section.name}]"):
                 behind = surfaces[-1].medium_after if surfaces else medium_before
                 surfaces.append(section.surface(media, behind))
-        obstructions = []
-        for obstruction in self.obstructions:
-            with error_context(key=f"obstructions[{obstruction.name}]"):
-                obstructions.append(obstruction.build())
         return Telescope(
             name=self.name,
             description=self.description,
@@ -217,7 +216,7 @@ class Prescription(Section):
             groups={name: group.surfaces for name, group in self.groups.items()},
             group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},
             camera=self.camera,
-            obstructions=tuple(obstructions),
+            obstructions=self.obstructions,
         )
 
 

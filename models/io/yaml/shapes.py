@@ -33,7 +33,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ValidationInfo
 
-from ....core.errors import PrescriptionError, error_context
+from ....core.errors import PrescriptionError
 from ....core.schema import Parameters, Tagged, checked, either, expected
 from ....core.yaml_reader import as_number
 from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
@@ -41,14 +41,14 @@ from ...shapes.grid import GridSag
 from ...shapes.mesh import MeshSurface
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
 from ..grid_file import read_grid
-from .values import Flag, Length, Lengths, Number, Numbers, OptionalFile, PositiveNumber, Radius, array, rows
+from .values import Flag, Length, Lengths, Number, Numbers, OptionalFile, PositiveNumber, Radius, array, rows, units
 
 
 def _powers(powers: range) -> AfterValidator:
     """Return the conversion of coefficients of powers of the radius: lengths over lengths to these powers."""
 
     def convert(coefficients: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
-        unit = info.context.length(1.0)
+        unit = units(info).length(1.0)
         pairs = zip(powers, coefficients, strict=False)
         return tuple(a if unit == 1.0 else a * unit ** (1 - n) for n, a in pairs)
 
@@ -58,7 +58,7 @@ def _powers(powers: range) -> AfterValidator:
 def _terms(value: Any, info: ValidationInfo) -> tuple[tuple[int, int, float], ...]:
     if not isinstance(value, list) or not value:
         raise expected("a list of [power of x, power of y, coefficient]")
-    unit = info.context.length(1.0)
+    unit = units(info).length(1.0)
     terms = []
     for row in value:
         i, j, a = map(as_number, row) if isinstance(row, list) and len(row) == 3 else (None, None, None)
@@ -146,16 +146,11 @@ class SumSection(ShapeSection):
     """Sum of shapes: their list in place of a name."""
 
     shape: Annotated[  # type: ignore[assignment]
-        tuple[Annotated[ShapeSection, Tagged.by_value("shape", SHAPES)], ...],
-        checked(rows, "a list of mappings, one a line"),
+        tuple[Annotated[Any, Tagged.by_value("shape", SHAPES)], ...], checked(rows, "a list of mappings, one a line")
     ]
 
-    def build(self) -> Shape:  # noqa: D102
-        parts = []
-        for part in self.shape:
-            with error_context(key=f"shape[{part.shape}]"):
-                parts.append(part.build())
-        return Sum(tuple(parts))
+    def build(self) -> Sum:  # noqa: D102
+        return Sum(self.shape)  # type: ignore[arg-type]
 
 
 def shape_items(shape: Shape, number: Callable[[float], str], listed: Callable[..., str]) -> dict[str, str]:

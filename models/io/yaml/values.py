@@ -115,16 +115,22 @@ def array(kind: str, shape: tuple[int, ...]) -> Callable[[Any], np.ndarray | Non
     return decode
 
 
+def units(info: ValidationInfo) -> Units:
+    """Return the units of the file that is validated."""
+    assert isinstance(info.context, Units)
+    return info.context
+
+
 def _converted(quantity: str) -> AfterValidator:
     def convert(value: Any, info: ValidationInfo) -> Any:
-        to_si = getattr(info.context, quantity)
+        to_si = getattr(units(info), quantity)
         return tuple(to_si(v) for v in value) if isinstance(value, tuple) else to_si(value)
 
     return AfterValidator(convert)
 
 
 _TEXT = checked(lambda v: v if isinstance(v, str) and v.strip() else None, "a text")
-_BESIDE = AfterValidator(lambda name, info: info.context.folder / name)
+_BESIDE = AfterValidator(lambda name, info: units(info).folder / name)
 _NUMBER, _POSITIVE = checked(as_number, "a number"), checked(_positive, "a positive number")
 _LIST, _PAIR, _TRIPLE = (
     checked(_numbers(size), f"a list of {size} numbers" if size else "a list of numbers") for size in (None, 2, 3)

@@ -1,3 +1,4 @@
+import os
 import re
 
 import numpy as np
@@ -194,7 +195,7 @@ def test_missing_and_unreadable_files_are_one_line(tmp_path):
     (tmp_path / "bytes.yaml").write_bytes(b"name: \xff\xfe")
     with pytest.raises(PrescriptionError, match="not a UTF-8 text file"):
         load_telescope(tmp_path / "bytes.yaml")
-    with pytest.raises(PrescriptionError, match="cannot be written"):
+    with pytest.raises(PrescriptionError, match=r"cannot write .*folder\.yaml: No such file or directory"):
         save_telescope(load_telescope("paul_baker"), tmp_path / "no" / "folder.yaml")
 
 
@@ -289,11 +290,11 @@ def test_a_missing_header_key_is_named_or_optional(tmp_path, key):
 
 
 def test_a_failed_save_leaves_no_scrap(tmp_path, monkeypatch):
-    def full(self, target):
+    def full(source, target):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(type(tmp_path), "replace", full)
-    with pytest.raises(PrescriptionError, match="cannot be written \\(No space left on device\\)"):
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(PrescriptionError, match=r"cannot write .*full\.yaml: No space left on device"):
         save_telescope(load_telescope("paul_baker"), tmp_path / "full.yaml")
     assert list(tmp_path.iterdir()) == []
 

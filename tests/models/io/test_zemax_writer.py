@@ -118,5 +118,5 @@ def test_a_telescope_without_a_detector_is_refused(tmp_path, lsst):
 
 
 def test_a_place_that_cannot_be_written_is_one_line(lsst, tmp_path):
-    with pytest.raises(PrescriptionError, match="cannot be written"):
+    with pytest.raises(PrescriptionError, match="cannot write"):
         save_telescope(lsst, tmp_path / "none" / "a.zmx")
