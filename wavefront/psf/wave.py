@@ -118,7 +118,7 @@ class WavePsfEngine(PsfEngine):
             jacobians = [star.jacobian[0] for star in optics]
             return np.stack(self._map(self._sample, spectra, jacobians, places))
 
-        return Exposed(draw, lit, np.concatenate([star.reference for star in optics]))
+        return Exposed(draw, lit, np.concatenate([star.reference_points for star in optics]))
 
     def _expose_star(self, field: np.ndarray) -> tuple[PupilOptics, np.ndarray]:
         """Return the optics of a star and its spectra, the OTF times the transfer function of the detector."""
