@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    products = [read_product(path, truth_images=False) for path in sorted(arguments.run.glob("ccd_*.fits"))]
+    products = [read_product(path, holdout_images=False) for path in sorted(arguments.run.glob("ccd_*.fits"))]
     stars = [int(p.observed.used.sum()) for p in products]
     print(
         f"pachon {version('pachon')}, numpy {np.__version__}, scikit-learn {version('scikit-learn')}, "

@@ -62,14 +62,14 @@ def fit_piff(stars: list[piff.Star], size: int, order: int) -> piff.SimplePSF:
 
 
 def draw_piff(psf: piff.SimplePSF, product, size: int) -> np.ndarray:
-    places = pixels(product.truth, product)
+    places = pixels(product.holdout, product)
     return np.stack([psf.draw(x, y, center=True, stamp_size=size).array for x, y in places])
 
 
 def residuals(images: np.ndarray, product) -> np.ndarray:
     """Return e1, e2 and relative size of drawn PSFs less the truth, [3, n]."""
     found = measure_shapes(images, product.pixel_scale, WEIGHT)
-    truth = product.truth
+    truth = product.holdout
     return np.stack([found.e1 - truth.e1, found.e2 - truth.e2, found.size / truth.size - 1.0])
 
 
@@ -91,7 +91,7 @@ def main() -> None:
         used = product.observed.used
         stamps = product.observed_images[used].astype(np.float64)
         places = np.stack([product.observed.x, product.observed.y], axis=1)[used]
-        elsewhere = np.stack([product.truth.x, product.truth.y], axis=1)
+        elsewhere = np.stack([product.holdout.x, product.holdout.y], axis=1)
         stars, options = piff_stars(product), {"order": order, "extent": product.model.extent}
         weights = product.observed.snr[used] ** 2
         jobs = {

@@ -25,7 +25,7 @@ class _Unit(NamedTuple):
 
 
 _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("arcsec", ARCSEC), _Unit("", 1.0)
-_MODEL, _TRUTH_MODEL = "PSF", "TRUEPSF"
+_MODEL, _NOISE_FREE_MODEL = "PSF", "TRUEPSF"
 #: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
 KINDS = ("truth", "observed", "residual", "left_out", "away")
 _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
@@ -46,8 +46,8 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "model_e1": ("MODEL_E1", _NONE, "ellipticity of the model there"),
     "model_e2": ("MODEL_E2", _NONE, "ellipticity of the model there"),
     "model_size": ("MODELSZ", _SEC, "weighted rms size of the model there"),
-    "left_out_e1": ("LOO_E1", _NONE, "of the model fitted without the star"),
-    "left_out_e2": ("LOO_E2", _NONE, "of the model fitted without the star"),
+    "leave_one_out_e1": ("LOO_E1", _NONE, "of the model fitted without the star"),
+    "leave_one_out_e2": ("LOO_E2", _NONE, "of the model fitted without the star"),
 }
 
 
@@ -100,7 +100,7 @@ class Stars:
 
 
 @dataclass(frozen=True)
-class TruthStars(Stars):
+class HoldoutStars(Stars):
     """Places without an observed star, where the PSF is known without noise.
 
     Attributes
@@ -129,7 +129,7 @@ class ObservedStars(Stars):
     defects : ndarray of int
         :class:`~.StarFlag` bits that were found: such a star has no ellipticity here. 0
         where none was looked for.
-    left_out_e1, left_out_e2 : ndarray
+    leave_one_out_e1, leave_one_out_e2 : ndarray
         Ellipticity of the model at the star with the star left out of the fit; NaN where it was not used.
     """
 
@@ -138,8 +138,8 @@ class ObservedStars(Stars):
     snr: np.ndarray
     used: np.ndarray
     defects: np.ndarray
-    left_out_e1: np.ndarray
-    left_out_e2: np.ndarray
+    leave_one_out_e1: np.ndarray
+    leave_one_out_e2: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -156,13 +156,13 @@ class CcdProduct:
         Angle of a stamp's pixel [rad].
     noise : tuple of float
         Sky [electrons/pixel] and rms noise without light [electrons/pixel].
-    truth : TruthStars
-        Places where the PSF is known.
+    holdout : HoldoutStars
+        Noise-free PSFs at positions without an observed star.
     observed : ObservedStars
         Observed stars.
-    truth_images, observed_images : ndarray of float32, shape [n, ny, nx]
+    holdout_images, observed_images : ndarray of float32, shape [n, ny, nx]
         Centred stamps of unit sum; NaN where a star could not be centred.
-    model, truth_model : PsfModel
+    model, noise_free_model : PsfModel
         Mean, components and polynomials fitted to the observed stars, and to the noise-free PSFs.
     """
 
@@ -170,18 +170,18 @@ class CcdProduct:
     center: tuple[float, float]
     pixel_scale: float
     noise: tuple[float, float]
-    truth: TruthStars
+    holdout: HoldoutStars
     observed: ObservedStars
-    truth_images: np.ndarray
+    holdout_images: np.ndarray
     observed_images: np.ndarray
     model: PsfModel
-    truth_model: PsfModel
+    noise_free_model: PsfModel
 
-    def stars(self, kind: str) -> TruthStars | ObservedStars:
+    def stars(self, kind: str) -> HoldoutStars | ObservedStars:
         """Return the places that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""
         if kind not in KINDS:
             raise unknown_name("kind", kind, KINDS)
-        return self.truth if kind in ("truth", "away") else self.observed
+        return self.holdout if kind in ("truth", "away") else self.observed
 
     def ellipticity(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the components e1, e2 of one kind of ellipticity, at the places of :meth:`stars`.
@@ -202,7 +202,7 @@ class CcdProduct:
         if kind in ("truth", "observed"):
             return stars.e1, stars.e2
         if kind == "left_out":
-            return stars.e1 - self.observed.left_out_e1, stars.e2 - self.observed.left_out_e2
+            return stars.e1 - self.observed.leave_one_out_e1, stars.e2 - self.observed.leave_one_out_e2
         return stars.residual_e1, stars.residual_e2
 
 
@@ -244,16 +244,16 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
     ]
     hdus = [
         table_hdu("STARS", _table(product.observed)),
-        table_hdu("TRUTH", _table(product.truth)),
+        table_hdu("TRUTH", _table(product.holdout)),
         image_hdu("STAMPS", product.observed_images, "each star centred, of unit sum"),
-        image_hdu("TRUTH_PSF", product.truth_images, "each PSF centred, of unit sum"),
+        image_hdu("TRUTH_PSF", product.holdout_images, "each PSF centred, of unit sum"),
         *product.model.to_hdus(_MODEL),
-        *product.truth_model.to_hdus(_TRUTH_MODEL),
+        *product.noise_free_model.to_hdus(_NOISE_FREE_MODEL),
     ]
     write_fits(product_path(folder, product.name), hdus, stamp, header)
 
 
-def read_product(path: Path, stamp: Stamp | None = None, *, truth_images: bool = True) -> CcdProduct:
+def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool = True) -> CcdProduct:
     """Read the product of one CCD.
 
     Parameters
@@ -262,7 +262,7 @@ def read_product(path: Path, stamp: Stamp | None = None, *, truth_images: bool =
         File to read.
     stamp : Stamp, optional
         What the product must carry.
-    truth_images : bool
+    holdout_images : bool
         Whether to keep the noise-free PSFs, by far the largest part; without, there are none of them.
 
     Raises
@@ -280,12 +280,12 @@ def read_product(path: Path, stamp: Stamp | None = None, *, truth_images: bool =
             center=(header["XCENTER"] * 1e-3, header["YCENTER"] * 1e-3),
             pixel_scale=header["PIXSCALE"] * ARCSEC,
             noise=(header["SKY"], header["NOISE"]),
-            truth=_stars(TruthStars, hdus["TRUTH"]),
+            holdout=_stars(HoldoutStars, hdus["TRUTH"]),
             observed=_stars(ObservedStars, hdus["STARS"]),
-            truth_images=_image(hdus["TRUTH_PSF"])[: None if truth_images else 0].copy(),
+            holdout_images=_image(hdus["TRUTH_PSF"])[: None if holdout_images else 0].copy(),
             observed_images=_image(hdus["STAMPS"]),
             model=PsfModel.from_hdus(hdus, _MODEL),
-            truth_model=PsfModel.from_hdus(hdus, _TRUTH_MODEL),
+            noise_free_model=PsfModel.from_hdus(hdus, _NOISE_FREE_MODEL),
         )
     except KeyError as error:
         raise ProductError(f"{path}: no product of a CCD ({' '.join(str(error).split())})") from None

@@ -122,7 +122,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     return ResolvedConfiguration(resolved, telescope, camera, site)
 
 
-def truth_components(config: Configuration) -> int:
+def noise_free_components(config: Configuration) -> int:
     """Return how many principal components describe the noise-free PSFs of a resolved configuration."""
     components = config.reconstruction.components
     return min(COMPONENTS, config.stars.truth - 1) if components is None else components
@@ -171,7 +171,7 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     for kind in ("observed", "truth"):
         count = getattr(stars, kind)
         # The noise-free PSFs are always described by principal components.
-        components = truth_components(config) if kind == "truth" else fit.components
+        components = noise_free_components(config) if kind == "truth" else fit.components
         if components is not None and components > count - 1 and (kind == "truth" or fit.basis == "pca"):
             raise ConfigError(
                 f"reconstruction.components = {components}: expected at most {count - 1}, one less than "

@@ -49,7 +49,7 @@ class Experiment:
         What active optics leaves uncorrected; None for nothing.
     site : Site
         Where the telescope stands.
-    air_alone : bool
+    atmosphere_only : bool
         Whether stars are seen through a beam without aberrations, from the same places on the sky: without what the
         design of the telescope, the heights and active optics do.
     """
@@ -60,7 +60,7 @@ class Experiment:
     atmosphere: Atmosphere | None
     aberration: ResidualWavefront | None
     site: Site
-    air_alone: bool = False
+    atmosphere_only: bool = False
 
     @classmethod
     def from_config(cls, config: Configuration, folder: Path | None = None) -> Experiment:

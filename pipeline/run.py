@@ -125,7 +125,7 @@ def run(
     with reporter.stage("correlations"):
         stamp = stamp_of(experiment)
         # Pictures and figures need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
-        products = [read_product(product_path(folder, name), stamp, truth_images=False) for name in names]
+        products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)
         summary = {**_origin(experiment), **run_figures(products, correlated), "not_modelled": failed}
         write_json(folder / SUMMARY_NAME, summary)

@@ -151,7 +151,7 @@ def _product(folder: Path, name: str, stamp: Stamp) -> CcdProduct:
     """Return the product of a CCD; the error without one gives the reason, where the run has left one."""
     path = product_path(folder, name)
     if path.exists():
-        return read_product(path, stamp, truth_images=False)
+        return read_product(path, stamp, holdout_images=False)
     reason = "has no product yet"
     with suppress(OSError, ValueError, KeyError):
         reason = json.loads((folder / SUMMARY_NAME).read_text())["not_modelled"][name]
@@ -198,7 +198,7 @@ def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, 
         "y_mm": (np.array([round(p.center[1] * 1e3, 6) for p in products]), "mm", "centre on the detector"),
         "stars": (np.array([len(p.observed) for p in products]), "", "observed stars"),
         "stars_used": (np.array([int(p.observed.used.sum()) for p in products]), "", "stars in the fit"),
-        "truth_psfs": (np.array([len(p.truth) for p in products]), "", "places where the PSF is known"),
+        "truth_psfs": (np.array([len(p.holdout) for p in products]), "", "places where the PSF is known"),
     }
     for kind in RESIDUALS:
         rows = [_moments([p], kind) for p in products]
@@ -214,7 +214,7 @@ def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlatio
     figures: dict[str, Any] = {
         "ccds": len(products),
         "stars": sum(len(p.observed) for p in products),
-        "truth_psfs": sum(len(p.truth) for p in products),
+        "truth_psfs": sum(len(p.holdout) for p in products),
     }
     for kind in RESIDUALS:
         figures |= _moments(products, kind)

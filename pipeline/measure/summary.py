@@ -50,7 +50,7 @@ def patches(stars: Sequence[Stars]) -> np.ndarray | None:
 def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
     """Return the bins of separation of a run, as arguments: ``min_sep`` and ``max_sep`` [rad], and ``n_bins``."""
     everywhere = np.concatenate(
-        [np.stack([s.field_x, s.field_y]) for p in products for s in (p.truth, p.observed)], axis=1
+        [np.stack([s.field_x, s.field_y]) for p in products for s in (p.holdout, p.observed)], axis=1
     )
     longest = float(np.hypot(*np.ptp(everywhere, axis=1)))
     bins = max(4, round(_BINS_PER_DECADE * np.log10(longest / (SHORTEST_ARCMIN * ARCMIN))))
@@ -59,7 +59,7 @@ def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
 
 def ccd_figures(product: CcdProduct) -> dict[str, Any]:
     """Return the figures of one CCD; keys end in their unit."""
-    truth, observed = product.truth, product.observed
+    truth, observed = product.holdout, product.observed
     field = np.array([np.median(truth.field_x), np.median(truth.field_y)])
     return {
         "x_mm": product.center[0] * 1e3,
@@ -74,11 +74,11 @@ def ccd_figures(product: CcdProduct) -> dict[str, Any]:
         "mean_e_truth": _mean(np.hypot(truth.e1, truth.e2)),
         "mean_e_observed": _mean(np.hypot(observed.e1, observed.e2)),
         "rms_residual_at_stars": _rms(observed.residual_e1, observed.residual_e2),
-        "rms_residual_left_out": _rms(observed.e1 - observed.left_out_e1, observed.e2 - observed.left_out_e2),
+        "rms_residual_left_out": _rms(observed.e1 - observed.leave_one_out_e1, observed.e2 - observed.leave_one_out_e2),
         "rms_residual_away": _rms(truth.residual_e1, truth.residual_e2),
-        "truth_variance_in_components": product.truth_model.explained,
-        "kink_observed": product.model.kink,
-        "kink_truth": product.truth_model.kink,
+        "truth_variance_in_components": product.noise_free_model.explained,
+        "kink_observed": product.model.elbow,
+        "kink_truth": product.noise_free_model.elbow,
     }
 
 
@@ -89,7 +89,7 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
     to 180 arcmin.
     """
     each = {p.name: ccd_figures(p) for p in products}
-    truth = [p.truth for p in products]
+    truth = [p.holdout for p in products]
     observed = [p.observed for p in products]
 
     def column(stars: Sequence[Stars], key: str) -> np.ndarray:
@@ -110,11 +110,11 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
         "mean_e_observed": _mean(np.hypot(column(observed, "e1"), column(observed, "e2"))),
         "rms_residual_at_stars": _rms(column(observed, "residual_e1"), column(observed, "residual_e2")),
         "rms_residual_left_out": _rms(
-            column(observed, "e1") - column(observed, "left_out_e1"),
-            column(observed, "e2") - column(observed, "left_out_e2"),
+            column(observed, "e1") - column(observed, "leave_one_out_e1"),
+            column(observed, "e2") - column(observed, "leave_one_out_e2"),
         ),
         "rms_residual_away": _rms(column(truth, "residual_e1"), column(truth, "residual_e2")),
-        "truth_variance_in_components": min(p.truth_model.explained for p in products),
+        "truth_variance_in_components": min(p.noise_free_model.explained for p in products),
     }
     for kind, correlation in correlated.items():
         for name in SEPARATION_RANGES:

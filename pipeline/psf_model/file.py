@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -11,44 +11,41 @@ from astropy.io import fits
 from ...core.errors import ProductError
 from .basis import BASES
 
-if TYPE_CHECKING:
-    from .model import PsfModel
 
-
-def model_hdus(model: PsfModel, name: str) -> list[fits.ImageHDU | fits.BinTableHDU]:
-    """Return a model as extensions: NAME_MEAN and so on.
+def model_hdus(fields: Mapping[str, Any], name: str) -> list[fits.ImageHDU | fits.BinTableHDU]:
+    """Return the fields of a model as extensions NAME_MEAN and so on.
 
     What only other models than polynomials of principal components have is written only where it differs: header
-    cards BASIS and SCALE, the star's weight and pull, and NAME_KERNEL.
+    cards BASIS and SCALE, the star's weight and alpha, and NAME_KERNEL.
     """
-    mean = fits.ImageHDU(model.mean, name=f"{name}_MEAN")
-    mean.header["ORDER"] = (model.order, "total degree of the polynomials")
-    k = model.n_components
+    mean = fits.ImageHDU(fields["mean"], name=f"{name}_MEAN")
+    mean.header["ORDER"] = (fields["order"], "total degree of the polynomials")
+    k = len(fields["components"])
     stars = [
-        fits.Column("position", "2D", array=model.positions),
-        fits.Column("coefficient", f"{k}D", array=model.coefficients),
-        fits.Column("unexplained", "D", array=model.unexplained),
-        fits.Column("rejected", "K", array=model.rejected),
+        fits.Column("position", "2D", array=fields["positions"]),
+        fits.Column("coefficient", f"{k}D", array=fields["coefficients"]),
+        fits.Column("unexplained", "D", array=fields["unexplained"]),
+        fits.Column("rejected", "K", array=fields["rejected"]),
     ]
     more = []
-    if model.basis != "pca":
-        mean.header["BASIS"] = (model.basis, "kind of the components")
-    if np.isfinite(model.scale):
-        mean.header["SCALE"] = (model.scale, "[pixel] rms width of the shapelets' Gaussian")
-    if model.weights is not None:
-        stars.append(fits.Column("weight", "D", array=model.weights))
-    if model.kernel is not None:
-        stars.append(fits.Column("pull", f"{k}D", array=model.pull))
-        more.append(fits.ImageHDU(model.kernel, name=f"{name}_KERNEL"))
+    if fields["basis"] != "pca":
+        mean.header["BASIS"] = (fields["basis"], "kind of the components")
+    if np.isfinite(fields["scale"]):
+        mean.header["SCALE"] = (fields["scale"], "[pixel] rms width of the shapelets' Gaussian")
+    if fields["weights"] is not None:
+        stars.append(fits.Column("weight", "D", array=fields["weights"]))
+    if fields["kernel"] is not None:
+        stars.append(fits.Column("pull", f"{k}D", array=fields["alpha"]))
+        more.append(fits.ImageHDU(fields["kernel"], name=f"{name}_KERNEL"))
     # The pixels' own components are unit vectors: thirty times the size of all else, and known.
-    components = [] if model.basis == "pixels" else [fits.ImageHDU(model.components, name=f"{name}_EIGEN")]
+    components = [] if fields["basis"] == "pixels" else [fits.ImageHDU(fields["components"], name=f"{name}_EIGEN")]
     return [
         mean,
         *components,
-        fits.ImageHDU(model.polynomial, name=f"{name}_POLY"),
-        fits.ImageHDU(np.array(model.extent), name=f"{name}_EXTENT"),
+        fits.ImageHDU(fields["polynomial"], name=f"{name}_POLY"),
+        fits.ImageHDU(np.array(fields["extent"]), name=f"{name}_EXTENT"),
         fits.BinTableHDU.from_columns(
-            [fits.Column("eigenvalue", "D", array=model.eigenvalues)], name=f"{name}_SPECTRUM"
+            [fits.Column("eigenvalue", "D", array=fields["eigenvalues"])], name=f"{name}_SPECTRUM"
         ),
         fits.BinTableHDU.from_columns(stars, name=f"{name}_STARS"),
         *more,
@@ -97,7 +94,7 @@ def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
             "scale": float(mean.header.get("SCALE", np.nan)),
             "weights": _native(stars["weight"]) if "weight" in columns else None,
             "kernel": _native(kernel.data) if kernel is not None else None,
-            "pull": _native(stars["pull"]).reshape(len(stars), -1) if kernel is not None else None,
+            "alpha": _native(stars["pull"]).reshape(len(stars), -1) if kernel is not None else None,
         }
     except KeyError as error:
         raise ProductError(f"no PSF model {name!r} in the FITS file: {error.args[0]} is missing") from error

@@ -84,11 +84,11 @@ def fit_fields(
             replacement=replacement,
         )
         coefficients = stars.coefficients
-        kernel = pull = None
+        kernel = alpha = None
         if interpolation == "gp":
             points = mapped(places, span)
             kernel = gaussian_process.fit_kernels(points, coefficients, terms, shared=basis == "pixels")
-            polynomial, pull, _ = gaussian_process.krige(points, coefficients, terms, kernel)
+            polynomial, alpha, _ = gaussian_process.krige(points, coefficients, terms, kernel)
         else:
             q, r = np.linalg.qr(weighted(terms, star_weights))
             polynomial = scipy.linalg.solve_triangular(r, q.T @ weighted(coefficients, star_weights))
@@ -107,7 +107,7 @@ def fit_fields(
             scale=stars.basis.scale,
             weights=star_weights,
             kernel=kernel,
-            pull=pull,
+            alpha=alpha,
         )
 
 

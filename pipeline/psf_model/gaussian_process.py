@@ -143,11 +143,11 @@ def krige(
         projected = q.T @ whitened
         trend[:, group] = scipy.linalg.solve_triangular(r, projected)
         rest = inverse - q @ (q.T @ inverse)
-        pull = inverse.T @ (whitened - q @ projected)
+        alpha = inverse.T @ (whitened - q @ projected)
         own = (rest**2).sum(axis=0)
         own = np.where(own * np.diagonal(covariance) > 1e-10, own, np.nan)
-        left_out[:, group] = pull / own[:, None]
-        weights[:, group] = pull if variance > 0.0 else 0.0
+        left_out[:, group] = alpha / own[:, None]
+        weights[:, group] = alpha if variance > 0.0 else 0.0
     return trend, weights, left_out
 
 
@@ -165,10 +165,10 @@ def predict(points: np.ndarray, at: np.ndarray, kernels: np.ndarray, weights: np
     """
     different, which = np.unique(kernels, axis=0, return_inverse=True)
     result = np.zeros((len(at), len(kernels)))
-    for point, pull in zip(points, weights, strict=True):
+    for point, alpha in zip(points, weights, strict=True):
         squares = ((at - point) ** 2).sum(axis=1)
         near = different[:, 0] * np.exp(-0.5 * squares[:, None] / different[:, 1] ** 2)
-        result += near[:, which] * pull
+        result += near[:, which] * alpha
     return result
 
 

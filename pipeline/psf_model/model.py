@@ -8,7 +8,7 @@ for the polynomials, behind the same interface.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -66,8 +66,8 @@ class PsfModel:
     kernel : array or None
         Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
         the noise, [k, 3]. None where there are only polynomials.
-    pull : array or None
-        What each star's covariance with a place is multiplied with, [n, k].
+    alpha : array or None
+        Dual coefficients of the Gaussian process: inverse covariance times coefficients less trend, [n, k].
     """
 
     mean: np.ndarray
@@ -84,7 +84,7 @@ class PsfModel:
     scale: float = np.nan
     weights: np.ndarray | None = None
     kernel: np.ndarray | None = None
-    pull: np.ndarray | None = None
+    alpha: np.ndarray | None = None
 
     @classmethod
     def fit(
@@ -129,7 +129,7 @@ class PsfModel:
             that saw the pixel stands for them, so that they have no say.
         n_components : int or str, optional
             Components to keep, 20 where left out: principal ones at most n - 1, of shapelets those of sum zero.
-            ``auto`` takes what :attr:`cross_validated` says of up to 65; :attr:`kink` is the other opinion. None for
+            ``auto`` takes :attr:`cross_validated_components` of up to 65; :attr:`elbow` is the alternative. None for
             pixels.
         order : int, optional
             Largest total degree of the polynomials, 3 where left out; 0 for the trend under a Gaussian process.
@@ -156,7 +156,7 @@ class PsfModel:
             If an array has the wrong shape, a pixel is not finite, a star has no flux, or the stars do not determine
             the polynomials (all on a line, say).
         """
-        fields = fit_fields(
+        fitted = fit_fields(
             stamps,
             positions,
             basis=basis,
@@ -171,8 +171,8 @@ class PsfModel:
             max_iterations=max_iterations,
             replacement=replacement,
         )
-        model = cls(**fields)
-        return model.truncated(max(1, model.cross_validated)) if n_components == "auto" else model
+        model = cls(**fitted)
+        return model.truncated(max(1, model.cross_validated_components)) if n_components == "auto" else model
 
     @property
     def n_stars(self) -> int:
@@ -204,7 +204,7 @@ class PsfModel:
         return float(self.explained_variance.sum())
 
     @property
-    def kink(self) -> int:
+    def elbow(self) -> int:
         """Number of principal components before the eigenvalues flatten out.
 
         The index, counted from 0, at which the logarithm of the eigenvalues lies farthest below the straight line
@@ -219,20 +219,20 @@ class PsfModel:
         return int(np.argmin(curve - np.linspace(curve[0], curve[-1], len(curve))))
 
     @property
-    def left_out_curve(self) -> np.ndarray:
+    def leave_one_out_curve(self) -> np.ndarray:
         """Rms over stars and pixels of stamp minus model without that star, by components used, 0 to k: [k + 1].
 
         As :attr:`leave_one_out_rms`, its last element.
         """
-        left_out, own = self._left_out_residuals() ** 2, self.coefficients**2
+        left_out, own = self._leave_one_out_residuals() ** 2, self.coefficients**2
         gained = np.concatenate([[0.0], np.cumsum((left_out - own).sum(axis=0))])
         total = self.unexplained.sum() + own.sum() + gained
         return np.sqrt(np.maximum(total, 0.0) / (self.n_stars * self.mean.size))
 
     @property
-    def cross_validated(self) -> int:
+    def cross_validated_components(self) -> int:
         """Number of components that predicts the stars left out best, 0 to k; k where that cannot be told."""
-        curve = self.left_out_curve
+        curve = self.leave_one_out_curve
         return int(np.argmin(curve)) if np.isfinite(curve).all() else self.n_components
 
     @property
@@ -268,9 +268,9 @@ class PsfModel:
         result = np.zeros((len(terms), self.n_components))
         for column, row in zip(terms.T, self.polynomial, strict=True):  # no BLAS: its sums depend on the batch
             result += column[:, None] * row
-        if self.kernel is not None and self.pull is not None:
+        if self.kernel is not None and self.alpha is not None:
             points, at = (mapped(p, self.extent) for p in (self.positions, positions))
-            result += gaussian_process.predict(points, at, self.kernel, self.pull)
+            result += gaussian_process.predict(points, at, self.kernel, self.alpha)
         return result
 
     def reconstruct(self) -> np.ndarray:
@@ -285,12 +285,12 @@ class PsfModel:
         is its residual in the full fit divided by 1 - leverage. NaN where the other stars do not determine the
         polynomials.
         """
-        return self._combine(self.coefficients - self._left_out_residuals())
+        return self._combine(self.coefficients - self._leave_one_out_residuals())
 
     @property
     def leave_one_out_rms(self) -> float:
         """Rms over stars and pixels of (stamp - :meth:`leave_one_out`), what the components cannot hold included."""
-        squares = (self._left_out_residuals() ** 2).sum(axis=1) + self.unexplained
+        squares = (self._leave_one_out_residuals() ** 2).sum(axis=1) + self.unexplained
         return float(np.sqrt(squares.mean() / self.mean.size))
 
     def truncated(self, n_components: int) -> PsfModel:
@@ -311,7 +311,7 @@ class PsfModel:
             polynomial=self.polynomial[:, :k],
             unexplained=self.unexplained + (self.coefficients[:, k:] ** 2).sum(axis=1),
             kernel=None if self.kernel is None else self.kernel[:k],
-            pull=None if self.pull is None else self.pull[:, :k],
+            alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
@@ -323,7 +323,7 @@ class PsfModel:
             Start of the extension names, such as the CCD's name: NAME_MEAN, NAME_EIGEN, NAME_POLY, NAME_EXTENT images
             and NAME_SPECTRUM, NAME_STARS tables.
         """
-        return model_hdus(self, name)
+        return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
 
     @classmethod
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
@@ -344,8 +344,7 @@ class PsfModel:
         ProductError
             If it cannot be written.
         """
-        creator = CREATOR
-        write_fits(Path(path), self.to_hdus(name), None, [creator])
+        write_fits(Path(path), self.to_hdus(name), None, [CREATOR])
 
     @classmethod
     def read(cls, path: str | Path, name: str = "PSF") -> PsfModel:
@@ -362,7 +361,7 @@ class PsfModel:
         except ProductError as error:
             raise ProductError(f"{path}: {error}") from None
 
-    def _left_out_residuals(self) -> np.ndarray:
+    def _leave_one_out_residuals(self) -> np.ndarray:
         """Return coefficient minus its prediction by the other stars, [n, k]."""
         if self.kernel is not None:
             points = mapped(self.positions, self.extent)

@@ -178,7 +178,7 @@ def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: 
 
 def _common_key(products: Sequence[CcdProduct]) -> float:
     """Return the ellipticity of the key whisker, from truth and observed stars together."""
-    stars: list[Stars] = [s for p in products for s in (p.truth, p.observed)]
+    stars: list[Stars] = [s for p in products for s in (p.holdout, p.observed)]
     return key_ellipticity(np.concatenate([np.hypot(s.e1, s.e2) for s in stars]))
 
 

@@ -24,7 +24,7 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
     truth : bool
         Whether to draw the components of the noise-free PSFs, or of the observed stars.
     """
-    model = product.truth_model if truth else product.model
+    model = product.noise_free_model if truth else product.model
     count = min(model.n_components, 20)
     columns = 7
     rows = -(-(count + 1) // columns)
@@ -43,7 +43,7 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
             image = axes.imshow(component / edge, extent=extent, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
             axes.set_title(f"n = {k + 1}: {percent(model.explained_variance[k])}", fontsize=8)
         # Beyond three times the width of the PSF there is nothing to see.
-        shown = min(extent[1], 3.0 * float(np.nanmedian(product.truth.fwhm)) / ARCSEC)
+        shown = min(extent[1], 3.0 * float(np.nanmedian(product.holdout.fwhm)) / ARCSEC)
         panels[0].set_xlim(-shown, shown)
         panels[0].set_ylim(-shown, shown)
         for i, axes in enumerate(panels[: count + 1]):
@@ -70,12 +70,12 @@ def spectrum_figure(products: Sequence[CcdProduct]) -> bytes:
         figure = new_figure(10.0, 4.2)
         left, right = figure.subplots(1, 2)
         for product in products:
-            for model, color in ((product.model, OBSERVED), (product.truth_model, TRUTH)):
+            for model, color in ((product.model, OBSERVED), (product.noise_free_model, TRUTH)):
                 n = np.arange(1, len(model.eigenvalues) + 1)
                 total = model.eigenvalues.sum()
                 left.plot(n, model.eigenvalues, "-", color=color, linewidth=0.8, alpha=0.7)
-                if 0 < model.kink <= len(n):
-                    left.plot(model.kink, model.eigenvalues[model.kink - 1], "o", color=color, markersize=3.5)
+                if 0 < model.elbow <= len(n):
+                    left.plot(model.elbow, model.eigenvalues[model.elbow - 1], "o", color=color, markersize=3.5)
                 if total > 0:
                     missing = 1.0 - np.cumsum(model.eigenvalues) / total
                     right.plot(n[missing > 1e-15], missing[missing > 1e-15], "-", color=color, linewidth=0.8, alpha=0.7)
@@ -87,13 +87,13 @@ def spectrum_figure(products: Sequence[CcdProduct]) -> bytes:
             axes.set_xlim(0, 2.2 * count)
         right.axhline(0.01, color=AWAY, linewidth=0.8)
         right.annotate("1 %", (0.99, 0.01), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
-        values = [m.eigenvalues[: 2 * count] for p in products for m in (p.model, p.truth_model)]
+        values = [m.eigenvalues[: 2 * count] for p in products for m in (p.model, p.noise_free_model)]
         positive = np.concatenate(values)
         positive = positive[positive > 1e-12 * positive.max()]
         left.set_ylim(0.5 * positive.min(), 2.0 * positive.max())
         right.set_ylim(1e-6, 1.0)
-        left.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: kink")
-        left.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: kink")
+        left.plot([], [], "-o", color=OBSERVED, markersize=3.5, label="observed stars, dot: elbow")
+        left.plot([], [], "-o", color=TRUTH, markersize=3.5, label="noise-free PSFs, dot: elbow")
         left.legend(loc="upper right")
         left.set_title("eigenvalues, one line a CCD; dashed: components kept", loc="left")
         left.set_ylabel("variance of unit-sum stamps along n")

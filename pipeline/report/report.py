@@ -9,7 +9,7 @@ import numpy as np
 
 from ..ccd_product import CcdProduct
 from ..config import ReconstructionConfig, to_yaml
-from ..defaults import truth_components
+from ..defaults import noise_free_components
 from ..experiment import Experiment
 from ..measure.correlation import Correlation
 from .focal_plane_plots import close_up_figure, heights_figure, whiskers_figure
@@ -67,7 +67,7 @@ def draw_pictures(
     radius = experiment.field_radius_on_detector
     close = closest_middle_farthest(products)
     optics = not config.atmosphere.enabled
-    components = truth_components(config)
+    components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
     errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
     pictures = [
@@ -119,8 +119,8 @@ def draw_pictures(
             spectrum_figure(products),
             "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
             "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
-            "is the kink, the point farthest below the straight line from the first eigenvalue to the last.",
-            "The paper finds a kink by eye and that about 20 components suffice; physics asks for over 99 % of the "
+            "is the elbow, the point farthest below the straight line from the first eigenvalue to the last.",
+            "The paper finds it by eye and that about 20 components suffice; physics asks for over 99 % of the "
             "variance of the truth.",
         ),
         Picture(

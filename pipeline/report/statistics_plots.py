@@ -25,7 +25,7 @@ def scatter_figure(products: Sequence[CcdProduct]) -> bytes:
     """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
     panels: tuple[tuple[str, Sequence[Stars], str, str, str, str], ...] = (
         ("at the observed stars", [p.observed for p in products], OBSERVED, RESIDUAL, "observed", "observed - model"),
-        ("where no star is", [p.truth for p in products], TRUTH, AWAY, "truth", "truth - model"),
+        ("where no star is", [p.holdout for p in products], TRUTH, AWAY, "truth", "truth - model"),
     )
     with styled():
         figure = new_figure(10.0, 5.2)
@@ -40,7 +40,7 @@ def scatter_figure(products: Sequence[CcdProduct]) -> bytes:
             axes.set_title(title, loc="left")
             axes.legend(loc="upper right")
         both[0].set_ylabel("$e_2$: along the diagonal x = y")
-        values = np.concatenate([np.abs([s.e1, s.e2]).ravel() for p in products for s in (p.truth, p.observed)])
+        values = np.concatenate([np.abs([s.e1, s.e2]).ravel() for p in products for s in (p.holdout, p.observed)])
         edge = 1.1 * float(np.nanmax(values))
         both[0].set_xlim(-edge, edge)
         both[0].set_ylim(-edge, edge)

@@ -54,7 +54,7 @@ PER_CCD_COLUMNS = (
     ("left out", "%"),
     ("no star", "%"),
     ("variance", "%"),
-    ("kink", ""),
+    ("elbow", ""),
     ("stars used", ""),
 )
 PER_CCD_CAPTION = (

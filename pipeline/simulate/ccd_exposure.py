@@ -37,7 +37,7 @@ _PLAIN_RATIO = 1e5
 
 
 @dataclass(frozen=True)
-class Exposed:
+class NoiseFreeStars:
     """Noise-free stars.
 
     Attributes
@@ -48,14 +48,14 @@ class Exposed:
         Angle of a pixel [rad].
     fields : ndarray, shape [n, 2]
         Field angles [rad].
-    light : ndarray, shape [n]
-        Light of each star over what an unvignetted pupil lets through.
+    lit_fraction : ndarray, shape [n]
+        Part of the entrance pupil whose light arrives, mean over the wavelengths.
     """
 
     image: np.ndarray
     pixel_scale: float
     fields: np.ndarray
-    light: np.ndarray
+    lit_fraction: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -68,24 +68,24 @@ class CcdExposure:
         Name of the CCD.
     places : StarField
         Positions of the stars; their magnitudes are provisional.
-    truth : Exposed
-        PSFs for the truth, each seen at the centre of a pixel.
-    observed : Exposed
+    holdout : NoiseFreeStars
+        PSFs at positions without an observed star, each centred on a pixel.
+    observed : NoiseFreeStars
         PSFs of the stars that will be observed, where they fall on their pixels.
     """
 
     name: str
     places: StarField
-    truth: Exposed
-    observed: Exposed
+    holdout: NoiseFreeStars
+    observed: NoiseFreeStars
 
 
-def truth_places(experiment: Experiment, name: str) -> np.ndarray:
+def holdout_positions(experiment: Experiment, name: str) -> np.ndarray:
     """Return the places of a CCD where a run has noise-free PSFs [m], shape [n, 2]; they depend on the seed alone."""
-    return ccd_stars(experiment, name, _PROVISIONAL_FWHM).truth
+    return ccd_stars(experiment, name, _PROVISIONAL_FWHM).holdout
 
 
-def expose_places(experiment: Experiment, positions: np.ndarray, threads: int | None = None) -> Exposed:
+def expose_places(experiment: Experiment, positions: np.ndarray, threads: int | None = None) -> NoiseFreeStars:
     """Make noise-free PSFs at positions on the detector [m], shape [n, 2], of any CCDs.
 
     A star stands where the chief ray of the middle wavelength lands, at the centre of a pixel.
@@ -100,8 +100,8 @@ def expose_places(experiment: Experiment, positions: np.ndarray, threads: int | 
     return exposed
 
 
-def _check_light(exposed: Exposed, whose: str) -> None:
-    if not exposed.light.min() > 0.0:
+def _check_light(exposed: NoiseFreeStars, whose: str) -> None:
+    if not exposed.lit_fraction.min() > 0.0:
         raise DomainError(f"no light reaches {whose}: expected a CCD within the field of the telescope")
 
 
@@ -127,7 +127,7 @@ def expose_ccd(
         If a stage fails.
     """
     places = ccd_stars(experiment, name, _PROVISIONAL_FWHM)
-    truth = _truth(experiment, places.truth, threads, progress)
+    truth = _expose_holdout(experiment, places.holdout, threads, progress)
     pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
     size = experiment.stamp_size + _SHIFT_ROOM
     observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, progress, size=size)
@@ -135,9 +135,9 @@ def expose_ccd(
     return CcdExposure(name, places, truth, observed)
 
 
-def _truth(
+def _expose_holdout(
     experiment: Experiment, positions: np.ndarray, threads: int | None, progress: Callable[[int], None] | None
-) -> Exposed:
+) -> NoiseFreeStars:
     """Make noise-free PSFs whose centroid is the centre of a pixel.
 
     The atmosphere moves a star by a part of a pixel. The engine draws the truth at the place that undoes this; it is
@@ -161,7 +161,7 @@ def _expose(
     *,
     size: int,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
-) -> Exposed:
+) -> NoiseFreeStars:
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
@@ -185,7 +185,7 @@ def _expose(
         threads=threads,
         progress=progress,
     )
-    return Exposed(psfs.image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
+    return NoiseFreeStars(psfs.image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
 
 
 class _Seen(NamedTuple):
@@ -198,7 +198,7 @@ class _Seen(NamedTuple):
 def _seen_through(experiment: Experiment) -> _Seen:
     """Return what stars are seen through, and how much larger than on the camera's CCDs their images are."""
     telescope = experiment.telescope
-    if not experiment.air_alone:
+    if not experiment.atmosphere_only:
         return _Seen(telescope, experiment.focal_plane, experiment.aberration, 1.0)
     plain = without_aberration(telescope, _PLAIN_RATIO)
     here, there = (center_focal_length(t, experiment.wavelengths) for t in (telescope, plain))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..ccd_product import CcdProduct, ObservedStars, TruthStars
-from ..defaults import truth_components
+from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
+from ..defaults import noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..psf_model.checks import snr_weights
@@ -34,15 +34,15 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         If a stage fails.
     """
     config = experiment.config
-    name, places, truth, observed = exposure.name, exposure.places, exposure.truth, exposure.observed
-    truth_images = truth.image.astype(np.float64)
-    truth_shapes = measure_shapes(truth_images, truth.pixel_scale, experiment.weight_fwhm)
+    name, places, truth, observed = exposure.name, exposure.places, exposure.holdout, exposure.observed
+    holdout_images = truth.image.astype(np.float64)
+    truth_shapes = measure_shapes(holdout_images, truth.pixel_scale, experiment.weight_fwhm)
     # Places do not depend on the limits of magnitude, which in turn need to know how much light the stars lose.
     width = effective_fwhm(truth.image, truth.pixel_scale)
-    stars = ccd_stars(experiment, name, width, least_light=float(observed.light.min()))
-    electrons = stars.electrons * observed.light
+    stars = ccd_stars(experiment, name, width, least_light=float(observed.lit_fraction.min()))
+    electrons = stars.electrons * observed.lit_fraction
     snr = signal_to_noise(
-        stars.magnitude - 2.5 * np.log10(observed.light), stars.band, config.atmosphere.exposure_s, width
+        stars.magnitude - 2.5 * np.log10(observed.lit_fraction), stars.band, config.atmosphere.exposure_s, width
     )
     seen = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
     fit, used = config.reconstruction, seen.used
@@ -60,10 +60,10 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
     # Noise-free stars have no outliers: what stands out there is the PSF.
-    truth_model = PsfModel.fit(
-        truth_images,
-        places.truth,
-        n_components=truth_components(config),
+    noise_free_model = PsfModel.fit(
+        holdout_images,
+        places.holdout,
+        n_components=noise_free_components(config),
         order=fit.truth_order,
         extent=places.bounds,
         clip_sigma=None,
@@ -72,18 +72,18 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
-    at_truth, at_stars = shapes_of(model.at(places.truth)), shapes_of(model.at(stars.observed))
+    at_truth, at_stars = shapes_of(model.at(places.holdout)), shapes_of(model.at(stars.observed))
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     left_out = shapes_of(model.leave_one_out())
-    left_out_e1, left_out_e2 = np.full((2, len(used)), np.nan)
-    left_out_e1[used], left_out_e2[used] = left_out.e1, left_out.e2
+    leave_one_out_e1, leave_one_out_e2 = np.full((2, len(used)), np.nan)
+    leave_one_out_e1[used], leave_one_out_e2[used] = left_out.e1, left_out.e2
     return CcdProduct(
         name=name,
         center=(float(x), float(y)),
         pixel_scale=truth.pixel_scale,
         noise=seen.noise,
-        truth=TruthStars(
-            **_positions(places.truth, truth.fields),
+        holdout=HoldoutStars(
+            **_positions(places.holdout, truth.fields),
             **_shapes(truth_shapes, at_truth),
             fwhm=fwhm(truth.image, truth.pixel_scale),
         ),
@@ -95,13 +95,13 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
             snr=snr,
             defects=seen.defects,
             used=used,
-            left_out_e1=left_out_e1,
-            left_out_e2=left_out_e2,
+            leave_one_out_e1=leave_one_out_e1,
+            leave_one_out_e2=leave_one_out_e2,
         ),
-        truth_images=truth_images.astype(np.float32),
+        holdout_images=holdout_images.astype(np.float32),
         observed_images=seen.images.astype(np.float32),
         model=model,
-        truth_model=truth_model,
+        noise_free_model=noise_free_model,
     )
 
 

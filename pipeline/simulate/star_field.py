@@ -32,7 +32,7 @@ class StarField:
         (xmin, xmax, ymin, ymax) of the CCD on the focal plane [m], outer edges of its pixels.
     pixel_size : float
         [m].
-    truth, observed : array
+    holdout, observed : array
         Focal-plane positions (x, y) [m], [n, 2].
     magnitude : array
         AB magnitudes of the observed stars.
@@ -49,7 +49,7 @@ class StarField:
     ccd_name: str
     bounds: tuple[float, float, float, float]
     pixel_size: float
-    truth: np.ndarray
+    holdout: np.ndarray
     observed: np.ndarray
     magnitude: np.ndarray
     electrons: np.ndarray
@@ -59,9 +59,9 @@ class StarField:
     faint: float
 
     @property
-    def truth_pixel(self) -> np.ndarray:
+    def holdout_pixel(self) -> np.ndarray:
         """Positions of the truth stars [pixel] on the CCD, [n, 2]."""
-        return self.to_pixel(self.truth)
+        return self.to_pixel(self.holdout)
 
     @property
     def observed_pixel(self) -> np.ndarray:
@@ -77,7 +77,7 @@ class StarField:
 def make_star_field(
     ccd_name: str,
     bounds: Any,
-    n_truth: int,
+    n_holdout: int,
     n_observed: int,
     seed: int,
     *,
@@ -101,7 +101,7 @@ def make_star_field(
         Name of the CCD; part of the key of its streams.
     bounds : tuple of float or Quantity
         (xmin, xmax, ymin, ymax) of the CCD on the focal plane [m].
-    n_truth : int
+    n_holdout : int
         Places at which the PSF is known without noise, uniform over the CCD.
     n_observed : int
         Observed stars, uniform over the CCD but for the margin, counts per magnitude going as 10^(0.2 m).
@@ -133,7 +133,7 @@ def make_star_field(
     pixel = float(metres(pixel_size, "pixel_size"))
     if not (np.isfinite(pixel) and pixel > 0.0):
         raise DomainError(f"pixel_size = {pixel_size}: expected a positive length")
-    for name, count in (("n_truth", n_truth), ("n_observed", n_observed), ("margin", margin)):
+    for name, count in (("n_holdout", n_holdout), ("n_observed", n_observed), ("margin", margin)):
         if count < 0:
             raise DomainError(f"{name} = {count}: expected a number that is not negative")
     if 2 * margin * pixel >= min(edges[1] - edges[0], edges[3] - edges[2]):
@@ -150,7 +150,7 @@ def make_star_field(
         ccd_name=ccd_name,
         bounds=edges,
         pixel_size=pixel,
-        truth=_uniform(seed, ccd_name, "truth", n_truth, edges),
+        holdout=_uniform(seed, ccd_name, "truth", n_holdout, edges),
         observed=_uniform(seed, ccd_name, "observed", n_observed, inner),
         magnitude=magnitude,
         electrons=photometry.electrons(magnitude, band, exposure),

@@ -233,7 +233,7 @@ def _without(full: Experiment, cause: str) -> Experiment:
     if full.atmosphere is not None and experiment.atmosphere is not None:
         # Screens are the same and take their time.
         experiment = replace(experiment, atmosphere=full.atmosphere.at_altitudes(experiment.atmosphere.altitudes))
-    return replace(experiment, air_alone=cause == OPTICS)
+    return replace(experiment, atmosphere_only=cause == OPTICS)
 
 
 def _products(
@@ -252,12 +252,12 @@ def _products(
 
 def _without_images(product: CcdProduct) -> CcdProduct:
     """Return a product without its stamps, of which 189 CCDs have half a gigabyte."""
-    return replace(product, truth_images=product.truth_images[:0], observed_images=product.observed_images[:0])
+    return replace(product, holdout_images=product.holdout_images[:0], observed_images=product.observed_images[:0])
 
 
 def _figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
     together = run_figures(products, correlated)["all"]
-    e = np.concatenate([[p.truth.e1, p.truth.e2] for p in products], axis=1)
+    e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
     figures = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
     figures |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
     for kind in _XI:

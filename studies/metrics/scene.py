@@ -15,7 +15,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from ...pipeline.measure.summary import SHORTEST_ARCMIN
-from ...pipeline.simulate.ccd_exposure import Exposed, expose_places, truth_places
+from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_places, holdout_positions
 from ...wavefront.bundles import trace_bundles
 from .plan import Plan, make_plan
 
@@ -100,10 +100,10 @@ class Scene:
     @cached_property
     def positions(self) -> list[np.ndarray]:
         """Detector positions of the noise-free stars of each CCD [m], shape [n, 2]."""
-        return [truth_places(self.camera_experiment, name) for name in self.ccds]
+        return [holdout_positions(self.camera_experiment, name) for name in self.ccds]
 
     @cached_property
-    def stars(self) -> Exposed:
+    def stars(self) -> NoiseFreeStars:
         """Noise-free stars at :attr:`positions`."""
         return expose_places(self.camera_experiment, np.concatenate(self.positions), self.threads)
 

@@ -130,7 +130,7 @@ def ee80(scene: Scene) -> dict[str, float]:
 @STARS.group("throughput", Metric("throughput"))
 def lit_fraction(scene: Scene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil."""
-    light = scene.stars.light
+    light = scene.stars.lit_fraction
     return {"throughput_mean": float(light.mean()), "throughput_min": float(light.min())}
 
 

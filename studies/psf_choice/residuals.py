@@ -78,7 +78,7 @@ def measure_residuals(
                 exposure.observed,
                 used,
             ),
-            (places.truth, ccd.holdout, exposure.truth, np.ones(len(places.truth), dtype=bool)),
+            (places.holdout, ccd.holdout, exposure.holdout, np.ones(len(places.holdout), dtype=bool)),
         )
         for k, (at, shapes, exposed, chosen) in enumerate(jobs):
             found = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
@@ -88,7 +88,7 @@ def measure_residuals(
             fields[k].append(exposed.fields[chosen])
         if case.interpolation != "gp":
             law[i] = noise_law(
-                places.observed[used], places.truth, stars.variance[used], model.weights, case.order, model.extent
+                places.observed[used], places.holdout, stars.variance[used], model.weights, case.order, model.extent
             )
     correlated = [residual_correlations(*pair) for pair in zip(fields, residuals, strict=True)]
     return Residuals(

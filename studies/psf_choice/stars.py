@@ -59,7 +59,7 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
     """Return the noise-free stars of all CCDs."""
 
     def measured(exposure: CcdExposure) -> SimulatedCcd:
-        truth = measure_shapes(exposure.truth.image, exposure.truth.pixel_scale, experiment.weight_fwhm)
+        truth = measure_shapes(exposure.holdout.image, exposure.holdout.pixel_scale, experiment.weight_fwhm)
         return SimulatedCcd(exposure, truth, _look_at(experiment, exposure, exposure.observed.image))
 
     with experiment.screens(threads, reporter):
@@ -91,8 +91,8 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     n_stars = len(exposed.image)
     if snr_min == NOISE_FREE:
         return ObservedCcd(ccd.noise_free, np.full(n_stars, np.inf), np.zeros(n_stars))
-    seed, light = experiment.config.seed, exposed.light
-    width = effective_fwhm(ccd.exposure.truth.image, ccd.exposure.truth.pixel_scale)
+    seed, light = experiment.config.seed, exposed.lit_fraction
+    width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
     faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
     # The same stars in the same order; the limit alone changes.
     stars = make_star_field(

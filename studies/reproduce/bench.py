@@ -182,6 +182,6 @@ class Bench:
         if len(finished_ccds(folder, experiment)) < len(names):
             run(experiment.config, folder, resume=True, strict=True, threads=self.threads, reporter=self.reporter)
         stamp = stamp_of(experiment)
-        products = [read_product(product_path(folder, name), stamp, truth_images=False) for name in names]
+        products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)
         return PipelineRun(experiment, products, correlated, run_figures(products, correlated))

@@ -34,9 +34,9 @@ def eigen_psfs(bench: Bench) -> Reproduced:
     """Show mean, eigen-PSFs and eigenvalues (Fig. 9)."""
     products = bench.pipeline.products
     product = closest_middle_farthest(products)[0]
-    model = product.truth_model
-    explained = np.array([p.truth_model.explained for p in products])
-    kinks = np.array([p.model.kink for p in products])
+    model = product.noise_free_model
+    explained = np.array([p.noise_free_model.explained for p in products])
+    elbows = np.array([p.model.elbow for p in products])
     worst = float(explained.min())
     n = np.arange(1, len(model.eigenvalues) + 1)
     values = {
@@ -58,8 +58,8 @@ def eigen_psfs(bench: Bench) -> Reproduced:
         {"": eigen_figure(product, truth=True), "_eigenvalues": spectrum_figure(products)},
         {"": FitsData(hdus, [("CCD", product.name, ""), ("NPSF", model.n_stars, "noise-free PSFs")])},
         f"{model.n_components} components hold {percent(worst)} of the variance of the noise-free PSFs on the worst of"
-        f" {len(products)} CCDs, {percent(float(np.median(explained)))} on the median one; observed stars: kink at"
-        f" {np.median(kinks):.0f}",
+        f" {len(products)} CCDs, {percent(float(np.median(explained)))} on the median one; observed stars: elbow at"
+        f" {np.median(elbows):.0f}",
         worst > 0.99 if model.n_stars >= _ENOUGH else None,
         (few if model.n_stars < _ENOUGH else "") + source,
         {
@@ -67,7 +67,7 @@ def eigen_psfs(bench: Bench) -> Reproduced:
             "components": model.n_components,
             "explained_worst": worst,
             "explained_median": float(np.median(explained)),
-            "kink_observed_median": float(np.median(kinks)),
+            "kink_observed_median": float(np.median(elbows)),
         },
     )
 
@@ -82,7 +82,7 @@ def eigen_psfs(bench: Bench) -> Reproduced:
 def whiskers_of_stars(bench: Bench) -> Reproduced:
     """Show whiskers of the PSFs with the atmosphere (Fig. 11)."""
     made = bench.pipeline
-    e = np.concatenate([np.hypot(p.truth.e1, p.truth.e2) for p in made.products])
+    e = np.concatenate([np.hypot(p.holdout.e1, p.holdout.e2) for p in made.products])
     mean, largest = float(np.nanmean(e)), float(np.nanmax(e))
     alike, ratio = _against_optics(bench)
     png = whiskers_figure(made.products, made.experiment.focal_plane, bench.field_radius, ("truth",))
@@ -107,7 +107,7 @@ def _against_optics(bench: Bench) -> tuple[float, float]:
     """Return how the pattern goes with that of the optics alone: its correlation with it, and its rms over that."""
     products = bench.pipeline.products
     each = min(_COMPARED, max(1, _MOST_COMPARED // len(products)))
-    stars = [p.truth for p in products]
+    stars = [p.holdout for p in products]
     x, y, e1, e2 = (np.concatenate([getattr(s, key)[:each] for s in stars]) for key in ("x", "y", "e1", "e2"))
     alone = optics_ellipticity(bench, np.stack([x, y], axis=1))
     both = e1 + 1j * e2

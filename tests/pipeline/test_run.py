@@ -232,7 +232,7 @@ def test_errors_of_mean_correlations_are_their_jackknife(finished_run):
     summary = json.loads((finished_run / "summary.json").read_text())
     products = [read_product(finished_run / f"ccd_{name}.fits") for name in CCDS]
     bins = separation_bins(products)
-    for kind, stars in (("residual", [p.observed for p in products]), ("away", [p.truth for p in products])):
+    for kind, stars in (("residual", [p.observed for p in products]), ("away", [p.holdout for p in products])):
         short = np.array(summary["correlation"][kind]["r_arcmin"]) < 10.0
         left = []
         for s in stars:
@@ -253,7 +253,7 @@ def test_the_summary_holds_what_the_products_say(finished_run, tiny):
     residuals = []
     for name in CCDS:
         product = read_product(finished_run / f"ccd_{name}.fits", run_folder.stamp_of(experiment))
-        truth = product.truth
+        truth = product.holdout
         residuals.append(np.concatenate([truth.e1 - truth.model_e1, truth.e2 - truth.model_e2]))
         figures = summary["ccd"][name]
         # JSON keeps nine digits.
@@ -267,14 +267,14 @@ def test_the_summary_holds_what_the_products_say(finished_run, tiny):
 def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run, tiny):
     product = read_product(finished_run / "ccd_R24_S12.fits")
     camera = Experiment.from_config(tiny()).camera
-    for stars in (product.truth, product.observed):
+    for stars in (product.holdout, product.observed):
         assert np.all(camera.ccd_at(stars.x, stars.y) == camera.ccd_index("R24_S12"))
         # 10.31 m of focal length: a detector position is the tangent of the field angle to a per cent (distortion).
         np.testing.assert_allclose(np.tan(stars.field_x) * 10.31, stars.x, rtol=0.01)
-    assert product.truth_images.shape == (14, 31, 31)
+    assert product.holdout_images.shape == (14, 31, 31)
     assert product.observed_images.shape == (12, 31, 31)
-    np.testing.assert_allclose(product.truth_images.sum(axis=(1, 2)), 1.0, rtol=1e-5)
-    peaks = product.truth_images.reshape(14, -1).argmax(axis=1)
+    np.testing.assert_allclose(product.holdout_images.sum(axis=(1, 2)), 1.0, rtol=1e-5)
+    peaks = product.holdout_images.reshape(14, -1).argmax(axis=1)
     assert np.all(np.abs(np.stack(np.unravel_index(peaks, (31, 31))) - 15) <= 1)
     # The faintest star is still at the limit asked for, S/N 30.
     assert product.observed.snr.min() >= 30.0 * (1 - 1e-9)
@@ -296,7 +296,7 @@ def test_visits_have_the_same_stars_and_other_noise(tiny):
     options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
     first, again, second = (computed(tiny(atmosphere__epoch=epoch, **options)) for epoch in (0, 0, 1))
     np.testing.assert_array_equal(first.observed_images, again.observed_images)
-    np.testing.assert_array_equal(first.truth_images, second.truth_images)
+    np.testing.assert_array_equal(first.holdout_images, second.holdout_images)
     for key in ("x", "y", "magnitude", "electrons"):
         np.testing.assert_array_equal(getattr(first.observed, key), getattr(second.observed, key))
     assert not np.any(np.all(first.observed_images == second.observed_images, axis=(1, 2)))
@@ -305,7 +305,7 @@ def test_visits_have_the_same_stars_and_other_noise(tiny):
 def test_residual_aberration_and_jitter_reach_the_stars(tiny):
     options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
     plain, bent, shaken = (
-        computed(tiny(**options, **more)).truth
+        computed(tiny(**options, **more)).holdout
         for more in ({}, {"active_optics__residual_um": 0.4}, {"psf__jitter_arcsec": 0.1})
     )
     # Near the axis the telescope is round; 0.4 um make several per cent, jitter only width.
@@ -320,4 +320,4 @@ def test_without_an_atmosphere_the_optics_alone_make_the_psf(tmp_path, tiny, no_
     run(config, tmp_path / "optics")
     product = read_product(tmp_path / "optics" / "ccd_R22_S11.fits")
     # A tenth of an arcsecond of aberrations and no half arcsecond of seeing.
-    assert np.median(product.truth.fwhm) < np.deg2rad(0.2 / 3600)
+    assert np.median(product.holdout.fwhm) < np.deg2rad(0.2 / 3600)

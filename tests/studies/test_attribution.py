@@ -49,7 +49,7 @@ def test_a_case_is_a_run_without_the_cause(tiny, attributed):
     experiment = Experiment.from_config(with_options(tiny(), focal_plane__tilt=False))
     names = experiment.config.ccds
     products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1)) for name in names]
-    e = np.concatenate([[p.truth.e1, p.truth.e2] for p in products], axis=1)
+    e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
     assert attributed.figures["tilt"]["rms_e_truth"] == np.sqrt(np.mean(e**2))
     for kind, expected in correlations(products, KINDS).items():
         assert attributed.correlations["tilt"][kind].xi_plus.tobytes() == expected.xi_plus.tobytes()
@@ -104,7 +104,7 @@ def test_without_noise_the_model_is_that_of_bright_stars(tiny):
     exposure = expose_ccd(experiment, "R22_S11", threads=1)
     product = model_ccd(experiment, exposure)
     quiet = model_ccd(experiment, exposure, noisy=False)
-    np.testing.assert_array_equal(quiet.truth.e1, product.truth.e1)
+    np.testing.assert_array_equal(quiet.holdout.e1, product.holdout.e1)
     stamps = center_stamps(exposure.observed.image, *_centroids(experiment, exposure), size=experiment.stamp_size)
     rng = np.random.default_rng(0)
     bright = rng.poisson(1e11 * np.maximum(stamps, 0.0)) / 1e11
@@ -114,7 +114,7 @@ def test_without_noise_the_model_is_that_of_bright_stars(tiny):
     np.testing.assert_allclose(quiet.observed.e2, shapes.e2, rtol=0.0, atol=3e-5)
     assert np.abs(product.observed.e1 - shapes.e1).max() > 3e-4
     assert quiet.observed.used.all()
-    assert np.isfinite(quiet.observed.left_out_e1).all()
+    assert np.isfinite(quiet.observed.leave_one_out_e1).all()
 
 
 def _centroids(experiment, exposure):
@@ -141,9 +141,9 @@ def test_optics_off_leaves_the_air_alone(tiny):
     experiment = Experiment.from_config(config)
     alone = attribution._without(experiment, OPTICS)
     full, air = (expose_ccd(e, "R24_S12", threads=1) for e in (experiment, alone))
-    np.testing.assert_array_equal(full.truth.fields, air.truth.fields)
-    assert air.truth.pixel_scale == pytest.approx(full.truth.pixel_scale, rel=1e-12)
-    np.testing.assert_allclose(air.truth.light, 1.0, rtol=1e-6)  # no rim of a camera in the way
+    np.testing.assert_array_equal(full.holdout.fields, air.holdout.fields)
+    assert air.holdout.pixel_scale == pytest.approx(full.holdout.pixel_scale, rel=1e-12)
+    np.testing.assert_allclose(air.holdout.lit_fraction, 1.0, rtol=1e-6)  # no rim of a camera in the way
     # What air, diffusion (0.4 pixel rms) and pixel (rms 0.29 of its side, 0.2") make of a point: a Hankel transform.
     # Of diffraction it knows the rims: each takes r times its diameter from the overlap of the pupil with itself.
     r, angle = np.linspace(0.0, 4.0, 4001)[1:], np.linspace(0.0, 0.6, 601) * ARCSEC

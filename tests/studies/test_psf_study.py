@@ -13,7 +13,7 @@ from pachon.pipeline.config import load_configuration
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.psf_model.polynomial import mapped
-from pachon.pipeline.simulate.ccd_exposure import CcdExposure, Exposed
+from pachon.pipeline.simulate.ccd_exposure import CcdExposure, NoiseFreeStars
 from pachon.pipeline.simulate.ccd_observation import Observation
 from pachon.pipeline.simulate.star_field import make_star_field
 from pachon.studies.psf_choice.plan import NOISE_FREE, Case, Plan, make_plan
@@ -24,9 +24,9 @@ from pachon.studies.psf_choice.study import Study, study, study_experiment
 SCALE = 0.2 * ARCSEC
 
 
-def _planted(name, degree, n_stars, n_truth, half=0.02):
+def _planted(name, degree, n_stars, n_holdout, half=0.02):
     """A CCD whose PSF is a Gaussian plus two even shapes, their amplitudes polynomials of this degree; centred."""
-    places = make_star_field(name, (-half, half, -half, half), n_truth, n_stars, 3, fwhm=0.7 * ARCSEC)
+    places = make_star_field(name, (-half, half, -half, half), n_holdout, n_stars, 3, fwhm=0.7 * ARCSEC)
     rng = np.random.default_rng([degree, *name.encode()])
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     amplitudes = rng.normal(0.0, 0.01, (2, len(powers)))
@@ -42,11 +42,11 @@ def _planted(name, degree, n_stars, n_truth, half=0.02):
         return round_psf + np.einsum("kn,kyx->nyx", a, shapes)
 
     def exposed(positions, size):
-        return Exposed(images(positions, size), SCALE, positions * 0.01, np.ones(len(positions)))
+        return NoiseFreeStars(images(positions, size), SCALE, positions * 0.01, np.ones(len(positions)))
 
-    exposure = CcdExposure(name, places, exposed(places.truth, 31), exposed(places.observed, 41))
+    exposure = CcdExposure(name, places, exposed(places.holdout, 31), exposed(places.observed, 41))
     stamps, nothing = images(places.observed, 31), np.zeros(n_stars, dtype=int)
-    truth, shapes = (measure_shapes(i, SCALE, 0.7 * ARCSEC) for i in (exposure.truth.image, stamps))
+    truth, shapes = (measure_shapes(i, SCALE, 0.7 * ARCSEC) for i in (exposure.holdout.image, stamps))
     return SimulatedCcd(exposure, truth, Observation((0.0, 0.0), stamps, shapes, nothing, nothing == 0))
 
 
@@ -89,7 +89,7 @@ def test_noise_leaves_what_the_law_says(experiment, order, interpolation):
         seen = observe(experiment, ccd, case.snr, 0)
         weights = np.ones(60) if interpolation == "equal" else 1.0 / (seen.snr**-2 + 1e-4)
         u, v = mapped(ccd.exposure.places.observed, ccd.exposure.places.bounds).T
-        at, bt = mapped(ccd.exposure.places.truth, ccd.exposure.places.bounds).T
+        at, bt = mapped(ccd.exposure.places.holdout, ccd.exposure.places.bounds).T
         powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
         terms, there = (np.stack([x**i * y**j for i, j in powers], axis=1) for x, y in ((u, v), (at, bt)))
         solve = there @ np.linalg.solve(terms.T @ (weights[:, None] * terms), terms.T * weights)

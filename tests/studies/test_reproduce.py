@@ -261,7 +261,7 @@ def test_eigenvalues_add_up_to_the_variance_of_the_psfs(made):
         fraction = np.array(hdus["EIGENVAL"].data["FRACTION"])
         components = hdus["EIGENPSF"].data.reshape(20, -1).astype(float)
     product = read_product(product_path(bench.folder / "run", name), stamp_of(bench.pipeline.experiment))
-    images = product.truth_images.astype(float).reshape(TINY.truth, -1)
+    images = product.holdout_images.astype(float).reshape(TINY.truth, -1)
     images /= images.sum(axis=1, keepdims=True)
     # The product keeps its images in single precision.
     assert values.sum() == pytest.approx(images.var(axis=0, ddof=1).sum(), rel=1e-4)

@@ -53,7 +53,7 @@ def test_sizes_are_of_the_model_at_the_star(finished_run, diagnosed):
     for name in CCDS:
         row = diagnosed.table[list(CCDS).index(name)]
         product = read_product(product_path(finished_run, name))
-        for kind, stars in (("residual", product.observed), ("away", product.truth)):
+        for kind, stars in (("residual", product.observed), ("away", product.holdout)):
             images = product.model.at(np.stack([stars.x, stars.y], axis=1))
             model = measure_shapes(images, product.pixel_scale, 0.7 * ARCSEC)
             # The product was made with the same weight: its ellipticities of the model come out again.

@@ -238,7 +238,7 @@ def test_kink_is_where_the_eigenvalues_flatten():
     noise = rng.normal(0.0, 1e-5, (80, SIZE, SIZE))
     noise -= noise.mean(axis=(1, 2), keepdims=True)  # else the normalisation makes of its sum a sixth component
     stamps = profile() + np.tensordot(amplitudes, basis, 1) + noise
-    assert PsfModel.fit(stamps, positions(80, 1), clip_sigma=None).kink == 5
+    assert PsfModel.fit(stamps, positions(80, 1), clip_sigma=None).elbow == 5
 
 
 def test_equal_stars_have_no_variance():

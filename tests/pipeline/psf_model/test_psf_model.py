@@ -201,12 +201,12 @@ def test_automatic_number_of_components():
     model = PsfModel.fit(stamps, places, n_components="auto", extent=EXTENT)
     assert model.n_components == 7  # as many modes as the field has
     twenty = PsfModel.fit(stamps, places, extent=EXTENT)
-    assert twenty.cross_validated == 7
-    assert twenty.left_out_curve.shape == (21,)
-    assert twenty.left_out_curve[-1] == pytest.approx(twenty.leave_one_out_rms, rel=1e-12)
+    assert twenty.cross_validated_components == 7
+    assert twenty.leave_one_out_curve.shape == (21,)
+    assert twenty.leave_one_out_curve[-1] == pytest.approx(twenty.leave_one_out_rms, rel=1e-12)
     # The curve is that of fits with fewer components.
     five = PsfModel.fit(stamps, places, n_components=5, extent=EXTENT)
-    assert twenty.left_out_curve[5] == pytest.approx(five.leave_one_out_rms, rel=1e-9)
+    assert twenty.leave_one_out_curve[5] == pytest.approx(five.leave_one_out_rms, rel=1e-9)
     short = twenty.truncated(5)
     np.testing.assert_allclose(short.unexplained, five.unexplained, rtol=1e-9)
     np.testing.assert_allclose(short.at(ELSEWHERE), five.at(ELSEWHERE), atol=1e-15)
@@ -218,7 +218,7 @@ def test_automatic_number_of_components():
     again = PsfModel.fit(faint, places, n_components="auto", extent=EXTENT)
     assert again.at(ELSEWHERE).tobytes() == few.at(ELSEWHERE).tobytes()
     exact = PsfModel.fit(faint[:10], places[:10], n_components="auto")  # no star can be left out of ten for ten terms
-    assert exact.n_components == exact.cross_validated == 9
+    assert exact.n_components == exact.cross_validated_components == 9
 
 
 @pytest.mark.parametrize("basis", BASES)

@@ -120,12 +120,12 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
     assert (model.weights is None) == (expected is None)
     if expected is not None:
         np.testing.assert_array_equal(model.weights, expected)
-    assert not np.array_equal(product.truth.model_e1, plain.truth.model_e1)
+    assert not np.array_equal(product.holdout.model_e1, plain.holdout.model_e1)
     # The noise-free PSFs are described by principal components all the same.
-    assert product.truth_model.basis == "pca"
+    assert product.noise_free_model.basis == "pca"
     # Another description of the same stars is about as good.
-    assert np.isfinite(product.observed.left_out_e1).all()
-    assert np.std(product.truth.residual_e1) < 3.0 * np.std(plain.truth.residual_e1)
+    assert np.isfinite(product.observed.leave_one_out_e1).all()
+    assert np.std(product.holdout.residual_e1) < 3.0 * np.std(plain.holdout.residual_e1)
 
 
 def test_weights_are_between_equal_and_inverse_variance():

@@ -10,13 +10,13 @@ BOUNDS = (-0.02048, 0.02048, 0.10652, 0.14748)
 FWHM = 0.7 * photometry.ARCSEC
 
 
-def field(ccd="R22_S11", n_truth=100, n_observed=40, seed=1, **options):
-    return make_star_field(ccd, BOUNDS, n_truth, n_observed, seed, fwhm=FWHM, **options)
+def field(ccd="R22_S11", n_holdout=100, n_observed=40, seed=1, **options):
+    return make_star_field(ccd, BOUNDS, n_holdout, n_observed, seed, fwhm=FWHM, **options)
 
 
 def test_positions_and_pixels():
-    stars = field(n_truth=4000, n_observed=4000)
-    for positions, margin in ((stars.truth, 0), (stars.observed, 20)):
+    stars = field(n_holdout=4000, n_observed=4000)
+    for positions, margin in ((stars.holdout, 0), (stars.observed, 20)):
         assert positions.shape == (4000, 2)
         low = np.array([BOUNDS[0], BOUNDS[2]]) + margin * 1e-5
         high = np.array([BOUNDS[1], BOUNDS[3]]) - margin * 1e-5
@@ -33,7 +33,7 @@ def test_positions_and_pixels():
     np.testing.assert_allclose(stars.to_pixel([[BOUNDS[0] + 5e-6, BOUNDS[2] + 15e-6]]), [[0.0, 1.0]], atol=1e-8)
     fraction = pixel % 1.0
     assert abs(fraction.mean() - 0.5) < 0.014  # sub-pixel phases are uniform: 4 sigma of 8000 numbers
-    assert not np.any(np.isin(stars.truth, stars.observed))
+    assert not np.any(np.isin(stars.holdout, stars.observed))
 
 
 def test_magnitudes_follow_the_star_counts():
@@ -63,32 +63,32 @@ def test_observed_stars_are_bright_but_not_saturated():
 
 def test_stars_depend_on_seed_and_ccd_alone():
     stars = field()
-    again = field(n_truth=30, n_observed=70)
-    assert again.truth.tobytes() == stars.truth[:30].tobytes()
+    again = field(n_holdout=30, n_observed=70)
+    assert again.holdout.tobytes() == stars.holdout[:30].tobytes()
     assert again.observed[:40].tobytes() == stars.observed.tobytes()
     assert again.magnitude[:40].tobytes() == stars.magnitude.tobytes()
     for other in (field(seed=2), field("R22_S12")):
-        assert not np.any(np.isin(other.truth, stars.truth))
+        assert not np.any(np.isin(other.holdout, stars.holdout))
         assert not np.any(np.isin(other.magnitude, stars.magnitude))
 
 
 def test_quantities():
     bounds = [v * 1e3 * u.mm for v in BOUNDS]
     stars = make_star_field("R22_S11", bounds, 100, 40, 1, fwhm=0.7 * u.arcsec, pixel_size=10 * u.um)
-    np.testing.assert_allclose(stars.truth, field().truth, rtol=1e-12)  # the conversion's rounding
+    np.testing.assert_allclose(stars.holdout, field().holdout, rtol=1e-12)  # the conversion's rounding
     np.testing.assert_allclose(stars.magnitude, field().magnitude, rtol=1e-12)
 
 
 def test_no_stars():
-    stars = field(n_truth=0, n_observed=0)
-    assert stars.truth.shape == stars.observed.shape == (0, 2)
+    stars = field(n_holdout=0, n_observed=0)
+    assert stars.holdout.shape == stars.observed.shape == (0, 2)
     assert stars.magnitude.shape == (0,)
 
 
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        ({"n_truth": -1}, "n_truth"),
+        ({"n_holdout": -1}, "n_holdout"),
         ({"n_observed": -1}, "n_observed"),
         ({"margin": 2048}, "margin"),
         ({"margin": -1}, "margin"),
