@@ -80,7 +80,9 @@ def attribute_command(
     """
     from ..core.files import json_text, make_folder
     from ..pipeline.report.tables import ATTRIBUTION_CAPTION, ATTRIBUTION_COLUMNS, attribution_rows
-    from ..studies.attribution.attribution import attribute, checked_causes, write_attribution
+    from ..studies.attribution.attribution import attribute
+    from ..studies.attribution.causes import checked_causes
+    from ..studies.attribution.product import write_attribution
 
     names = one_name_list(ccds=ccds, raft=raft)
     engine = "long_exposure" if average else None
@@ -93,8 +95,8 @@ def attribute_command(
         result = attribute(resolved, chosen, threads=threads, reporter=reporter)
     write_attribution(result, out, resolved)
     if as_json:
-        print(json_text(result.figures))
+        print(json_text(result.metrics))
         return
     if not quiet:
-        Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.figures), ATTRIBUTION_CAPTION).show()
+        Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.metrics), ATTRIBUTION_CAPTION).show()
     print(f"attribution: {out.resolve()}")

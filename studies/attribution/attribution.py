@@ -1,118 +1,60 @@
-"""What each cause does to the PSF: the same stars once with everything, and once more with each cause switched off.
+"""Effect of each cause on the PSF: the same stars with all causes, and with each cause switched off.
 
-Random numbers are common: heights, turbulence, wind, positions of the stars and the order in which their magnitudes
-are drawn stay what they were when another cause goes, so that a difference is the doing of that cause. Two things
-follow the PSF, as they do at a telescope: the faintest star is the one of the wanted signal-to-noise ratio, and photons
-are counted in other numbers.
+Random numbers are common to all cases: heights, turbulence, wind, positions of the stars and the order of their
+magnitudes. Differences are then effects of a cause. Two quantities depend on the PSF, as in observations: the magnitude
+of the faintest star, by its signal-to-noise ratio, and the numbers of the photons.
 
-The same beam without aberrations is no telescope that can be traced over the CCD heights. With the optics off, stars
-are therefore seen from the same places on the sky through a paraboloid so long that nothing the telescope does is left:
-neither its design, nor the heights, nor what active optics leaves. The design's own share is what the heights' case has
-more than that of the optics.
+A telescope without aberrations cannot be traced over the CCD heights. With the optics off, stars at the same positions
+on the sky are therefore imaged by a paraboloid so long that design, heights and residuals of the active optics have no
+effect. The effect of the design is that of the optics less that of the heights.
 
-The layer on the ground does most of the turbulence, and at exactly 0 m all stars of the field see the same part of it
-at the same moment: they share its ellipticity. Its case lifts it, with the same turbulence, so far that stars share it
-no more than they do the next layer.
+The ground layer holds most of the turbulence. At exactly 0 m all stars of the field have the same part of it in front
+of them at any time, and one ellipticity in common. Its case lifts the layer with the same turbulence, so far that stars
+have no more of it in common than of the next layer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ...core.errors import ConfigError, unknown_name
-from ...core.files import write_bytes, write_json
-from ...core.products import write_ecsv
 from ...core.progress import Reporter
-from ...models.io.site_file import load_site
 from ...pipeline.ccd_product import KINDS, CcdProduct
-from ...pipeline.config import Configuration, to_yaml, with_options
+from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.diagnostics import correlation_columns
 from ...pipeline.measure.summary import (
     correlations,
     run_figures,
 )
 from ...pipeline.memory import check_memory
-from ...pipeline.run_folder import CONFIG_NAME, stamp_of
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
-from .plots import attribution_figure
+from .causes import CAUSES, FULL, NOISE, OPTICS, checked_causes
 
-FULL, NOISE, OPTICS = "full", "noise", "optics"
-#: Height that the layer on the ground is lifted to [m]: about that of the next one over Cerro Pachon.
-GROUND_LIFT = 2500.0
-_SWITCHES: dict[str, dict[str, Any]] = {
-    "global": {"focal_plane__global": False},
-    "raft": {"focal_plane__raft": False},
-    "ccd": {"focal_plane__ccd": False},
-    "tilt": {"focal_plane__tilt": False},
-    "potato_chip": {"focal_plane__potato_chip": False},
-    "heights": {"focal_plane__budget": "flat"},
-    "active_optics": {"active_optics__residual_um": 0.0},
-    OPTICS: {},
-    "atmosphere": {"atmosphere__enabled": False},
-    "ground_layer": {"atmosphere__ground_lift_m": GROUND_LIFT},
-    "diffusion": {"psf__diffusion_pixels": 0.0},
-    NOISE: {},
-}
-#: All causes: five terms of the heights and these together, residual aberration, all that the telescope does,
-#: turbulence with refraction, that all stars share the layer on the ground, charge diffusion, and the noise of the
-#: observed stars.
-CAUSES = tuple(_SWITCHES)
 _RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
 _XI = ("truth", "observed", "residual", "away")
 
 
 @dataclass(frozen=True)
 class Attribution:
-    """What came out with everything, and without each cause.
+    """Metrics with all causes, and without each.
 
     Attributes
     ----------
-    figures : dict of str to dict
-        For ``full`` and for each cause that was off: rms of e and of its residuals, median FWHM, and the mean xi+ of
-        noise-free PSFs, observed stars, residual at the stars and away from them, over the short and the long
-        separations; ``change_`` and a key is the effect of the cause, the full case less this one, and ``error_`` and a
-        key of xi+ its jackknife error over the CCDs.
+    metrics : dict of str to dict
+        For ``full`` and each cause that is switched off: rms of e and of its residuals, median FWHM, and the mean xi+
+        of noise-free PSFs, observed stars and residuals, over short and long separations. ``change_`` and a key is the
+        effect of the cause, the full case less this one; ``error_`` and a key of xi+ its jackknife error over the CCDs.
     correlations : dict of str to dict of str to Correlation
-        Of each case.
+        Correlations of each case, by kind.
     """
 
-    figures: dict[str, dict[str, float]]
+    metrics: dict[str, dict[str, float]]
     correlations: dict[str, dict[str, Correlation]]
-
-
-def causes_of(config: Configuration) -> tuple[str, ...]:
-    """Return the causes that are on in a resolved configuration, and can be switched off with its engine."""
-    return tuple(cause for cause in CAUSES if _why_not(config, cause) is None)
-
-
-def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Return causes each once, or all of :func:`causes_of` where none are given.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such cause.
-    ConfigError
-        If one is off in the configuration already, or cannot be switched off with its engine.
-    """
-    if causes is None:
-        return causes_of(config)
-    for cause in causes:
-        if cause not in _SWITCHES:
-            raise unknown_name("cause", cause, CAUSES)
-        problem = _why_not(config, cause)
-        if problem is not None:
-            raise ConfigError(f"{cause} cannot be switched off: {problem}")
-    return tuple(dict.fromkeys(causes))
 
 
 def attribute(
@@ -122,26 +64,26 @@ def attribute(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> Attribution:
-    """Make the same stars with everything and without each cause, model them, and compare.
+    """Simulate and model the same stars with all causes and without each, and compare.
 
-    The engine ``long_exposure`` in the configuration averages over all turbulence: quick, and what is left is the
-    doing of optics and heights; the atmosphere is then no cause of ellipticity and cannot be switched off.
+    The engine ``long_exposure`` averages over all turbulence. It is fast, and ellipticities are effects of optics and
+    heights alone; the atmosphere cannot be switched off.
 
     Parameters
     ----------
     config : Configuration
         Resolved configuration.
     causes : sequence of str, optional
-        Of :data:`CAUSES`; all of :func:`causes_of` by default.
+        Names of :data:`~pachon.studies.attribution.causes.CAUSES`; by default all that are on.
     threads : int, optional
-        Number of threads; all processors by default. No byte depends on it.
+        Number of threads; all processors by default. Results do not depend on it.
     reporter : Reporter, optional
-        Who tells how far it is; nobody by default.
+        Progress display; silent by default.
 
     Raises
     ------
     UnknownNameError, ConfigError
-        If a cause is none, see :func:`checked_causes`.
+        See :func:`~pachon.studies.attribution.causes.checked_causes`.
     PachonError
         If a case cannot be computed.
     """
@@ -149,89 +91,27 @@ def attribute(
     chosen = checked_causes(config, causes)
     full = Experiment.from_config(config)
     check_memory(full, threads)
-    correlated, figures = {}, {}
+    correlated, metrics = {}, {}
     cases = [FULL, *(c for c in chosen if c != NOISE)]
     with full.screens(threads, reporter):
         for case in cases:
-            experiment = full if case == FULL else _without(full, case)
+            experiment = full if case == FULL else without_cause(full, case)
             products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
             for name, found in ((case, products), (NOISE, noiseless)):
                 if found:
                     correlated[name] = correlations(found, KINDS)
-                    figures[name] = _figures(found, correlated[name])
+                    metrics[name] = _metrics(found, correlated[name])
     order = (FULL, *chosen)
     for name in chosen:
-        figures[name] |= _changes(figures[FULL], figures[name], correlated[FULL], correlated[name])
-    return Attribution({n: figures[n] for n in order}, {n: correlated[n] for n in order})
+        metrics[name] |= changes(metrics[FULL], metrics[name], correlated[FULL], correlated[name])
+    return Attribution({n: metrics[n] for n in order}, {n: correlated[n] for n in order})
 
 
-def write_attribution(result: Attribution, folder: Path, config: Configuration) -> tuple[str, ...]:
-    """Write the figures, the correlations, a picture and the configuration, and return the names of the files.
-
-    Parameters
-    ----------
-    result : Attribution
-        What to write.
-    folder : Path
-        Where; it exists.
-    config : Configuration
-        Resolved configuration of the full case.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
-    """
-    stamp = stamp_of(Experiment.from_config(config))
-    meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed}
-    cases = list(result.figures)
-    keys = list(dict.fromkeys(key for figures in result.figures.values() for key in figures))
-    columns = {"off": (np.array(cases), "", "cause that is switched off, or full")}
-    for key in keys:
-        values = np.array([result.figures[case].get(key, np.nan) for case in cases])
-        columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _meaning(key))
-    everything = {f"{case} {kind}": c for case, each in result.correlations.items() for kind, c in each.items()}
-    write_ecsv(folder / "attribution.ecsv", columns, {"what": "the same stars without one cause", **meta})
-    write_ecsv(folder / "correlations.ecsv", correlation_columns(everything), {"what": "xi of each case", **meta})
-    write_bytes(folder / "attribution.png", attribution_figure(result.figures, result.correlations))
-    write_json(folder / "attribution.json", {"figures": result.figures, **meta})
-    heading = (f"pachon {stamp.version}: the case with everything on.",)
-    write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
-    return "attribution.ecsv", "correlations.ecsv", "attribution.png", "attribution.json", CONFIG_NAME
-
-
-def _why_not(config: Configuration, cause: str) -> str | None:
-    """Return why a cause cannot be switched off, or None."""
-    plane = config.focal_plane
-    if cause in ("global", "raft", "ccd", "tilt", "potato_chip", "heights") and plane.budget == "flat":
-        return "focal_plane.budget = flat"
-    if cause == "heights" and not plane.terms:
-        return "all terms of focal_plane are off already"
-    if cause in ("global", "raft", "ccd", "tilt", "potato_chip") and cause not in plane.terms:
-        return f"focal_plane.{cause} = false"
-    if cause == "active_optics" and config.active_optics.residual_um == 0.0:
-        return "active_optics.residual_um = 0"
-    if cause == "atmosphere" and not config.atmosphere.enabled:
-        return "atmosphere.enabled = false"
-    if cause == "atmosphere" and config.psf.engine == "long_exposure":
-        return "psf.engine = long_exposure, which needs it"
-    if cause == OPTICS and not config.atmosphere.enabled:
-        return "atmosphere.enabled = false, nothing would be left"
-    if cause == "ground_layer":
-        if not config.atmosphere.enabled or config.psf.engine == "long_exposure":
-            return "no star sees turbulence"
-        if config.atmosphere.ground_lift_m > 0.0 or load_site(config.atmosphere.site).altitudes[0] > 0.0:
-            return "no layer is on the ground"
-    if cause == "diffusion" and config.psf.diffusion_pixels == 0.0:
-        return "psf.diffusion_pixels = 0"
-    return None
-
-
-def _without(full: Experiment, cause: str) -> Experiment:
-    """Return the experiment with one cause off. All that a default filled in stays: pixels, stamps, weight."""
-    experiment = Experiment.from_config(with_options(full.config, **_SWITCHES[cause]))
+def without_cause(full: Experiment, cause: str) -> Experiment:
+    """Return the experiment with one cause off; defaults that were filled in stay: pixels, stamps, weight."""
+    experiment = Experiment.from_config(with_options(full.config, **CAUSES[cause].options))
     if full.atmosphere is not None and experiment.atmosphere is not None:
-        # Screens are the same and take their time.
+        # The screens are the same, and slow to make.
         experiment = replace(experiment, atmosphere=full.atmosphere.at_altitudes(experiment.atmosphere.altitudes))
     return replace(experiment, atmosphere_only=cause == OPTICS)
 
@@ -239,7 +119,7 @@ def _without(full: Experiment, cause: str) -> Experiment:
 def _products(
     experiment: Experiment, case: str, noiseless: bool, threads: int | None, reporter: Reporter
 ) -> tuple[list[CcdProduct], list[CcdProduct]]:
-    """Return the products of all CCDs, and those of the same stars without noise where wanted."""
+    """Return the products of all CCDs, and of the same stars without noise."""
     noisy_or_not = (True, False) if noiseless else (True,)
 
     def model(exposure: CcdExposure) -> list[CcdProduct]:
@@ -251,29 +131,32 @@ def _products(
 
 
 def _without_images(product: CcdProduct) -> CcdProduct:
-    """Return a product without its stamps, of which 189 CCDs have half a gigabyte."""
+    """Return a product without its stamps: half a gigabyte for 189 CCDs."""
     return replace(product, holdout_images=product.holdout_images[:0], observed_images=product.observed_images[:0])
 
 
-def _figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
+def _metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
     together = run_figures(products, correlated)["all"]
     e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
-    figures = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
-    figures |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
+    metrics = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
+    metrics |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
     for kind in _XI:
         for name in SEPARATION_RANGES:
-            figures[f"xi_plus_{kind}_{name}"] = correlated[kind].mean_xi_plus(name)
-    return figures
+            metrics[f"xi_plus_{kind}_{name}"] = correlated[kind].mean_xi_plus(name)
+    return metrics
 
 
-def _changes(
+def changes(
     full: Mapping[str, float],
     case: Mapping[str, float],
     with_all: Mapping[str, Correlation],
     without: Mapping[str, Correlation],
 ) -> dict[str, float]:
-    """Return the full case less this one; the stars are the same, so what both have in common is in no error."""
-    changes = {f"change_{key}": full[key] - case[key] for key in case}
+    """Return the metrics of the full case less those of another, with jackknife errors of xi+.
+
+    The stars are the same in both, so that errors in common cancel.
+    """
+    found = {f"change_{key}": full[key] - case[key] for key in case}
     for kind in _XI:
         for name in SEPARATION_RANGES:
             one, other = with_all[kind], without[kind]
@@ -282,15 +165,5 @@ def _changes(
                 error = float(
                     jackknife_error(one.leave_one_out_mean_xi_plus(name) - other.leave_one_out_mean_xi_plus(name))
                 )
-            changes[f"error_xi_plus_{kind}_{name}"] = error
-    return changes
-
-
-def _meaning(key: str) -> str:
-    for start, words in (("change_", "full case less this one: "), ("error_", "jackknife error of the change: ")):
-        if key.startswith(start):
-            return words + _meaning(key.removeprefix(start))
-    if key.startswith("xi_plus_"):
-        low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
-        return f"mean xi+ of {key.split('_')[2]}, {low:g} to {high:g} arcmin"
-    return "median FWHM" if key == "fwhm_arcsec" else key.replace("_", " ") + ", one component"
+            found[f"error_xi_plus_{kind}_{name}"] = error
+    return found

@@ -1,4 +1,4 @@
-"""Figure of an attribution: what is left of ellipticity, residual and correlation without each cause."""
+"""Plot of an attribution: ellipticity, residual and correlation without each cause."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from matplotlib.axes import Axes
 from ...core.plotting import new_figure, png_bytes, styled
 from ...pipeline.measure.correlation import Correlation
 from ...pipeline.report.focal_plane_axes import AWAY, RESIDUAL, TRUTH
+from .causes import FULL
 
-_FULL = "full"
 
-
-def attribution_figure(
-    figures: Mapping[str, Mapping[str, float]], correlations: Mapping[str, Mapping[str, Correlation]]
+def attribution_plot(
+    metrics: Mapping[str, Mapping[str, float]], correlations: Mapping[str, Mapping[str, Correlation]]
 ) -> bytes:
-    """Draw rms ellipticity and residuals as bars, a row for each case, and xi+ of truth and of the residual.
+    """Draw rms ellipticities and residuals as bars, and xi+ as curves, for each case.
 
     Parameters
     ----------
-    figures : mapping of str to mapping
-        Of each case, as in :class:`~pachon.studies.attribution.attribution.Attribution`; ``full`` comes first.
+    metrics : mapping of str to mapping
+        Metrics of each case, as in :class:`~pachon.studies.attribution.attribution.Attribution`; ``full`` first.
     correlations : mapping of str to mapping of str to Correlation
-        Of each case.
+        Correlations of each case.
     """
-    cases = list(figures)
-    colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {_FULL: "black"}
+    cases = list(metrics)
+    colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {FULL: "black"}
     with styled():
         figure = new_figure(12.5, 3.4 + 0.42 * len(cases) + 3.4)
         panels = figure.subplots(2, 2, height_ratios=[1.2 + 0.42 * len(cases), 4.6])
@@ -43,7 +42,7 @@ def attribution_figure(
             ),
             strict=True,
         ):
-            _draw_bars(axes, figures, keys)
+            _draw_bars(axes, metrics, keys)
         panels[0, 0].set_title("rms of one component of e: truth", loc="left")
         panels[0, 1].set_title("rms of one component of the residual", loc="left")
         for axes, kind, title in (
@@ -62,17 +61,17 @@ def attribution_figure(
 
 
 def _title(case: str) -> str:
-    return "everything on" if case == _FULL else f"{case.replace('_', ' ')} off"
+    return "everything on" if case == FULL else f"{case.replace('_', ' ')} off"
 
 
-def _draw_bars(axes: Axes, figures: Mapping[str, Mapping[str, float]], keys: tuple[tuple[str, str, str], ...]) -> None:
-    rows = np.arange(len(figures))
+def _draw_bars(axes: Axes, metrics: Mapping[str, Mapping[str, float]], keys: tuple[tuple[str, str, str], ...]) -> None:
+    rows = np.arange(len(metrics))
     height = 0.7 / len(keys)
     for i, (key, color, label) in enumerate(keys):
-        values = [each[key] for each in figures.values()]
+        values = [each[key] for each in metrics.values()]
         axes.barh(rows + (i - 0.5 * (len(keys) - 1)) * height, values, 0.9 * height, color=color, label=label)
-        axes.axvline(figures[_FULL][key], color=color, linewidth=0.8, linestyle=(0, (3, 2)))
-    axes.set_yticks(rows, [_title(case) for case in figures])
+        axes.axvline(metrics[FULL][key], color=color, linewidth=0.8, linestyle=(0, (3, 2)))
+    axes.set_yticks(rows, [_title(case) for case in metrics])
     axes.invert_yaxis()
     axes.set_xlim(0.0)
     if len(keys) > 1:
@@ -82,7 +81,7 @@ def _draw_bars(axes: Axes, figures: Mapping[str, Mapping[str, float]], keys: tup
 def _draw_curve(axes: Axes, correlation: Correlation, color: object, case: str) -> None:
     r, xi = correlation.r_arcmin, correlation.xi_plus
     some = np.isfinite(xi) & (xi != 0.0)
-    width = 1.8 if case == _FULL else 0.9
+    width = 1.8 if case == FULL else 0.9
     axes.plot(r[some], np.abs(xi[some]), "-", color=color, linewidth=width, label=_title(case))
     for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
         axes.plot(r[chosen], np.abs(xi[chosen]), "o", color=color, markersize=3.5, markerfacecolor=face)

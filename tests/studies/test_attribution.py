@@ -17,16 +17,9 @@ from pachon.pipeline.measure.summary import correlations
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.stamps import center_stamps
-from pachon.studies.attribution.attribution import (
-    CAUSES,
-    FULL,
-    NOISE,
-    OPTICS,
-    attribute,
-    attribution,
-    causes_of,
-    write_attribution,
-)
+from pachon.studies.attribution.attribution import attribute, changes, without_cause
+from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes
+from pachon.studies.attribution.product import write_attribution
 from pachon.wavefront.atmosphere.turbulence import structure_function
 
 
@@ -37,7 +30,7 @@ def attributed(tiny):
 
 def test_the_full_case_is_the_run(finished_run, attributed):
     summary = json.loads((finished_run / "summary.json").read_text())["all"]
-    full = attributed.figures[FULL]
+    full = attributed.metrics[FULL]
     for key in ("rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec"):
         assert full[key] == pytest.approx(summary[key], rel=1e-8)  # nine digits in the file
     # Below 10' the summary averages the same pairs; with patches sums go in another order.
@@ -50,17 +43,17 @@ def test_a_case_is_a_run_without_the_cause(tiny, attributed):
     names = experiment.config.ccds
     products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1)) for name in names]
     e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
-    assert attributed.figures["tilt"]["rms_e_truth"] == np.sqrt(np.mean(e**2))
+    assert attributed.metrics["tilt"]["rms_e_truth"] == np.sqrt(np.mean(e**2))
     for kind, expected in correlations(products, KINDS).items():
         assert attributed.correlations["tilt"][kind].xi_plus.tobytes() == expected.xi_plus.tobytes()
-    assert attributed.figures["tilt"]["rms_e_truth"] != attributed.figures[FULL]["rms_e_truth"]
+    assert attributed.metrics["tilt"]["rms_e_truth"] != attributed.metrics[FULL]["rms_e_truth"]
 
 
 def test_changes_are_differences(attributed):
-    full = attributed.figures[FULL]
+    full = attributed.metrics[FULL]
     assert not any(key.startswith(("change_", "error_")) for key in full)
     for case in ("tilt", "diffusion", "atmosphere", NOISE):
-        figures = attributed.figures[case]
+        figures = attributed.metrics[case]
         for key in full:
             assert figures[f"change_{key}"] == full[key] - figures[key]
 
@@ -83,14 +76,14 @@ def test_error_of_a_change_is_its_own_jackknife():
     kinds = ("truth", "observed", "residual", "away")
     keys = {f"xi_plus_{kind}_{name}": 0.0 for kind in kinds for name in SEPARATION_RANGES}
     one, other = (dict.fromkeys(kinds, shear_correlation(x, y, *v, patch=patch, **bins)) for v in (e, f))
-    changes = attribution._changes(keys, keys, one, other)
-    assert changes["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order
+    found = changes(keys, keys, one, other)
+    assert found["error_xi_plus_away_long"] == pytest.approx(expected, rel=1e-9)  # sums in another order
     # Stars and their mates in the other case are the same: what both have in common is in no error.
-    assert attribution._changes(keys, keys, one, one)["error_xi_plus_away_long"] == 0.0
+    assert changes(keys, keys, one, one)["error_xi_plus_away_long"] == 0.0
 
 
 def test_without_noise_the_truth_stays(attributed):
-    full, quiet = attributed.figures[FULL], attributed.figures[NOISE]
+    full, quiet = attributed.metrics[FULL], attributed.metrics[NOISE]
     assert quiet["rms_e_truth"] == full["rms_e_truth"]
     assert quiet["fwhm_arcsec"] == full["fwhm_arcsec"]
     assert quiet["rms_residual_at_stars"] < full["rms_residual_at_stars"]
@@ -123,23 +116,23 @@ def _centroids(experiment, exposure):
 
 
 def test_causes_do_what_they_should(attributed):
-    full = attributed.figures[FULL]["fwhm_arcsec"]
+    full = attributed.metrics[FULL]["fwhm_arcsec"]
     # Charge diffusion of 0.4 pixel of 0.2" adds 0.08" rms, 0.19" FWHM, about in quadrature to a seeing-limited core.
-    sharper = attributed.figures["diffusion"]["fwhm_arcsec"]
+    sharper = attributed.metrics["diffusion"]["fwhm_arcsec"]
     assert np.sqrt(full**2 - sharper**2) == pytest.approx(0.19, rel=0.2)
-    assert attributed.figures["atmosphere"]["fwhm_arcsec"] < 0.75 * full
+    assert attributed.metrics["atmosphere"]["fwhm_arcsec"] < 0.75 * full
 
 
 def test_optics_off_leaves_the_air_alone(tiny):
     """The mean over all turbulence is round: what ellipticity there is, the telescope makes."""
     config = tiny(psf__engine="long_exposure", ccds=("R22_S11", "R24_S12"))
-    figures = attribute(config, ("heights", OPTICS), threads=1).figures
+    figures = attribute(config, ("heights", OPTICS), threads=1).metrics
     # Heights of some micrometres do most, the design a little.
     assert figures["full"]["rms_e_truth"] > figures["heights"]["rms_e_truth"] > figures[OPTICS]["rms_e_truth"]
     # A flat detector stretches the sky by 1/cos along the radius more than across: e = 2.2e-4 at 1.7 deg.
     assert figures[OPTICS]["rms_e_truth"] < 3e-4
     experiment = Experiment.from_config(config)
-    alone = attribution._without(experiment, OPTICS)
+    alone = without_cause(experiment, OPTICS)
     full, air = (expose_ccd(e, "R24_S12", threads=1) for e in (experiment, alone))
     np.testing.assert_array_equal(full.holdout.fields, air.holdout.fields)
     assert air.holdout.pixel_scale == pytest.approx(full.holdout.pixel_scale, rel=1e-12)
@@ -161,22 +154,22 @@ def test_optics_off_leaves_the_air_alone(tiny):
 
 def test_a_lifted_ground_layer_is_the_same_air(tiny):
     full = Experiment.from_config(tiny())
-    lifted = attribution._without(full, "ground_layer")
+    lifted = without_cause(full, "ground_layer")
     np.testing.assert_array_equal(lifted.atmosphere.altitudes[1:], full.atmosphere.altitudes[1:])
-    assert (full.atmosphere.altitudes[0], lifted.atmosphere.altitudes[0]) == (0.0, attribution.GROUND_LIFT)
-    asked = Experiment.from_config(with_options(tiny(), atmosphere__ground_lift_m=attribution.GROUND_LIFT))
+    assert (full.atmosphere.altitudes[0], lifted.atmosphere.altitudes[0]) == (0.0, GROUND_LIFT)
+    asked = Experiment.from_config(with_options(tiny(), atmosphere__ground_lift_m=GROUND_LIFT))
     np.testing.assert_array_equal(lifted.atmosphere.altitudes, asked.atmosphere.altitudes)
     assert lifted.atmosphere.screens("slopes") is full.atmosphere.screens("slopes")
 
 
 def test_causes_that_are_off_are_no_causes(tiny):
     config = tiny()
-    assert causes_of(config) == tuple(c for c in CAUSES if c != "active_optics")
+    assert checked_causes(config) == tuple(c for c in CAUSES if c != "active_optics")
     config = tiny(focal_plane__tilt=False, psf__diffusion_pixels=0.0, active_optics__residual_um=0.2)
-    assert not {"tilt", "diffusion"} & set(causes_of(config))
-    assert "active_optics" in causes_of(config)
-    assert not {"heights", "ccd"} & set(causes_of(tiny(focal_plane__budget="flat")))
-    assert "atmosphere" not in causes_of(tiny(psf__engine="long_exposure"))
+    assert not {"tilt", "diffusion"} & set(checked_causes(config))
+    assert "active_optics" in checked_causes(config)
+    assert not {"heights", "ccd"} & set(checked_causes(tiny(focal_plane__budget="flat")))
+    assert "atmosphere" not in checked_causes(tiny(psf__engine="long_exposure"))
     for options, cause, message in (
         ({"focal_plane__tilt": False}, "tilt", "focal_plane.tilt = false"),
         ({"focal_plane__budget": "flat"}, "heights", "focal_plane.budget = flat"),
@@ -198,8 +191,8 @@ def test_files_hold_what_was_returned(tiny, attributed, tmp_path):
     assert load_configuration(tmp_path / "config.yaml") == tiny()
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(files)
     table = Table.read(tmp_path / "attribution.ecsv")
-    assert list(table["off"]) == list(attributed.figures)
-    assert table["change_rms_e_truth"][1] == attributed.figures["tilt"]["change_rms_e_truth"]
+    assert list(table["off"]) == list(attributed.metrics)
+    assert table["change_rms_e_truth"][1] == attributed.metrics["tilt"]["change_rms_e_truth"]
     assert np.isnan(table["change_rms_e_truth"][0])
     assert all(column.description for column in table.itercols())
     xi = Table.read(tmp_path / "correlations.ecsv")
@@ -209,7 +202,7 @@ def test_files_hold_what_was_returned(tiny, attributed, tmp_path):
 
 
 def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(attribution, "attribution_figure", lambda *_: b"")
+    monkeypatch.setattr("pachon.studies.attribution.product.attribution_plot", lambda *_: b"")
     out = tmp_path / "out"
     command = ["attribute", str(settings_file), "--out", str(out), "--average", "--threads", "1", "--quiet"]
     assert main([*command, "--causes", "ccd,noise", "--json"]) == 0

@@ -1,0 +1,101 @@
+"""Causes of ellipticity and of residuals that can be switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from ...core.errors import ConfigError, unknown_name
+from ...models.io.site_file import load_site
+from ...pipeline.config import Configuration
+
+#: Name of the case with all causes, and of the two causes that are no options of the configuration.
+FULL, NOISE, OPTICS = "full", "noise", "optics"
+#: Altitude to which the ground layer is lifted [m]: about that of the next one over Cerro Pachon.
+GROUND_LIFT = 2500.0
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Options that switch a cause off, and the reason why a configuration cannot, or None."""
+
+    options: dict[str, Any]
+    problem: Callable[[Configuration], str | None]
+
+
+def _flat(config: Configuration) -> str | None:
+    return "focal_plane.budget = flat" if config.focal_plane.budget == "flat" else None
+
+
+def _no_heights(config: Configuration) -> str | None:
+    return _flat(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
+
+
+def _no_term(term: str, config: Configuration) -> str | None:
+    return _flat(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
+
+
+def _no_aberration(config: Configuration) -> str | None:
+    return "active_optics.residual_um = 0" if config.active_optics.residual_um == 0.0 else None
+
+
+def _nothing_left(config: Configuration) -> str | None:
+    return None if config.atmosphere.enabled else "atmosphere.enabled = false, nothing would be left"
+
+
+def _no_atmosphere(config: Configuration) -> str | None:
+    if not config.atmosphere.enabled:
+        return "atmosphere.enabled = false"
+    return "psf.engine = long_exposure, which needs it" if config.psf.engine == "long_exposure" else None
+
+
+def _no_ground_layer(config: Configuration) -> str | None:
+    if not config.atmosphere.enabled or config.psf.engine == "long_exposure":
+        return "no star sees turbulence"
+    if config.atmosphere.ground_lift_m > 0.0 or load_site(config.atmosphere.site).altitudes[0] > 0.0:
+        return "no layer is on the ground"
+    return None
+
+
+def _no_diffusion(config: Configuration) -> str | None:
+    return "psf.diffusion_pixels = 0" if config.psf.diffusion_pixels == 0.0 else None
+
+
+#: All causes by name: terms of the CCD heights and all of them, residual aberration, the whole telescope, turbulence
+#: with refraction, the ground layer in common to all stars, charge diffusion, and noise.
+CAUSES: dict[str, Cause] = {
+    **{
+        term: Cause({f"focal_plane__{term}": False}, partial(_no_term, term))
+        for term in ("global", "raft", "ccd", "tilt", "potato_chip")
+    },
+    "heights": Cause({"focal_plane__budget": "flat"}, _no_heights),
+    "active_optics": Cause({"active_optics__residual_um": 0.0}, _no_aberration),
+    OPTICS: Cause({}, _nothing_left),
+    "atmosphere": Cause({"atmosphere__enabled": False}, _no_atmosphere),
+    "ground_layer": Cause({"atmosphere__ground_lift_m": GROUND_LIFT}, _no_ground_layer),
+    "diffusion": Cause({"psf__diffusion_pixels": 0.0}, _no_diffusion),
+    NOISE: Cause({}, lambda _: None),
+}
+
+
+def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Return causes each once; by default all that can be switched off in a resolved configuration.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such cause.
+    ConfigError
+        If one is off in the configuration already, or cannot be switched off with its engine.
+    """
+    if causes is None:
+        return tuple(name for name, cause in CAUSES.items() if cause.problem(config) is None)
+    for name in causes:
+        if name not in CAUSES:
+            raise unknown_name("cause", name, CAUSES)
+        problem = CAUSES[name].problem(config)
+        if problem is not None:
+            raise ConfigError(f"{name} cannot be switched off: {problem}")
+    return tuple(dict.fromkeys(causes))
