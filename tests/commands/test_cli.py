@@ -20,12 +20,6 @@ from pachon.pipeline import memory
 from pachon.pipeline import run as run_module
 
 
-@pytest.fixture
-def in_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def refused(capsys, *arguments):
     """Return the one line on standard error of a call that must exit with status 2 and print nothing else."""
     assert main(arguments) == 2
@@ -70,7 +64,7 @@ def test_version(capsys):
         (["opd", "lsst_v3.3_r", "--field-deg", "1"], ["--field-deg = '1'", "two numbers"]),
         (["opd", "lsst_v3.3_r", "--field-deg", "0,9"], ["deg", "expected within"]),
         (["opd", "lsst_v3.3_r", "--wavelength-nm", "2000"], ["wavelength = 2000 nm", "expected 300 to 1200"]),
-        (["opd", "lsst_v3.3_r", "--out", "no/such/folder.png"], ["no/such/folder.png", "No such file"]),
+        (["opd", "lsst_v3.3_r", "--grid", "16", "--out", "no/such/folder.png"], ["no/such/folder.png", "No such file"]),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(capsys, in_folder, arguments, parts):
@@ -181,7 +175,8 @@ def test_opd_writes_a_picture_and_prints_its_zernikes(capsys, in_folder):
     assert picture.read_bytes() == first
 
 
-def test_run_prints_its_figures_and_where_the_report_is(capsys, finished_run, tmp_path):
+def test_run_prints_its_metrics_and_where_the_report_is(capsys, monkeypatch, finished_run, tmp_path):
+    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
     folder = tmp_path / "copied"
     shutil.copytree(finished_run, folder)
     assert main(["run", str(folder / "config.yaml"), "--out", str(folder), "--resume"]) == 0

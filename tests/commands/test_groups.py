@@ -9,11 +9,7 @@ from pachon.commands.cli import main
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import PointResult, SweepPoint, SweepStore, create_store
 
-
-@pytest.fixture(autouse=True)
-def in_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("in_folder")
 
 
 @pytest.fixture
