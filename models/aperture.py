@@ -1,13 +1,13 @@
-"""Clear apertures of a surface: discs, rings, rectangles, polygons, spider vanes, and what set algebra makes of them.
+"""Clear apertures of a surface: discs, rings, rectangles, polygons, spider vanes, and their unions and intersections.
 
-An aperture is the region of a surface's own x, y that light passes. What blocks light leaves its :class:`Complement`
-clear: ``Complement(Circle(1.1))`` for a camera body, ``Complement(Union((vane, vane, vane, vane)))`` for a spider. Each
-class says to which side its rim counts; for a complement it is the other side.
+An aperture is the region of a surface's own x, y that light passes. The complement of an obstacle is what it leaves
+clear: ``Complement(Circle(1.1))`` for a camera body, ``Complement(Union((vane, vane, vane, vane)))`` for a spider.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,37 +17,61 @@ import numpy as np
 from ..core.errors import PrescriptionError
 
 
+class Aperture(ABC):
+    """A region of the x, y plane of a surface's own frame."""
+
+    @abstractmethod
+    def contains(self, x: Any, y: Any) -> np.ndarray:
+        """Return whether points lie in the region.
+
+        Parameters
+        ----------
+        x, y : float or array
+            Position in the surface's own frame [m].
+
+        Returns
+        -------
+        ndarray of bool
+        """
+
+
+def _require(condition: Any, problem: str) -> None:
+    if not condition:
+        raise PrescriptionError(problem)
+
+
 def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(x, dtype=np.float64) - centre_x, np.asarray(y, dtype=np.float64) - centre_y
 
 
-def _turned(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return coordinates along axes turned by an angle [rad] from x towards y."""
+def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return coordinates along axes rotated by an angle [rad] from x towards y."""
     cosine, sine = math.cos(angle), math.sin(angle)
     return x * cosine + y * sine, y * cosine - x * sine
 
 
 @dataclass(frozen=True)
-class Circle:
-    """Clear disc of the surface's own x, y [m]; its rim is not clear."""
+class Circle(Aperture):
+    """Disc of a radius [m] about a centre x, y [m]; its rim is outside."""
 
     radius: float
     x: float = 0.0
     y: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.radius) and self.radius > 0 and np.isfinite(self.x) and np.isfinite(self.y)):
-            raise PrescriptionError(f"circle = {self.radius!r} m: expected a positive radius and finite centre")
+        _require(
+            0 < self.radius < np.inf and np.all(np.isfinite((self.x, self.y))),
+            f"circle = {self.radius!r} m: expected a positive radius and finite centre",
+        )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies in the clear region."""
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         dx, dy = _shifted(x, y, self.x, self.y)
         return dx**2 + dy**2 < self.radius**2
 
 
 @dataclass(frozen=True)
-class Annulus:
-    """Clear ring of the surface's own x, y [m]; its inner rim is clear, its outer is not."""
+class Annulus(Aperture):
+    """Ring between two radii [m] about a centre x, y [m]; its inner rim is inside, its outer rim outside."""
 
     inner: float
     outer: float
@@ -55,21 +79,23 @@ class Annulus:
     y: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 <= self.inner < self.outer < np.inf and np.isfinite(self.x) and np.isfinite(self.y)):
-            raise PrescriptionError(
-                f"annulus = [{self.inner!r}, {self.outer!r}] m: expected 0 <= inner < outer and finite centre"
-            )
+        _require(
+            0 <= self.inner < self.outer < np.inf and np.all(np.isfinite((self.x, self.y))),
+            f"annulus = [{self.inner!r}, {self.outer!r}] m: expected 0 <= inner < outer and finite centre",
+        )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies in the clear region."""
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         dx, dy = _shifted(x, y, self.x, self.y)
         r2 = dx**2 + dy**2
         return (r2 >= self.inner**2) & (r2 < self.outer**2)
 
 
 @dataclass(frozen=True)
-class Rectangle:
-    """Rectangle of a width along x and a height along y [m], turned by `angle` [rad] from x towards y; no rim."""
+class Rectangle(Aperture):
+    """Rectangle of a width and height [m] about a centre x, y [m], without rim.
+
+    It is rotated by an angle [rad] from x towards y.
+    """
 
     width: float
     height: float
@@ -78,24 +104,25 @@ class Rectangle:
     angle: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 < self.width < np.inf and 0 < self.height < np.inf):
-            raise PrescriptionError(f"rectangle = [{self.width!r}, {self.height!r}] m: expected two positive lengths")
-        if not all(np.isfinite(v) for v in (self.x, self.y, self.angle)):
-            raise PrescriptionError(
-                f"rectangle at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle"
-            )
+        _require(
+            0 < self.width < np.inf and 0 < self.height < np.inf,
+            f"rectangle = [{self.width!r}, {self.height!r}] m: expected two positive lengths",
+        )
+        _require(
+            np.all(np.isfinite((self.x, self.y, self.angle))),
+            f"rectangle at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle",
+        )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies inside."""
-        along, across = _turned(*_shifted(x, y, self.x, self.y), self.angle)
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
         return (np.abs(along) < 0.5 * self.width) & (np.abs(across) < 0.5 * self.height)
 
 
 @dataclass(frozen=True)
-class Vane:
-    """Strip of a width [m] from a point outwards, towards `angle` [rad] from x towards y, without end; no rim.
+class Vane(Aperture):
+    """Strip of a width [m] from a point x, y [m] outwards, at an angle [rad] from x towards y; endless, without rims.
 
-    With ``both_ways`` it runs through the point to the other side as well.
+    With ``both_ways`` it extends to the other side of the point too.
     """
 
     width: float
@@ -105,33 +132,33 @@ class Vane:
     both_ways: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 < self.width < np.inf:
-            raise PrescriptionError(f"vane = {self.width!r} m: expected a positive width")
-        if not all(np.isfinite(v) for v in (self.x, self.y, self.angle)):
-            raise PrescriptionError(
-                f"vane from ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite point and angle"
-            )
+        _require(0 < self.width < np.inf, f"vane = {self.width!r} m: expected a positive width")
+        _require(
+            np.all(np.isfinite((self.x, self.y, self.angle))),
+            f"vane from ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite point and angle",
+        )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies inside."""
-        along, across = _turned(*_shifted(x, y, self.x, self.y), self.angle)
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+        along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
         beside = np.abs(across) < 0.5 * self.width
         return beside if self.both_ways else beside & (along > 0.0)
 
 
 @dataclass(frozen=True)
-class Polygon:
-    """Polygon of at least three corners (x, y) [m] in either sense; the last is joined to the first.
+class Polygon(Aperture):
+    """Polygon of at least three corners (x, y) [m], in either sense; the last is joined to the first.
 
-    Rims count half: of two polygons that share an edge, one contains it.
+    Of two polygons that share an edge, one contains it.
     """
 
     corners: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
         corners = self.corners
-        if len(corners) < 3 or any(len(c) != 2 for c in corners) or not np.all(np.isfinite(np.array(corners))):
-            raise PrescriptionError(f"polygon of {len(corners)} corners: expected at least three finite (x, y) pairs")
+        _require(
+            len(corners) >= 3 and all(len(c) == 2 for c in corners) and np.all(np.isfinite(np.array(corners))),
+            f"polygon of {len(corners)} corners: expected at least three finite (x, y) pairs",
+        )
         crossing = _crossing_edges(np.array(corners, dtype=np.float64))
         if crossing is not None:
             first, second = crossing
@@ -146,7 +173,7 @@ class Polygon:
         return start, np.roll(start, -1, axis=0)
 
     def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies inside: where a line towards +x crosses the outline an odd number of times.
+        """Return whether points lie inside, by the number of edges that a line towards +x crosses.
 
         See Shimrat (1962), Communications of the ACM 5, 434 (algorithm 112).
         """
@@ -192,7 +219,7 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
 
 
 @dataclass(frozen=True)
-class Union:
+class Union(Aperture):
     """Points of at least one of several regions."""
 
     parts: tuple[Aperture, ...]
@@ -200,27 +227,25 @@ class Union:
     def __post_init__(self) -> None:
         _check_parts("union", self.parts)
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies in at least one part."""
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
 
 
 @dataclass(frozen=True)
-class Intersection:
-    """Points of every one of several regions."""
+class Intersection(Aperture):
+    """Points of all of several regions."""
 
     parts: tuple[Aperture, ...]
 
     def __post_init__(self) -> None:
         _check_parts("intersection", self.parts)
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] lies in every part."""
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
 
 
 @dataclass(frozen=True)
-class Complement:
+class Complement(Aperture):
     """Points outside a region: what an obscuration leaves clear."""
 
     part: Aperture
@@ -228,17 +253,11 @@ class Complement:
     def __post_init__(self) -> None:
         _check_parts("complement", (self.part,))
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return True where (x, y) [m] does not lie in the region."""
+    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         return np.logical_not(self.part.contains(x, y))
 
 
-Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
-
-
 def _check_parts(name: str, parts: tuple[Aperture, ...]) -> None:
-    if not isinstance(parts, tuple) or not parts:
-        raise PrescriptionError(f"{name} = {parts!r}: expected a tuple of at least one region")
+    _require(isinstance(parts, tuple) and parts, f"{name} = {parts!r}: expected a tuple of at least one region")
     for part in parts:
-        if not isinstance(part, Aperture):
-            raise PrescriptionError(f"{name} of {part!r}: expected a Circle, Annulus, Rectangle, Vane, Polygon or set")
+        _require(isinstance(part, Aperture), f"{name} of {part!r}: expected an aperture")

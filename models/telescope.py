@@ -20,6 +20,7 @@ from .media.medium import ConstantIndex, Medium
 from .obstruction import Obstruction
 from .shapes.shape import Shape, Sum
 from .surface import Interaction, Matrix, Surface, Vector, move_frame
+from .wavelengths import check_wavelength_range, wavelengths_within
 
 VACUUM = ConstantIndex(1.0)
 #: Surfaces that leave light in the medium that it came through.
@@ -137,9 +138,8 @@ class Telescope:
         if math.isnan(self.object_distance) or self.object_distance == self.stop_z:
             raise PrescriptionError(f"object_distance = {self.object_distance!r}: expected a number other than stop_z")
         self._check_obstructions()
+        check_wavelength_range(self.wavelength_range)
         low, high = self.wavelength_range
-        if not 0 < low < high < np.inf:
-            raise PrescriptionError(f"wavelength_range = {self.wavelength_range!r}: expected 0 < shortest < longest")
         if self.band is None:
             object.__setattr__(self, "band", (low, high))
         for key, values in (("default_wavelength", (self.default_wavelength,)), ("band", self.band or ())):
@@ -310,15 +310,7 @@ class Telescope:
         DomainError
             If it lies outside `wavelength_range`.
         """
-        w = metres(wavelength, "wavelength")
-        low, high = self.wavelength_range
-        bad = ~((w >= low) & (w <= high))
-        if np.any(bad):
-            raise DomainError(
-                f"wavelength = {np.atleast_1d(w)[np.atleast_1d(bad)][0] * 1e9:.6g} nm: "
-                f"expected {low * 1e9:.6g} to {high * 1e9:.6g} nm for {self.name}"
-            )
-        return w
+        return wavelengths_within(wavelength, self.wavelength_range, self.name)
 
     def check_field(self, tx: Any, ty: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the field angles [rad] as float64 arrays.

@@ -1,8 +1,7 @@
 """The refractive index of moist air.
 
-Ciddor (1996), Appl. Opt. 35, 1566, appendix B: the equations carry his own names and, in brackets, their numbers
-there. Filippenko (1982), PASP 94, 715, eqs. 1 to 3, is the older formula of Edlen that many ground-based telescopes'
-models use.
+Ciddor (1996), Appl. Opt. 35, 1566, appendix B: names and numbers of equations, in brackets, are his. Filippenko (1982),
+PASP 94, 715, eqs. 1 to 3, is the older formula of Edlen, still common in models of ground-based telescopes.
 """
 
 from __future__ import annotations
@@ -14,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import PrescriptionError
-from .medium import wavelength_within
+from ..wavelengths import wavelengths_within
+from .medium import Medium
 
 #: Ciddor's equations hold from the ultraviolet to 1.7 um, Filippenko's to 2 um.
 WAVELENGTH_RANGES = {"ciddor": (0.23e-6, 1.7e-6), "filippenko": (0.2e-6, 2.0e-6)}
@@ -27,7 +27,7 @@ WATER_MOLAR_MASS = 0.018015
 
 
 @dataclass(frozen=True)
-class Air:
+class Air(Medium):
     """Moist air as a medium.
 
     Parameters
@@ -39,11 +39,11 @@ class Air:
     water_vapour : float
         Partial pressure of water vapour [Pa].
     co2_ppm : float
-        Carbon dioxide, parts in a million by number; Filippenko's formula does not know it.
+        Carbon dioxide, parts in a million by number; without effect in Filippenko's formula.
     formula : {"ciddor", "filippenko"}
-        Which formula to use.
+        Formula of the refractive index.
     name : str
-        Name for messages and files; not part of what the medium is.
+        Name for messages and files; not part of equality.
     """
 
     pressure: float = STANDARD_ATMOSPHERE
@@ -74,12 +74,12 @@ class Air:
         temperature: float = 288.15,
         co2_ppm: float = 450,
     ) -> Air:
-        """Return air of a relative humidity (0 to 1), with Ciddor's formula and his saturation pressure.
+        """Return air of a relative humidity (0 to 1), with Ciddor's saturation pressure.
 
         Raises
         ------
         PrescriptionError
-            If the humidity is not from 0 to 1, or another figure is not one of air.
+            If the humidity is not from 0 to 1, or another argument is out of range.
         """
         if not 0 <= humidity <= 1:
             raise PrescriptionError(f"humidity = {humidity!r}: expected 0 to 1")
@@ -103,31 +103,14 @@ class Air:
         DomainError
             If a wavelength lies outside `wavelength_range`.
         """
-        w = wavelength_within(wavelength, self.wavelength_range, "air")
+        w = wavelengths_within(wavelength, self.wavelength_range, "air")
         s2 = (1e-6 / w) ** 2
         if self.formula == "filippenko":
             celsius = self.temperature - ZERO_CELSIUS
             return filippenko_refractivity(s2, self.pressure / MMHG, celsius, self.water_vapour / MMHG)
         return self._ciddor(s2)
 
-    def index(self, wavelength: Any) -> np.ndarray:
-        """Return the refractive index.
-
-        Parameters
-        ----------
-        wavelength : float, array or Quantity
-            Vacuum wavelength [m].
-
-        Returns
-        -------
-        ndarray
-            Refractive index, shape of `wavelength`.
-
-        Raises
-        ------
-        DomainError
-            If a wavelength lies outside `wavelength_range`.
-        """
+    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
         return 1.0 + self.refractivity(wavelength)
 
     def _ciddor(self, s2: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A medium whose refractive index is off by a constant: a melt that is not what its catalogue says."""
+"""Refractive index with a constant offset, such as that of a melt from its catalogue."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from .medium import Medium
 
 
 @dataclass(frozen=True)
-class ChangedIndex:
-    """Medium whose index is that of another plus a constant, at every wavelength.
+class ChangedIndex(Medium):
+    """Medium with the index of another plus a constant at every wavelength.
 
     Parameters
     ----------
     medium : Medium
         The other medium.
     change : float
-        What is added to its index.
+        Addition to its index.
     name : str
-        Name for messages and files; not part of what the medium is.
+        Name for messages and files; not part of equality.
     """
 
     medium: Medium
@@ -33,12 +33,11 @@ class ChangedIndex:
         if not np.isfinite(self.change):
             raise PrescriptionError(f"change = {self.change!r}: expected a finite change of the refractive index")
 
-    def index(self, wavelength: Any) -> np.ndarray:
-        """Return the refractive index at vacuum wavelengths [m], in their shape."""
+    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
         return self.medium.index(wavelength) + self.change
 
 
 def with_index_change(medium: Medium, change: float) -> Medium:
-    """Return a medium with its index changed by a constant; changes of changes are summed up."""
+    """Return a medium with its index changed by a constant; successive changes add up."""
     base, before = (medium.medium, medium.change) if isinstance(medium, ChangedIndex) else (medium, 0.0)
     return ChangedIndex(base, before + change, medium.name) if before + change else base

@@ -29,12 +29,13 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import PrescriptionError
-from .medium import ConstantIndex, check_range, check_real, wavelength_within
+from ..wavelengths import check_wavelength_range, wavelengths_within
+from .medium import ConstantIndex, Medium, real_index
 
 
 @dataclass(frozen=True)
 class _Formula:
-    """How many coefficients a formula takes, whether it gives the square of the index, and the formula of ``x``."""
+    """Number of coefficients, whether the value is the square of the index, and the formula of ``x``."""
 
     size: int
     square: bool
@@ -70,7 +71,7 @@ FORMULAS = {
 
 
 @dataclass(frozen=True)
-class Dispersion:
+class Dispersion(Medium):
     """Medium whose index follows a named dispersion formula.
 
     Parameters
@@ -80,9 +81,9 @@ class Dispersion:
     coefficients : tuple of float
         Its coefficients, wavelengths in micrometres; those left out at the end are zero.
     wavelength_range : tuple of float, shape (2,)
-        Shortest and longest wavelength [m] that the coefficients hold for.
+        Shortest and longest wavelength [m] of validity.
     name : str
-        Name for messages and files; not part of what the medium is.
+        Name for messages and files; not part of equality.
     """
 
     formula: str
@@ -98,33 +99,15 @@ class Dispersion:
             raise PrescriptionError(
                 f"coefficients = {self.coefficients!r}: expected 1 to {size} finite numbers for {self.formula}"
             )
-        check_range(self.wavelength_range)
+        check_wavelength_range(self.wavelength_range)
 
-    def index(self, wavelength: Any) -> np.ndarray:
-        """Return the refractive index.
-
-        Parameters
-        ----------
-        wavelength : float, array or Quantity
-            Wavelength [m].
-
-        Returns
-        -------
-        ndarray
-            Refractive index, shape of `wavelength`.
-
-        Raises
-        ------
-        DomainError
-            If a wavelength lies outside `wavelength_range`, or the formula gives no real index there.
-        """
-        w = wavelength_within(wavelength, self.wavelength_range)
+    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+        w = wavelengths_within(wavelength, self.wavelength_range, "this glass")
         formula = FORMULAS[self.formula]
         padded = (*self.coefficients, *[0.0] * (formula.size - len(self.coefficients)))
         with np.errstate(all="ignore"):
             value = np.asarray(formula.value((w * 1e6) ** 2, padded))
-        check_real(value, w)
-        return np.sqrt(value) if formula.square else value
+            return real_index(value, w, squared=formula.square)
 
 
 #: Fraunhofer lines d, F, C and g [um], at which glass makers state the index.
@@ -136,13 +119,13 @@ INFRARED_TERM = -0.0128
 
 
 def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Dispersion | ConstantIndex:
-    """Return a glass of which only the index and its dispersion are known.
+    """Return a glass of given index and dispersion at the d line.
 
-    Schott's formula with a typical infrared term and the three others (in 1, w^-2, w^-4) from the three figures:
+    Schott's formula with a typical infrared term and the three others (in 1, w^-2, w^-4) from three conditions:
     ``n_d``, ``n_F - n_C = (n_d - 1) / V_d`` and ``n_g - n_F = P_gF (n_F - n_C)``, with ``P_gF`` on Schott's normal
     line ``0.6438 - 0.001682 V_d`` (Schott, technical information TIE-29) plus its deviation. This is an
-    approximation, and not the one that Zemax keeps to itself: against eight catalogue glasses of common kinds it is
-    good to 5e-4 at 0.40 um, 4e-6 at 0.55 um, 3e-4 at 0.71 um, 8e-4 at 1 um and 2e-3 at 1.55 um.
+    approximation, and not the unpublished one of Zemax: against eight catalogue glasses of common kinds it is good to
+    5e-4 at 0.40 um, 4e-6 at 0.55 um, 3e-4 at 0.71 um, 8e-4 at 1 um and 2e-3 at 1.55 um.
 
     Parameters
     ----------
@@ -156,9 +139,9 @@ def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Disper
     Raises
     ------
     PrescriptionError
-        If the figures are not those of a glass.
+        If the numbers are not those of a glass.
     """
-    wrong = PrescriptionError(f"nd, vd, dPgF = {nd!r}, {vd!r}, {partial_dispersion!r}: expected the figures of a glass")
+    wrong = PrescriptionError(f"nd, vd, dPgF = {nd!r}, {vd!r}, {partial_dispersion!r}: expected the numbers of a glass")
     if not (1 < nd < 10 and 0 <= vd < 1e4 and abs(partial_dispersion) < 1):
         raise wrong
     if vd == 0:
@@ -167,7 +150,7 @@ def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Disper
     target = np.array([nd, spread, (0.6438 - 0.001682 * vd + partial_dispersion) * spread])
     w = np.array([LINE_D, LINE_F, LINE_C, LINE_G])
     terms = np.stack([np.ones(4), w**-2, w**-4], axis=1)
-    figures = np.array([[1.0, 0, 0, 0], [0, 1, -1, 0], [0, -1, 0, 1]])
+    conditions = np.array([[1.0, 0, 0, 0], [0, 1, -1, 0], [0, -1, 0, 1]])
     solution = np.array([nd**2, 0.01, 0.0])
     # Newton's method in the square of the index; eight steps leave rounding.
     for _ in range(8):
@@ -175,7 +158,7 @@ def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Disper
         if not np.all(square > 0):
             raise wrong
         n = np.sqrt(square)
-        solution = solution - np.linalg.solve(figures @ (terms / (2 * n[:, None])), figures @ n - target)
+        solution = solution - np.linalg.solve(conditions @ (terms / (2 * n[:, None])), conditions @ n - target)
     if not np.all(np.isfinite(solution)):
         raise wrong
     a, c, d = (float(v) for v in solution)

@@ -10,26 +10,27 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from ...core.errors import PrescriptionError
-from .medium import wavelength_within
+from ..wavelengths import wavelengths_within
+from .medium import Medium
 
 INTERPOLATIONS = ("monotone", "linear")
 
 
 @dataclass(frozen=True)
-class TabulatedIndex:
+class TabulatedIndex(Medium):
     """Medium whose index is interpolated from a table.
 
     Parameters
     ----------
     wavelengths : tuple of float, shape (n,)
-        Vacuum wavelengths [m], rising; at least two. The medium covers what lies between the first and the last.
+        Vacuum wavelengths [m], rising; at least two. The medium covers the wavelengths between the first and the last.
     indices : tuple of float, shape (n,)
         Refractive index at each.
     interpolation : {"monotone", "linear"}
         Between two entries: the cubic of Fritsch & Carlson (1980, SIAM J. Numer. Anal. 17, 238) in wavelength, which
-        has a continuous slope and no extremum of its own, or a straight line.
+        has a continuous slope and no additional extremum, or a straight line.
     name : str
-        Name for messages and files; not part of what the medium is.
+        Name for messages and files; not part of equality.
     """
 
     wavelengths: tuple[float, ...]
@@ -57,25 +58,8 @@ class TabulatedIndex:
         """Shortest and longest wavelength of the table [m]."""
         return self.wavelengths[0], self.wavelengths[-1]
 
-    def index(self, wavelength: Any) -> np.ndarray:
-        """Return the refractive index.
-
-        Parameters
-        ----------
-        wavelength : float, array or Quantity
-            Vacuum wavelength [m].
-
-        Returns
-        -------
-        ndarray
-            Refractive index, shape of `wavelength`.
-
-        Raises
-        ------
-        DomainError
-            If a wavelength lies outside the table.
-        """
-        w = np.clip(wavelength_within(wavelength, self.wavelength_range, "this table"), *self.wavelength_range)
+    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+        w = np.clip(wavelengths_within(wavelength, self.wavelength_range, "this table"), *self.wavelength_range)
         if self.interpolation == "linear":
             return np.asarray(np.interp(w, self.wavelengths, self.indices))
         return np.asarray(self._cubic(w))

@@ -112,7 +112,7 @@ def test_a_polygon_that_crosses_itself_is_refused(corners):
         (lambda: Vane(-0.1), "vane = -0.1 m: expected a positive width"),
         (lambda: Vane(0.1, x=np.nan), "expected finite point and angle"),
         (lambda: Union(()), "union = .*: expected a tuple of at least one region"),
-        (lambda: Complement("disc"), "complement of 'disc': expected a Circle"),
+        (lambda: Complement("disc"), "complement of 'disc': expected an aperture"),
     ],
 )
 def test_impossible_regions_are_refused(make, message):

@@ -113,7 +113,7 @@ AnyMedium = Annotated[MediumSection, Tagged(MEDIA, _kind, built=False)]
 def medium_wavelengths(medium: Medium) -> tuple[float, ...]:
     """Return the wavelengths [m] in the section of a medium."""
     if isinstance(medium, RelativeToAir):
-        return medium_wavelengths(medium.figures)
+        return medium_wavelengths(medium.relative)
     if isinstance(medium, ChangedIndex):
         return medium_wavelengths(medium.medium)
     if isinstance(medium, TabulatedIndex):
@@ -152,7 +152,7 @@ def medium_items(
         return {"air": medium.formula} | {key: number(getattr(medium, name)) for key, name in AIR_KEYS.items()}
     if isinstance(medium, RelativeToAir):
         air = ", ".join(f"{key}: {value}" for key, value in medium_items(medium.air, number, listed, waves).items())
-        return medium_items(medium.figures, number, listed, waves) | {"in_air": f"{{{air}}}"}
+        return medium_items(medium.relative, number, listed, waves) | {"in_air": f"{{{air}}}"}
     if isinstance(medium, ChangedIndex):
         return medium_items(medium.medium, number, listed, waves) | {"shift": number(medium.change)}
     raise PrescriptionError(f"medium {type(medium).__name__}: expected one that prescription files can hold")
