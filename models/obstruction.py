@@ -1,4 +1,4 @@
-"""Solid things in the light's way: triangle meshes of a camera body, spider vanes or a whole top end."""
+"""Obstructions: triangle meshes of a camera body, spider vanes or a whole top end that block light."""
 
 from __future__ import annotations
 
@@ -12,22 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import PrescriptionError, error_context
+from .content_equality import ContentEquality
+from .mesh_file import load_mesh
 
 if TYPE_CHECKING:
     import trimesh
 
-#: Endings of files that meshes are read from: those that trimesh reads with nothing else installed.
-MESH_SUFFIXES = (".stl", ".glb", ".gltf", ".obj", ".ply", ".off")
-
 
 @dataclass(frozen=True, eq=False)
-class Obstruction:
-    """A mesh that blocks every ray which meets one of its triangles on the stated parts of its way.
+class Obstruction(ContentEquality):
+    """A mesh that blocks every ray through one of its triangles.
 
-    Any soup of triangles will do, open or closed: light does not pass a triangle from either side, and what lies inside
-    does not matter. Triangles are kept in single precision, and rays are tested in it: what is blocked is good to some
-    micrometres. The last 10 um before and after a surface are not looked at, so a mount may touch its mirror; the
-    mirrors and lenses themselves do not belong into the mesh.
+    The triangles may form open or closed bodies; they block light from both sides. Triangles and rays are compared in
+    single precision, good to some micrometres. The last 10 um before and after a surface are exempt, so a mount may
+    touch its mirror; the mirrors and lenses themselves do not belong into the mesh.
 
     Parameters
     ----------
@@ -50,7 +48,8 @@ class Obstruction:
     before: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        triangles = np.array(self.triangles, dtype=np.float32)
+        self._freeze(triangles=np.float32)
+        triangles = self.triangles
         if triangles.ndim != 3 or triangles.shape[1:] != (3, 3) or len(triangles) == 0:
             raise PrescriptionError(
                 f"obstruction {self.name!r}: mesh of shape {triangles.shape}: expected at least one triangle, [n, 3, 3]"
@@ -62,8 +61,6 @@ class Obstruction:
             )
         if self.before is not None and not self.before:
             raise PrescriptionError(f"obstruction {self.name!r}: before = []: expected names of surfaces, or no list")
-        triangles.flags.writeable = False
-        object.__setattr__(self, "triangles", triangles)
 
     @classmethod
     def from_mesh(
@@ -74,7 +71,7 @@ class Obstruction:
         scale: float = 1.0,
         before: tuple[str, ...] | None = None,
     ) -> Obstruction:
-        """Return the obstruction that a mesh, or all meshes of a scene, make in the telescope frame.
+        """Return the obstruction of a mesh, or of all meshes of a scene.
 
         Parameters
         ----------
@@ -89,7 +86,6 @@ class Obstruction:
         """
         if not (np.isfinite(scale) and scale > 0):
             raise PrescriptionError(f"obstruction {name!r}: scale = {scale!r}: expected a positive number")
-        # Only where it is needed: to load it takes as long as everything else that a telescope needs.
         import trimesh
 
         solid = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
@@ -112,23 +108,9 @@ class Obstruction:
         PrescriptionError
             If the file cannot be read as a mesh, is empty, or holds numbers that are not finite.
         """
-        import trimesh
-
-        path = Path(path)
-        if path.suffix.lower() not in MESH_SUFFIXES:
-            raise PrescriptionError(f"expected a mesh that ends in one of {', '.join(MESH_SUFFIXES)}", file=path)
-        if not path.is_file():
-            raise PrescriptionError("no such file", file=path)
-        try:
-            # Unprocessed: trimesh would drop what is not finite and join corners.
-            scene = trimesh.load_scene(path, process=False)
-        except Exception as error:  # trimesh's readers raise whatever their parsers do
-            reason = " ".join(str(error).split())[:120]
-            raise PrescriptionError(f"cannot be read as a mesh ({reason or type(error).__name__})", file=path) from None
-        if not any(len(getattr(g, "faces", ())) for g in scene.geometry.values()):
-            raise PrescriptionError("expected a mesh with at least one triangle", file=path)
+        scene = load_mesh(path, merged=False)
         with error_context(file=path):
-            return cls.from_mesh(name or path.stem, scene, scale=scale, before=before)
+            return cls.from_mesh(name or Path(path).stem, scene, scale=scale, before=before)
 
     @property
     def mesh(self) -> trimesh.Trimesh:
@@ -146,9 +128,3 @@ class Obstruction:
     @cached_property
     def _content(self) -> tuple[Any, ...]:
         return self.name, self.before, hashlib.sha256(self.triangles.tobytes()).digest()
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Obstruction) and self._content == other._content
-
-    def __hash__(self) -> int:
-        return hash(self._content)

@@ -1,8 +1,8 @@
-"""Shapes without symmetry of revolution, and odd powers of the radius, in closed form."""
+"""Shapes in closed form: odd powers of the radius, biconics, toroids, polynomials, Zernike polynomials."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +12,7 @@ from ...core.errors import PrescriptionError
 from .polar_polynomial import PolarPolynomial, from_monomials, from_zernikes
 from .shape import (
     Conic,
+    Pair,
     Plane,
     Rotational,
     Shape,
@@ -20,17 +21,25 @@ from .shape import (
     check_conic,
     check_radius,
     conic_derivative,
-    coordinates,
     root,
+    with_coefficient,
 )
 
 
 @dataclass(frozen=True)
 class OddAsphere(Shape):
-    """Conic plus all powers of the radius: coefficients of r^1, r^2, r^3... in SI (1, m^-1, m^-2, ...).
+    """Conic plus all powers of the distance from the axis.
 
-    An infinite radius leaves the powers alone.
-    A term in r^1 makes a cone: at its very tip the slope is taken as zero.
+    A term in r^1 makes a cone; the slope at its tip is taken as zero.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of curvature at the vertex [m]; infinite for the powers alone.
+    conic : float
+        Conic constant.
+    coefficients : tuple of float
+        Coefficients of r^1, r^2, r^3... [1, m^-1, m^-2, ...].
     """
 
     radius: float
@@ -44,7 +53,7 @@ class OddAsphere(Shape):
 
     @property
     def base(self) -> Rotational:
-        """The conic that the powers are added to; a plane where the radius is infinite."""
+        """The conic without the powers; a plane where the radius is infinite."""
         return Conic(self.radius, self.conic) if np.isfinite(self.radius) else Plane()
 
     @property
@@ -59,28 +68,25 @@ class OddAsphere(Shape):
     def _powers(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return r and the powers' sum, its derivative by r over r, and its second derivative by r."""
         r = np.hypot(x, y)
-        value, slope, bend = (np.zeros_like(r) for _ in range(3))
+        value, slope, second = (np.zeros_like(r) for _ in range(3))
         for a in (*reversed(self.coefficients), 0.0):
-            bend = bend * r + 2 * slope
+            second = second * r + 2 * slope
             slope = slope * r + value
             value = value * r + a
-        return r, value, np.divide(slope, r, out=np.where(r == 0, bend, 0.0), where=r > 0), bend
+        return r, value, np.divide(slope, r, out=np.where(r == 0, second, 0.0), where=r > 0), second
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
-        x, y = coordinates(x, y)
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return self.base.sag(x, y) + self._powers(x, y)[1]
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
-        x, y = coordinates(x, y)
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
         slope = self._powers(x, y)[2]
         sx, sy = self.base.gradient(x, y)
         return sx + slope * x, sy + slope * y
 
-    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
-        x, y = coordinates(x, y)
-        r, _, over, bend = self._powers(x, y)
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
+        r, _, over, second = self._powers(x, y)
         xx, xy, yy = self.base.hessian(x, y)
-        twist = np.divide(bend - over, r * r, out=np.zeros_like(r), where=r > 0)
+        twist = np.divide(second - over, r * r, out=np.zeros_like(r), where=r > 0)
         return xx + over + twist * x * x, xy + twist * x * y, yy + over + twist * y * y
 
     @property
@@ -99,15 +105,12 @@ class OddAsphere(Shape):
     def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
         self._check_parameter(name)
         if name.startswith("a"):
-            place = int(name[1:]) - 1
-            return replace(
-                self, coefficients=(*self.coefficients[:place], float(value), *self.coefficients[place + 1 :])
-            )
+            return replace(self, coefficients=with_coefficient(self.coefficients, int(name[1:]) - 1, value))
         return replace(self, **_conic_change(name, value))
 
 
 def _conic_change(name: str, value: float) -> dict[str, Any]:
-    """Return the field and its value that a figure stands for: a curvature is kept as a radius."""
+    """Return the field and the value for a parameter: a curvature is stored as a radius."""
     if name.startswith("curvature"):
         return {name.replace("curvature", "radius"): 1.0 / value if value else np.inf}
     return {name: float(value)}
@@ -115,7 +118,7 @@ def _conic_change(name: str, value: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _TwoRadii(Shape):
-    """What shapes of different radius [m] along x and y share."""
+    """Base of shapes with different radii [m] along x and y."""
 
     radius_x: float
     radius_y: float
@@ -142,9 +145,9 @@ class _TwoRadii(Shape):
 
 @dataclass(frozen=True)
 class Biconic(_TwoRadii):
-    """Conics of different radius [m] along x and y; an infinite radius is flat in that direction.
+    """Conics of different radii `radius_x`, `radius_y` [m] along x and y; an infinite radius is flat.
 
-    With cx, cy the curvatures and kx, ky the conic constants::
+    With cx, cy the curvatures and kx, ky the conic constants `conic_x`, `conic_y`::
 
         z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2))
     """
@@ -161,7 +164,7 @@ class Biconic(_TwoRadii):
         return (3 * cx * px + 3 * cy * py + cx * py + cy * px) / 64 - self.curvature**3 / 8
 
     def _pieces(self, x: np.ndarray, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return u and v of the formula and their derivatives by x, y and the figures, named by letters."""
+        """Return u and v of the formula and their derivatives by x, y and the parameters, named by letters."""
         cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
         kx, ky = 1 + self.conic_x, 1 + self.conic_y
         one = np.ones_like(x)
@@ -205,15 +208,15 @@ class Biconic(_TwoRadii):
                 )
         return found
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
-        return self._derivatives(*coordinates(x, y), "")[0]
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return self._derivatives(x, y, "")[0]
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
-        sx, sy = self._derivatives(*coordinates(x, y), "x", "y")
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
+        sx, sy = self._derivatives(x, y, "x", "y")
         return sx, sy
 
-    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
-        xx, xy, yy = self._derivatives(*coordinates(x, y), "xx", "xy", "yy")
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
+        xx, xy, yy = self._derivatives(x, y, "xx", "xy", "yy")
         return xx, xy, yy
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
@@ -224,7 +227,7 @@ class Biconic(_TwoRadii):
 
 @dataclass(frozen=True)
 class Toroid(_TwoRadii):
-    """A conic of the y, z plane turned about an axis parallel to y, `radius_x` [m] from the vertex.
+    """A conic of the y, z plane rotated about an axis parallel to y, `radius_x` [m] from the vertex.
 
     With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, ``cx = 1 / radius_x``::
 
@@ -242,7 +245,7 @@ class Toroid(_TwoRadii):
         return (3 * cx**3 + 3 * (1 + self.conic_y) * cy**3 + 2 * cx**2 * cy) / 64 - self.curvature**3 / 8
 
     def _pieces(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the sag, and what its derivatives are made of: q, w, g', g'', h_q and h_qq; h is the sag less g."""
+        """Return the sag and the pieces of its derivatives: q, w, g', g'', h_q and h_qq, with h the sag less g."""
         cx, cy = 1.0 / self.radius_x, 1.0 / self.radius_y
         b = root(1.0 - (1.0 + self.conic_y) * cy**2 * y * y)
         g, g1, g2 = cy * y * y / (1 + b), cy * y / b, cy / b**3
@@ -252,17 +255,15 @@ class Toroid(_TwoRadii):
         h_q = 0.5 * (x * x + h * h) / w
         return g + h, q, w, g1, g2, h_q, h_q * q * x * x / w**2 + h * h_q / w
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
-        return self._pieces(*coordinates(x, y))[0]
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return self._pieces(x, y)[0]
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
-        x, y = coordinates(x, y)
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
         _, q, w, g1, _, h_q, _ = self._pieces(x, y)
-        # dq/dg = q^2, so what moves g moves the whole by 1 + h_q q^2.
+        # dq/dg = q^2: a change of g changes the sag by 1 + h_q q^2 times as much.
         return q * x / w, g1 * (1 + h_q * q**2)
 
-    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
-        x, y = coordinates(x, y)
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
         _, q, w, g1, g2, h_q, h_qq = self._pieces(x, y)
         yy = g2 * (1 + h_q * q**2) + g1**2 * (h_qq * q**4 + 2 * h_q * q**3)
         return q / w**3, x / w**3 * q**2 * g1, yy
@@ -282,12 +283,10 @@ class Toroid(_TwoRadii):
 
 
 class _Polynomial(Shape):
-    """What shapes that are a polynomial of x and y share."""
+    """Base of shapes that are a polynomial of x and y."""
 
-    @property
-    def polynomial(self) -> PolarPolynomial:
-        """The polynomial."""
-        raise NotImplementedError
+    #: The sag as a polynomial.
+    polynomial: cached_property[PolarPolynomial]
 
     @property
     def curvature(self) -> float:
@@ -299,19 +298,19 @@ class _Polynomial(Shape):
         terms = self.polynomial.terms
         return (float(terms[0, 2].real) if terms.shape[1] > 2 else 0.0) - self.curvature**3 / 8
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:
-        return self.polynomial.value(*coordinates(x, y))
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return self.polynomial.value(x, y)
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-        return self.polynomial.gradient(*coordinates(x, y))
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
+        return self.polynomial.gradient(x, y)
 
-    def hessian(self, x: Any, y: Any) -> Triple:
-        return self.polynomial.hessian(*coordinates(x, y))
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
+        return self.polynomial.hessian(x, y)
 
 
 @dataclass(frozen=True)
 class XYPolynomial(_Polynomial):
-    """Sum of ``a x^i y^j`` over terms (i, j, a), a in m^(1 - i - j)."""
+    """Sum of ``a x^i y^j`` over terms (i, j, a), with a in m^(1 - i - j), each pair of powers once."""
 
     terms: tuple[tuple[int, int, float], ...]
 
@@ -352,14 +351,14 @@ class ZernikeSag(_Polynomial):
     Parameters
     ----------
     coefficients : tuple of float
-        Of the terms j = 1, 2, ... [m]; each is its own rms over the annulus.
+        Coefficients of j = 1, 2, ... [m]; each is the rms of its term over the annulus.
     outer_radius, inner_radius : float
         Rims of the annulus [m].
     """
 
     coefficients: tuple[float, ...]
     outer_radius: float
-    inner_radius: float = field(default=0.0)
+    inner_radius: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "coefficients", tuple(float(a) for a in self.coefficients))
@@ -387,5 +386,4 @@ class ZernikeSag(_Polynomial):
 
     def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
         self._check_parameter(name)
-        j = int(name[1:])
-        return replace(self, coefficients=(*self.coefficients[: j - 1], float(value), *self.coefficients[j:]))
+        return replace(self, coefficients=with_coefficient(self.coefficients, int(name[1:]) - 1, value))

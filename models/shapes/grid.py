@@ -1,23 +1,26 @@
-"""A sag given on a grid of nodes, such as a measured figure or a bending mode, and interpolated by bicubics."""
+"""Sag on a grid of nodes, such as a measured deformation, interpolated by bicubics."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ...core.errors import PrescriptionError
+from ..content_equality import ContentEquality
 from .bicubic import hermite, hermite_curvature, hermite_slope
-from .shape import Shape, Triple, coordinates
+from .shape import Pair, Shape, Triple
 
 #: A bicubic needs the slopes at the four corners of its cell, and so a node beyond each of them.
 LEAST_NODES = 4
-#: How far from equal the steps of a grid may be, relative to the step: rounding of figures written with six digits.
+#: Largest difference between the steps of a grid, relative to the step: rounding to six digits.
 EQUAL_STEPS = 1e-5
 
 
-class GridSag(Shape):
+@dataclass(frozen=True, eq=False, repr=False)
+class GridSag(ContentEquality, Shape):
     """Bicubic interpolation of a sag on a regular grid.
 
     Within a cell the sag is the cubic in x and in y that has, at its corners, the values of the nodes and their slopes;
@@ -27,7 +30,7 @@ class GridSag(Shape):
     Parameters
     ----------
     x, y : array_like, shape [nx] and [ny]
-        Nodes along x and y [m], at equal steps, ascending.
+        Nodes along x and y [m] of the surface's own frame, at equal steps, ascending.
     values : array_like, shape [ny, nx]
         Sag at the nodes [m].
 
@@ -37,9 +40,12 @@ class GridSag(Shape):
         If there are fewer than four nodes along an axis, the steps are not equal, or a number is not finite.
     """
 
-    def __init__(self, x: Any, y: Any, values: Any) -> None:
-        self.x, self.y = (np.array(v, dtype=np.float64) for v in (x, y))
-        self.values = np.array(values, dtype=np.float64)
+    x: np.ndarray
+    y: np.ndarray
+    values: np.ndarray
+
+    def __post_init__(self) -> None:
+        self._freeze(x=np.float64, y=np.float64, values=np.float64)
         for name, axis in (("x", self.x), ("y", self.y)):
             if axis.ndim != 1 or len(axis) < LEAST_NODES:
                 raise PrescriptionError(
@@ -57,21 +63,13 @@ class GridSag(Shape):
             raise PrescriptionError(
                 f"grid values[{row}, {column}] = {self.values[row, column]}: expected finite numbers at all nodes"
             )
-        for array in (self.x, self.y, self.values):
-            array.flags.writeable = False
 
     @cached_property
-    def _identity(self) -> tuple[bytes, bytes, bytes]:
+    def _content(self) -> tuple[Any, ...]:
         return self.x.tobytes(), self.y.tobytes(), self.values.tobytes()
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, GridSag) and self._identity == other._identity
-
-    def __hash__(self) -> int:
-        return hash(self._identity)
-
     def __repr__(self) -> str:
-        return f"GridSag(x={_shown(self.x)}, y={_shown(self.y)}, values of shape {list(self.values.shape)})"
+        return f"{type(self).__name__}(x={_shown(self.x)}, y={_shown(self.y)}, values={list(self.values.shape)})"
 
     @property
     def step(self) -> tuple[float, float]:
@@ -86,9 +84,8 @@ class GridSag(Shape):
         along_y = _differences(self.values.T).T
         return np.stack([self.values, along_x, along_y, _differences(along_y)], axis=-1)
 
-    def _evaluate(self, x: Any, y: Any, *derivatives: tuple[int, int]) -> list[np.ndarray]:
+    def _evaluate(self, x: np.ndarray, y: np.ndarray, *derivatives: tuple[int, int]) -> list[np.ndarray]:
         """Return derivatives of the sag, each given by how often along x and how often along y."""
-        x, y = coordinates(x, y)
         hx, hy = self.step
         px, py = (x - self.x[0]) / hx, (y - self.y[0]) / hy
         outside = ~((px >= 0) & (px <= len(self.x) - 1) & (py >= 0) & (py <= len(self.y) - 1))
@@ -107,15 +104,15 @@ class GridSag(Shape):
             found.append(np.where(outside, np.nan, value / (hx**nx * hy**ny)))
         return found
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return self._evaluate(x, y, (0, 0))[0]
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
         sx, sy = self._evaluate(x, y, (1, 0), (0, 1))
         return sx, sy
 
-    def hessian(self, x: Any, y: Any) -> Triple:
-        """Return the second derivatives along xx, xy, yy [1/m]; they jump where two cells meet."""
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
+        # Second derivatives jump where two cells meet.
         xx, xy, yy = self._evaluate(x, y, (2, 0), (1, 1), (0, 2))
         return xx, xy, yy
 
@@ -128,7 +125,7 @@ class GridSag(Shape):
 
     @property
     def fourth_order(self) -> float:
-        """Taken as zero: bicubics have no fourth derivative to speak of."""
+        """Zero: bicubics have no meaningful fourth derivative."""
         return 0.0
 
     @property

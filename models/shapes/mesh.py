@@ -1,37 +1,40 @@
-"""A surface given as triangles, such as a measured or a designed shape out of a CAD programme."""
+"""Surfaces made of triangles, such as measured shapes or those of a CAD program."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
-import trimesh
 
 from ...core.errors import PrescriptionError, UnknownNameError, error_context
-from ..obstruction import MESH_SUFFIXES
-from .shape import Shape, Triple, coordinates
+from ..content_equality import ContentEquality
+from ..mesh_file import load_mesh
+from .shape import Pair, Shape, Triple
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: A point this far beyond the edge of a facet, as a fraction of the facet, still belongs to it: rounding must not open
 #: gaps between facets.
 EDGE = 1e-9
 
 
-class MeshSurface(Shape):
-    """Triangles that cover a region of x and y once, seen from +z.
+@dataclass(frozen=True, eq=False, repr=False)
+class MeshSurface(ContentEquality, Shape):
+    """Surface of triangles with one height at each x, y.
 
     Parameters
     ----------
     vertices : array_like, shape [n_vertex, 3]
-        Points [m] in the frame of the surface.
+        Points [m] in the surface's own frame.
     faces : array_like of int, shape [n_facet, 3]
         Vertices of each facet; facets that share an edge share its vertices.
     smooth : bool
-        Whether rays are bent by slopes interpolated between the vertices, each of which has the mean slope of its
-        facets weighted with their areas, or (by default) by the slope of the facet itself. Where rays land is on the
-        facet, in either case.
+        Whether slopes are interpolated between the vertices, each of which has the mean slope of its facets weighted
+        with their areas, or (by default) those of the facet itself. Intersections are on the facet in either case.
 
     Raises
     ------
@@ -40,10 +43,14 @@ class MeshSurface(Shape):
         or the surface folds over itself, as a closed solid does.
     """
 
-    def __init__(self, vertices: Any, faces: Any, *, smooth: bool = False) -> None:
-        self.vertices = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-        self.faces = np.array(faces, dtype=np.int32).reshape(-1, 3)
-        self.smooth = bool(smooth)
+    vertices: np.ndarray
+    faces: np.ndarray
+    smooth: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices", np.reshape(self.vertices, (-1, 3)))
+        object.__setattr__(self, "faces", np.reshape(self.faces, (-1, 3)))
+        self._freeze(vertices=np.float64, faces=np.int32)
         n = len(self.vertices)
         if len(self.faces) == 0:
             raise PrescriptionError("mesh without facets: expected at least one")
@@ -52,7 +59,7 @@ class MeshSurface(Shape):
         if self.faces.min() < 0 or self.faces.max() >= n:
             raise PrescriptionError(f"mesh faces: expected vertices 0 to {n - 1}")
         self._check_manifold()
-        area = self._normals[:, 2]
+        area = self._facet_normals()[:, 2]
         if area.min() < 0 < area.max():
             raise PrescriptionError(
                 f"mesh folds over: {int((area < 0).sum())} of {len(area)} facets face the other way; "
@@ -61,10 +68,8 @@ class MeshSurface(Shape):
         if np.any(area == 0):
             raise PrescriptionError(f"mesh facet {int(np.flatnonzero(area == 0)[0])} is seen edge-on: expected an area")
         if area[0] < 0:
-            self.faces = np.ascontiguousarray(self.faces[:, ::-1])
-            del self.__dict__["_normals"]
-        for array in (self.vertices, self.faces):
-            array.flags.writeable = False
+            object.__setattr__(self, "faces", self.faces[:, ::-1])
+            self._freeze(faces=np.int32)
 
     @classmethod
     def from_mesh(cls, mesh: trimesh.Trimesh, *, scale: float = 1.0, smooth: bool = False) -> MeshSurface:
@@ -80,20 +85,8 @@ class MeshSurface(Shape):
         PrescriptionError
             If the file cannot be read, or is no such surface.
         """
-        path = Path(path)
-        if path.suffix.lower() not in MESH_SUFFIXES:
-            raise PrescriptionError(f"expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}", file=path)
-        if not path.is_file():
-            raise PrescriptionError("no such file", file=path)
-        try:
-            mesh = trimesh.load(path, force="mesh")
-        except Exception as error:
-            # trimesh's readers raise whatever their parsing runs into.
-            raise PrescriptionError(f"cannot be read as a mesh ({type(error).__name__})", file=path) from None
-        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-            raise PrescriptionError("mesh without facets: expected at least one", file=path)
         with error_context(file=path):
-            return cls.from_mesh(mesh, scale=scale, smooth=smooth)
+            return cls.from_mesh(load_mesh(path, merged=True), scale=scale, smooth=smooth)
 
     def _check_manifold(self) -> None:
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -105,14 +98,8 @@ class MeshSurface(Shape):
             )
 
     @cached_property
-    def _identity(self) -> tuple[bytes, bytes, bool]:
+    def _content(self) -> tuple[Any, ...]:
         return self.vertices.tobytes(), self.faces.tobytes(), self.smooth
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, MeshSurface) and self._identity == other._identity
-
-    def __hash__(self) -> int:
-        return hash(self._identity)
 
     def __repr__(self) -> str:
         return f"MeshSurface({len(self.vertices)} vertices, {len(self.faces)} facets, smooth={self.smooth})"
@@ -122,23 +109,23 @@ class MeshSurface(Shape):
         """Corners of the facets [m], shape [n_facet, 3, 3]."""
         return self.vertices[self.faces]
 
-    @cached_property
-    def _normals(self) -> np.ndarray:
-        """Normals of the facets, their length twice the area, shape [n_facet, 3]."""
+    def _facet_normals(self) -> np.ndarray:
+        """Return the normals of the facets, their length twice the area, shape [n_facet, 3]."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         return np.cross(b - a, c - a)
 
     @cached_property
     def corner_slopes(self) -> np.ndarray:
         """Slopes dz/dx, dz/dy at the corners of each facet, shape [n_facet, 3, 2]."""
+        normals = self._facet_normals()
         if not self.smooth:
-            slope = -self._normals[:, :2] / self._normals[:, 2:]
+            slope = -normals[:, :2] / normals[:, 2:]
             return np.repeat(slope[:, None], 3, axis=1)
         total = np.zeros_like(self.vertices)
         for corner in range(3):
-            np.add.at(total, self.faces[:, corner], self._normals)
+            np.add.at(total, self.faces[:, corner], normals)
         with np.errstate(invalid="ignore"):
-            # A vertex that no facet uses is asked by nobody.
+            # Vertices without facets are ignored.
             slope = -total[:, :2] / total[:, 2:]
         return slope[self.faces]
 
@@ -161,9 +148,8 @@ class MeshSurface(Shape):
         starts = np.searchsorted((row * side + column)[order], np.arange(side * side + 1))
         return low, size, side, starts, facet[order]
 
-    def _locate(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _locate(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the facet over each point, -1 where there is none, and the weights of its corners [..., 3]."""
-        x, y = coordinates(x, y)
         low, size, side, starts, facets = self._bins
         place = np.stack([x, y], axis=-1)
         cell = np.floor((place - low) / size)
@@ -173,31 +159,30 @@ class MeshSurface(Shape):
         found, weights = np.full(x.shape, -1), np.full((*x.shape, 3), np.nan)
         corners = self.corners[..., :2]
         for step in range(int(np.where(inside, stop - start, 0).max(initial=0))):
-            ask = inside & (found < 0) & (start + step < stop)
-            facet = facets[(start + step)[ask]]
+            open_ = inside & (found < 0) & (start + step < stop)
+            facet = facets[(start + step)[open_]]
             a, b, c = np.moveaxis(corners[facet], 1, 0)
-            p, q, r = b - a, c - a, place[ask] - a
+            p, q, r = b - a, c - a, place[open_] - a
             area = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
             wb = (r[:, 0] * q[:, 1] - r[:, 1] * q[:, 0]) / area
             wc = (p[:, 0] * r[:, 1] - p[:, 1] * r[:, 0]) / area
             w = np.stack([1 - wb - wc, wb, wc], axis=-1)
-            hit = np.all(w >= -EDGE, axis=-1)
-            found[ask] = np.where(hit, facet, -1)
-            weights[ask] = np.where(hit[:, None], w, np.nan)
+            within = np.all(w >= -EDGE, axis=-1)
+            found[open_] = np.where(within, facet, -1)
+            weights[open_] = np.where(within[:, None], w, np.nan)
         return found, weights
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         facet, weights = self._locate(x, y)
         return np.einsum("...i,...i", self.corners[facet][..., 2], weights)
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slopes that bend rays at points x, y [m]."""
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
         facet, weights = self._locate(x, y)
         slope = np.einsum("...ij,...i->...j", self.corner_slopes[facet], weights)
         return slope[..., 0], slope[..., 1]
 
-    def hessian(self, x: Any, y: Any) -> Triple:
-        """Return how the slopes that bend rays change within a facet; nothing, where each facet has one slope [1/m]."""
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
+        # Change of the slopes within a facet: zero unless smooth.
         facet, weights = self._locate(x, y)
         a, b, c = np.moveaxis(self.corners[facet][..., :2], -2, 0)
         edges = np.stack([b - a, c - a], axis=-2)
@@ -226,14 +211,17 @@ class MeshSurface(Shape):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """None: a mesh has no figures to differentiate by."""
+        """No parameters."""
         return {}
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
-        self._no_figure(name)
+        raise self._unknown(name)
 
     def with_parameter(self, name: str, value: float) -> NoReturn:  # noqa: D102
-        self._no_figure(name)
+        raise self._unknown(name)
 
-    def _no_figure(self, name: str) -> NoReturn:
-        raise UnknownNameError(f"unknown figure {name!r} of a mesh: a mesh has none to change")
+    def _check_parameter(self, name: str) -> NoReturn:
+        raise self._unknown(name)
+
+    def _unknown(self, name: str) -> UnknownNameError:
+        return UnknownNameError(f"unknown parameter {name!r} of a mesh: a mesh has none")

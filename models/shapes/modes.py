@@ -1,8 +1,9 @@
-"""Several maps of sag on one grid, each with an amount of its own: the bending modes of a mirror."""
+"""Several maps of sag on one grid with an amount each, such as the bending modes of a mirror."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,17 +14,18 @@ from .grid import GridSag
 from .shape import Triple
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class GridModes(GridSag):
     """Sum of maps times amounts, interpolated as a :class:`~pachon.models.shapes.grid.GridSag`.
 
-    Its figures are the amounts, by the names of the maps.
+    Its parameters are the amounts, by the names of the maps [m, where a map is the sag of one metre of its mode].
 
     Parameters
     ----------
     modes : mapping of str to GridSag
         The maps, all on the same nodes.
-    amounts : mapping of str to float, optional
-        How much of each; none by default.
+    amounts : mapping of str to float
+        Amount of each map; zero for those left out.
 
     Raises
     ------
@@ -31,27 +33,35 @@ class GridModes(GridSag):
         If there is no map, or their nodes differ.
     """
 
-    def __init__(self, modes: Mapping[str, GridSag], amounts: Mapping[str, float] | None = None) -> None:
-        if not modes:
+    x: np.ndarray = field(init=False)
+    y: np.ndarray = field(init=False)
+    values: np.ndarray = field(init=False)
+    modes: Mapping[str, GridSag]
+    amounts: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.modes:
             raise PrescriptionError("modes = {}: expected at least one map")
-        self.modes = dict(modes)
-        self.amounts = {name: float((amounts or {}).get(name, 0.0)) for name in self.modes}
+        amounts = {name: float(self.amounts.get(name, 0.0)) for name in self.modes}
         (first, grid), *others = self.modes.items()
         for name, other in others:
             if not (np.array_equal(grid.x, other.x) and np.array_equal(grid.y, other.y)):
                 raise PrescriptionError(f"mode {name!r}: expected the nodes of mode {first!r}")
-        super().__init__(grid.x, grid.y, sum(a * self.modes[name].values for name, a in self.amounts.items()))
+        values = sum(a * self.modes[name].values for name, a in amounts.items())
+        for name, value in (("modes", dict(self.modes)), ("amounts", amounts), ("x", grid.x), ("y", grid.y)):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "values", values)
+        super().__post_init__()
 
     @cached_property
-    def _identity(self) -> tuple[Any, ...]:
-        return super()._identity, *((name, a, self.modes[name]) for name, a in self.amounts.items())
+    def _content(self) -> tuple[Any, ...]:
+        return super()._content, *((name, a, self.modes[name]) for name, a in self.amounts.items())
 
     def __repr__(self) -> str:
         return f"GridModes({', '.join(f'{name}: {amount:.6g}' for name, amount in self.amounts.items())})"
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """The amounts by name [m, where a map is the sag of one metre of its mode]."""
+    def parameters(self) -> dict[str, float]:  # noqa: D102
         return dict(self.amounts)
 
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
@@ -60,4 +70,4 @@ class GridModes(GridSag):
 
     def with_parameter(self, name: str, value: float) -> GridModes:  # noqa: D102
         self._check_parameter(name)
-        return GridModes(self.modes, self.amounts | {name: value})
+        return replace(self, amounts={**self.amounts, name: value})

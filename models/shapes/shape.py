@@ -1,12 +1,11 @@
-"""Shapes of surfaces: their sag, its slopes and curvatures, and how it answers to each figure.
+"""Shapes of surfaces: sag, slopes, curvatures, and derivatives of the sag by the parameters of a shape.
 
 The sag z(x, y) [m] is the height over the vertex plane in the frame of the surface. Most shapes are a conic of
 revolution and something added; with ``s = x^2 + y^2``, curvature ``c = 1/R`` and conic constant ``k``::
 
     z = c s / (1 + sqrt(1 - (1 + k) c^2 s)) + a_4 s^2 + a_6 s^3 + ...
 
-A positive radius has its centre of curvature on the +z side of the vertex. Where a shape does not reach, its sag is
-NaN.
+A positive radius has its centre of curvature on the +z side of the vertex. Beyond the rim of a shape its sag is NaN.
 """
 
 from __future__ import annotations
@@ -20,28 +19,34 @@ import numpy as np
 
 from ...core.errors import PrescriptionError, unknown_name
 
+Pair = tuple[np.ndarray, np.ndarray]
 Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def check_radius(radius: float, name: str = "radius", *, flat: bool = False) -> None:
-    """Refuse a radius of curvature [m] of zero or, unless `flat` allows it, of infinity."""
+    """Raise PrescriptionError for a radius [m] of zero or, unless `flat` is set, of infinity."""
     if np.isnan(radius) or radius == 0 or (np.isinf(radius) and not flat):
         raise PrescriptionError(f"{name} = {radius!r}: expected a finite radius of curvature in m, not zero")
 
 
 def check_conic(conic: float, name: str = "conic") -> None:
-    """Refuse a conic constant that is not finite."""
+    """Raise PrescriptionError for a conic constant that is not finite."""
     if not np.isfinite(conic):
         raise PrescriptionError(f"{name} = {conic!r}: expected a finite conic constant")
 
 
 def check_coefficients(coefficients: tuple[float, ...]) -> None:
-    """Refuse coefficients that are not finite."""
+    """Raise PrescriptionError for coefficients that are not finite."""
     if not np.all(np.isfinite(coefficients)):
         raise PrescriptionError(f"coefficients = {coefficients!r}: expected finite numbers")
 
 
-def coordinates(x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+def with_coefficient(coefficients: tuple[float, ...], place: int, value: float) -> tuple[float, ...]:
+    """Return coefficients with another value at one place."""
+    return (*coefficients[:place], float(value), *coefficients[place + 1 :])
+
+
+def coordinates(x: Any, y: Any) -> Pair:
     """Return x and y [m] as float64 arrays of one shape."""
     x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
     return x, y
@@ -53,30 +58,31 @@ def root(inside: np.ndarray) -> np.ndarray:
 
 
 class Shape(ABC):
-    """What every shape answers to."""
+    """Shape of a surface: immutable and hashable.
 
-    @abstractmethod
+    Positions x, y [m] are in the surface's own frame, scalars or arrays; results have their common shape.
+    """
+
     def sag(self, x: Any, y: Any) -> np.ndarray:
-        """Return the height of the surface over its vertex plane.
+        """Return the height over the vertex plane [m]; NaN beyond the rim of the shape."""
+        return self._sag(*coordinates(x, y))
 
-        Parameters
-        ----------
-        x, y : float or array
-            Position in the surface's own frame [m].
+    def gradient(self, x: Any, y: Any) -> Pair:
+        """Return the slopes dz/dx and dz/dy."""
+        return self._gradient(*coordinates(x, y))
 
-        Returns
-        -------
-        ndarray
-            Sag [m]; NaN where the shape does not reach.
-        """
-
-    @abstractmethod
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slopes dz/dx and dz/dy at points x, y [m] of the surface's own frame."""
-
-    @abstractmethod
     def hessian(self, x: Any, y: Any) -> Triple:
         """Return the second derivatives of the sag along xx, xy and yy [1/m]."""
+        return self._hessian(*coordinates(x, y))
+
+    @abstractmethod
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray: ...
+
+    @abstractmethod
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair: ...
+
+    @abstractmethod
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple: ...
 
     @property
     @abstractmethod
@@ -86,44 +92,44 @@ class Shape(ABC):
     @property
     @abstractmethod
     def fourth_order(self) -> float:
-        """What the coefficient of r^4 of the sag has beyond that of the sphere of the same curvature [m^-3].
+        """Coefficient of r^4 of the sag less that of the sphere of the same curvature [m^-3], mean over azimuth.
 
-        The mean over azimuth: for a conic ``k c^3 / 8``, for an even asphere a_4 more.
+        For a conic ``k c^3 / 8``, for an even asphere a_4 more.
         """
 
     @property
     @abstractmethod
     def parameters(self) -> dict[str, float]:
-        """Figures that the sag can be differentiated by, in SI; radius and curvature are two names of one."""
+        """Parameters by name, in SI; radius and curvature are two names of one."""
 
     @abstractmethod
     def with_parameter(self, name: str, value: float) -> Shape:
-        """Return the shape with another value of a figure; this one stays as it is."""
+        """Return the shape with another value of a parameter."""
 
     def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:
-        """Return how the sag answers to a figure.
+        """Return the derivative of the sag by a parameter.
 
         Parameters
         ----------
         name : str
-            Name of the figure, one of `parameters`.
+            Name of the parameter, one of `parameters`.
         x, y : float or array
             Position in the surface's own frame [m].
 
         Returns
         -------
         f, fx, fy : ndarray
-            Derivative of the sag with respect to the figure, and the slopes of that derivative along x and y.
+            Derivative of the sag with respect to the parameter, and the slopes of that derivative along x and y.
 
         Raises
         ------
         UnknownNameError
-            If the shape has no such figure.
+            If the shape has no such parameter.
         """
         self._check_parameter(name)
         x, y = coordinates(x, y)
         if name.startswith("radius"):
-            # Everything is worked out by curvature c = 1/R: d/dR = -c^2 d/dc.
+            # By curvature c = 1/R: d/dR = -c^2 d/dc.
             name = name.replace("radius", "curvature")
             factor = -(self.parameters[name] ** 2)
             f, fx, fy = self._derivative(name, x, y)
@@ -132,38 +138,46 @@ class Shape(ABC):
 
     @abstractmethod
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
-        """Return what `sag_derivative` does, for a name that exists and is no radius."""
+        """Return `sag_derivative` for an existing parameter other than a radius."""
 
     def _check_parameter(self, name: str) -> None:
         if name not in self.parameters:
-            raise unknown_name(f"figure of {type(self).__name__}", name, self.parameters)
+            raise unknown_name(f"parameter of {type(self).__name__}", name, self.parameters)
 
 
 class Rotational(Shape):
-    """A conic of revolution plus even powers of the radius from the fourth."""
+    """Conic of revolution plus even powers of the distance from the axis, from the fourth."""
 
+    #: Radius of curvature at the vertex [m]; infinite for a plane.
+    radius: float = np.inf
     #: Conic constant.
-    conic: float
+    conic: float = 0.0
     #: Coefficients of r^4, r^6... [m^-3, m^-5, ...].
-    coefficients: tuple[float, ...]
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_radius(self.radius, flat=isinstance(self, (Plane, EvenAsphere)))
+        check_conic(self.conic)
+        check_coefficients(self.coefficients)
+
+    @property
+    def curvature(self) -> float:  # noqa: D102
+        return 1.0 / self.radius
 
     @property
     def fourth_order(self) -> float:  # noqa: D102
         return self.conic * self.curvature**3 / 8 + (*self.coefficients, 0.0)[0]
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
-        x, y = coordinates(x, y)
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return self._radial(x * x + y * y)[0]
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
-        x, y = coordinates(x, y)
-        _, slope, _ = self._radial(x * x + y * y)
-        return 2 * x * slope, 2 * y * slope
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
+        _, first, _ = self._radial(x * x + y * y)
+        return 2 * x * first, 2 * y * first
 
-    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
-        x, y = coordinates(x, y)
-        _, slope, bend = self._radial(x * x + y * y)
-        return 2 * slope + 4 * x * x * bend, 4 * x * y * bend, 2 * slope + 4 * y * y * bend
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
+        _, first, second = self._radial(x * x + y * y)
+        return 2 * first + 4 * x * x * second, 4 * x * y * second, 2 * first + 4 * y * y * second
 
     def _radial(self, s: np.ndarray) -> Triple:
         """Return the sag and its first and second derivative by ``s = x^2 + y^2``."""
@@ -171,15 +185,15 @@ class Rotational(Shape):
         w = root(1.0 - (1.0 + k) * c**2 * s)
         # Where the rim of a sphere is vertical the slope is infinite; the sag there is still finite.
         with np.errstate(divide="ignore"):
-            z, slope, bend = c * s / (1.0 + w), 0.5 * c / w, 0.25 * (1.0 + k) * c**3 / w**3
+            z, z_s, z_ss = c * s / (1.0 + w), 0.5 * c / w, 0.25 * (1.0 + k) * c**3 / w**3
         if self.coefficients:
             value, first, second = (np.zeros_like(s) for _ in range(3))
             for a in (*reversed(self.coefficients), 0.0, 0.0):
                 second = second * s + 2 * first
                 first = first * s + value
                 value = value * s + a
-            z, slope, bend = z + value, slope + first, bend + second
-        return z, slope, bend
+            z, z_s, z_ss = z + value, z_s + first, z_ss + second
+        return z, z_s, z_ss
 
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
@@ -199,8 +213,7 @@ class Rotational(Shape):
     def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
         self._check_parameter(name)
         if name.startswith("a"):
-            place = int(name[1:]) // 2 - 2
-            terms = (*self.coefficients[:place], float(value), *self.coefficients[place + 1 :])
+            terms = with_coefficient(self.coefficients, int(name[1:]) // 2 - 2, value)
             return EvenAsphere(self.parameters["radius"], self.conic, terms)
         conic = float(value) if name == "conic" else self.conic
         if name == "curvature" and value == 0 and not any(self.coefficients):
@@ -232,13 +245,6 @@ def conic_derivative(c: float, k: float, name: str, s: np.ndarray) -> tuple[np.n
 class Plane(Rotational):
     """Flat surface, ``z = 0``."""
 
-    conic = 0.0
-    coefficients = ()
-
-    @property
-    def curvature(self) -> float:  # noqa: D102
-        return 0.0
-
     @property
     def parameters(self) -> dict[str, float]:  # noqa: D102
         return {"curvature": 0.0}
@@ -250,64 +256,49 @@ class Plane(Rotational):
 
 @dataclass(frozen=True)
 class Sphere(Rotational):
-    """Sphere of radius of curvature `radius` [m]."""
+    """Sphere of a radius of curvature [m], positive where the centre lies on the +z side."""
 
-    conic = 0.0
-    coefficients = ()
     radius: float
-
-    def __post_init__(self) -> None:
-        check_radius(self.radius)
-
-    @property
-    def curvature(self) -> float:  # noqa: D102
-        return 1.0 / self.radius
 
 
 @dataclass(frozen=True)
 class Conic(Rotational):
-    """Conic of revolution: vertex radius [m] and conic constant (0 sphere, -1 paraboloid)."""
+    """Conic of revolution: radius of curvature at the vertex [m], and conic constant (0 sphere, -1 paraboloid)."""
 
-    coefficients = ()
     radius: float
     conic: float
-
-    def __post_init__(self) -> None:
-        check_radius(self.radius)
-        check_conic(self.conic)
-
-    @property
-    def curvature(self) -> float:  # noqa: D102
-        return 1.0 / self.radius
 
 
 @dataclass(frozen=True)
 class EvenAsphere(Rotational):
-    """Conic plus even powers of the radius; coefficients of r^4, r^6, r^8... in SI (m^-3, m^-5, ...).
+    """Conic plus even powers of the distance from the axis.
 
-    An infinite radius leaves the powers alone, as on a Schmidt plate.
+    Parameters
+    ----------
+    radius : float
+        Radius of curvature at the vertex [m]; infinite for the powers alone, as on a Schmidt plate.
+    conic : float
+        Conic constant.
+    coefficients : tuple of float
+        Coefficients of r^4, r^6, r^8... [m^-3, m^-5, m^-7, ...].
     """
 
     radius: float
     conic: float
     coefficients: tuple[float, ...]
 
-    def __post_init__(self) -> None:
-        check_radius(self.radius, flat=True)
-        check_conic(self.conic)
-        check_coefficients(self.coefficients)
-
-    @property
-    def curvature(self) -> float:  # noqa: D102
-        return 1.0 / self.radius
-
 
 @dataclass(frozen=True)
 class Sum(Shape):
     """Sum of the sags of several shapes.
 
-    Figures keep their names; where two parts have the same, that of a later one is written ``part2.Z4``, parts counted
+    Parameters keep their names; where two parts have the same, that of a later one is ``part2.Z4``, parts counted
     from 1.
+
+    Parameters
+    ----------
+    parts : tuple of Shape
+        At least one shape.
     """
 
     parts: tuple[Shape, ...]
@@ -326,14 +317,14 @@ class Sum(Shape):
         # The coefficients of r^4 add, those of the spheres (c^3 / 8) do not add to that of the sum's sphere.
         return sum(p.fourth_order + p.curvature**3 / 8 for p in self.parts) - self.curvature**3 / 8
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def _sag(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.sum([part.sag(x, y) for part in self.parts], axis=0)
 
-    def gradient(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> Pair:
         along_x, along_y = np.sum([part.gradient(x, y) for part in self.parts], axis=0)
         return along_x, along_y
 
-    def hessian(self, x: Any, y: Any) -> Triple:  # noqa: D102
+    def _hessian(self, x: np.ndarray, y: np.ndarray) -> Triple:
         xx, xy, yy = np.sum([part.hessian(x, y) for part in self.parts], axis=0)
         return xx, xy, yy
 
@@ -352,9 +343,8 @@ class Sum(Shape):
         return places
 
     def place(self, name: str) -> tuple[Shape, str]:
-        """Return the part that a figure belongs to, and its name there."""
-        if name not in self._places:
-            raise unknown_name(f"figure of {type(self).__name__}", name, self._places)
+        """Return the part that a parameter belongs to, and its name there."""
+        self._check_parameter(name)
         i, inner = self._places[name]
         return self.parts[i], inner
 

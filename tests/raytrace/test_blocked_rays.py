@@ -240,7 +240,7 @@ def test_obstructions_are_written_and_read(tmp_path, lsst_r):
         (lambda t: Obstruction("x", np.full((2, 3, 3), np.nan)), "'x': 2 of 2 triangles: expected finite corners"),
         (lambda t: Obstruction("x", np.zeros((1, 3, 3)), ()), "'x': before = .*: expected names of surfaces"),
         (lambda t: Obstruction.from_mesh("x", trimesh.creation.box(), scale=0.0), "scale = 0.0: expected a positive"),
-        (lambda t: Obstruction.from_file("box.step"), "box.step: expected a mesh that ends in one of .stl"),
+        (lambda t: Obstruction.from_file("box.step"), "box.step: expected a mesh file that ends in .stl"),
         (lambda t: Obstruction.from_file("box.stl"), "box.stl: no such file"),
         (lambda t: replace(t, obstructions=(Obstruction("x", np.ones((1, 3, 3)), ("M9",)),)), "unknown mirror, lens"),
         (lambda t: replace(t, obstructions=(Obstruction("x", np.full((1, 3, 3), 99.0)),)), "reaches z = 99 m: exp"),

@@ -118,7 +118,7 @@ def test_a_formula_without_a_real_index_is_refused():
         (("schott", (2.0,), (1e-6, 1e-7)), "wavelength_range"),
     ],
 )
-def test_impossible_figures_are_refused(arguments, expected):
+def test_impossible_numbers_are_refused(arguments, expected):
     with pytest.raises(PrescriptionError, match=expected):
         Dispersion(*arguments)
 

@@ -108,7 +108,7 @@ def test_gradient_and_hessian_are_differences_of_the_sag(shape):
 
 
 @each_shape
-def test_figures_answer_as_differences_do(shape):
+def test_derivatives_equal_differences(shape):
     names = [n for n, v in shape.parameters.items() if np.isfinite(v)]
     for name in names[:: max(1, len(names) // 12)]:
         value = shape.parameters[name]
@@ -147,7 +147,7 @@ def test_fourth_order_of_sums_and_odd_aspheres():
     assert odd.fourth_order + odd.curvature**3 / 8 == pytest.approx(3e-3, rel=1e-13)
 
 
-def test_changing_a_figure_gives_the_simplest_shape_that_has_it():
+def test_changing_a_parameter_gives_the_simplest_shape_that_has_it():
     assert Plane().with_parameter("curvature", 0.25) == Sphere(4.0)
     assert Sphere(4.0).with_parameter("conic", -1.0) == Conic(4.0, -1.0)
     assert Sphere(4.0).with_parameter("curvature", 0.0) == Plane()
@@ -155,11 +155,11 @@ def test_changing_a_figure_gives_the_simplest_shape_that_has_it():
     twice = Sum((ZernikeSag((1e-6, 0.0), 1.0), ZernikeSag((2e-6,), 1.0)))
     assert twice.parameters == {"Z1": 1e-6, "Z2": 0.0, "part2.Z1": 2e-6}
     assert twice.with_parameter("part2.Z1", 0.5).parts[1].coefficients == (0.5,)
-    with pytest.raises(UnknownNameError, match="unknown figure of Conic 'a4'"):
+    with pytest.raises(UnknownNameError, match="unknown parameter of Conic 'a4'"):
         Conic(4.0, -1.0).sag_derivative("a4", X, Y)
 
 
-def test_impossible_figures_are_refused():
+def test_impossible_numbers_are_refused():
     cases = [
         (lambda: Biconic(0.0, 1.0), "radius_x = 0.0"),
         (lambda: Toroid(1.0, float("nan")), "radius_y = nan"),
