@@ -17,7 +17,7 @@ import numpy as np
 from ..core.errors import PrescriptionError
 
 
-class Aperture(ABC):
+class Region(ABC):
     """A region of the x, y plane of a surface's own frame."""
 
     @abstractmethod
@@ -51,7 +51,7 @@ def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np
 
 
 @dataclass(frozen=True)
-class Circle(Aperture):
+class Circle(Region):
     """Disc of a radius [m] about a centre x, y [m]; its rim is outside."""
 
     radius: float
@@ -70,7 +70,7 @@ class Circle(Aperture):
 
 
 @dataclass(frozen=True)
-class Annulus(Aperture):
+class Annulus(Region):
     """Ring between two radii [m] about a centre x, y [m]; its inner rim is inside, its outer rim outside."""
 
     inner: float
@@ -91,7 +91,7 @@ class Annulus(Aperture):
 
 
 @dataclass(frozen=True)
-class Rectangle(Aperture):
+class Rectangle(Region):
     """Rectangle of a width and height [m] about a centre x, y [m], without rim.
 
     It is rotated by an angle [rad] from x towards y.
@@ -119,7 +119,7 @@ class Rectangle(Aperture):
 
 
 @dataclass(frozen=True)
-class Vane(Aperture):
+class Vane(Region):
     """Strip of a width [m] from a point x, y [m] outwards, at an angle [rad] from x towards y; endless, without rims.
 
     With ``both_ways`` it extends to the other side of the point too.
@@ -145,7 +145,7 @@ class Vane(Aperture):
 
 
 @dataclass(frozen=True)
-class Polygon(Aperture):
+class Polygon(Region):
     """Polygon of at least three corners (x, y) [m], in either sense; the last is joined to the first.
 
     Of two polygons that share an edge, one contains it.
@@ -219,7 +219,7 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
 
 
 @dataclass(frozen=True)
-class Union(Aperture):
+class Union(Region):
     """Points of at least one of several regions."""
 
     parts: tuple[Aperture, ...]
@@ -232,7 +232,7 @@ class Union(Aperture):
 
 
 @dataclass(frozen=True)
-class Intersection(Aperture):
+class Intersection(Region):
     """Points of all of several regions."""
 
     parts: tuple[Aperture, ...]
@@ -245,7 +245,7 @@ class Intersection(Aperture):
 
 
 @dataclass(frozen=True)
-class Complement(Aperture):
+class Complement(Region):
     """Points outside a region: what an obscuration leaves clear."""
 
     part: Aperture
@@ -255,6 +255,9 @@ class Complement(Aperture):
 
     def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         return np.logical_not(self.part.contains(x, y))
+
+
+Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
 
 
 def _check_parts(name: str, parts: tuple[Aperture, ...]) -> None:

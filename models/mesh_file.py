@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from ..core.errors import PrescriptionError
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 MESH_SUFFIXES = (".stl", ".glb", ".gltf", ".obj", ".ply", ".off")
 
 
-def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh | trimesh.Scene:
+def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh:
     """Return the content of an STL, GLB, OBJ, PLY or OFF file, in the unit of the file.
 
     Parameters
@@ -47,4 +47,4 @@ def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh 
     parts = mesh.geometry.values() if isinstance(mesh, trimesh.Scene) else [mesh]
     if not any(len(getattr(part, "faces", ())) for part in parts):
         raise PrescriptionError("expected a mesh with at least one triangle", file=path)
-    return mesh
+    return cast("trimesh.Trimesh", mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh)

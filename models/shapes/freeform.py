@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -285,8 +286,10 @@ class Toroid(_TwoRadii):
 class _Polynomial(Shape):
     """Base of shapes that are a polynomial of x and y."""
 
-    #: The sag as a polynomial.
-    polynomial: cached_property[PolarPolynomial]
+    @property
+    @abstractmethod
+    def polynomial(self) -> PolarPolynomial:
+        """The sag as a polynomial."""
 
     @property
     def curvature(self) -> float:

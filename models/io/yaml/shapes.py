@@ -98,7 +98,9 @@ class GridSection(ShapeSection):
         either(content, "file", ("nodes_x", "nodes_y", "values"))
 
     def build(self) -> Shape:  # noqa: D102
-        return GridSag(self.nodes_x, self.nodes_y, self.values) if self.file is None else read_grid(self.file)
+        if self.file is not None:
+            return read_grid(self.file)
+        return GridSag(*(np.array(v) for v in (self.nodes_x, self.nodes_y, self.values)))
 
 
 class MeshSection(ShapeSection):
