@@ -25,10 +25,7 @@ from ...pipeline.ccd_product import KINDS, CcdProduct
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import (
-    correlations,
-    run_figures,
-)
+from ...pipeline.measure.summary import correlations, run_figures
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds

@@ -213,10 +213,7 @@ def prescription_hash(telescope: Telescope) -> str:
 
 
 def _subject(
-    path: Path,
-    baseline: Baseline,
-    model: str | os.PathLike[str] | Telescope | None,
-    configuration: Path | None,
+    path: Path, baseline: Baseline, model: str | os.PathLike[str] | Telescope | None, configuration: Path | None
 ) -> tuple[str, Telescope, Experiment | None]:
     """Return the name of the telescope to check, itself, and the experiment with it."""
     own = _absolute(baseline.model, path.parent)
@@ -260,11 +257,7 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
         del content["telescope"], content["ccds"]
         content["atmosphere"]["site"] = Path(content["atmosphere"]["site"]).name
         hashed = digest(content)
-    return {
-        "pachon": VERSION,
-        "model_sha256": prescription_hash(telescope),
-        "configuration_sha256": hashed,
-    }
+    return {"pachon": VERSION, "model_sha256": prescription_hash(telescope), "configuration_sha256": hashed}
 
 
 def _notes(baseline: Baseline, now: Mapping[str, Any]) -> tuple[str, ...]:

@@ -77,12 +77,7 @@ def spot(scene: Scene) -> dict[str, float]:
 def ee80(scene: Scene) -> dict[str, float]:
     """Return the radius of 80 % of the diffraction image's light at the middle wavelength."""
     energy = encircled_energy(
-        scene.telescope,
-        scene.fields,
-        scene.middle,
-        pixels=_EE_PIXELS,
-        n_pupil=_EE_POINTS,
-        threads=scene.threads,
+        scene.telescope, scene.fields, scene.middle, pixels=_EE_PIXELS, n_pupil=_EE_POINTS, threads=scene.threads
     )
     radii = energy.radius_holding(0.8) * 1e6
     return {f"ee80 field {_pair(p)}": float(v) for v, p in zip(radii, scene.plan.fields_deg, strict=True)}

@@ -23,11 +23,7 @@ from .stars import ObservedCcd, SimulatedCcd, used_stars
 KINDS = ("at_stars", "away")
 # Two bins of equal width in the logarithm: 0.56' to 10', and 10' to 180'.
 _LOW, _HIGH = SEPARATION_RANGES["long"]
-_BINS: dict[str, Any] = {
-    "min_sep": _LOW**2 / _HIGH * ARCMIN,
-    "max_sep": _HIGH * ARCMIN,
-    "n_bins": 2,
-}
+_BINS: dict[str, Any] = {"min_sep": _LOW**2 / _HIGH * ARCMIN, "max_sep": _HIGH * ARCMIN, "n_bins": 2}
 
 
 @dataclass(frozen=True)
@@ -141,12 +137,7 @@ def case_metrics(samples: Sequence[Residuals]) -> dict[str, float]:
 
 
 def noise_law(
-    stars: np.ndarray,
-    places: np.ndarray,
-    variance: np.ndarray,
-    weights: np.ndarray | None,
-    order: int,
-    extent: Extent,
+    stars: np.ndarray, places: np.ndarray, variance: np.ndarray, weights: np.ndarray | None, order: int, extent: Extent
 ) -> tuple[float, float]:
     r"""Return the mean square residual of a polynomial fit by noise, at its stars and elsewhere.
 

@@ -14,13 +14,7 @@ from ...core.units import ARCMIN, ARCSEC
 from ...models.ideal_telescope import without_aberration
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import measure_shapes
-from ...pipeline.report.focal_plane_axes import (
-    TRUTH,
-    draw_key_whisker,
-    draw_whiskers,
-    key_ellipticity,
-    whiskers,
-)
+from ...pipeline.report.focal_plane_axes import TRUTH, draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.psf.psf import make_psfs
 from .bench import Bench

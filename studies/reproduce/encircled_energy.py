@@ -11,10 +11,7 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
 from ...models.io.prescription import load_telescope
-from ...pipeline.report.focal_plane_axes import (
-    OBSERVED,
-    RESIDUAL,
-)
+from ...pipeline.report.focal_plane_axes import OBSERVED, RESIDUAL
 from ...wavefront.psf.psf import make_psfs
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure

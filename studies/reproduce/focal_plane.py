@@ -10,9 +10,7 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
-from ...pipeline.report.focal_plane_axes import (
-    OBSERVED,
-)
+from ...pipeline.report.focal_plane_axes import OBSERVED
 from ...pipeline.report.focal_plane_plots import heights_figure
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure

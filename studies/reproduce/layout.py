@@ -15,14 +15,7 @@ from ...models.camera.camera import Camera
 from ...models.first_order import first_order
 from ...models.surface import Surface
 from ...models.telescope import Telescope
-from ...pipeline.report.focal_plane_axes import (
-    OBSERVED,
-    RESIDUAL,
-    TRUTH,
-    draw_field_circle,
-    draw_outlines,
-    frame_axes,
-)
+from ...pipeline.report.focal_plane_axes import OBSERVED, RESIDUAL, TRUTH, draw_field_circle, draw_outlines, frame_axes
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
 

@@ -10,16 +10,7 @@ from ...core.errors import ConfigError, unknown_name
 from ...core.files import make_folder, write_json
 from ...core.progress import Reporter
 from ...core.version import VERSION
-from . import (
-    atmosphere,
-    encircled_energy,
-    focal_plane,
-    layout,
-    optics_whiskers,
-    reconstruction,
-    screens,
-    speckles,
-)
+from . import atmosphere, encircled_energy, focal_plane, layout, optics_whiskers, reconstruction, screens, speckles
 from .bench import SCALES, Bench, Scale
 from .figure import Figure
 

@@ -1,7 +1,7 @@
-"""What a sweep says: effects of single parameters, how they add, and what each may be for a stated xi.
+"""Analysis of a sweep: effects of single parameters, their sum, and allowances for a target of xi.
 
-Points with one seed have random numbers in common, so an effect is taken within each replica first, and its mean and
-its standard error over the replicas after that.
+Points with one seed have random numbers in common. An effect is therefore taken within each replica first, then its
+mean and standard error over the replicas.
 """
 
 from __future__ import annotations
@@ -16,114 +16,73 @@ from scipy.stats import rankdata
 from .file import SweepFile
 from .table import SweepTable
 
-#: Points that vary one numeric parameter at least so many times have a curve.
+#: Least number of values of a parameter for a curve.
 _CURVE = 2
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One figure against one parameter, all others nominal.
-
-    Attributes
-    ----------
-    parameter, metric : str
-        What is varied, and what is measured.
-    value : ndarray, shape [n]
-        Values of the parameter, ascending.
-    mean, error : ndarray, shape [n]
-        Mean of the figure over the replicas, and the standard error of its change from nominal; NaN with one replica.
-    spread : ndarray, shape [n]
-        Standard deviation of the figure over the replicas; NaN with one.
-    change : ndarray, shape [n]
-        Mean change from the nominal point.
-    marks : dict of str to (value, change)
-        The named values that are among them.
-    nominal : float
-        Value of the nominal point.
-    """
+    """One metric against one parameter, all others nominal; arrays have shape [n]."""
 
     parameter: str
     metric: str
+    #: Values of the parameter, ascending.
     value: np.ndarray
+    #: Mean of the metric over the replicas.
     mean: np.ndarray
+    #: Standard error of the mean change, and standard deviation over the replicas; NaN with one replica.
     error: np.ndarray
     spread: np.ndarray
+    #: Mean change from the nominal point.
     change: np.ndarray
+    #: Value and change of the marks among the values.
     marks: dict[str, tuple[float, float]]
+    #: Nominal value of the parameter.
     nominal: float
 
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """Effect of one cause on one figure at one mark.
-
-    Attributes
-    ----------
-    parameter : str
-        The cause.
-    value : float
-        Its value there.
-    change, error : float
-        Change of the figure by it alone, and the standard error over the replicas.
-    share : float
-        Of the sum of all single changes.
-    """
+    """Effect of one parameter on one metric at one mark, and its standard error over the replicas."""
 
     parameter: str
     value: float
     change: float
     error: float
-    share: float
+    #: Fraction of the sum of all single changes.
+    fraction: float
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How single effects add at one mark.
-
-    Attributes
-    ----------
-    metric, mark : str
-        What is measured, and at which named values.
-    lines : tuple of BudgetLine
-        Largest effect first.
-    total : float
-        Sum of the single changes.
-    together, together_error : float
-        Change with all of them at once, and its standard error; NaN where that was not computed.
-    """
+    """Single effects on one metric at one mark, and their sum."""
 
     metric: str
     mark: str
+    #: Largest effect first.
     lines: tuple[BudgetLine, ...]
+    #: Sum of the single changes.
     total: float
+    #: Change with all effects at once, and its standard error; NaN where it was not computed.
     together: float
     together_error: float
 
 
 @dataclass(frozen=True)
 class Allowance:
-    """What one parameter may be for a target.
-
-    Attributes
-    ----------
-    parameter : str
-        The parameter.
-    power : float
-        Exponent of the change against the distance from nominal, fitted over the curve.
-    alone : float
-        Distance from nominal at which it reaches the target alone; NaN where it never does within twice the curve.
-    shared : float
-        The same for an equal share of the target between all parameters.
-    """
+    """Allowed distance of one parameter from nominal, for a target of a metric."""
 
     parameter: str
+    #: Exponent of the change against the distance from nominal.
     power: float
+    #: Distance at which the parameter alone reaches the target; NaN where beyond twice the curve.
     alone: float
+    #: The same for an equal fraction of the target for each parameter.
     shared: float
 
 
 def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
-    """Return one curve for each numeric parameter that was varied one at a time."""
+    """Return a curve for each numeric parameter that was varied one at a time."""
     found = []
     nominal = {name: p.nominal for name, p in sweep.parameters.items()}
     for name, parameter in sweep.parameters.items():
@@ -154,7 +113,7 @@ def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
 
 
 def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budget | None:
-    """Return how the effects of all parameters with that mark add; None where there are none."""
+    """Return the budget of all parameters with a mark; None where there are none."""
     marked = {name: p.marks[mark] for name, p in sweep.parameters.items() if mark in p.marks}
     lines = []
     for curve in curves(table, sweep, metric):
@@ -178,10 +137,9 @@ def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budge
 
 
 def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
-    """Return what each parameter may be for a figure not to grow by more than a target.
+    """Return the allowance of each parameter for a growth of the metric up to a target.
 
-    The change is taken as a power of the distance from nominal, fitted to the larger half of the curve, where it stands
-    out of what other causes do.
+    The change is a power of the distance from nominal, fitted to the outer half of the curve, where it is largest.
     """
     each = []
     for curve in found:
@@ -194,17 +152,14 @@ def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
         bounds = []
         for goal in (target, target / len(found)):
             reach = float(np.exp((np.log(goal) - intercept) / power)) if power > 0 else np.nan
-            # A power law says nothing far beyond what was computed.
+            # The power law holds near the computed points only.
             bounds.append(reach if reach <= 2.0 * distance.max() else np.nan)
         each.append(Allowance(curve.parameter, float(power), *bounds))
     return each
 
 
 def rank_correlations(table: SweepTable, metric: str) -> dict[str, tuple[float, float]]:
-    """Return Spearman's rank correlation of a figure with each numeric parameter, and its standard error.
-
-    For random designs, in which all parameters vary at once.
-    """
+    """Return Spearman's rank correlation of a metric with each numeric parameter, and its standard error."""
     found = {}
     good = np.isfinite(table.metrics[metric])
     for name in table.parameters:
@@ -219,9 +174,9 @@ def rank_correlations(table: SweepTable, metric: str) -> dict[str, tuple[float, 
 
 
 def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
-    """Return what the report says as plain numbers."""
+    """Return the content of the report as plain numbers."""
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
-    figures: dict[str, Any] = {}
+    metrics: dict[str, Any] = {}
     for metric in table.metrics:
         found = curves(table, sweep, metric)
         entry: dict[str, Any] = {
@@ -244,13 +199,13 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
                 a.parameter: {"power": a.power, "alone": a.alone, "shared": a.shared}
                 for a in allowances(found, sweep.xi_target)
             }
-        figures[metric] = entry
+        metrics[metric] = entry
     return {
         "name": sweep.name,
         "points": len(table),
         "failed": int((table.problem != "").sum()),
         "replicas": sweep.design.replicas,
-        "metrics": figures,
+        "metrics": metrics,
     }
 
 
@@ -259,7 +214,7 @@ def _numeric(table: SweepTable, name: str) -> bool:
 
 
 def _over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mean, standard deviation and standard error of the mean over the first axis, missing values left out."""
+    """Return mean, standard deviation and standard error over the first axis, without missing values."""
     count = np.isfinite(values).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(count > 0, np.nansum(values, axis=0) / count, np.nan)
@@ -269,7 +224,7 @@ def _over_replicas(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _at(table: SweepTable, point: dict[str, Any], seed: int, metric: str) -> float:
-    """Return the figure of one point; NaN where it was not computed."""
+    """Return the metric of one point; NaN where it was not computed."""
     here = table.seed == seed
     for name, value in point.items():
         if name in table.parameters:

@@ -1,4 +1,4 @@
-"""Compensators of an experiment: focus, tilt and the like, solved for the smallest spots before it is measured."""
+"""Compensators of an experiment, such as focus and tilt, solved for the smallest spots."""
 
 from __future__ import annotations
 
@@ -13,37 +13,36 @@ from ...design.parameters.changes import parse_change
 from ...pipeline.experiment import Experiment
 from ...wavefront.chief_rays import fields_at
 
-# Places on each CCD at which spots count, in units of half its side: the centre, and where CCDs are few also the
-# middles of its quarters.
+# Positions of the spots on each CCD, in units of half its side: the centre and, for few CCDs, the middles of its
+# quarters.
 _PLACES = np.array([[0.0, 0.0], [0.5, 0.5], [0.5, -0.5], [-0.5, 0.5], [-0.5, -0.5]])
 _FEW = 40
-# Rings of pupil points: the mean square radius of a spot is exact to the aberrations that they can tell apart.
+# Rings of pupil points: the mean square radius of a spot is exact for the aberrations that they resolve.
 _RINGS = 4
-#: Relative change of the mean square radius at which the solver stops: figures of a sweep then stand to six digits.
+#: Relative change of the mean square radius at which the solver stops: metrics of a sweep then have six digits.
 _TOLERANCE = 1e-9
 
 
 def compensated(
     experiment: Experiment, names: Sequence[str], threads: int | None = None
 ) -> tuple[Experiment, dict[str, float]]:
-    """Return the experiment with compensators at their best, and their values.
+    """Optimize compensators for the smallest mean square spot radius.
 
-    Best is the smallest mean square spot radius over the CCDs of the configuration, on their surfaces, at the middle
-    wavelength.
+    Spots are those on the surfaces of the CCDs of the configuration, at the middle wavelength.
 
     Parameters
     ----------
     experiment : Experiment
-        The experiment; it stays as it is.
+        The experiment.
     names : sequence of str
         Changes of the prescription with their units, such as Camera.dz_um and Camera.rx_urad.
     threads : int, optional
-        Number of threads; no byte depends on it.
+        Number of threads; results do not depend on it.
 
     Returns
     -------
     tuple of Experiment and dict
-        The values by name, in the unit of the name.
+        The experiment with the compensators at their best, and their values in the units of their names.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The points of a sweep: one at a time, on a grid, at random, or from a table."""
+"""Designs of sweeps: one parameter at a time, grids, random points, or a table."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from ...core.errors import ConfigError
 from ...core.random_streams import stream
 from .file import Design, SweepFile, SweptParameter
 
-#: Values of the parameters at one point, by name.
+#: Values of the parameters of one point by name.
 Point = dict[str, Any]
-# A normal distribution on a grid is covered to so many standard deviations on either side.
+# Half the width of a normal distribution on a grid, in standard deviations.
 _SIGMAS = 2.0
 
 
 def design_points(sweep: SweepFile) -> list[Point]:
-    """Return the points of a sweep in the order that they are numbered.
+    """Return the points of a sweep in the order of their numbers.
 
-    One at a time, the first point has every parameter at its nominal value, and the others differ from it in one; a
-    parameter's marks are among its values, and for every name of a mark there is one more point with all parameters
-    that have it there, which shows how single effects add. A random design covers the unit cube and maps it through
-    each parameter's distribution: evenly over a range or a list, by quantiles of a normal distribution. Latin hypercube
-    and Sobol points are SciPy's (``scipy.stats.qmc``), scrambled with the design's seed.
+    One at a time, the first point is nominal, and each other point differs from it in one parameter. Marks are among
+    the values of a parameter; for each mark one more point has all parameters at their values of it. A random design covers
+    the unit cube, mapped through the distribution of each parameter: uniform over a range or a list, or by quantiles of
+    a normal distribution. Latin hypercube and Sobol points are SciPy's (``scipy.stats.qmc``), scrambled by the seed.
 
     Raises
     ------
@@ -49,7 +48,7 @@ def design_points(sweep: SweepFile) -> list[Point]:
 
 
 def point_count(sweep: SweepFile) -> int:
-    """Return how many points a sweep has, without making them: a grid can be larger than memory."""
+    """Return the number of points of a sweep without making them: a grid can exceed the memory."""
     design = sweep.design
     if design.kind == "grid":
         count = 1
@@ -94,19 +93,19 @@ def _cube(design: Design, dimensions: int) -> np.ndarray:
     """Return points of the open unit cube, [points, dimensions]."""
     rng = stream(design.seed, "sweep", design.kind)
     if design.kind == "monte_carlo":
-        # A row a point: more points leave the first ones as they are.
+        # One row for each point: more points do not change the first ones.
         cube = rng.random((design.points, dimensions))
     elif design.kind == "latin_hypercube":
         cube = qmc.LatinHypercube(dimensions, rng=rng).random(design.points)
     else:
-        # Sobol sets are balanced in powers of two, of which this takes the first points.
+        # Sobol sets are balanced in powers of two; these are the first points of one.
         power = int(np.ceil(np.log2(max(design.points, 1))))
         cube = qmc.Sobol(dimensions, rng=rng).random_base2(power)[: design.points]
     return np.clip(cube, 1e-12, 1.0 - 1e-12)
 
 
 def _quantiles(parameter: SweptParameter, u: np.ndarray) -> list[Any]:
-    """Return the values of one parameter at places of the unit interval."""
+    """Return the values of one parameter at points of the unit interval."""
     if parameter.values is not None:
         return [parameter.values[int(v * len(parameter.values))] for v in u]
     if parameter.range is not None:
@@ -123,7 +122,7 @@ def _from_table(path: Path) -> list[Point]:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; expected an ECSV table of points") from None
     except Exception as error:
-        # astropy's readers raise many kinds of errors at what is no table.
+        # Readers of astropy raise many kinds of errors for files that are no tables.
         raise ConfigError(f"{path}: no ECSV table ({' '.join(str(error).split())[:120]})") from None
     if not len(table):
         raise ConfigError(f"{path}: no rows; expected at least one point")

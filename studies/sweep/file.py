@@ -1,4 +1,4 @@
-"""What a sweep is made of: one YAML file with a configuration to start from, parameters, a design and metrics.
+"""Sweep files: YAML with a base configuration, parameters, a design and metrics.
 
 ::
 
@@ -29,7 +29,7 @@ from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
 from ...pipeline.config import digest
 
-#: Folder of the sweeps that come along.
+#: Folder of the bundled sweeps.
 EXAMPLES = Path(__file__).parent / "examples"
 
 
@@ -64,13 +64,13 @@ class Design(Section):
 
 
 class SweepFile(Section):
-    """All that decides what a sweep computes."""
+    """Content of a sweep file."""
 
-    name: str = Field("sweep", description="what the report calls it")
+    name: str = Field("sweep", description="name in the report")
     base: dict[str, Any] | str = Field(default_factory=dict, description="configuration to start from, or its file")
-    parameters: dict[str, SweptParameter] = Field(default_factory=dict, description="what is varied")
+    parameters: dict[str, SweptParameter] = Field(default_factory=dict, description="varied parameters")
     design: Design = Design()
-    metrics: tuple[str, ...] = Field(("fwhm", "rms_e", "xi_raw"), description="what is measured at each point")
+    metrics: tuple[str, ...] = Field(("fwhm", "rms_e", "xi_raw"), description="groups of metrics of each point")
     compensators: tuple[str, ...] = Field((), description="motions solved for the sharpest image before measuring")
     xi_target: Annotated[Real, Field(gt=0)] | None = Field(
         None, description="xi+ that the report shares out between the causes"
@@ -78,7 +78,7 @@ class SweepFile(Section):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that decides the figures of the sweep, the contents of the files that it names included."""
+        """SHA-256 of the sweep, including the contents of the files that it names."""
         named: list[Any] = [self.design.file]
         if isinstance(self.base, dict):
             air = self.base.get("atmosphere")
@@ -109,7 +109,7 @@ def load_sweep(path: Path) -> SweepFile:
 
 
 def _with_path(section: Any, key: str, folder: Path) -> Any:
-    """Return a section in which a key that names a file, as seen from a folder, has its absolute path."""
+    """Return a section with the absolute path of a file that a key names relative to a folder."""
     if isinstance(section, dict) and isinstance(section.get(key), str) and (folder / section[key]).is_file():
         return {**section, key: str((folder / section[key]).resolve())}
     return section
@@ -123,7 +123,7 @@ def read_sweep(content: dict[str, Any], source: str) -> SweepFile:
 
 
 def _check(sweep: SweepFile, source: str) -> None:
-    """Check what several values must be together."""
+    """Check values that depend on each other."""
     table = sweep.design.kind == "table"
     if table and sweep.design.file is None:
         raise ConfigError(f"{source}: design.file is missing: kind table expects the path of an ECSV table of points")

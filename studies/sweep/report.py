@@ -1,4 +1,4 @@
-"""The report of a sweep: one HTML file with its pictures, and its figures as JSON."""
+"""Report of a sweep: an HTML file with plots, and the metrics as JSON."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .file import SweepFile
 from .store import SweepStore
 from .table import SweepTable, read_table
 
-# Figures with pictures of their own; all are in the tornado chart and in the table.
+# Number of metrics with plots of their own; all are in the tornado chart and in the table.
 _SHOWN = 4
-# Points of a random design from which slices have a meaning.
+# Least number of points of a random design for slices.
 _ENOUGH = 24
 
 
 def write_report(store: SweepStore, folder: Path) -> Path:
-    """Write ``report.html``, ``summary.json`` and the pictures of a sweep into a folder, and return the report's path.
+    """Write ``report.html``, ``summary.json`` and the plots of a sweep, and return the path of the report.
 
     Raises
     ------
@@ -34,15 +34,15 @@ def write_report(store: SweepStore, folder: Path) -> Path:
     if not len(table) or not table.metrics:
         raise ProductError(f"{store.path}: no point has been computed yet")
     make_folder(folder)
-    figures = summary(table, sweep)
+    metrics = summary(table, sweep)
     pictures = sweep_pictures(table, sweep)
     for name, picture in pictures:
         write_bytes(folder / f"{name}.png", picture.png)
-    write_json(folder / "summary.json", {**figures, "pachon": store.about["pachon"], "digest": store.about["digest"]})
+    write_json(folder / "summary.json", {**metrics, "pachon": store.about["pachon"], "digest": store.about["digest"]})
     page = render(
         "sweep.html",
         sweep=sweep,
-        summary=figures,
+        summary=metrics,
         pictures=[picture for _, picture in pictures],
         pachon=store.about["pachon"],
         points=len(store.points()),
@@ -55,8 +55,8 @@ def write_report(store: SweepStore, folder: Path) -> Path:
 
 
 def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Picture]]:
-    """Return the pictures that the design of a sweep allows, with the names of their files."""
-    # Correlations go first: they are what a sweep is for.
+    """Return the plots for the design of a sweep, with the names of their files."""
+    # Correlations first: they are the purpose of most sweeps.
     drawn = {m: curves(table, sweep, m) for m in sorted(table.metrics, key=lambda m: (not m.startswith("xi"), m))}
     drawn = {metric: each for metric, each in drawn.items() if each}
     pictures: list[tuple[str, Picture]] = []
@@ -76,8 +76,8 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
             Picture(
                 "What matters most",
                 plots.tornado_plot(drawn),
-                "How far each figure moves from its nominal value over the range of each parameter, others nominal: "
-                "blue below the nominal value of the parameter, red above. Upright strokes are the named values.",
+                "Change of each metric from its nominal value over the range of each parameter, others nominal: "
+                "blue below the nominal value of the parameter, red above. Vertical strokes are the marks.",
             ),
         )
     ]
@@ -109,12 +109,12 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
 
 
 def _budget_words(found: list[Budget]) -> str:
-    """Say how the effects add, and where they do not."""
+    """Return a sentence on the sum of the effects at each mark."""
     words = []
     for one in found:
         if np.isfinite(one.together) and one.total:
             apart = abs(one.together - one.total)
-            # Within two standard errors, or a tenth where there is but one replica to judge by, they are the same.
+            # Equal within two standard errors, or a tenth for one replica.
             same = apart < (2.0 * one.together_error if np.isfinite(one.together_error) else 0.1 * abs(one.total))
             error = f" +- {one.together_error:.2g}" if np.isfinite(one.together_error) else ""
             words.append(
@@ -135,7 +135,7 @@ def _random(table: SweepTable, numeric: list[str]) -> list[tuple[str, Picture]]:
             Picture(
                 "What matters most",
                 plots.correlations_plot(ranks),
-                "Spearman's rank correlation of each figure with each parameter, all of them varied at once.",
+                "Spearman's rank correlation of each metric with each parameter, all of them varied at once.",
             ),
         )
     ]
@@ -151,7 +151,7 @@ def _random(table: SweepTable, numeric: list[str]) -> list[tuple[str, Picture]]:
 
 
 def _rows(table: SweepTable) -> list[dict[str, Any]]:
-    """Return range and median of each figure."""
+    """Return range and median of each metric."""
     return [
         {
             "name": name,
