@@ -54,6 +54,17 @@ from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus
 from .raytrace.rays import launch_rays as launch_rays
 from .raytrace.trace import trace as trace
+from .studies.baseline.baseline import check_baseline as check_baseline
+from .studies.baseline.baseline import make_baseline as make_baseline
+from .studies.baseline.check import BaselineCheck as BaselineCheck
+from .studies.baseline.file import Baseline as Baseline
+from .studies.baseline.file import read_baseline as read_baseline
+from .studies.baseline.file import write_baseline as write_baseline
+from .studies.sweep.file import load_sweep as load_sweep
+from .studies.sweep.sweep import run_sweep as run_sweep
+from .studies.sweep.table import SweepTable as SweepTable
+from .studies.sweep.table import load_sweep_table as load_sweep_table
+from .testing import assert_matches_baseline as assert_matches_baseline
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
 from .wavefront.chief_rays import fields_at as fields_at

@@ -1,7 +1,7 @@
-"""A pytest plugin that makes a test of every ``*.baseline.json`` that pytest comes across.
+"""Pytest plugin that makes a test of every ``*.baseline.json`` in the folders of the tests.
 
-pytest loads it by itself where pachon is installed (``-p no:pachon`` turns it off). It imports nothing of pachon until
-such a test runs.
+pytest loads it where pachon is installed; ``-p no:pachon`` turns it off. It imports nothing of pachon until such a test
+runs.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 class BaselineFile(pytest.File):
-    """The file of a baseline."""
+    """File of a baseline."""
 
     def collect(self) -> Iterator[pytest.Item]:
-        """Yield its one test."""
+        """Yield its test."""
         yield BaselineItem.from_parent(self, name="baseline")
 
 
 class BaselineItem(pytest.Item):
-    """The figures of a telescope against its baseline."""
+    """Metrics of a telescope against its baseline."""
 
     def runtest(self) -> None:
-        """Compute them and compare."""
+        """Compare them."""
         from .testing import assert_matches_baseline
 
         assert_matches_baseline(None, self.path)
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """Return the table of what is out, or the line that says what cannot be read."""
+        """Return the table of the worst metrics, or the line of the error."""
         from .core.errors import PachonError
 
         if isinstance(excinfo.value, (AssertionError, PachonError)):
@@ -46,5 +46,5 @@ class BaselineItem(pytest.Item):
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Return what the test is called."""
+        """Return the name of the test."""
         return self.path, None, f"baseline {self.path.name}"

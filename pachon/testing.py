@@ -1,9 +1,8 @@
-"""For the tests of other projects: a telescope against its baseline."""
+"""Assertions for the tests of other projects."""
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,14 +16,14 @@ def assert_matches_baseline(
     configuration: str | os.PathLike[str] | None = None,
     threads: int | None = None,
 ) -> None:
-    """Assert that every figure of a telescope lies within the tolerance of its baseline.
+    """Assert that all metrics of a telescope agree with its baseline.
 
     Parameters
     ----------
     model : str, path or Telescope, or None
-        Bundled telescope, path of a prescription, or a telescope; None for the one that the baseline names.
+        Bundled telescope, path of a prescription, or a telescope; None for that of the baseline.
     baseline : path
-        The file that ``pachon baseline save`` wrote.
+        File of the baseline.
     configuration : path, optional
         Run configuration in place of the baseline's own.
     threads : int, optional
@@ -33,13 +32,12 @@ def assert_matches_baseline(
     Raises
     ------
     AssertionError
-        If a figure is out of tolerance; it says which, worst first.
+        If a metric is out of tolerance, with a table of the worst ones.
     PachonError
         If one of the files cannot be read.
     """
     from .studies.baseline.baseline import check_baseline
 
-    config = None if configuration is None else Path(configuration)
-    check = check_baseline(Path(baseline), model, config, threads=threads)
+    check = check_baseline(baseline, model, configuration, threads=threads)
     if not check.passed:
         raise AssertionError(check.text())

@@ -43,8 +43,8 @@ def bundled_baselines() -> tuple[Path, ...]:
 
 def make_baseline(
     model: str,
-    folder: Path,
-    configuration: Path | None = None,
+    folder: str | os.PathLike[str] = "",
+    configuration: str | os.PathLike[str] | None = None,
     *,
     fields: np.ndarray | None = None,
     wavelengths: Sequence[float] | None = None,
@@ -60,9 +60,9 @@ def make_baseline(
     ----------
     model : str
         Bundled telescope, or path of its file.
-    folder : Path
-        Folder of the baseline, from which it names other files.
-    configuration : Path, optional
+    folder : str or path
+        Folder of the baseline, from which it names other files; the current one by default.
+    configuration : str or path, optional
         Run configuration, for the metrics of focal plane, PSF and reconstruction. Its telescope is replaced by `model`.
     fields : ndarray, shape [n, 2], optional
         Field angles [rad]; five over the field of view by default.
@@ -90,7 +90,8 @@ def make_baseline(
     PachonError
         If the telescope or the configuration cannot be read, or no metric can be computed.
     """
-    telescope = load_telescope(model)
+    telescope, folder = load_telescope(model), Path(folder)
+    configuration = None if configuration is None else Path(configuration)
     experiment = None if configuration is None else _experiment(configuration, _absolute(model, Path()), telescope)
     plan = make_plan(telescope, experiment, fields, wavelengths, ccds, pupil)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, plan, threads)
@@ -121,9 +122,9 @@ def make_baseline(
 
 
 def check_baseline(
-    path: Path,
+    path: str | os.PathLike[str],
     model: str | os.PathLike[str] | Telescope | None = None,
-    configuration: Path | None = None,
+    configuration: str | os.PathLike[str] | None = None,
     *,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -132,11 +133,11 @@ def check_baseline(
 
     Parameters
     ----------
-    path : Path
+    path : str or path
         The baseline.
     model : str, path or Telescope, optional
         Telescope in place of the baseline's own.
-    configuration : Path, optional
+    configuration : str or path, optional
         Run configuration in place of the baseline's own.
     threads : int, optional
         Number of threads; results do not depend on it.
@@ -148,6 +149,7 @@ def check_baseline(
     PachonError
         If the baseline, the telescope or the configuration cannot be read.
     """
+    path = Path(path)
     baseline = read_baseline(path)
     name, telescope, experiment = _subject(path, baseline, model, configuration)
     scene = Scene(telescope if experiment is None else experiment.telescope, experiment, baseline.plan, threads)
@@ -213,7 +215,10 @@ def prescription_hash(telescope: Telescope) -> str:
 
 
 def _subject(
-    path: Path, baseline: Baseline, model: str | os.PathLike[str] | Telescope | None, configuration: Path | None
+    path: Path,
+    baseline: Baseline,
+    model: str | os.PathLike[str] | Telescope | None,
+    configuration: str | os.PathLike[str] | None,
 ) -> tuple[str, Telescope, Experiment | None]:
     """Return the name of the telescope to check, itself, and the experiment with it."""
     own = _absolute(baseline.model, path.parent)
@@ -227,7 +232,7 @@ def _subject(
         except PachonError as error:
             raise (error.within(subject="model").within(file=path) if model is None else error) from None
     if configuration is not None:
-        return name, telescope, _experiment(configuration, source, telescope)
+        return name, telescope, _experiment(Path(configuration), source, telescope)
     if baseline.configuration is None:
         return name, telescope, None
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -48,7 +49,7 @@ class Baseline(Section):
     figures: Annotated[dict[str, BaselineMetric], Field(min_length=1)] = Field(description="the metrics by name")
 
 
-def read_baseline(path: Path) -> Baseline:
+def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     """Read a baseline.
 
     Raises
@@ -57,7 +58,7 @@ def read_baseline(path: Path) -> Baseline:
         If the file cannot be read, is no JSON or no baseline, or is of another version of the format: one line.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_mapping)
+        content = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_mapping)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except OSError as error:
@@ -82,7 +83,7 @@ def read_baseline(path: Path) -> Baseline:
     return baseline
 
 
-def write_baseline(path: Path, baseline: Baseline) -> None:
+def write_baseline(path: str | os.PathLike[str], baseline: Baseline) -> None:
     """Write a baseline, whole or not at all.
 
     Raises
@@ -90,7 +91,7 @@ def write_baseline(path: Path, baseline: Baseline) -> None:
     ProductError
         If it cannot be written.
     """
-    write_bytes(path, baseline_text(baseline).encode())
+    write_bytes(Path(path), baseline_text(baseline).encode())
 
 
 def baseline_text(baseline: Baseline) -> str:

@@ -24,9 +24,10 @@ def design_points(sweep: SweepFile) -> list[Point]:
     """Return the points of a sweep in the order of their numbers.
 
     One at a time, the first point is nominal, and each other point differs from it in one parameter. Marks are among
-    the values of a parameter; for each mark one more point has all parameters at their values of it. A random design covers
-    the unit cube, mapped through the distribution of each parameter: uniform over a range or a list, or by quantiles of
-    a normal distribution. Latin hypercube and Sobol points are SciPy's (``scipy.stats.qmc``), scrambled by the seed.
+    the values of a parameter; for each mark one more point has all parameters at their values of it. A random design
+    covers the unit cube, mapped through the distribution of each parameter: uniform over a range or a list, or by
+    quantiles of a normal distribution. Latin hypercube and Sobol points are SciPy's (``scipy.stats.qmc``), scrambled by
+    the seed.
 
     Raises
     ------

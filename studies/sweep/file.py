@@ -19,6 +19,7 @@ of the prescription (``M2.dz_um``, ``M1.Z5_nm``): see :mod:`pachon.studies.sweep
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -88,7 +89,7 @@ class SweepFile(Section):
         return digest({"sweep": self.model_dump(mode="json"), "files": contents})
 
 
-def load_sweep(path: Path) -> SweepFile:
+def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
     """Read a sweep file; the configuration that it names is read into it.
 
     Raises
@@ -96,6 +97,7 @@ def load_sweep(path: Path) -> SweepFile:
     ConfigError
         If the file cannot be read, is not YAML, or a key or value is not as expected: one line.
     """
+    path = Path(path)
     content = read_mapping(path, ConfigError)
     if isinstance(content.get("base"), str):
         content["base"] = read_mapping(path.parent / content["base"], ConfigError)

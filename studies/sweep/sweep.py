@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ class SweepOutcome:
 
 def run_sweep(
     sweep: SweepFile,
-    path: Path,
+    path: str | os.PathLike[str],
     *,
     folder: Path | None = None,
     resume: bool = False,
@@ -63,7 +64,7 @@ def run_sweep(
     ----------
     sweep : SweepFile
         The sweep.
-    path : Path
+    path : str or path
         The store, a SQLite file.
     folder : Path, optional
         Folder that relative paths in the configuration start from; the current one by default.
@@ -82,7 +83,7 @@ def run_sweep(
         If a name or value of the sweep is not possible, the store cannot be written, or the workers are lost.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    folder = Path() if folder is None else folder
+    path, folder = Path(path), Path() if folder is None else folder
     if path.exists() and not resume:
         raise ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
     if not path.exists():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,18 @@ class SweepTable:
 
     def __len__(self) -> int:
         return len(self.number)
+
+
+def load_sweep_table(path: str | os.PathLike[str]) -> SweepTable:
+    """Read the results of a sweep from the file that ``pachon sweep`` or :func:`~pachon.run_sweep` wrote.
+
+    Raises
+    ------
+    ProductError
+        If it is no store of a sweep, or damaged.
+    """
+    with SweepStore(Path(path)) as store:
+        return read_table(store)
 
 
 def read_table(store: SweepStore) -> SweepTable:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+import pachon
 from pachon.core.errors import ConfigError, ProductError
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.record import PointResult, SweepPoint
@@ -141,3 +142,12 @@ def test_what_can_be_read_of_a_damaged_store_is_saved(tmp_path):
 
 def test_the_sweep_is_kept_as_people_wrote_it(store):
     assert list(json.loads(store.about["sweep"])["parameters"]) == ["b", "a"]
+
+
+def test_a_store_is_loaded_as_a_table(store):
+    for number in (5, 2):
+        store.write(result(number))
+    table = pachon.load_sweep_table(store.path)
+    assert table.number.tolist() == [2, 5]
+    assert table.parameters["b"].tolist() == [0.1 * 2, 0.1 * 5]
+    assert table.metrics["xi_nm"].tolist() == [0.1 * 2 + 0.2, 0.1 * 5 + 0.2]
