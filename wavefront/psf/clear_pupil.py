@@ -10,12 +10,12 @@ import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
+from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import clear_ring, pack_surfaces
 from ...raytrace.rays import parallel_rays
 from ...raytrace.trace import trace_packets
 from .clear_pupil_kernels import find_edges
-from .sample_packets import shared
 
 # Spokes to a ring: the phase of a blur goes round the pupil some three times faster than across its ring.
 _SPOKES_TO_A_RING = 3.2
@@ -130,10 +130,10 @@ def clear_edges(
         n_star * n_spoke,
         [
             surfaces,
-            shared(places.numpy().reshape(n_surface, 3, -1), wp.float64),
-            shared(radius, wp.float64),
+            warp_array(places.numpy().reshape(n_surface, 3, -1), wp.float64),
+            warp_array(radius, wp.float64),
             n_spoke,
-            shared(edges, wp.float64),
+            warp_array(edges, wp.float64),
         ],
         threads=threads,
     )

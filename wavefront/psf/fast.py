@@ -26,6 +26,7 @@ import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
+from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
 from ..pupil_optics import PupilOptics
@@ -33,7 +34,7 @@ from .engine import Exposed, PsfEngine, PsfInputs, metric_of
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
 from .pupil_lattice import PupilLattice
-from .sample_packets import indices, samples, shared, to_packets
+from .sample_packets import indices, samples, to_packets
 
 #: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
 PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
@@ -212,21 +213,21 @@ class FastPsfEngine(PsfEngine):
             deposit_rays,
             n_star,
             [
-                shared(self._slopes, wp.int32),
-                shared(self._units, wp.float32),
+                warp_array(self._slopes, wp.int32),
+                warp_array(self._units, wp.float32),
                 screen_size,
                 n_layer,
                 n_time,
-                shared(start, wp.float64),
-                shared(step, wp.float64),
-                shared(lattice, indices),
+                warp_array(start, wp.float64),
+                warp_array(step, wp.float64),
+                warp_array(lattice, indices),
                 int(max(column.max(), row.max())) + 1,
-                shared(cells_per_slope.astype(np.float32), wp.float32),
-                shared(displacement, samples),
-                shared(to_packets(light, np.float32, fill="constant"), samples),
+                warp_array(cells_per_slope.astype(np.float32), wp.float32),
+                warp_array(displacement, samples),
+                warp_array(to_packets(light, np.float32, fill="constant"), samples),
                 self._grid_size,
                 wp.empty((n_star, len(lattice), 2), dtype=samples, device="cpu"),
-                shared(image, wp.float32),
+                warp_array(image, wp.float32),
             ],
             threads=self._threads,
         )
@@ -244,16 +245,16 @@ class FastPsfEngine(PsfEngine):
             combine_wavelengths,
             n_star * n_row,
             [
-                shared(spectra, wp.vec2f),
+                warp_array(spectra, wp.vec2f),
                 float(self._kx[1]),
-                shared(metric_of(optics.jacobian), wp.float32),
-                shared((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
-                shared(self._filter, wp.float32),
+                warp_array(metric_of(optics.jacobian), wp.float32),
+                warp_array((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
+                warp_array(self._filter, wp.float32),
                 self._filter_step,
-                shared(self._detector, wp.float32),
-                shared(np.exp(-1j * shift[..., :1] * self._kx).astype(np.complex64), wp.vec2f),
-                shared(np.exp(-1j * shift[..., 1:] * self._ky).astype(np.complex64), wp.vec2f),
-                shared(combined, wp.vec2f),
+                warp_array(self._detector, wp.float32),
+                warp_array(np.exp(-1j * shift[..., :1] * self._kx).astype(np.complex64), wp.vec2f),
+                warp_array(np.exp(-1j * shift[..., 1:] * self._ky).astype(np.complex64), wp.vec2f),
+                warp_array(combined, wp.vec2f),
             ],
             threads=self._threads,
         )

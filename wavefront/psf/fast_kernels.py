@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from .packet_functions import squared_baseline, tabulated
 from .sample_packets import LANES, indices, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -79,7 +80,7 @@ def deposit_rays(
             corner_y = nearest_sample(start[star, layer, 1] + time * step[layer, 1], screen_size)
             corner = corner_y * screen_size + corner_x
             counts = indices()
-            # Two loops in place of one with a choice inside: the compiler vectorizes these.
+            # Two loops, each to its end: with a choice or a shared function inside, the compiler makes slower code.
             if corner_x + reach <= screen_size and corner_y + reach <= screen_size:
                 for packet in range(n_packet):
                     offset = lattice[packet]
@@ -100,10 +101,10 @@ def deposit_rays(
                     slope[star, packet, 0] = slope[star, packet, 0] + slope_x
                     slope[star, packet, 1] = slope[star, packet, 1] + slope_y
         for packet in range(n_packet):
-            bend_x = slope[star, packet, 0]
-            bend_y = slope[star, packet, 1]
-            moved_x = bend_x * xx + bend_y * xy
-            moved_y = bend_x * yx + bend_y * yy
+            angle_x = slope[star, packet, 0]
+            angle_y = slope[star, packet, 1]
+            moved_x = angle_x * xx + angle_y * xy
+            moved_y = angle_x * yx + angle_y * yy
             for wave in range(n_wave):
                 cell_x = moved_x + displacement[star, wave, packet, 0]
                 cell_y = moved_y + displacement[star, wave, packet, 1]
@@ -147,14 +148,10 @@ def combine_wavelengths(
     ky = wp.float32(wp.where(2 * row > n_row, row - n_row, row)) * frequency
     for column in range(spectra.shape[3]):
         kx = wp.float32(column) * frequency
-        squared = metric[star, 0] * kx * kx + wp.float32(2.0) * metric[star, 1] * kx * ky + metric[star, 2] * ky * ky
-        separation = wp.sqrt(wp.max(squared, wp.float32(0.0))) / table_step
+        separation = wp.sqrt(squared_baseline(metric, star, kx, ky)) / table_step
         total = wp.vec2f(0.0, 0.0)
         for wave in range(spectra.shape[1]):
-            place = wp.min(separation * baseline[wave], wp.float32(table.shape[1]) - wp.float32(1.001))
-            knot = wp.int32(place)
-            part = place - wp.float32(knot)
-            value = table[wave, knot] + part * (table[wave, knot + 1] - table[wave, knot])
+            value = tabulated(table, wave, separation * baseline[wave])
             px = ramp_x[star, wave, column]
             py = ramp_y[star, wave, row]
             re = px[0] * py[0] - px[1] * py[1]

@@ -27,12 +27,13 @@ import warp as wp
 
 from ...core.errors import ConfigError, DomainError
 from ...core.launch import launch
+from ...core.warp_arrays import warp_array
 from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges
 from .engine import Exposed, PsfEngine, PsfInputs, metric_of
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
-from .sample_packets import LANES, samples, shared
+from .sample_packets import LANES, samples
 
 #: Pupil points by default: 16 spokes of 5 rings.
 PUPIL_POINTS = 80
@@ -180,22 +181,22 @@ class LongExposureEngine(PsfEngine):
             place_points,
             n_star * pupil.n_spoke,
             [
-                shared(pupil.radius, wp.float64),
-                shared(pupil.inverse, wp.float64),
-                shared(pupil.share, wp.float64),
-                shared(pupil.quadrature, wp.float64),
-                shared(pupil.unit, wp.vec2d),
-                shared(edges, wp.float64),
-                shared(optics.displacement, wp.float32),
-                shared(landed, wp.float64),
-                shared(optics.jacobian, wp.mat22d),
-                shared(self._dispersion, wp.vec2d),
+                warp_array(pupil.radius, wp.float64),
+                warp_array(pupil.inverse, wp.float64),
+                warp_array(pupil.share, wp.float64),
+                warp_array(pupil.quadrature, wp.float64),
+                warp_array(pupil.unit, wp.vec2d),
+                warp_array(edges, wp.float64),
+                warp_array(optics.displacement, wp.float32),
+                warp_array(landed, wp.float64),
+                warp_array(optics.jacobian, wp.mat22d),
+                warp_array(self._dispersion, wp.vec2d),
                 self.period,
-                shared(area, wp.float64),
-                shared(place, wp.float32),
-                shared(light, wp.float32),
-                shared(cut, wp.float32),
-                shared(lean, wp.float32),
+                warp_array(area, wp.float64),
+                warp_array(place, wp.float32),
+                warp_array(light, wp.float32),
+                warp_array(cut, wp.float32),
+                warp_array(lean, wp.float32),
             ],
             threads=self._threads,
         )
@@ -206,19 +207,19 @@ class LongExposureEngine(PsfEngine):
             n_star,
             [
                 pupil.n_spoke,
-                shared(place, wp.float32),
-                shared(light, wp.float32),
-                shared(cut, wp.float32),
-                shared(lean, wp.float32),
-                shared(self._wavelengths.astype(np.float32), wp.float32),
-                shared(self._rows, wp.int32),
-                shared(metric_of(optics.jacobian), wp.float32),
-                shared(self._filter, wp.float32),
-                shared(self._filter_steps, wp.float32),
-                shared(along_x, samples),
-                shared(along_y, samples),
-                shared(along_y.reshape(n_star, -1), wp.float32),
-                shared(spectrum, samples),
+                warp_array(place, wp.float32),
+                warp_array(light, wp.float32),
+                warp_array(cut, wp.float32),
+                warp_array(lean, wp.float32),
+                warp_array(self._wavelengths.astype(np.float32), wp.float32),
+                warp_array(self._rows, wp.int32),
+                warp_array(metric_of(optics.jacobian), wp.float32),
+                warp_array(self._filter, wp.float32),
+                warp_array(self._filter_steps, wp.float32),
+                warp_array(along_x, samples),
+                warp_array(along_y, samples),
+                warp_array(along_y.reshape(n_star, -1), wp.float32),
+                warp_array(spectrum, samples),
             ],
             threads=self._threads,
         )
@@ -234,16 +235,16 @@ class LongExposureEngine(PsfEngine):
             sample_pixels,
             n_star,
             [
-                shared(spectrum, samples),
-                shared(self._detector, samples),
-                shared(self._rows, wp.int32),
-                shared((offsets * (self._plane.pixel_size / self.period)).astype(np.float32), wp.float32),
-                shared(self._pixel_rows, wp.vec2f),
-                shared(self._pixel_columns, samples),
-                shared(np.empty_like(spectrum), samples),
-                shared(lines, samples),
-                shared(lines.reshape(n_star, -1), wp.float32),
-                shared(image, samples),
+                warp_array(spectrum, samples),
+                warp_array(self._detector, samples),
+                warp_array(self._rows, wp.int32),
+                warp_array((offsets * (self._plane.pixel_size / self.period)).astype(np.float32), wp.float32),
+                warp_array(self._pixel_rows, wp.vec2f),
+                warp_array(self._pixel_columns, samples),
+                warp_array(np.empty_like(spectrum), samples),
+                warp_array(lines, samples),
+                warp_array(lines.reshape(n_star, -1), wp.float32),
+                warp_array(image, samples),
             ],
             threads=self._threads,
         )

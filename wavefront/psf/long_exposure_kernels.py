@@ -5,8 +5,8 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from .packet_functions import squared_baseline, tabulated, unit_circle
 from .sample_packets import LANES, samples
-from .wave_kernels import unit_circle
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -161,18 +161,9 @@ def filtered(
     row: wp.float32,
 ):
     """Value of the filter of a wavelength at the baselines of a row of frequencies, by linear interpolation."""
-    last = wp.float32(table.shape[1]) - wp.float32(1.001)
     value = samples()
     for i in range(LANES):
-        squared = (
-            metric[star, 0] * column[i] * column[i]
-            + wp.float32(2.0) * metric[star, 1] * column[i] * row
-            + metric[star, 2] * row * row
-        )
-        at = wp.min(wp.sqrt(wp.max(squared, wp.float32(0.0))) * per_step, last)
-        knot = wp.int32(at)
-        before = table[wave, knot]
-        value[i] = before + (at - wp.float32(knot)) * (table[wave, knot + 1] - before)
+        value[i] = tabulated(table, wave, wp.sqrt(squared_baseline(metric, star, column[i], row)) * per_step)
     return value
 
 

@@ -11,7 +11,6 @@ import warp as wp
 LANES = 16
 
 samples = wp.types.vector(LANES, wp.float32)
-places = wp.types.vector(LANES, wp.float64)
 indices = wp.types.vector(LANES, wp.int32)
 
 
@@ -31,10 +30,3 @@ def to_packets(values: np.ndarray, dtype: Any, fill: str = "edge") -> np.ndarray
     padding = [(0, 0)] * (values.ndim - 1) + [(0, missing)]
     filled = np.pad(values.astype(dtype), padding, mode=fill)  # type: ignore[call-overload]
     return np.ascontiguousarray(filled.reshape(*values.shape[:-1], -1, LANES))
-
-
-def shared(values: np.ndarray, dtype: Any) -> wp.array:
-    """Wrap a contiguous array for a kernel without a copy; complex numbers as pairs."""
-    if values.dtype == np.complex64:
-        values = values.view(np.float32).reshape(*values.shape, 2)
-    return wp.array(values, dtype=dtype, device="cpu", copy=False)

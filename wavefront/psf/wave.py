@@ -35,11 +35,12 @@ import warp as wp
 from ...core.errors import DomainError
 from ...core.launch import launch
 from ...core.threads import thread_count
+from ...core.warp_arrays import warp_array
 from ..atmosphere.spline import spline_weights
 from ..pupil_optics import PupilOptics
 from .engine import Exposed, PsfEngine, PsfInputs
 from .pupil_lattice import PupilLattice
-from .sample_packets import LANES, indices, samples, shared
+from .sample_packets import LANES, indices, samples
 from .wave_kernels import add_squares, pupil_fields
 
 #: Longest baseline [m] that an unpadded grid keeps.
@@ -105,7 +106,7 @@ class WavePsfEngine(PsfEngine):
         """Return the screens as the kernel takes them, and the number of layers."""
         arguments: list[Any] = []
         for screens, side, run in zip(self._splines, self._sides, self._runs, strict=True):
-            arguments += [shared(screens, wp.float32), int(side), run]
+            arguments += [warp_array(screens, wp.float32), int(side), run]
         return arguments, 0 if self._atmosphere is None else self._atmosphere.layer_count
 
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
@@ -142,20 +143,20 @@ class WavePsfEngine(PsfEngine):
         squares = [wp.zeros(2 * size * size // LANES, dtype=samples, device="cpu") for _ in range(n_wave)]
         screens, n_layer = self._screen_arguments()
         after: list[Any] = [
-            shared(used, wp.int32),
-            shared((1.0 / self._wavelengths).astype(np.float32), wp.float32),
-            shared(phase, samples),
-            shared(amplitude, samples),
+            warp_array(used, wp.int32),
+            warp_array((1.0 / self._wavelengths).astype(np.float32), wp.float32),
+            warp_array(phase, samples),
+            warp_array(amplitude, samples),
             wp.empty((line, max(self._runs) * LANES), dtype=wp.float32, device="cpu"),
             wp.empty((line, self._packets), dtype=samples, device="cpu"),
-            shared(fields, wp.vec2f),
+            warp_array(fields, wp.vec2f),
         ]
         steps = self._screen_places(field)
         for places in steps:
             launch(pupil_fields, line, [*screens, n_layer, *self._taps(places), *after], threads=1)
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
-                launch(add_squares, len(focused), [shared(focused, samples), squares[wave]], threads=1)
+                launch(add_squares, len(focused), [warp_array(focused, samples), squares[wave]], threads=1)
         parts = np.stack([square.numpy() for square in squares]).reshape(n_wave, size, size, 2)
         return parts.sum(axis=-1, dtype=np.float64) / (len(steps) * lit.sum())
 
@@ -194,11 +195,11 @@ class WavePsfEngine(PsfEngine):
         packed = (len(places), self._packets, LANES)
         of_columns = np.ascontiguousarray(np.moveaxis(weights[:, 0].reshape(*packed, 4), -1, 1))
         return [
-            shared(np.ascontiguousarray(column, dtype=np.int32), wp.int32),
-            shared(np.ascontiguousarray(row, dtype=np.int32), wp.int32),
-            shared(np.ascontiguousarray(weights[:, 1]), wp.vec4f),
-            shared(np.ascontiguousarray(sample[:, 0].reshape(packed)), indices),
-            shared(of_columns, samples),
+            warp_array(np.ascontiguousarray(column, dtype=np.int32), wp.int32),
+            warp_array(np.ascontiguousarray(row, dtype=np.int32), wp.int32),
+            warp_array(np.ascontiguousarray(weights[:, 1]), wp.vec4f),
+            warp_array(np.ascontiguousarray(sample[:, 0].reshape(packed)), indices),
+            warp_array(of_columns, samples),
         ]
 
     def _filtered(self, intensity: np.ndarray, jacobian: np.ndarray) -> np.ndarray:

@@ -5,9 +5,30 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from .packet_functions import unit_circle
 from .sample_packets import LANES, indices, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def blend(
+    screens: wp.array2d(dtype=wp.float32),
+    layer: wp.int32,
+    weight: wp.vec4f,
+    before: wp.int32,
+    first: wp.int32,
+    second: wp.int32,
+    after: wp.int32,
+    column: wp.int32,
+):
+    """Weighted sum of one column of four rows, each given by its first sample."""
+    return (
+        weight[0] * screens[layer, before + column]
+        + weight[1] * screens[layer, first + column]
+        + weight[2] * screens[layer, second + column]
+        + weight[3] * screens[layer, after + column]
+    )
 
 
 @wp.func
@@ -36,58 +57,12 @@ def blend_rows(
         # Two loops in place of one with a choice inside: the compiler vectorizes the first.
         if start + LANES <= size:
             for i in range(LANES):
-                at = start + i
-                values[i] = (
-                    weight[0] * screens[layer, before + at]
-                    + weight[1] * screens[layer, first + at]
-                    + weight[2] * screens[layer, second + at]
-                    + weight[3] * screens[layer, after + at]
-                )
+                values[i] = blend(screens, layer, weight, before, first, second, after, start + i)
         else:
             for i in range(LANES):
-                at = (start + i) % size
-                values[i] = (
-                    weight[0] * screens[layer, before + at]
-                    + weight[1] * screens[layer, first + at]
-                    + weight[2] * screens[layer, second + at]
-                    + weight[3] * screens[layer, after + at]
-                )
+                values[i] = blend(screens, layer, weight, before, first, second, after, (start + i) % size)
         for i in range(LANES):
             blended[item, packet * LANES + i] = values[i]
-
-
-@wp.func
-def unit_circle(turns: samples):
-    """Cosine and sine of an angle given in turns, to 1e-7; unlike the library's functions, polynomials vectorize.
-
-    Taylor series over an eighth of a turn to either side of the nearest quarter: the first term left out is below
-    3e-8.
-    """
-    cosine = samples()
-    sine = samples()
-    for i in range(LANES):
-        quarter = wp.floor(wp.float32(4.0) * turns[i] + wp.float32(0.5))
-        angle = (wp.float32(4.0) * turns[i] - quarter) * wp.float32(wp.HALF_PI)
-        s = angle * angle
-        near_sine = angle * (
-            wp.float32(1.0)
-            + s
-            * (
-                wp.float32(-1.0 / 6.0)
-                + s * (wp.float32(1.0 / 120.0) + s * (wp.float32(-1.0 / 5040.0) + s * wp.float32(1.0 / 362880.0)))
-            )
-        )
-        near_cosine = wp.float32(1.0) + s * (
-            wp.float32(-0.5)
-            + s * (wp.float32(1.0 / 24.0) + s * (wp.float32(-1.0 / 720.0) + s * wp.float32(1.0 / 40320.0)))
-        )
-        quadrant = wp.int32(quarter) & 3
-        odd = (quadrant & 1) == 1
-        c = wp.where(odd, near_sine, near_cosine)
-        d = wp.where(odd, near_cosine, near_sine)
-        cosine[i] = wp.where(quadrant == 1 or quadrant == 2, -c, c)
-        sine[i] = wp.where(quadrant >= 2, -d, d)
-    return cosine, sine
 
 
 @wp.func

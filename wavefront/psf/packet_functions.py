@@ -1,0 +1,60 @@
+"""Functions of several PSF kernels: the unit circle on packets, and filters tabulated against the baseline."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from ...core.launch import FORWARD_OPTIONS
+from .sample_packets import LANES, samples
+
+wp.set_module_options(FORWARD_OPTIONS)
+
+
+@wp.func
+def unit_circle(turns: samples):
+    """Cosine and sine of an angle given in turns, to 1e-7; unlike the library's functions, polynomials vectorize.
+
+    Taylor series over an eighth of a turn to either side of the nearest quarter: the first term left out is below
+    3e-8.
+    """
+    cosine = samples()
+    sine = samples()
+    for i in range(LANES):
+        quarter = wp.floor(wp.float32(4.0) * turns[i] + wp.float32(0.5))
+        angle = (wp.float32(4.0) * turns[i] - quarter) * wp.float32(wp.HALF_PI)
+        s = angle * angle
+        near_sine = angle * (
+            wp.float32(1.0)
+            + s
+            * (
+                wp.float32(-1.0 / 6.0)
+                + s * (wp.float32(1.0 / 120.0) + s * (wp.float32(-1.0 / 5040.0) + s * wp.float32(1.0 / 362880.0)))
+            )
+        )
+        near_cosine = wp.float32(1.0) + s * (
+            wp.float32(-0.5)
+            + s * (wp.float32(1.0 / 24.0) + s * (wp.float32(-1.0 / 720.0) + s * wp.float32(1.0 / 40320.0)))
+        )
+        quadrant = wp.int32(quarter) & 3
+        odd = (quadrant & 1) == 1
+        c = wp.where(odd, near_sine, near_cosine)
+        d = wp.where(odd, near_cosine, near_sine)
+        cosine[i] = wp.where(quadrant == 1 or quadrant == 2, -c, c)
+        sine[i] = wp.where(quadrant >= 2, -d, d)
+    return cosine, sine
+
+
+@wp.func
+def squared_baseline(metric: wp.array2d(dtype=wp.float32), star: wp.int32, kx: wp.float32, ky: wp.float32):
+    """|J^T k|^2 of a frequency k, not negative; ``metric`` [star, 3] holds xx, xy, yy of jacobian @ jacobian.T."""
+    squared = metric[star, 0] * kx * kx + wp.float32(2.0) * metric[star, 1] * kx * ky + metric[star, 2] * ky * ky
+    return wp.max(squared, wp.float32(0.0))
+
+
+@wp.func
+def tabulated(table: wp.array2d(dtype=wp.float32), wave: wp.int32, place: wp.float32):
+    """Linear interpolation in the table of a wavelength [samples], held at its end."""
+    at = wp.min(place, wp.float32(table.shape[1]) - wp.float32(1.001))
+    knot = wp.int32(at)
+    before = table[wave, knot]
+    return before + (at - wp.float32(knot)) * (table[wave, knot + 1] - before)
