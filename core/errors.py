@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import Self
+from typing import Any, Self
 
 
 class PachonError(Exception):
@@ -63,22 +63,17 @@ class PachonError(Exception):
     ) -> Self:
         """Return the same error in a wider context; an error of the same file already has it.
 
-        Parameters
-        ----------
-        subject, file, place : str, optional
-            As above.
-        key : str, optional
-            Section that the key of the error belongs to, or that names the file with the error.
+        `key` is the section of the error's own key, or the key that names another file with the error.
         """
         if file is not None and self.file == os.fspath(file):
             return self
         if file is None and not key:
             both = ": ".join(part for part in (subject, self.subject) if part)
             return type(self)(self.problem, subject=both or None, file=self.file, place=self.place, key=self.key)
-        text, joint = (self.problem, ".") if self.file is None and self.subject is None else (str(self), ": ")
-        keys = key if self.key is None or joint == ": " or not key else f"{key}.{self.key}"
-        problem = f"{key}{joint}{text}" if key else text
-        return type(self)(problem, subject=subject, file=file, place=place, key=keys or self.key)
+        inner = self.file is None and self.subject is None
+        problem = (f"{key}." if key else "") + self.problem if inner else ": ".join(filter(None, (key, str(self))))
+        keys = ".".join(filter(None, (key, self.key))) if inner else key
+        return type(self)(problem, subject=subject, file=file, place=place, key=keys or None)
 
 
 class PrescriptionError(PachonError):
@@ -106,18 +101,12 @@ class ProductError(PachonError):
 
 
 @contextmanager
-def error_context(
-    *,
-    subject: str | None = None,
-    file: str | os.PathLike[str] | None = None,
-    place: str | None = None,
-    key: str | None = None,
-) -> Iterator[None]:
-    """Raise errors of the block again within a wider context: see :meth:`PachonError.within`."""
+def error_context(**context: Any) -> Iterator[None]:
+    """Raise errors of the block again within a wider context; keywords as of :meth:`PachonError.within`."""
     try:
         yield
     except PachonError as error:
-        raise error.within(subject=subject, file=file, place=place, key=key) from None
+        raise error.within(**context) from None
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameError:

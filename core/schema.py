@@ -112,15 +112,7 @@ def unknown_key(key: str, known: list[str]) -> PydanticCustomError:
 
 
 def expected(text: str, key: str = "") -> PydanticCustomError:
-    """Return the error of a validator for a value that is not as expected.
-
-    Parameters
-    ----------
-    text : str
-        Expected value.
-    key : str
-        Key of the value, where the validator is that of a section; a key that the section does not have is missing.
-    """
+    """Return the error of a value, or of that under a key of a section, that is missing or not as expected."""
     return PydanticCustomError("expected", "expected", {"expected": text, "key": key})
 
 
@@ -198,16 +190,8 @@ class Parameters(Section):
 
     @classmethod
     def of(cls, make: Callable[..., Any], **fields: Any) -> type[Self]:
-        """Return the subclass for a constructor.
-
-        Parameters
-        ----------
-        make : callable
-            Constructor.
-        **fields : type or (type, default)
-            Types of the values by key, in the order of the arguments.
-        """
-        entries = {key: field if isinstance(field, tuple) else (field, ...) for key, field in fields.items()}
+        """Return the subclass for a constructor; fields are types, or types and defaults, in its order."""
+        entries: Any = {key: field if isinstance(field, tuple) else (field, ...) for key, field in fields.items()}
         section = create_model(cls.__name__, __base__=cls, **entries)
         section.make, section.parameters = staticmethod(make), tuple(fields)
         return section
@@ -282,7 +266,7 @@ def _first_problem(problems: ValidationError, content: Any, source: str, error: 
     # A misspelt key is the likelier cause of the other problems, so it goes first.
     problem = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
     kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
-    path = dotted([*problem["loc"], *filter(None, [limits.get("key")])], content)
+    path = _dotted([*problem["loc"], *filter(None, [limits.get("key")])], content)
     if kind == "unknown_key":
         key, known = limits["key"], limits["known"]
         hint = nearest(key, known) or f"expected one of {', '.join(known)}"
@@ -317,31 +301,17 @@ def _as_in(error: type[PachonError], value: Any) -> str:
 _LABELS = {"layers": "altitude", "shape": "shape"}
 
 
-def dotted(location: Iterable[int | str], content: Any) -> str:
-    """Return a location as a path of keys: ``surfaces[M1].radius``.
-
-    Parameters
-    ----------
-    location : iterable of int or str
-        Keys and indices; tags of unions stand in angle brackets, and are no keys of the file.
-    content : object
-        Content of the file, for the names of entries.
-    """
+def _dotted(location: Iterable[int | str], content: Any) -> str:
+    """Return a location as a path of keys: ``surfaces[M1].radius``; tags, in angle brackets, are left out."""
     path = label = ""
     for part in location:
         if isinstance(part, str) and part.startswith("<"):
             continue
-        content = _item(content, part)
+        inside = (isinstance(content, dict) and part in content) or isinstance(content, list)
+        content = content[part] if inside else None
         if isinstance(part, int):
-            path += f"[{content.get(label, part) if isinstance(content, Mapping) else part}]"
+            path += f"[{content.get(label, part) if isinstance(content, dict) else part}]"
         else:
             path += f".{part}" if path else part
             label = _LABELS.get(part, "name")
     return path
-
-
-def _item(content: Any, part: int | str) -> Any:
-    try:
-        return content[part]
-    except (KeyError, IndexError, TypeError):
-        return None

@@ -14,6 +14,7 @@ from ...models.aperture import Annulus, Circle, Complement
 from ...models.first_order import first_order
 from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.apertures import aperture_items
+from ...models.io.yaml.values import flow
 from ...models.io.yaml.writer import INTERACTION_NAMES
 from ...models.media.medium import ConstantIndex
 from ...models.shapes.shape import Rotational
@@ -75,14 +76,6 @@ def describe(telescope: Telescope) -> dict[str, Any]:
     }
 
 
-def _few(values: Any) -> str:
-    return "[" + ", ".join(f"{v:g}" for v in values) + "]"
-
-
-# Text of a number, of several, and of an angle [deg].
-_SHORT = ("{:g}".format, _few, lambda angle: f"{math.degrees(angle):g}")
-
-
 def _row(surface: Surface, wavelength: float) -> dict[str, Any]:
     shape, medium = surface.shape, surface.medium_after
     curvature = shape.curvature
@@ -101,7 +94,7 @@ def _row(surface: Surface, wavelength: float) -> dict[str, Any]:
         "index_after": float(medium.index(wavelength)),
         "medium_after": "" if isinstance(medium, ConstantIndex) else "glass",
         "clear_m": _clear(surface),
-        "aperture": ", ".join(f"{key}: {value}" for key, value in aperture_items(surface.aperture, *_SHORT).items()),
+        "aperture": flow(aperture_items(surface.aperture, math.degrees), "{:g}".format)[1:-1],
     }
 
 

@@ -18,8 +18,6 @@ A mesh that blocks light is ``{name: top_end, file: top_end.stl, scale: 0.001, b
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
@@ -38,6 +36,7 @@ from .values import (
     PositiveNumber,
     Text,
     array,
+    encoded,
     rows,
 )
 
@@ -143,67 +142,46 @@ def aperture_angles(aperture: Aperture | None) -> Iterator[float]:
             yield from aperture_angles(part)
 
 
-def aperture_items(
-    aperture: Aperture | None, number: Callable[[float], str], listed: Callable[..., str], angle: Callable[[float], str]
-) -> dict[str, str]:
-    """Return the keys of a surface for its aperture, and their values as text.
-
-    Parameters
-    ----------
-    aperture : Aperture or None
-        Clear aperture.
-    number, listed, angle : callable
-        Text of a number, of several, and of an angle [rad] in the unit of the file.
-    """
-
-    def region(a: Aperture) -> dict[str, str]:
-        if isinstance(a, Circle):
-            items = {"circle": number(a.radius)}
-        elif isinstance(a, Annulus):
-            items = {"annulus": listed((a.inner, a.outer))}
-        elif isinstance(a, Rectangle):
-            items = {"rectangle": listed((a.width, a.height))}
-        elif isinstance(a, Vane):
-            items = {"vane": number(a.width)}
-        elif isinstance(a, Polygon):
-            return {"polygon": "[" + ", ".join(listed(c) for c in a.corners) + "]"}
-        elif isinstance(a, Complement):
-            return {"complement": nested(a.part)}
-        else:
-            key = "union" if isinstance(a, Union) else "intersection"
-            return {key: "[" + ", ".join(nested(part) for part in a.parts) + "]"}
-        if a.x or a.y:
-            items["from" if isinstance(a, Vane) else "centre"] = listed((a.x, a.y))
-        if isinstance(a, (Rectangle, Vane)) and a.angle:
-            items["angle"] = angle(a.angle)
-        if isinstance(a, Vane) and a.both_ways:
-            items["both_ways"] = "true"
-        return items
-
-    def nested(a: Aperture) -> str:
-        return "{" + ", ".join(f"{key}: {value}" for key, value in region(a).items()) + "}"
-
+def aperture_items(aperture: Aperture | None, angle: Callable[[float], float]) -> dict[str, Any]:
+    """Return the keys of a surface for its aperture; `angle` converts radians to the unit of the file."""
     if aperture is None:
         return {}
     if isinstance(aperture, (Circle, Annulus)):
-        return region(aperture)
+        return _region_items(aperture, angle)
     if isinstance(aperture, Complement):
-        return {"obscuration": nested(aperture.part)}
+        return {"obscuration": _region_items(aperture.part, angle)}
     if isinstance(aperture, Intersection) and len(aperture.parts) == 2:
         clear, outside = aperture.parts
         if isinstance(clear, (Circle, Annulus)) and isinstance(outside, Complement):
-            return region(clear) | {"obscuration": nested(outside.part)}
-    return {"aperture": nested(aperture)}
+            return _region_items(clear, angle) | {"obscuration": _region_items(outside.part, angle)}
+    return {"aperture": _region_items(aperture, angle)}
 
 
-def obstruction_lines(obstructions: tuple[Obstruction, ...], text: Callable[[str], str]) -> list[str]:
-    """Return the lines of the list of obstructions, triangles included, so that a file stands by itself."""
-    lines = ["obstructions:"] if obstructions else []
-    for obstruction in obstructions:
-        items = [f"name: {text(obstruction.name)}"]
-        if obstruction.before is not None:
-            items.append("before: [" + ", ".join(text(name) for name in obstruction.before) + "]")
-        content = base64.b64encode(obstruction.triangles.astype("<f4").tobytes()).decode()
-        items.append(f"triangles: {json.dumps(content)}")
-        lines.append("  - {" + ", ".join(items) + "}")
-    return lines
+def _region_items(region: Aperture, angle: Callable[[float], float]) -> dict[str, Any]:
+    if isinstance(region, Polygon):
+        return {"polygon": region.corners}
+    if isinstance(region, Complement):
+        return {"complement": _region_items(region.part, angle)}
+    if isinstance(region, (Union, Intersection)):
+        key = "union" if isinstance(region, Union) else "intersection"
+        return {key: [_region_items(part, angle) for part in region.parts]}
+    items: dict[str, Any]
+    if isinstance(region, Circle):
+        items = {"circle": region.radius}
+    elif isinstance(region, Annulus):
+        items = {"annulus": (region.inner, region.outer)}
+    elif isinstance(region, Rectangle):
+        items = {"rectangle": (region.width, region.height)}
+    else:
+        items = {"vane": region.width}
+    if region.x or region.y:
+        items["from" if isinstance(region, Vane) else "centre"] = (region.x, region.y)
+    if isinstance(region, (Rectangle, Vane)) and region.angle:
+        items["angle"] = angle(region.angle)
+    return items | ({"both_ways": True} if isinstance(region, Vane) and region.both_ways else {})
+
+
+def obstruction_items(obstruction: Obstruction) -> dict[str, Any]:
+    """Return the section of an obstruction, triangles included, so that a file stands by itself."""
+    before = {} if obstruction.before is None else {"before": obstruction.before}
+    return {"name": obstruction.name} | before | {"triangles": encoded(obstruction.triangles, "<f4")}

@@ -121,38 +121,32 @@ def medium_wavelengths(medium: Medium) -> tuple[float, ...]:
     return medium.wavelength_range if isinstance(medium, (Sellmeier, Dispersion)) else ()
 
 
-def medium_items(
-    medium: Medium, number: Callable[[float], str], listed: Callable[..., str], waves: Callable[..., str]
-) -> dict[str, str]:
-    """Return the section of a medium, keys and values as text.
-
-    Parameters
-    ----------
-    medium : Medium
-        Medium.
-    number, listed, waves : callable
-        Text of a number, of a list of numbers, and of a list of wavelengths [m] in the unit of the file.
+def medium_items(medium: Medium, wavelength: Callable[[float], float]) -> dict[str, Any]:
+    """Return the section of a medium; `wavelength` converts metres to the unit of the file.
 
     Raises
     ------
     PrescriptionError
         If prescription files have no such kind of medium.
     """
+
+    def waves(values: tuple[float, ...]) -> list[float]:
+        return [wavelength(v) for v in values]
+
     if isinstance(medium, ConstantIndex):
-        return {"n": number(medium.n)}
+        return {"n": medium.n}
     if isinstance(medium, Sellmeier):
-        return {"B": listed(medium.B), "C": listed(medium.C), "range": waves(medium.wavelength_range)}
+        return {"B": medium.B, "C": medium.C, "range": waves(medium.wavelength_range)}
     if isinstance(medium, Dispersion):
-        coefficients, limits = listed(medium.coefficients), waves(medium.wavelength_range)
-        return {"formula": medium.formula, "coefficients": coefficients, "range": limits}
+        limits = waves(medium.wavelength_range)
+        return {"formula": medium.formula, "coefficients": medium.coefficients, "range": limits}
     if isinstance(medium, TabulatedIndex):
-        table = {"wavelengths": waves(medium.wavelengths), "indices": listed(medium.indices)}
+        table = {"wavelengths": waves(medium.wavelengths), "indices": medium.indices}
         return table | {"interpolation": medium.interpolation}
     if isinstance(medium, Air):
-        return {"air": medium.formula} | {key: number(getattr(medium, name)) for key, name in AIR_KEYS.items()}
+        return {"air": medium.formula} | {key: getattr(medium, name) for key, name in AIR_KEYS.items()}
     if isinstance(medium, RelativeToAir):
-        air = ", ".join(f"{key}: {value}" for key, value in medium_items(medium.air, number, listed, waves).items())
-        return medium_items(medium.relative, number, listed, waves) | {"in_air": f"{{{air}}}"}
+        return medium_items(medium.relative, wavelength) | {"in_air": medium_items(medium.air, wavelength)}
     if isinstance(medium, ChangedIndex):
-        return medium_items(medium.medium, number, listed, waves) | {"shift": number(medium.change)}
+        return medium_items(medium.medium, wavelength) | {"shift": medium.change}
     raise PrescriptionError(f"medium {type(medium).__name__}: expected one that prescription files can hold")

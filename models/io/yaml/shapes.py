@@ -25,9 +25,6 @@ of optical path.
 
 from __future__ import annotations
 
-import base64
-import json
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
@@ -41,7 +38,21 @@ from ...shapes.grid import GridSag
 from ...shapes.mesh import MeshSurface
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
 from ..grid_file import read_grid
-from .values import Flag, Length, Lengths, Number, Numbers, OptionalFile, PositiveNumber, Radius, array, rows, units
+from .values import (
+    Bare,
+    Flag,
+    Length,
+    Lengths,
+    Number,
+    Numbers,
+    OptionalFile,
+    PositiveNumber,
+    Radius,
+    array,
+    encoded,
+    rows,
+    units,
+)
 
 
 def _powers(powers: range) -> AfterValidator:
@@ -152,41 +163,23 @@ class SumSection(ShapeSection):
     ]
 
     def build(self) -> Sum:  # noqa: D102
-        return Sum(self.shape)  # type: ignore[arg-type]
+        return Sum(self.shape)
 
 
-def shape_items(shape: Shape, number: Callable[[float], str], listed: Callable[..., str]) -> dict[str, str]:
-    """Return the section of a shape, keys and values as text in metres.
-
-    Parameters
-    ----------
-    shape : Shape
-        Shape; grids and meshes are written out, so that a file stands by itself.
-    number, listed : callable
-        Text of a number, and of several.
-    """
-
-    def text(key: str, value: Any) -> str:
-        if key == "terms":
-            return "[" + ", ".join(f"[{i}, {j}, {number(a)}]" for i, j, a in value) + "]"
-        if isinstance(value, (int, float)):
-            return number(value) if np.isfinite(value) else "flat"
-        return listed(value)
-
-    def encoded(values: np.ndarray, kind: str) -> str:
-        return json.dumps(base64.b64encode(values.astype(kind).tobytes()).decode())
-
+def shape_items(shape: Shape) -> dict[str, Any]:
+    """Return the section of a shape, in metres; grids and meshes are written out, so that a file stands by itself."""
     if isinstance(shape, Sum):
-        parts = (shape_items(part, number, listed) for part in shape.parts)
-        texts = ("{" + ", ".join(f"{key}: {value}" for key, value in items.items()) + "}" for items in parts)
-        return {"shape": "[" + ", ".join(texts) + "]"}
+        return {"shape": [shape_items(part) for part in shape.parts]}
     if isinstance(shape, GridSag):
-        nodes = {"nodes_x": listed(shape.x), "nodes_y": listed(shape.y)}
-        return {"shape": "grid"} | nodes | {"values": "[" + ", ".join(listed(row) for row in shape.values) + "]"}
+        values = [[*row] for row in shape.values]
+        return {"shape": "grid", "nodes_x": [*shape.x], "nodes_y": [*shape.y], "values": values}
     if isinstance(shape, MeshSurface):
         points = {"vertices": encoded(shape.vertices, "<f8"), "faces": encoded(shape.faces, "<i4")}
-        return {"shape": "mesh"} | points | {"smooth": "true" if shape.smooth else "false"}
+        return {"shape": "mesh"} | points | {"smooth": shape.smooth}
+    if isinstance(shape, XYPolynomial):
+        return {"shape": "xy_polynomial", "terms": [(Bare(i), Bare(j), a) for i, j, a in shape.terms]}
     for name, section in SHAPES.items():
         if type(shape) is getattr(section, "make", None):
-            return {"shape": name} | {key: text(key, getattr(shape, key)) for key in section.parameters}
+            items = {key: getattr(shape, key) for key in section.parameters}
+            return {"shape": name} | {key: "flat" if v in (np.inf, -np.inf) else v for key, v in items.items()}
     raise PrescriptionError(f"shape {type(shape).__name__}: expected one of {', '.join(SHAPES)}")

@@ -1,4 +1,4 @@
-"""Values of prescription files as annotated types: checked, and converted to SI by the units of the file.
+"""Values of prescription files: annotated types that check and convert to SI, and their text.
 
 A prescription is validated with its :class:`Units` as context.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import base64
 import binascii
+import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
@@ -15,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import yaml
 from pydantic import AfterValidator, ValidationInfo
 
 from ....core.schema import checked
@@ -162,3 +165,34 @@ Wavelength = Annotated[float, _POSITIVE, _converted("wavelength")]
 Wavelengths = Annotated[tuple[float, ...], _LIST, _converted("wavelength")]
 Band = Annotated[tuple[float, float], _PAIR, _converted("wavelength")]
 OptionalBand = Annotated[tuple[float, float] | None, _PAIR, _converted("wavelength")]
+
+
+class Bare(str):
+    """Text that stands in a file as it is."""
+
+
+def encoded(values: np.ndarray, kind: str) -> Bare:
+    """Return an array as numbers of a kind in base 64, quoted."""
+    return Bare(json.dumps(base64.b64encode(values.astype(kind).tobytes()).decode()))
+
+
+def number_text(value: float) -> str:
+    """Return a float as the shortest text that loads back equal, a float in YAML too."""
+    # YAML 1.1 takes 8e-07 for text: a number needs its point.
+    return re.sub(r"^(-?\d+)e", r"\1.0e", repr(float(value) + 0.0))
+
+
+def flow(value: Any, number: Callable[[float], str] = number_text) -> str:
+    """Return a value in YAML's flow style, on one line; `number` gives the text of a float."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key}: {flow(v, number)}" for key, v in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(flow(v, number) for v in value) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Bare):
+        return value
+    if isinstance(value, str):
+        plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.()/;+ -]*", value) and value == value.strip()
+        return value if plain and yaml.safe_load(value) == value else json.dumps(value, ensure_ascii=False)
+    return number(value)

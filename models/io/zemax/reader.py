@@ -28,7 +28,7 @@ from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
 from ..yaml.media import medium_wavelengths
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile, read_zemax_file
-from .frame import TURN, turned_aperture, turned_axes, turned_shape
+from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
 from .shape_reader import read_aperture, read_shape
 from .system import UNITS, FirstSurfaces, read_pupil, read_wavelengths
 
@@ -224,11 +224,11 @@ class LensReader:
             Surface(
                 name=self._name(number, block.text("COMM"), last),
                 interaction=interaction,
-                shape=turned_shape(shape),
+                shape=rotated_shape(shape),
                 vertex=(x, y, z),
                 medium_after=after,
-                aperture=None if aperture is None else turned_aperture(aperture),
-                rotation=turned_axes(self.axes),
+                aperture=None if aperture is None else rotated_aperture(aperture),
+                rotation=rotated_axes(self.axes),
             )
         )
 
@@ -260,7 +260,7 @@ class LensReader:
             raise line.problem(f"{line.shown}: {problem}") from None
 
     def _turned(self, surface: Surface, z0: float) -> Surface:
-        x, y, z = TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
+        x, y, z = HALF_TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
         return replace(surface, vertex=(float(x), float(y), float(z)))
 
     def _wavelength_range(self, waves: tuple[float, ...]) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
-from .frame import TURN, turned_aperture, turned_shape
+from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .reader import PUPIL_COMMENT
 from .shape_writer import shape_lines
 
@@ -72,10 +72,10 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     place = -t.stop_z
     before = t.medium_before
     for surface in t.surfaces:
-        x, y, z = (float(v) for v in TURN @ np.array(surface.vertex))
+        x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex))
         blocks[-1].append(f"DISZ {_number((z - place) / MM)}")
         place = z
-        axes = TURN @ surface.matrix @ TURN
+        axes = HALF_TURN @ surface.matrix @ HALF_TURN
         own = _surface_lines(surface, before, glasses)
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
@@ -126,13 +126,13 @@ def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str])
     try:
         if surface.interaction == Interaction.PHASE:
             raise PrescriptionError("phase screens cannot be written")
-        lines += shape_lines(turned_shape(surface.shape), MM)
+        lines += shape_lines(rotated_shape(surface.shape), MM)
         if surface.interaction == Interaction.MIRROR:
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         elif surface.interaction != Interaction.DETECTOR:
             lines += _glass_line(surface.medium_after, glasses)
         if surface.aperture is not None:
-            lines += _aperture_lines(turned_aperture(surface.aperture))
+            lines += _aperture_lines(rotated_aperture(surface.aperture))
     except PrescriptionError as error:
         raise PrescriptionError(f"surface {surface.name}: {error}") from None
     return lines
