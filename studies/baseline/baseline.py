@@ -282,5 +282,5 @@ def _absolute(name: str, folder: Path) -> str:
 
 
 def _relative(name: str, folder: Path, bundled: Sequence[str]) -> str:
-    """Return a bundled name as it is, and the path of a file as seen from a folder."""
+    """Return a bundled name as it is, and the path of a file relative to a folder."""
     return name if name in bundled else Path(os.path.relpath(Path(name).resolve(), folder.resolve())).as_posix()

@@ -1,4 +1,4 @@
-"""What the study of PSF models tries: each way of modelling a CCD's stars, and which of them answer which question."""
+"""Cases of the study of PSF models: the parameters of each, and the combinations that are tried."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ...pipeline.psf_model.basis import BASES
 from ...pipeline.psf_model.fit import COMPONENTS
 from ...pipeline.psf_model.polynomial import term_count
 
-#: Weights of the stars in the polynomials, as :func:`~.snr_weights` names them (equal ones are
-#: the paper's), and a Gaussian process for each component in their place.
+#: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper), and a Gaussian process
+#: for each component in place of polynomials.
 INTERPOLATIONS = ("equal", "snr", "softened", "gp")
 #: Signal-to-noise ratio, or stars without noise.
 NOISE_FREE = math.inf
@@ -22,7 +22,7 @@ NOISE_FREE = math.inf
 
 @dataclass(frozen=True)
 class Case:
-    """One way of modelling the PSF of a CCD.
+    """Parameters of a PSF model of a CCD.
 
     Attributes
     ----------
@@ -35,9 +35,9 @@ class Case:
     interpolation : str
         One of :data:`INTERPOLATIONS`.
     order : int
-        Of the polynomials; 0 under a Gaussian process.
+        Order of the polynomials; 0 with a Gaussian process.
     components : int
-        Of the basis; 0 for pixels, which are all used.
+        Components of the basis; 0 for pixels, which are all used.
     """
 
     stars: int
@@ -49,11 +49,11 @@ class Case:
 
     @property
     def terms(self) -> int:
-        """Terms of a polynomial."""
+        """Number of terms of a polynomial."""
         return term_count(self.order)
 
     def settled(self) -> Case:
-        """Return the case as it is fitted: what has no meaning in it is set to one value."""
+        """Return the case as it is fitted: parameters without effect have one value."""
         components = self.components
         if self.basis == "pca":
             components = min(components, self.stars - 1)
@@ -73,16 +73,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the study varies.
+    """Values of the parameters of a study.
 
     Attributes
     ----------
     base : Case
-        What is held where something else varies.
+        Case of the parameters that do not vary.
     stars, orders, components, snrs : tuple
-        Values to try, rising, that of the base included.
+        Values, ascending, with that of the base.
     draws : int
-        Draws of the noise to average over.
+        Number of draws of the noise.
     """
 
     base: Case
@@ -93,10 +93,10 @@ class Plan:
     draws: int = 4
 
     def cases(self) -> tuple[Case, ...]:
-        """Return the cases that answer the questions of the study, each once.
+        """Return the cases of the study, each once.
 
-        Everything at once would be thousands. Each question has its axis through the base, and where the answers may
-        depend on each other (stars and order; order and components at the number of stars at hand) it has a plane.
+        All combinations would be thousands. Each parameter has an axis through the base, and parameters that depend on
+        each other have a plane: stars and order, order and components.
         """
         base = self.base
         polynomials = INTERPOLATIONS[:-1]
@@ -129,7 +129,7 @@ def make_plan(
     snrs: Iterable[float] = (30.0, 100.0, 300.0),
     draws: int = 4,
 ) -> Plan:
-    """Return a plan about what a configuration does: its observed stars, S/N and reconstruction are the base.
+    """Return a plan around the observed stars, S/N and reconstruction of a configuration.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Figures of the study of PSF models: a panel for each question, error bars over the CCDs."""
+"""Plots of the study of PSF models, with error bars over the CCDs."""
 
 from __future__ import annotations
 
@@ -24,16 +24,13 @@ _HOW = {
 }
 _BASIS = {"pca": (OBSERVED, "o"), "pixels": (AWAY, "s"), "shapelets": (LEFT_OUT, "D")}
 _RMS = "rms of one component of e, no star"
-# Fits with as many terms as stars go through the roof: what lies this many times above the base is cut off.
-_ROOF = 4.0
+# Upper limit of the axis over the base: fits with as many terms as stars diverge.
+_LIMIT = 4.0
 _QUIET = (0, (1, 1.5))
 
 
 def stars_plot(result: Study) -> bytes:
-    """Draw the residual of e where no star is against the number of stars, a line for each order.
-
-    A panel for each weighting; dashed: what noise alone should leave of such a fit; dotted: stars without noise.
-    """
+    """Draw the residual of e at the holdout positions against the number of stars, by order and weighting."""
     plan = result.plan
     colors = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.88, len(plan.orders)))
     with styled():
@@ -49,7 +46,7 @@ def stars_plot(result: Study) -> bytes:
                     _line(axes, result, quiet, "rms_e_away", color, "", None, _QUIET)
             _log(axes, plan.stars, "stars of a CCD", _HOW[how][2])
         panels[0].set_ylabel(_RMS)
-        _roof(panels[0], result)
+        _limit(panels[0], result)
         panels[0].plot([], [], color="0.4", linestyle=(0, (4, 2)), linewidth=0.9, label="noise alone, in theory")
         panels[0].plot([], [], color="0.4", linestyle=_QUIET, linewidth=0.9, label="stars without noise")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
@@ -58,12 +55,12 @@ def stars_plot(result: Study) -> bytes:
 
 
 def choices_plot(result: Study) -> bytes:
-    """Draw what is gained by other choices: order, components, basis, interpolation, S/N, and what CCDs share."""
+    """Draw the effect of order, components, basis, interpolation and S/N, and residuals in common to CCDs."""
     plan, base = result.plan, result.plan.base
     with styled():
         figure = new_figure(17.0, 9.0)
         panels = figure.subplots(2, 4)
-        _flattery(panels[0, 0], result)
+        _orders(panels[0, 0], result)
         _components(panels[0, 1], result)
         _bases(panels[0, 2], result)
         _snrs(panels[0, 3], result)
@@ -78,19 +75,19 @@ def choices_plot(result: Study) -> bytes:
             _line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
             _log(axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e"))
             axes.set_ylabel(what)
-        _roof(panels[1, 0], result)
+        _limit(panels[1, 0], result)
         _shared(panels[1, 2], result, "mean_e", "rms over CCDs of their mean of e", "what a CCD has in common")
         _shared(panels[1, 3], result, "xi_plus", "$|\\xi_+|$, 10' to 3 deg; open: negative", "correlation between CCDs")
         for axes in panels.flat:
-            # On a logarithmic scale: room for the legend above the curves.
+            # Room for the legend above the curves, on a logarithmic scale.
             low, high = axes.get_ylim()
             axes.set_ylim(low, high * (high / low) ** 0.45)
             axes.legend(loc="upper right", fontsize=7)
         return png_bytes(figure)
 
 
-def _flattery(axes: Axes, result: Study) -> None:
-    """Draw the residual at the stars and where no star is against the order."""
+def _orders(axes: Axes, result: Study) -> None:
+    """Draw the residual at the stars and at the holdout positions against the order."""
     plan, base = result.plan, result.plan.base
     cases = [(order, replace(base, order=order)) for order in plan.orders]
     for kind, color, marker, what, where in (
@@ -109,16 +106,30 @@ def _flattery(axes: Axes, result: Study) -> None:
 
 def _components(axes: Axes, result: Study) -> None:
     plan, base = result.plan, result.plan.base
-    for how, (color, marker, label) in _HOW.items():
-        orders = dict.fromkeys((base.order,) if how == "gp" else (base.order, _best_order(result, how)))
-        for order, line in zip(orders, ("-", (0, (4, 2))), strict=False):
-            cases = [(k, replace(base, components=k, order=order, interpolation=how)) for k in plan.components]
-            words = label if how == "gp" else f"{label}, order {order}"
-            _line(axes, result, cases, "rms_e_away", color, marker, words, line)
+    _against(axes, result, "components", plan.components)
     quiet = [(k, replace(base, components=k, snr=NOISE_FREE)) for k in plan.components]
     _line(axes, result, quiet, "rms_e_away", TRUTH, "", f"order {base.order}, stars without noise", _QUIET)
     _log(axes, plan.components, "components", f"components: {base.stars} stars")
     axes.set_ylabel(_RMS)
+
+
+def _snrs(axes: Axes, result: Study) -> None:
+    plan, base = result.plan, result.plan.base
+    _against(axes, result, "snr", plan.snrs)
+    _log(axes, plan.snrs, "S/N of the faintest star", f"S/N: {base.stars} stars")
+    axes.set_ylabel(_RMS)
+
+
+def _against(axes: Axes, result: Study, key: str, values: Sequence[float]) -> None:
+    """Draw the residual against one property of the cases, for each interpolation at the base's and the best order."""
+    base = result.plan.base
+    for how, (color, marker, label) in _HOW.items():
+        orders = dict.fromkeys((base.order,) if how == "gp" else (base.order, _best_order(result, how)))
+        for order, line in zip(orders, ("-", (0, (4, 2))), strict=False):
+            way = replace(base, order=order, interpolation=how)
+            cases = [(v, replace(way, **{key: v})) for v in values]  # type: ignore[arg-type]
+            text = label if how == "gp" else f"{label}, order {order}"
+            _line(axes, result, cases, "rms_e_away", color, marker, text, line)
 
 
 def _bases(axes: Axes, result: Study) -> None:
@@ -131,23 +142,11 @@ def _bases(axes: Axes, result: Study) -> None:
         _line(axes, result, quiet, "rms_e_away", color, "", f"{basis}, stars without noise", _QUIET)
     _log(axes, plan.stars, "stars of a CCD", f"basis: {_HOW[base.interpolation][2]}, order {base.order}")
     axes.set_ylabel(_RMS)
-    _roof(axes, result)
-
-
-def _snrs(axes: Axes, result: Study) -> None:
-    plan, base = result.plan, result.plan.base
-    for how, (color, marker, label) in _HOW.items():
-        orders = dict.fromkeys((base.order,) if how == "gp" else (base.order, _best_order(result, how)))
-        for order, line in zip(orders, ("-", (0, (4, 2))), strict=False):
-            cases = [(snr, replace(base, snr=snr, order=order, interpolation=how)) for snr in plan.snrs]
-            words = label if how == "gp" else f"{label}, order {order}"
-            _line(axes, result, cases, "rms_e_away", color, marker, words, line)
-    _log(axes, plan.snrs, "S/N of the faintest star", f"S/N: {base.stars} stars")
-    axes.set_ylabel(_RMS)
+    _limit(axes, result)
 
 
 def _shared(axes: Axes, result: Study, key: str, label: str, title: str) -> None:
-    """Draw what all places of a CCD, or several CCDs, have in common, at the stars and where no star is."""
+    """Draw residuals in common to a CCD, or to several, at the stars and at the holdout positions."""
     plan, base = result.plan, result.plan.base
     other = result.best_order(base.stars, "softened")
     ways: dict[str, tuple[Case, Any]] = {f"order {base.order}, {_HOW[base.interpolation][2]}": (base, "-")}
@@ -177,7 +176,7 @@ def _line(
     label: str | None,
     linestyle: Any = "-",
 ) -> None:
-    """Draw a figure of cases against something, those that could be fitted; negative values open."""
+    """Draw a metric of the fitted cases against their values, negative ones as open markers."""
     rows = [(x, found) for x, case in cases if (found := result.metrics.get(case.settled())) is not None]
     points = np.array([(x, found[key], found.get(f"error_{key}", np.nan)) for x, found in rows]).reshape(-1, 3)
     # A perfect fit leaves rounding alone, which has no place on the scale.
@@ -213,8 +212,8 @@ def _log_values(axes: Axes) -> None:
         axes.set_ylim(1e-4, 1e-1)  # nothing to draw, of which no limits can be made
 
 
-def _roof(axes: Axes, result: Study) -> None:
+def _limit(axes: Axes, result: Study) -> None:
     base = result.metrics.get(result.plan.base)
     low, high = axes.get_ylim()
     if base is not None:
-        axes.set_ylim(low, min(high, _ROOF * base["rms_e_away"]))
+        axes.set_ylim(low, min(high, _LIMIT * base["rms_e_away"]))

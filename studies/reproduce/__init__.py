@@ -1,1 +1,1 @@
-"""The figures of Jee & Tyson (2011)."""
+"""Reproduction of the figures of Jee & Tyson (2011)."""

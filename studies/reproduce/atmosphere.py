@@ -24,7 +24,7 @@ _SITE = "cerro_pachon"
 _EXPOSURES = (1.0, 5.0, 15.0, 60.0)
 _VISIT = 15.0
 _WAVELENGTH = 620e-9
-#: Half the side of a CCD on the sky [rad], and the weight of the moments [rad].
+#: Half the side of a CCD on the sky, and FWHM of the weight of the moments [rad].
 _HALF_CCD, _WEIGHT = 6.8 * ARCMIN, 0.7 * ARCSEC
 _PAIRS: dict[str, Any] = {"min_sep": 0.3 * ARCMIN, "max_sep": 12.0 * ARCMIN, "n_bins": 9}
 _COLORS = ("#b8b8b8", "#7fa8d1", "#1f6fbf", "#0b2a55")
@@ -38,7 +38,7 @@ _COLORS = ("#b8b8b8", "#7fa8d1", "#1f6fbf", "#0b2a55")
     minutes=(0.3, 15.0),
 )
 def ellipticity(bench: Bench) -> Reproduced:
-    """Measure ellipticities by the atmosphere alone on one CCD, and correlate them (Fig. 6), by the fast engine."""
+    """Correlate ellipticities by the atmosphere alone on one CCD, by the fast engine (Fig. 6)."""
     scale = bench.scale
     fields = stream(bench.seed, "reproduce", "whiskers").uniform(-_HALF_CCD, _HALF_CCD, (scale.whisker_stars, 2))
     pairs = stream(bench.seed, "reproduce", "pairs").uniform(-_HALF_CCD, _HALF_CCD, (scale.pair_stars, 2))
@@ -52,11 +52,11 @@ def ellipticity(bench: Bench) -> Reproduced:
         )
         for time in _EXPOSURES:
             begun = beginning(air, time, scale.time_step)
-            seen = _atmosphere_ellipticity(bench, begun, pairs)
-            correlated[time].append(shear_correlation(pairs[:, 0], pairs[:, 1], seen.real, seen.imag, **_PAIRS))
-            mean_e[time].append(float(np.abs(seen).mean()))
+            e_pairs = _atmosphere_ellipticity(bench, begun, pairs)
+            correlated[time].append(shear_correlation(pairs[:, 0], pairs[:, 1], e_pairs.real, e_pairs.imag, **_PAIRS))
+            mean_e[time].append(float(np.abs(e_pairs).mean()))
             if time == _VISIT:
-                visits.append(seen)
+                visits.append(e_pairs)
                 if epoch == 0:
                     e = _atmosphere_ellipticity(bench, begun, fields)
         air.release()
@@ -113,7 +113,7 @@ def ellipticity(bench: Bench) -> Reproduced:
 
 
 def beginning(air: Atmosphere, exposure: float, time_step: float) -> Atmosphere:
-    """Return the beginning of a longer exposure, through the same screens, in 100 moments or more."""
+    """Return the beginning of a longer exposure, with the same screens and at least 100 times."""
     count = max(100, round(exposure / time_step))
     return air.at_times((np.arange(count) + 0.5) * (exposure / count), exposure)
 
@@ -146,7 +146,7 @@ def _mean_and_error(measured: Sequence[Correlation]) -> tuple[np.ndarray, np.nda
 def _atmosphere_plot(
     positions: np.ndarray, e: np.ndarray, r: np.ndarray, xi: Mapping[float, tuple[np.ndarray, ...]]
 ) -> bytes:
-    """Draw whiskers by the atmosphere alone on one CCD, and correlations against exposure time (Fig. 6)."""
+    """Draw whiskers on one CCD, and correlations for each exposure time."""
     with styled():
         figure = new_figure(12.0, 5.6)
         left, right = figure.subplots(1, 2)

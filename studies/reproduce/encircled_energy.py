@@ -16,10 +16,10 @@ from ...wavefront.psf.psf import make_psfs
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
 
-#: Middle of the i band, at which peers have been asked for the same figure [m].
+#: Middle of the i band, the wavelength of the peers' results [m].
 _I_BAND = 750e-9
 _EE_PIXEL, _EE_STAMP = 0.5e-6, 161
-#: Pupil points farther apart would let the image come round within the stamp [m].
+#: Largest spacing of the pupil points without aliasing within the stamp [m].
 _EE_SPACING = 0.09
 _EE_CURVES = (0.0, 1.0, 1.4, 1.75)
 _EE_STAMPS = (0.0, 0.5, 1.0, 1.2, 1.75)

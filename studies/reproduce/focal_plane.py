@@ -64,7 +64,7 @@ def heights(bench: Bench) -> Reproduced:
     minutes=(0.05, 0.05),
 )
 def height_budget(bench: Bench) -> Reproduced:
-    """Compare what was drawn of each term of the height budget with what the paper allows (Table 1)."""
+    """Compare the drawn terms of the height budget with those of the paper (Table 1)."""
     drawn = {name: drawn_heights(bench.camera, bench.seed, name) for name in ("specification", "simulated")}
     allowed = {
         name: np.array([b.global_height, b.raft_height, b.ccd_height, b.ccd_tilt * 1e-2, b.potato_chip]) * 1e6
@@ -99,7 +99,7 @@ def height_budget(bench: Bench) -> Reproduced:
 
 
 def drawn_heights(camera: Camera, seed: int, budget: str) -> np.ndarray:
-    """Return the peak to valley of each term as drawn: four in um, the tilt (fourth) in 1e-4 rad.
+    """Return the drawn peak to valley of each term: four in um, the tilt (fourth) in 1e-4 rad.
 
     The potato chip is that of the median CCD; pistons and tilts are over all rafts or CCDs.
     """
@@ -118,7 +118,7 @@ def drawn_heights(camera: Camera, seed: int, budget: str) -> np.ndarray:
 
 
 def _budget_plot(rows: Sequence[str], values: Mapping[str, np.ndarray], units: Sequence[str]) -> bytes:
-    """Draw the terms of the height budget: allowed, and what was drawn of it."""
+    """Draw the terms of the height budget, allowed and drawn."""
     colors = ("0.8", "0.55", "#9cc3e6", OBSERVED)
     with styled():
         figure = new_figure(9.0, 4.4)

@@ -76,7 +76,7 @@ def _numbers(paths: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _profile(surface: Surface) -> np.ndarray:
-    """Return points (y, z) of a surface in section [m], its rim to rim; a central hole breaks the line."""
+    """Return points (y, z) of a surface in section [m], from rim to rim, with NaN in a central hole."""
     return surface_section(surface, outer_radius(surface.aperture) if surface.aperture else _DETECTOR)[:, 1:]
 
 
@@ -128,7 +128,7 @@ def _layout_plot(
 
 
 def _draw_corner_rafts(axes: Axes, camera: Camera) -> None:
-    """Draw where the rafts of the wavefront sensors stand: at the corners of the square around the mosaic."""
+    """Draw the rafts of the wavefront sensors, at the corners of the square around the mosaic."""
     raft = 3.0 * camera.ccd_size * 1e3
     reach = float(np.abs(camera.centers).max() + camera.half_size) * 1e3 - raft
     for x in (-reach - raft, reach):

@@ -17,9 +17,9 @@ from .bench import Bench
 from .figure import Columns, EcsvData, FitsData, Reproduced, figure
 from .optics_whiskers import optics_ellipticity
 
-#: With fewer PSFs than this the part of the variance in 20 components says little.
+#: Least number of PSFs for a comparison of the variance in 20 components.
 _ENOUGH = 200
-#: Stars at which PSFs with and without the atmosphere are compared, on every CCD and in all.
+#: Stars for the comparison of PSFs with and without the atmosphere, on every CCD and in all.
 _COMPARED, _MOST_COMPARED = 3, 189
 
 
@@ -104,7 +104,7 @@ def whiskers_of_stars(bench: Bench) -> Reproduced:
 
 
 def _against_optics(bench: Bench) -> tuple[float, float]:
-    """Return how the pattern goes with that of the optics alone: its correlation with it, and its rms over that."""
+    """Return correlation and rms ratio of the pattern with that of the optics alone."""
     products = bench.pipeline.products
     each = min(_COMPARED, max(1, _MOST_COMPARED // len(products)))
     stars = [p.holdout for p in products]
@@ -126,7 +126,7 @@ def _against_optics(bench: Bench) -> tuple[float, float]:
     of_run=True,
 )
 def whiskers_of_residual(bench: Bench) -> Reproduced:
-    """Show whiskers of the residual, at the stars and away from them (Fig. 12)."""
+    """Show whiskers of the residual, at the stars and at holdout positions (Fig. 12)."""
     made = bench.pipeline
     figures = made.summary["all"]
     png = whiskers_figure(made.products, made.experiment.focal_plane, bench.field_radius, ("residual", "away"))
@@ -195,7 +195,7 @@ def scatter(bench: Bench) -> Reproduced:
     of_run=True,
 )
 def correlation(bench: Bench) -> Reproduced:
-    """Show the correlation of the ellipticity: raw, residual at the stars, and away from them (Fig. 14)."""
+    """Show the correlation of ellipticity and residuals (Fig. 14)."""
     made = bench.pipeline
     correlated = made.correlated
     columns: Columns = {"separation_arcmin": (correlated["observed"].r_arcmin, "arcmin", "of the observed stars")}
@@ -244,7 +244,7 @@ def _rms(products: Sequence[CcdProduct], kind: str, keys: tuple[str, str]) -> fl
 
 
 def _star_columns(products: Sequence[CcdProduct], kind: str) -> Columns:
-    """Return places and ellipticities of one kind: truth, observed, residual or away."""
+    """Return positions and ellipticities of one kind: truth, observed, residual or away."""
     stars = [p.stars(kind) for p in products]
     places = ("x", "y", "field_x", "field_y")
     x, y, field_x, field_y = (np.concatenate([getattr(s, key) for s in stars]) for key in places)

@@ -27,7 +27,7 @@ def _number(figure: Figure) -> tuple[str, int]:
 _FOUND = [each for module in _MODULES for each in vars(module).values() if isinstance(each, Figure)]
 #: Figures and tables in the order of the paper.
 FIGURES = {each.name: each for each in sorted(_FOUND, key=_number)}
-#: Figures of the paper that are not offered, and what they would need.
+#: Figures of the paper that are not offered, and their requirements.
 _NOT_OFFERED = {"fig10": "galaxies", **dict.fromkeys(("fig15", "fig16", "fig17", "fig18"), "galaxies or many visits")}
 _RUN_MINUTES = (0.5, 24.0)
 _ALL = "all"

@@ -23,7 +23,7 @@ _SITE = "cerro_pachon"
 _LARGEST_ZENITH = 60
 _SEEING = 0.7
 _BANDS = {"u": "#7b3294", "g": "#2166ac", "r": "#1a9850", "i": "#d9a400", "z": "#d95f02", "y": "#a50026"}
-#: So large a piece of the screens is drawn and kept [m], with at most so many samples on a side.
+#: Side of the piece of the screens that is drawn [m], and its largest number of samples on a side.
 _PIECE, _KEPT = 200.0, 400
 
 
@@ -34,7 +34,7 @@ _PIECE, _KEPT = 200.0, 400
     minutes=(0.02, 0.02),
 )
 def dispersion(bench: Bench) -> Reproduced:
-    """Compute how far apart the air puts the edges of each band (Fig. 3)."""
+    """Compute the atmospheric dispersion between the edges of each band (Fig. 3)."""
     weather = load_site(_SITE).weather
     zenith = np.arange(0, _LARGEST_ZENITH + 1, dtype=np.float64)
     spread = {}

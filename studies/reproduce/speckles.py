@@ -21,9 +21,9 @@ _SITE = "cerro_pachon"
 _TIMES = (0.0, 0.5, 1.0, 2.0, 5.0, 15.0)
 _SPECKLE_WAVELENGTH = 600e-9
 _SPECKLE_PIXEL, _SPECKLE_STAMP = 0.02, 125
-#: Pixels of the width are so many of the speckles' on a side: half of one bright speckle says nothing of it.
+#: Pixels of the width over those of the speckles: single speckles do not define a width.
 _SPECKLE_BLOCK = 5
-#: Half the side of a CCD on the sky [rad], and the weight of the moments [rad].
+#: FWHM of the weight of the moments [rad].
 _WEIGHT = 0.7 * ARCSEC
 
 
@@ -34,7 +34,7 @@ _WEIGHT = 0.7 * ARCSEC
     minutes=(0.3, 11.0),
 )
 def speckles(bench: Bench) -> Reproduced:
-    """Follow one star through 15 s of turbulence, without optics and charge diffusion (Fig. 5), by the wave engine."""
+    """Expose one star for up to 15 s through turbulence alone, by the wave engine (Fig. 5)."""
     size, length = bench.scale.speckle_screen
     telescope = without_aberration(bench.telescope)
     air = Atmosphere.from_site(
@@ -112,7 +112,7 @@ def speckles(bench: Bench) -> Reproduced:
 
 
 def _speckles_plot(images: np.ndarray, times: Sequence[float], width: np.ndarray, e: np.ndarray, pixel: float) -> bytes:
-    """Draw one star after some exposure times, each over its peak, with its FWHM and |e| (Fig. 5)."""
+    """Draw one star after each exposure time, over its peak, with its FWHM and |e|."""
     half = 0.5 * pixel * images.shape[1]
     with styled():
         figure = new_figure(10.2, 7.0)

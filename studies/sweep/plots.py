@@ -31,7 +31,7 @@ def tornado_plot(curves: Mapping[str, Sequence[Curve]]) -> bytes:
 
 
 def _panels(count: int, most: int, width: float, height: float, label: str = "") -> tuple[Figure, np.ndarray]:
-    """Return a figure with panels of a size [inch] in rows of at most so many; a label is that of a common y axis."""
+    """Return a figure and its panels of a size [inch]; with a label they have a common y axis."""
     columns = min(most, count)
     rows = -(-count // columns)
     figure = new_figure(width * columns, height * rows)

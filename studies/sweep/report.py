@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,95 +60,70 @@ def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Pictu
     # Correlations first: they are the purpose of most sweeps.
     drawn = {m: curves(table, sweep, m) for m in sorted(table.metrics, key=lambda m: (not m.startswith("xi"), m))}
     drawn = {metric: each for metric, each in drawn.items() if each}
-    pictures: list[tuple[str, Picture]] = []
-    if drawn:
-        pictures += _one_at_a_time(table, sweep, drawn)
+    pictures = list(_one_at_a_time(table, sweep, drawn)) if drawn else []
     numeric = [n for n, v in table.parameters.items() if v.dtype.kind in "fi" and len(np.unique(v)) > 2]
-    random = sweep.design.kind in ("monte_carlo", "latin_hypercube", "sobol", "table", "grid")
-    if random and len(table) >= _ENOUGH and numeric:
+    if sweep.design.kind != "one_at_a_time" and len(table) >= _ENOUGH and numeric:
         pictures += _random(table, numeric)
     return pictures
 
 
-def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Curve]]) -> list[tuple[str, Picture]]:
-    pictures = [
-        (
-            "tornado",
-            Picture(
-                "What matters most",
-                plots.tornado_plot(drawn),
-                "Change of each metric from its nominal value over the range of each parameter, others nominal: "
-                "blue below the nominal value of the parameter, red above. Vertical strokes are the marks.",
-            ),
-        )
-    ]
+def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Curve]]) -> Iterator[tuple[str, Picture]]:
+    text = (
+        "Change of each metric from its nominal value over the range of each parameter, others nominal: blue below the "
+        "nominal value of the parameter, red above. Vertical strokes are the marks."
+    )
+    yield "tornado", Picture("What matters most", plots.tornado_plot(drawn), text)
     for metric in list(drawn)[:_SHOWN]:
-        shows = f"{metric} against each parameter, the others nominal; the band is the spread over the replicas."
-        picture = Picture(f"{metric}, one at a time", plots.curves_plot(drawn[metric]), shows)
-        pictures.append((f"curves_{metric}", picture))
+        text = f"{metric} against each parameter, the others nominal; the band is the spread over the replicas."
+        yield f"curves_{metric}", Picture(f"{metric}, one at a time", plots.curves_plot(drawn[metric]), text)
     marks = list(dict.fromkeys(mark for p in sweep.parameters.values() for mark in p.marks))
-    for metric in (m for m in drawn if m.startswith("xi")):
+    correlated = [m for m in drawn if m.startswith("xi")]
+    for metric in correlated:
         found = [b for mark in marks if (b := budget(table, sweep, metric, mark)) is not None]
         if found:
-            picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_words(found))
-            pictures.append((f"budget_{metric}", picture))
+            picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_text(found))
+            yield f"budget_{metric}", picture
     if sweep.xi_target is not None:
-        for metric in (m for m in drawn if m.startswith("xi")):
+        for metric in correlated:
             allowed = allowances(drawn[metric], sweep.xi_target)
-            words = "; ".join(
-                f"{a.parameter}: {a.alone:.3g} alone, {a.shared:.3g} with an equal share"
-                for a in allowed
-                if np.isfinite(a.alone)
-            )
-            picture = Picture(
-                f"What each term may be for {metric} below {sweep.xi_target:g}",
-                plots.allowance_plot(drawn[metric], allowed, sweep.xi_target),
-                words or "No term reaches the target within twice its range.",
-            )
-            pictures.append((f"allowance_{metric}", picture))
-    return pictures
+            each = (f"{a.parameter}: {a.alone:.3g} alone, {a.shared:.3g} with an equal share" for a in allowed
+                    if np.isfinite(a.alone))  # fmt: skip
+            title = f"Allowance of each term for {metric} below {sweep.xi_target:g}"
+            plot = plots.allowance_plot(drawn[metric], allowed, sweep.xi_target)
+            text = "; ".join(each) or "No term reaches the target within twice its range."
+            yield f"allowance_{metric}", Picture(title, plot, text)
 
 
-def _budget_words(found: list[Budget]) -> str:
+def _budget_text(found: list[Budget]) -> str:
     """Return a sentence on the sum of the effects at each mark."""
-    words = []
+    texts = []
     for one in found:
         if np.isfinite(one.together) and one.total:
             apart = abs(one.together - one.total)
             # Equal within two standard errors, or a tenth for one replica.
             same = apart < (2.0 * one.together_error if np.isfinite(one.together_error) else 0.1 * abs(one.total))
             error = f" +- {one.together_error:.2g}" if np.isfinite(one.together_error) else ""
-            words.append(
+            texts.append(
                 f"{one.mark}: single effects sum to {one.total:.3g}, all at once make {one.together:.3g}{error}: "
                 + ("they add, as far as this tells." if same else "they do not simply add.")
             )
-    return "Independent errors add in their squares, which xi is made of. " + " ".join(words)
+    return "Independent errors add in their squares, which xi is made of. " + " ".join(texts)
 
 
-def _random(table: SweepTable, numeric: list[str]) -> list[tuple[str, Picture]]:
+def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Picture]]:
     ranks = {metric: rank_correlations(table, metric) for metric in table.metrics}
     ranks = {metric: each for metric, each in ranks.items() if each}
     if not ranks:
-        return []
-    pictures = [
-        (
-            "ranks",
-            Picture(
-                "What matters most",
-                plots.correlations_plot(ranks),
-                "Spearman's rank correlation of each metric with each parameter, all of them varied at once.",
-            ),
-        )
-    ]
+        return
+    text = "Spearman's rank correlation of each metric with each parameter, all of them varied at once."
+    yield "ranks", Picture("What matters most", plots.correlations_plot(ranks), text)
     for metric in list(ranks)[:_SHOWN]:
         names = sorted(ranks[metric], key=lambda n: -abs(ranks[metric][n][0]))
-        shows = f"{metric} of every point; the line joins the medians of eight slices, the band their quartiles."
-        pictures.append((f"scatter_{metric}", Picture(metric, plots.scatter_plot(table, metric, names), shows)))
+        text = f"{metric} of every point; the line joins the medians of eight slices, the band their quartiles."
+        yield f"scatter_{metric}", Picture(metric, plots.scatter_plot(table, metric, names), text)
         if len(names) > 1:
-            shows = f"{metric} over pairs of the parameters that it depends on most."
-            picture = Picture(f"{metric} over pairs", plots.pairs_plot(table, metric, names), shows)
-            pictures.append((f"pairs_{metric}", picture))
-    return pictures
+            text = f"{metric} over pairs of the parameters that it depends on most."
+            yield f"pairs_{metric}", Picture(f"{metric} over pairs", plots.pairs_plot(table, metric, names), text)
 
 
 def _rows(table: SweepTable) -> list[dict[str, Any]]:

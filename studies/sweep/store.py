@@ -224,8 +224,8 @@ def _finite(value: Any) -> Any:
 
 
 def _result(number: int, metrics: str | None, problem: str | None, seconds: float, worker: str) -> PointResult:
-    figures = None if metrics is None else {k: float("nan") if v is None else v for k, v in json.loads(metrics).items()}
-    return PointResult(number, figures, problem, seconds, worker)
+    values = None if metrics is None else {k: float("nan") if v is None else v for k, v in json.loads(metrics).items()}
+    return PointResult(number, values, problem, seconds, worker)
 
 
 def _beside(path: Path) -> Sequence[Path]:

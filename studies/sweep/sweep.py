@@ -100,9 +100,9 @@ def run_sweep(
         if done:
             reporter.line(f"{len(done)} of {len(points)} points are there already")
         if missing:
-            who = workers(PointMeasurement(sweep, str(folder.resolve())))
-            with reporter.stage(f"{sweep.name}: {len(missing)} points, {who.description}", len(missing)) as stage:
-                for number, result in enumerate(who.results(missing), start=1):
+            chosen = workers(PointMeasurement(sweep, str(folder.resolve())))
+            with reporter.stage(f"{sweep.name}: {len(missing)} points, {chosen.description}", len(missing)) as stage:
+                for number, result in enumerate(chosen.results(missing), start=1):
                     store.write(result)
                     stage.advance()
                     if result.problem is not None:
@@ -144,13 +144,13 @@ def check_room(sweep: SweepFile, path: Path) -> None:
         disk = shutil.disk_usage(place).free
     except OSError as error:
         raise ProductError(f"{place}: {error.strerror}") from None
-    for what, need, there in (
+    for kind, need, there in (
         ("memory", count * _BYTES_IN_MEMORY, available_bytes()),
         ("disk", count * _BYTES_ON_DISK, disk),
     ):
         if there is not None and need > 0.8 * there:
             raise ConfigError(
-                f"sweep {sweep.name}: {count:,} points take about {readable(need)} of {what}, {readable(there)} are "
+                f"sweep {sweep.name}: {count:,} points take about {readable(need)} of {kind}, {readable(there)} are "
                 "free: expected fewer points"
             )
     if count > MOST_POINTS:
