@@ -15,7 +15,7 @@ import numpy as np
 
 import pachon
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
-from pachon.design.parameters.parameters import apply, with_figures
+from pachon.design.parameters.parameters import apply, with_shape_terms
 from pachon.raytrace.rays import field_direction, parallel_rays
 from pachon.wavefront.pupil_sampling import pupil_sampling
 from pachon.wavefront.zernike import annular_zernikes
@@ -78,7 +78,7 @@ def farthest(telescope, result, pupil) -> float:
     worst = 0.0
     for i, parameter in enumerate(shown.parameters):
         # Zernike terms of a mirror with rims need a shape of their own, given here: without rims there are none.
-        present = with_figures(telescope, [parameter])
+        present = with_shape_terms(telescope, [parameter])
         start = replace(bare, surfaces=tuple(replace(s, aperture=None) for s in present.surfaces))
         step = {"m": 2e-4, "rad": 2e-5}[parameter.unit] * (0.1 if parameter.kind == "figure" else 1.0)
         slopes = []

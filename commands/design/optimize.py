@@ -22,10 +22,10 @@ def _largest_terms(result: Any) -> list[str]:
 
 
 @design_command(
-    Column("parameter", lambda result: [p.address for p in result.parameters]),
+    Column("parameter", lambda result: result.parameters.names),
     Column("largest Noll terms", _largest_terms),
     Column("rms wavefront", lambda result: result.rms, ".5g"),
-    Column("unit", lambda result: [f"m/{p.unit}" if p.unit else "m" for p in result.parameters]),
+    Column("unit", lambda result: ["m" if unit == "1" else f"m/{unit}" for unit in result.parameters.units]),
     caption="Rms over the fields, piston and tilt left out.",
     left=2,
 )

@@ -1,4 +1,4 @@
-"""From what surfaces answer for to what parameters do: every parameter is linear in the columns of a sweep back."""
+"""Chain rule from surface adjoints to telescope parameters: derivatives are linear in the adjoint matrix."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
 from ...raytrace.adjoint.forward_pass import ForwardPass
 from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS, SphereAdjoint
 from ...wavefront.reference_sphere import sphere_distance_derivatives
-from ..parameters.parameters import Parameter, apply, figured_shapes, index_surfaces, twists
-from ..parameters.surface_deformation import figure_polynomial
+from ..parameters.parameters import Parameter, apply, index_surfaces, shapes_with_terms, twists
+from ..parameters.shape_terms import term_polynomial
 
 
 @dataclass(frozen=True)
 class ParameterColumns:
-    """Which columns a set of parameters needs, and with which weights.
+    """Columns of the adjoint matrix for a set of parameters, and their weights.
 
     Attributes
     ----------
     telescope : Telescope
-        The telescope with all changes applied, whose derivatives these are.
+        The telescope with all changes applied, at which derivatives are taken.
     parameters : tuple of Parameter
         The parameters.
-    rows : ndarray of int, shape [n_surface + 1, 13]
-        Table of the columns, for :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`.
-    polynomials : tuple of (surface, scale, degree, rows)
-        Surfaces with figures that are polynomials, for the same.
-    figures : tuple of (surface, name)
-        Figures that are not; each has a row of its own behind all others.
-    helpers : int
-        So many rows come first that others are made of; those of a sphere follow, and then all that have weights.
-    weights : ndarray, shape [n_row, n_parameter]
-        Derivative of an output with respect to a parameter, per unit of each of these.
+    table : ndarray of int, shape [n_surface + 1, 13]
+        Numbers of the columns, for :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`.
+    polynomials : tuple of (surface, scale, degree, columns)
+        Surfaces with polynomial shape terms, for the same.
+    other_terms : tuple of (surface, name)
+        Other shape terms; each has a column of its own behind all others.
+    intermediate : int
+        Number of intermediate columns, which come first; those of a sphere follow, then all with weights.
+    weights : ndarray, shape [n_column, n_parameter]
+        Derivatives of the columns with respect to the parameters.
     """
 
     telescope: Telescope
     parameters: tuple[Parameter, ...]
-    rows: np.ndarray
+    table: np.ndarray
     polynomials: tuple[tuple[int, float, int, np.ndarray], ...]
-    figures: tuple[tuple[int, str], ...]
-    helpers: int
+    other_terms: tuple[tuple[int, str], ...]
+    intermediate: int
     weights: np.ndarray
 
     @classmethod
@@ -55,13 +55,13 @@ class ParameterColumns:
         values = np.zeros(len(parameters)) if values is None else values
         moved = apply(telescope, dict(zip(parameters, values, strict=True)))
         names = telescope.surface_names
-        figured = [(p, names.index(one.target), one) for p, one in enumerate(parameters) if one.kind == "figure"]
-        wanted = {(s, name) for _, s, _ in figured for name in ("sag", "intersection")}
-        helpers = column_table(telescope, wanted)
-        count = int(helpers.max()) + 1
+        shaped = [(p, names.index(one.target), one) for p, one in enumerate(parameters) if one.kind == "shape"]
+        wanted = {(s, name) for _, s, _ in shaped for name in ("sag", "intersection")}
+        intermediate = column_table(telescope, wanted)
+        count = int(intermediate.max()) + 1
         first = count + SPHERE_COLUMNS
 
-        # Across a gap a motion counts by what the bodies on both sides do differently.
+        # The effect of motions is that of the difference between the bodies on both sides of a gap.
         ends = np.zeros((len(parameters), 1, 6))
         motion = -np.diff(twists(telescope, parameters, values), axis=1, prepend=ends, append=ends)
         runs = {p: index_surfaces(telescope, one.target) for p, one in enumerate(parameters) if one.kind == "index"}
@@ -69,17 +69,17 @@ class ParameterColumns:
         before = {(s + 1, "index") for run in runs.values() for s in run if s + 1 < len(names)}
         gaps = {(int(g), "gap") for g in np.flatnonzero(motion.any(axis=(0, 2)))}
         own = column_table(telescope, behind | before | gaps, first)
-        rows = np.maximum(helpers, own)
+        table = np.maximum(intermediate, own)
 
-        # Where rays go, a shape has the figures that are not zero; to be differentiated by, all that are named.
-        shapes = figured_shapes(moved, parameters)
+        # Rays need only terms that are not zero; derivatives need all terms of the parameters.
+        shapes = shapes_with_terms(moved, parameters)
         used = max(first, int(own.max()) + 1)
         terms: dict[int, dict[int, PolarPolynomial]] = {}
-        figures: list[tuple[int, int, str]] = []
-        for p, s, parameter in figured:
-            polynomial = figure_polynomial(shapes[parameter.target], parameter.name)
+        others: list[tuple[int, int, str]] = []
+        for p, s, parameter in shaped:
+            polynomial = term_polynomial(shapes[parameter.target], parameter.name)
             if polynomial is None:
-                figures.append((p, s, parameter.name))
+                others.append((p, s, parameter.name))
             else:
                 terms.setdefault(s, {})[p] = polynomial
         blocks = []
@@ -87,25 +87,26 @@ class ParameterColumns:
             scale = _scale(telescope, s)
             degree, weights = _polynomial_weights(found, len(parameters), scale)
             present = weights.any(axis=1)
-            places = np.where(present, used + np.cumsum(present) - 1, -1).astype(np.int32)
-            blocks.append((s, scale, degree, places, weights[present]))
+            columns = np.where(present, used + np.cumsum(present) - 1, -1).astype(np.int32)
+            blocks.append((s, scale, degree, columns, weights[present]))
             used += int(present.sum())
 
-        total = np.zeros((used + len(figures), len(parameters)))
+        total = np.zeros((used + len(others), len(parameters)))
         for g in np.flatnonzero(motion.any(axis=(0, 2))):
-            total[rows[g, 7:]] = motion[:, g].T
+            total[table[g, 7:]] = motion[:, g].T
         for p, run in runs.items():
-            total[rows[run, 4], p] = 1.0
-            total[[rows[s + 1, 3] for s in run if s + 1 < len(names)], p] = 1.0
-        for *_, places, weights in blocks:
-            total[places[places >= 0]] = weights
-        for i, (p, _, _) in enumerate(figures):
+            total[table[run, 4], p] = 1.0
+            total[[table[s + 1, 3] for s in run if s + 1 < len(names)], p] = 1.0
+        for *_, columns, weights in blocks:
+            total[columns[columns >= 0]] = weights
+        for i, (p, _, _) in enumerate(others):
             total[used + i, p] = 1.0
         listed = tuple(block[:4] for block in blocks)
-        return cls(moved, parameters, rows, listed, tuple((s, name) for _, s, name in figures), count, total[first:])
+        other_terms = tuple((s, name) for _, s, name in others)
+        return cls(moved, parameters, table, listed, other_terms, count, total[first:])
 
-    def responses(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
-        """Return all rows of every output and ray, shape [n_output, n_row, n]; times the weights they are derivatives.
+    def adjoints(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
+        """Return the weighted columns of the adjoint matrix, shape [n_output, n_column, n].
 
         Parameters
         ----------
@@ -116,8 +117,8 @@ class ParameterColumns:
         threads : int, optional
             Number of threads.
         """
-        response = backward_pass(forward, gradient, self.rows, polynomials=self.polynomials, threads=threads)
-        return self._with_figures(response, self.helpers + SPHERE_COLUMNS)
+        matrix = backward_pass(forward, gradient, self.table, polynomials=self.polynomials, threads=threads)
+        return self._with_other_terms(matrix, self.intermediate + SPHERE_COLUMNS)
 
     def to_spheres(
         self,
@@ -129,7 +130,7 @@ class ParameterColumns:
         *,
         lit_only: bool = False,
     ) -> SphereAdjoint:
-        """Return the sweep of the rays of field points to their reference spheres, whose rows :meth:`of_path` takes.
+        """Return the adjoints of rays from field points to their reference spheres, for :meth:`of_path`.
 
         Parameters are those of :class:`~pachon.raytrace.adjoint.sphere_adjoint.SphereAdjoint`.
         """
@@ -141,49 +142,49 @@ class ParameterColumns:
             center,
             path,
             self.telescope.reference_sphere_radius,
-            self.rows,
-            self.helpers,
+            self.table,
+            self.intermediate,
             self.polynomials,
             lit_only=lit_only,
         )
 
-    def of_path(self, response: AdjointMatrix) -> np.ndarray:
-        """Return the rows [n_row, n_field, n_pupil] of optical paths to reference spheres.
+    def of_path(self, matrix: AdjointMatrix) -> np.ndarray:
+        """Return the columns of optical paths to reference spheres, shape [n_column, n_field, n_pupil].
 
-        The first four are the path and its derivatives with respect to the landing point; all others have weights.
+        The first four are the path and its derivatives with respect to the landing point; the others have weights.
         """
-        return self._with_figures(response, self.helpers)[0]
+        return self._with_other_terms(matrix, self.intermediate)[0]
 
-    def _with_figures(self, response: AdjointMatrix, first: int) -> np.ndarray:
-        """Return the rows from a first one on, those of figures that are no polynomials added."""
-        values = response.values[:, first:]
-        if not self.figures:
+    def _with_other_terms(self, matrix: AdjointMatrix, first: int) -> np.ndarray:
+        """Return the columns from a first one on, and those of shape terms that are not polynomials."""
+        values = matrix.values[:, first:]
+        if not self.other_terms:
             return values
-        shapes, names = figured_shapes(self.telescope, self.parameters), self.telescope.surface_names
-        extra = np.empty((len(values), len(self.figures), *values.shape[2:]))
-        for i, (s, name) in enumerate(self.figures):
-            f, fx, fy = shapes[names[s]].sag_derivative(name, *response.intersection(s))
-            sag = response.sag(s)
+        shapes, names = shapes_with_terms(self.telescope, self.parameters), self.telescope.surface_names
+        extra = np.empty((len(values), len(self.other_terms), *values.shape[2:]))
+        for i, (s, name) in enumerate(self.other_terms):
+            f, fx, fy = shapes[names[s]].sag_derivative(name, *matrix.intersection(s))
+            sag = matrix.sag(s)
             extra[:, i] = sag[:, 0] * f + sag[:, 1] * fx + sag[:, 2] * fy
         return np.concatenate([values, extra], axis=1)
 
     def size_of_terms(
         self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None
     ) -> np.ndarray:
-        """Return how large the terms are that a derivative sums up, rms over rays and outputs, shape [n_parameter].
+        """Return the size of the terms of the derivatives, rms over rays and outputs, shape [n_parameter].
 
-        A derivative far below them is rounding: the terms cancel.
+        A derivative far below it is rounding, as the terms cancel.
         """
-        terms = np.abs(self.responses(forward, gradient, threads=threads)).transpose(0, 2, 1) @ np.abs(self.weights)
+        terms = np.abs(self.adjoints(forward, gradient, threads=threads)).transpose(0, 2, 1) @ np.abs(self.weights)
         return np.sqrt(np.mean(terms**2, axis=(0, 1)))
 
     def derivatives(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return the derivatives of every output and ray with respect to each parameter, [n_output, n, n_parameter]."""
-        return np.matmul(self.responses(forward, gradient, threads=threads).transpose(0, 2, 1), self.weights)
+        return np.matmul(self.adjoints(forward, gradient, threads=threads).transpose(0, 2, 1), self.weights)
 
 
 def _scale(telescope: Telescope, surface: int) -> float:
-    """Return a length [m] in whose units a polynomial over a surface is of order 1: that of the pupil, near enough."""
+    """Return the length unit [m] of polynomials over a surface: its outer radius, or that of the pupil."""
     aperture = telescope.surfaces[surface].aperture
     outer = getattr(aperture, "outer", getattr(aperture, "radius", None))
     return float(outer) if outer else 0.5 * telescope.pupil_diameter

@@ -1,7 +1,6 @@
-"""What an optimisation makes small: residuals in metres, and their exact derivatives with respect to all variables.
+"""Merit functions: residuals in metres, and their exact derivatives with respect to all variables.
 
-The rays of a merit are chosen once, those that are lit at the start; a merit that lost rays on the way would improve by
-vignetting itself.
+The rays of a merit are those that are lit at the start; otherwise a merit could improve by vignetting.
 """
 
 from __future__ import annotations
@@ -10,58 +9,59 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
+from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
-from ...raytrace.rays import Rays, RayStatus, field_direction, parallel_rays
+from ...raytrace.rays import Rays, RayStatus, parallel_rays
 from ...raytrace.trace import trace
-from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
-from ...wavefront.request import field_points, wavelength_points
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request, relative_weights
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
-#: Points along the radius of the pupil by default.
+#: Default points along the radius of the pupil.
 _RINGS = 6
 
 
 @dataclass(frozen=True)
 class Beams:
-    """The rays of a merit: field points, wavelengths, points of the pupil, and what each weighs.
+    """Rays of a merit with their weights.
 
     Attributes
     ----------
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
-    pupil : PupilSampling
-        Points of the pupil.
-    field_weights, wavelength_weights : ndarray
-        Weights of a mean square over fields and over wavelengths; each sums to 1.
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads.
+    request : Request
+        Field points, wavelengths and pupil points.
+    field_weights : ndarray, shape [n_field]
+        Weights of a mean square over fields; they sum to 1.
     """
 
-    fields: np.ndarray
-    wavelengths: np.ndarray
-    pupil: PupilSampling
+    request: Request
     field_weights: np.ndarray
-    wavelength_weights: np.ndarray
-    projection: str = "zemax"
-    threads: int | None = None
+
+    @classmethod
+    def of(
+        cls,
+        telescope: Telescope,
+        fields: ArrayLike | None = None,
+        wavelengths: ArrayLike | None = None,
+        *,
+        field_weights: ArrayLike | None = None,
+        sampling: str | PupilSampling = "gauss",
+        n_pupil: int | None = None,
+        **options: Any,
+    ) -> Beams:
+        """Return the rays of a request, by default in 6 rings; further options are those of :meth:`Request.of`."""
+        count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil
+        request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
+        return cls(request, relative_weights(field_weights, len(request.fields), "field_weights"))
 
     def rays(self, telescope: Telescope, wavelength: float) -> Rays:
         """Return the rays of one wavelength, field by field."""
-        light = field_direction(self.fields[:, 0], self.fields[:, 1], self.projection)
-        return parallel_rays(telescope, light, wavelength, self.pupil.points)
-
-    def wavefronts(self, columns: ParameterColumns, wavelength: float) -> FieldWavefronts:
-        """Return the wavefronts of one wavelength."""
-        return FieldWavefronts(columns, self.fields, wavelength, self.pupil.points, self.projection, self.threads)
+        return parallel_rays(telescope, self.request.directions, wavelength, self.request.pupil.points)
 
     def weights(self, telescope: Telescope) -> np.ndarray:
         """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit.
@@ -71,49 +71,23 @@ class Beams:
         DomainError
             If no ray of a field point is lit.
         """
-        found = []
-        for wavelength in self.wavelengths:
-            status = trace(telescope, self.rays(telescope, wavelength), threads=self.threads).status
-            lit = (status == RayStatus.OK).reshape(len(self.fields), -1) * np.maximum(self.pupil.weights, 0.0)
+        fields, pupil, found = self.request.fields, self.request.pupil, []
+        for wavelength in self.request.wavelengths:
+            status = trace(telescope, self.rays(telescope, wavelength), threads=self.request.threads).status
+            lit = (status == RayStatus.OK).reshape(len(fields), -1) * np.maximum(pupil.weights, 0.0)
             total = lit.sum(axis=1, keepdims=True)
             if not total.all():
-                x, y = np.rad2deg(self.fields[~total[:, 0].astype(bool)][0])
-                raise DomainError(f"field = ({x:.6g}, {y:.6g}) deg: no ray reaches the image of {telescope.name}")
+                dark = fields[~total[:, 0].astype(bool)][0]
+                raise DomainError(f"{field_label(dark)}: no ray reaches the image of {telescope.name}")
             found.append(lit / total * self.field_weights[:, None])
-        return np.array(found) * self.wavelength_weights[:, None, None]
-
-
-def beams(
-    telescope: Telescope,
-    fields: Any = None,
-    wavelengths: Any = None,
-    field_weights: Any = None,
-    wavelength_weights: Any = None,
-    sampling: Any = "gauss",
-    count: int | None = None,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> Beams:
-    """Return the rays of a merit; parameters are those of :func:`~.optimize.optimize`."""
-    points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
-    pupil = pupil_sampling(telescope, sampling, _RINGS if count is None and sampling == "gauss" else count)
-    by_field = _weights(field_weights, len(points), "field")
-    by_wavelength = _weights(wavelength_weights, len(waves), "wavelength")
-    return Beams(points, waves, pupil, by_field, by_wavelength, projection, threads)
-
-
-def _weights(given: Any, count: int, name: str) -> np.ndarray:
-    weights = np.ones(count) if given is None else np.asarray(given, dtype=np.float64)
-    if weights.shape != (count,) or not np.isfinite(weights).all() or (weights < 0).any() or not weights.any():
-        raise DomainError(f"{name}_weights: expected {count} numbers, none negative and not all zero")
-    return weights / weights.sum()
+        return np.array(found) * self.request.weights[:, None, None]
 
 
 class Merit(Protocol):
-    """Residuals whose sum of squares is to be small."""
+    """Merit function: residuals whose sum of squares is minimised."""
 
     def residuals(self, telescope: Telescope) -> np.ndarray:
-        """Return the residuals of a telescope [m], shape [n]; NaN where rays got lost."""
+        """Return the residuals of a telescope [m], shape [n]; NaN where rays are lost."""
         ...
 
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:
@@ -121,59 +95,59 @@ class Merit(Protocol):
         ...
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:
-        """Return how large the terms are that cancel where a variable has no effect [m], shape [n_parameter]."""
+        """Return the size of the terms that cancel where a variable has no effect [m], shape [n_parameter]."""
         ...
 
 
 class SpotMerit:
-    """Landing points less the centroid of each field point's light, all wavelengths together.
+    """Landing points relative to the centroid of each field point, all wavelengths together.
 
     The sum of squares is the mean square radius of the spots.
 
     Parameters
     ----------
     telescope : Telescope
-        The telescope at the start: its lit rays are the merit's.
+        Telescope at the start, whose lit rays count.
     beams : Beams
         The rays.
     reference : {"centroid", "chief"}
-        What spots are measured from; "chief" is the chief ray of the first wavelength.
+        Origin of the landing points; "chief" is the chief ray of the first wavelength.
     heights : array_like, shape [n_field], optional
-        Height of the image surface at each field point above the detector, along its own z [m]: that of a CCD. Rays
-        go on straight to it; derivatives leave out how the slopes of rays change there, 1e-6 of them for 10 um.
+        Height of the image surface, such as a CCD, above the detector at each field point [m]. Rays continue straight
+        to it; derivatives leave out the change of their slopes, 1e-6 of them for 10 um.
     """
 
     def __init__(self, telescope: Telescope, beams: Beams, reference: str = "centroid", heights: Any = None) -> None:
         self._beams = beams
         self._weights = beams.weights(telescope)
         self._reference = reference
-        given = np.zeros(len(beams.fields)) if heights is None else np.asarray(heights, dtype=np.float64)
-        if given.shape != (len(beams.fields),):
+        given = np.zeros(len(beams.request.fields)) if heights is None else np.asarray(heights, dtype=np.float64)
+        if given.shape != (len(beams.request.fields),):
             raise DomainError(
-                f"heights of shape {list(given.shape)}: expected one for each of {len(beams.fields)} fields"
+                f"heights of shape {list(given.shape)}: expected one for each of {len(beams.request.fields)} fields"
             )
         # One for each ray, field by field.
-        self._heights = np.repeat(given, len(beams.pupil))
+        self._heights = np.repeat(given, len(beams.request.pupil))
 
     def residuals(self, telescope: Telescope) -> np.ndarray:  # noqa: D102
         landing = []
-        for wavelength in self._beams.wavelengths:
-            end = trace(telescope, self._beams.rays(telescope, wavelength), threads=self._beams.threads)
+        for wavelength in self._beams.request.wavelengths:
+            end = trace(telescope, self._beams.rays(telescope, wavelength), threads=self._beams.request.threads)
             position = telescope.surfaces[-1].to_local(end.position)[:, :2].T
             landing.append(position + self._beyond(telescope, end.direction))
         chief = None
         if self._reference == "chief":
-            end = trace(telescope, self._chief_rays(telescope), threads=self._beams.threads)
+            end = trace(telescope, self._chief_rays(telescope), threads=self._beams.request.threads)
             chief = telescope.surfaces[-1].to_local(end.position)[:, :2].T[..., None]
         return self._reduced(np.array(landing)[..., None], chief).ravel()
 
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         stacked = []
-        for wavelength in self._beams.wavelengths:
+        for wavelength in self._beams.request.wavelengths:
             rays = self._beams.rays(columns.telescope, wavelength)
             stacked.append(self._landing(columns, rays))
             if self._heights.any():
-                end = trace(columns.telescope, rays, threads=self._beams.threads)
+                end = trace(columns.telescope, rays, threads=self._beams.request.threads)
                 stacked[-1][..., 0] += self._beyond(columns.telescope, end.direction)
         chief = None
         if self._reference == "chief":
@@ -183,30 +157,30 @@ class SpotMerit:
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:  # noqa: D102
         forward = forward_pass(
-            columns.telescope, self._beams.rays(columns.telescope, float(self._beams.wavelengths[0]))
+            columns.telescope, self._beams.rays(columns.telescope, float(self._beams.request.wavelengths[0]))
         )
-        return columns.size_of_terms(forward, landing_gradient(forward), threads=self._beams.threads)
+        return columns.size_of_terms(forward, landing_gradient(forward), threads=self._beams.request.threads)
 
     def _chief_rays(self, telescope: Telescope) -> Rays:
-        light = field_direction(self._beams.fields[:, 0], self._beams.fields[:, 1], self._beams.projection)
-        return parallel_rays(telescope, light, float(self._beams.wavelengths[0]), np.zeros((1, 2)))
+        directions = self._beams.request.directions
+        return parallel_rays(telescope, directions, float(self._beams.request.wavelengths[0]), np.zeros((1, 2)))
 
     def _beyond(self, telescope: Telescope, direction: np.ndarray) -> np.ndarray:
-        """Return how much farther rays [n, 3] land at the heights than on the detector [m], [2, n]."""
+        """Return the shift of the landing points of rays [n, 3] from the detector to the heights [m], [2, n]."""
         along = direction @ telescope.surfaces[-1].matrix
         return (along[:, :2] / along[:, 2:]).T * self._heights
 
     def _landing(self, columns: ParameterColumns, rays: Rays) -> np.ndarray:
         """Return landing points and, behind them, their derivatives, shape [2, n, 1 + n_parameter]."""
-        forward = forward_pass(columns.telescope, rays, threads=self._beams.threads)
-        change = columns.derivatives(forward, landing_gradient(forward), threads=self._beams.threads)
+        forward = forward_pass(columns.telescope, rays, threads=self._beams.request.threads)
+        change = columns.derivatives(forward, landing_gradient(forward), threads=self._beams.request.threads)
         return np.concatenate([forward.landing[:2, :, None], change], axis=2)
 
     def _reduced(self, landing: np.ndarray, chief: np.ndarray | None) -> np.ndarray:
         """Return weighted deviations of [n_wave, 2, n_field * n_pupil, k] from the centroid or the chief ray's."""
         weights = self._weights
         values = landing.reshape(len(weights), 2, *weights.shape[1:], -1)
-        # What is not lit has no weight, and may be NaN.
+        # Rays that are not lit have no weight and may be NaN.
         values = np.where((weights > 0)[:, None, ..., None], values, 0.0)
         if chief is None:
             mean = np.einsum("wfp,wxfpk->xfk", weights, values) / weights.sum(axis=(0, 2))[:, None]
@@ -216,18 +190,18 @@ class SpotMerit:
 
 
 class WavefrontMerit:
-    """The wavefront without piston and tilt, or what is left of it when a goal is subtracted.
+    """Wavefront without piston and tilt, minus a goal.
 
     The sum of squares is the mean square of the wavefront.
 
     Parameters
     ----------
     telescope : Telescope
-        The telescope at the start: its lit rays are the merit's.
+        Telescope at the start, whose lit rays count.
     beams : Beams
         The rays.
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
-        Wavefronts to be reached [m]; points that are NaN do not count.
+        Target wavefronts [m]; NaN points do not count.
     """
 
     def __init__(self, telescope: Telescope, beams: Beams, goal: Any = None) -> None:
@@ -236,7 +210,7 @@ class WavefrontMerit:
         self._goal = np.zeros(weights.shape)
         if goal is not None:
             given = np.asarray(goal, dtype=np.float64)
-            expected = (len(beams.fields), len(beams.wavelengths), len(beams.pupil))
+            expected = (*weights.shape[1::-1], weights.shape[2])
             if given.shape != expected:
                 raise DomainError(f"goal of shape {list(given.shape)}: expected {list(expected)}, field by wave by ray")
             given = given.transpose(1, 0, 2)
@@ -246,8 +220,8 @@ class WavefrontMerit:
             self._goal = np.where(known, given, 0.0)
             weights *= total / np.maximum(weights.sum(axis=2, keepdims=True), np.finfo(float).tiny)
         self._roots = np.sqrt(weights)
-        # Piston and the two tilts, as an orthonormal basis of what is taken off each wavefront.
-        x, y = beams.pupil.points.T / (0.5 * telescope.pupil_diameter)
+        # Orthonormal basis of piston and tilts, to be removed from each wavefront.
+        x, y = beams.request.pupil.points.T / (0.5 * telescope.pupil_diameter)
         tilts = self._roots[..., None] * np.stack([np.ones_like(x), x, y], axis=-1)
         self._basis = np.linalg.qr(tilts)[0]
 
@@ -256,26 +230,26 @@ class WavefrontMerit:
 
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         beams, parts = self._beams, []
-        for i, wavelength in enumerate(beams.wavelengths):
+        for i, wavelength in enumerate(beams.request.wavelengths):
 
             def reduced(block: WavefrontBlock, i: int = i) -> np.ndarray:
                 roots, basis = self._roots[i, block.fields], self._basis[i, block.fields]
                 value = block.value - self._goal[i, block.fields]
-                # A ray of the merit that got lost shows as NaN, which makes the solver take a shorter step.
+                # NaN for a lost ray makes the solver take a shorter step.
                 value = np.where((block.status > RayStatus.VIGNETTED) & (roots > 0), np.nan, value)
-                change = block.by_center @ block.moved - block.rows @ columns.weights
+                change = block.by_center @ block.moved - block.columns @ columns.weights
                 both = roots[..., None] * np.concatenate([value[..., None], change], axis=2)
                 return (both - basis @ (basis.transpose(0, 2, 1) @ both)).reshape(-1, both.shape[-1])
 
-            parts += beams.wavefronts(columns, float(wavelength)).map(reduced)
+            parts += FieldWavefronts(columns, beams.request, float(wavelength)).map(reduced)
         whole = np.concatenate(parts)
         return whole[:, 0], whole[:, 1:]
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:  # noqa: D102
         def squares(block: WavefrontBlock) -> np.ndarray:
-            size = np.abs(block.by_center) @ np.abs(block.moved) + np.abs(block.rows) @ np.abs(columns.weights)
+            size = np.abs(block.by_center) @ np.abs(block.moved) + np.abs(block.columns) @ np.abs(columns.weights)
             return (size**2).sum(axis=(0, 1))
 
-        beams = self._beams
-        total = sum(beams.wavefronts(columns, float(beams.wavelengths[0])).map(squares))
-        return np.sqrt(total / (len(beams.fields) * len(beams.pupil)))
+        request = self._beams.request
+        total = sum(FieldWavefronts(columns, request, float(request.wavelengths[0])).map(squares))
+        return np.sqrt(total / (len(request.fields) * len(request.pupil)))

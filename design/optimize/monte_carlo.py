@@ -1,4 +1,4 @@
-"""What telescopes within their tolerances are worth: many draws, each traced, or all through the exact derivatives."""
+"""Monte Carlo of tolerances: merits of many drawn telescopes, traced or from exact derivatives."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.plotting import BLUE, GREY, RED, new_figure, styled
 from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import PupilSampling
 from ..parameters.degrees_of_freedom import DegreesOfFreedom
 from ..parameters.tolerances import Tolerance, draw
 from .jacobian import ParameterColumns
-from .merit import Beams, Merit, SpotMerit, WavefrontMerit, beams
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit
 from .optimize import NO_EFFECT
 from .sensitivity import field_rings
 
@@ -22,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MERITS: dict[str, Callable[[Telescope, Beams], Merit]] = {"wavefront": WavefrontMerit, "spots": SpotMerit}
-_SHARES = (50, 80, 90, 95)
-#: So many tolerances are drawn, the largest contributions first.
+_PERCENTILES = (50, 80, 90, 95)
+#: Largest contributions in the plot.
 _BARS = 20
 _TITLES = {"wavefront": "rms wavefront", "spots": "rms spot radius"}
 
@@ -43,19 +45,19 @@ class MonteCarlo:
     tolerances : tuple of Tolerance
         The tolerances.
     compensators : tuple of str
-        Degrees of freedom that are set anew for each draw.
+        Degrees of freedom that are optimised for each draw.
     units, compensator_units : tuple of str
         Units of the deviations and of the compensators.
     deviations : ndarray, shape [n, n_tolerance]
-        What was drawn.
+        Drawn deviations.
     moves : ndarray, shape [n, n_compensator]
-        Where the compensators were set.
+        Values of the compensators.
     merit : ndarray, shape [n]
-        Merit of each draw [m]; NaN where a traced telescope lost rays.
+        Merit of each draw [m]; NaN where a traced telescope loses rays.
     nominal : float
-        Merit of the telescope as it is, compensated [m].
+        Merit of the telescope without deviations, compensated [m].
     contribution : ndarray, shape [n_tolerance]
-        Root mean square that each tolerance alone adds, compensated, in quadrature, to first order [m].
+        Rms contribution of each tolerance alone, compensated, in quadrature, to first order [m].
     """
 
     telescope: str
@@ -71,12 +73,12 @@ class MonteCarlo:
     nominal: float
     contribution: np.ndarray
 
-    def at_most(self, share: float) -> float:
-        """Return the merit [m] that a share (0 to 1) of the telescopes keeps below; lost ones count as the worst."""
-        return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), share, method="higher"))
+    def at_most(self, fraction: float) -> float:
+        """Return the quantile of the merit [m] for a fraction (0 to 1) of the telescopes; lost ones count as worst."""
+        return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), fraction, method="higher"))
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names."""
+        """Return the results by name and unit."""
         return {
             "telescope": self.telescope,
             "merit": self.merit_name,
@@ -84,7 +86,7 @@ class MonteCarlo:
             "draws": len(self.merit),
             "lost": int(np.isnan(self.merit).sum()),
             "nominal_m": self.nominal,
-            **{f"at_most_{share}_percent_m": self.at_most(share / 100.0) for share in _SHARES},
+            **{f"at_most_{percent}_percent_m": self.at_most(percent / 100.0) for percent in _PERCENTILES},
             "tolerances": [t.name for t in self.tolerances],
             "units": list(self.units),
             "contribution_m": self.contribution,
@@ -94,7 +96,7 @@ class MonteCarlo:
         }
 
     def plot(self) -> Figure:
-        """Draw how the merit is distributed, and what each tolerance contributes."""
+        """Draw the distribution of the merit and the contributions of the tolerances."""
         finite = np.sort(self.merit[np.isfinite(self.merit)])
         highest = float(finite.max(initial=self.nominal))
         unit, scale = ("nm", 1e9) if highest < 1e-6 else ("µm", 1e6)
@@ -102,8 +104,8 @@ class MonteCarlo:
         with styled():
             figure = new_figure(9.0, max(3.4, 1.2 + 0.19 * len(shown)))
             left, right = figure.subplots(1, 2)
-            share = 100.0 * np.arange(1, len(finite) + 1) / len(self.merit)
-            left.step(finite * scale, share, where="post", color=BLUE)
+            percent_below = 100.0 * np.arange(1, len(finite) + 1) / len(self.merit)
+            left.step(finite * scale, percent_below, where="post", color=BLUE)
             left.axvline(self.nominal * scale, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
             for percent in (50, 95):
                 value = self.at_most(percent / 100.0) * scale
@@ -139,49 +141,47 @@ def monte_carlo(
     degrees_of_freedom: DegreesOfFreedom | None = None,
     compensators: Iterable[str] = (),
     method: str = "linear",
-    fields: Any = None,
-    wavelengths: Any = None,
-    sampling: Any = "gauss",
-    count: int | None = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
+    sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> MonteCarlo:
-    """Draw telescopes within tolerances and return their merits.
+    """Return the merits of telescopes drawn within tolerances.
 
-    The linear method takes the residuals of the merit as linear in the deviations, with their exact derivatives: a
-    thousand draws cost little more than one, and the merit itself, the root of a sum of squares, is not linearised.
-    The traced method traces each telescope. Compensators are set by linear least squares in both.
+    In the linear method the residuals of the merit are linear in the deviations, with their exact derivatives: a
+    thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. The
+    traced method traces each telescope. Compensators follow from linear least squares in both.
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, wavelengths, sampling, n_pupil, projection, threads
+        As in :func:`~pachon.design.optimize.optimize.optimize`.
     tolerances : iterable of Tolerance
-        Of degrees of freedom by name, or of parameters by address where no degrees of freedom are given.
+        Tolerances of degrees of freedom by name, or of parameters by address if there are none.
     merit : {"wavefront", "spots"}
-        What telescopes are judged by.
+        Merit function.
     n : int
         Number of draws.
     seed : int
         Seed of the draws.
     degrees_of_freedom : DegreesOfFreedom, optional
-        What the names belong to.
+        Degrees of freedom of the names.
     compensators : iterable of str
-        Names of degrees of freedom that make the best of each draw, such as the camera's focus.
+        Names of degrees of freedom that are optimised for each draw, such as the focus of the camera.
     method : {"linear", "traced"}
-        How the merit is found.
+        Method, see above.
     fields : array_like or Quantity, shape [n_field, 2], optional
         Field angles [rad]; by default 31 over the field of view, see :func:`~.field_rings`.
-    wavelengths, sampling, count, projection, threads :
-        As for :func:`~pachon.design.optimize.optimize.optimize`.
     progress : callable, optional
-        Called with the number of draws done, of the traced method.
+        Called with the number of draws done since the last call (traced method).
 
     Raises
     ------
     ConfigError
-        If a merit or method does not exist, or something is both tolerance and compensator.
+        If a merit or method is unknown, or a name is both tolerance and compensator.
     UnknownNameError, DomainError
         If a name does not exist, a number is out of range, or no light arrives.
     """
@@ -199,17 +199,25 @@ def monte_carlo(
     dof = dof.select(names)
 
     fields = field_rings(telescope) if fields is None else fields
-    rays = beams(telescope, fields, wavelengths, None, None, sampling, count, projection, threads)
+    rays = Beams.of(
+        telescope,
+        fields,
+        wavelengths,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+    )
     judge: Merit = MERITS[merit](telescope, rays)
-    prepared, parameters, matrix = dof.combination(telescope)
+    prepared, parameters, matrix = dof.parameter_matrix(telescope)
     columns = ParameterColumns.at(prepared, parameters)
     residuals, slopes = judge.derivatives(columns)
     slopes = slopes @ matrix
     by_draw, by_free = slopes[:, : len(chosen)], slopes[:, len(chosen) :]
-    # What of an effect may be rounding: that much of the terms that cancel.
+    # Rounding errors of the effects, a fraction of the terms that cancel.
     least = NO_EFFECT * (judge.size_of_terms(columns) @ np.abs(matrix))[len(chosen) :] if free else np.zeros(0)
     setting = _settings(by_free, free, least)
-    # After the best setting of the compensators, what is left of the residuals and of their slopes.
+    # Residuals and their slopes after compensation.
     fixed = residuals - by_free @ (setting @ residuals)
     left = by_draw - by_free @ (setting @ by_draw)
     moves = -(deviations @ (setting @ by_draw).T + setting @ residuals)
@@ -225,7 +233,7 @@ def monte_carlo(
         for i, values in enumerate(np.concatenate([deviations, moves], axis=1)):
             found[i] = _merit(judge, dof.apply(telescope, values))
             if progress is not None:
-                progress(i + 1)
+                progress(1)
         still = np.concatenate([np.zeros(len(chosen)), -(setting @ residuals)])
         nominal = _merit(judge, dof.apply(telescope, still))
     units = dof.units
@@ -254,7 +262,7 @@ def _merit(judge: Merit, telescope: Telescope) -> float:
 
 
 def _settings(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> np.ndarray:
-    """Return the matrix that takes residuals to the opposite of the best setting of compensators, [n_free, n]."""
+    """Return the matrix from residuals to minus the best setting of compensators, shape [n_free, n]."""
     size = np.linalg.norm(slopes, axis=0)
     for name, value, rounding in zip(names, size, least, strict=True):
         if not value > rounding:

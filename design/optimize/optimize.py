@@ -1,4 +1,4 @@
-"""Optimise a telescope: least squares over chosen variables, with exact derivatives."""
+"""Optimisation of a telescope: least squares over chosen variables, with exact derivatives."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from ...core.errors import ConfigError, DomainError, PachonError
@@ -14,37 +15,38 @@ from ...core.plotting import BLUE, GREY, new_figure, styled
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
+from ...wavefront.pupil_sampling import PupilSampling
 from ..parameters.parameters import Parameter, apply, parse_parameters
 from .jacobian import ParameterColumns
-from .merit import Beams, Merit, SpotMerit, WavefrontMerit, beams
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit
 from .targets import FocalLength, Target
-from .wavefront_derivatives import WavefrontBlock
+from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: A variable whose effect is below this fraction of what single surfaces do to single rays has none: it is rounding.
+#: Fraction of the effects of single surfaces on single rays below which the effect of a variable is rounding.
 NO_EFFECT = 1e-11
 #: Effect of the longest first step, in units of the merit at the start.
 _FIRST_STEP = 100.0
-#: Variables whose effects, each scaled to 1, add up to less than this in some combination are collinear.
+#: Singular value, relative to the largest, below which variables scaled to equal effects are collinear.
 _COLLINEAR = 1e-6
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """What an optimisation found.
+    """Result of an optimisation.
 
     Attributes
     ----------
     telescope : Telescope
-        The new telescope.
+        The optimised telescope.
     variables : tuple of Parameter
-        What was free.
+        Free parameters.
     changes : ndarray, shape [n_variable]
         Change of each, in its own unit.
     start_values, values : ndarray, shape [n_variable]
-        What the telescope had and has; motions are counted from the start.
+        Values before and after; those of motions are relative to the start.
     merit_name : str
         "spots" or "wavefront".
     history : ndarray, shape [n_step + 1]
@@ -52,10 +54,9 @@ class Optimum:
     effect : ndarray, shape [n_variable]
         Rms change of the merit's residuals per unit of each variable [m], at the solution.
     covariance : ndarray, shape [n_variable, n_variable]
-        Covariance of the variables, from the residuals that are left taken as noise; that of combinations without
-        effect is left out.
+        Covariance of the variables, with the final residuals as noise, without combinations of no effect.
     collinear : tuple of str
-        Combinations of variables that the merit cannot tell apart, such as "M1.radius - 0.998 M1.curvature".
+        Combinations of variables without effect on the merit, such as "M1.radius - 0.998 M1.curvature".
     message : str
         Why the solver stopped.
     """
@@ -78,7 +79,7 @@ class Optimum:
         return np.sqrt(np.diag(self.covariance))
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names."""
+        """Return the results by name and unit."""
         return {
             "telescope": self.telescope.name,
             "merit": self.merit_name,
@@ -97,7 +98,7 @@ class Optimum:
         }
 
     def plot(self) -> Figure:
-        """Draw the merit step by step, and how much each variable's change did."""
+        """Draw the merit step by step, and the effect of the change of each variable."""
         from matplotlib.ticker import MaxNLocator
 
         with styled():
@@ -123,76 +124,69 @@ def optimize(
     telescope: Telescope,
     variables: Iterable[str | Parameter],
     merit: str | Merit = "spots",
-    fields: Any = None,
-    wavelengths: Any = None,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     targets: Sequence[FocalLength | Target] = (),
-    field_weights: Any = None,
-    wavelength_weights: Any = None,
+    field_weights: ArrayLike | None = None,
+    wavelength_weights: ArrayLike | None = None,
     reference: str = "centroid",
-    goal: Any = None,
-    sampling: Any = "gauss",
-    count: int | None = None,
+    goal: ArrayLike | None = None,
+    sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
     projection: str = "zemax",
     tolerance: float = 1e-10,
     max_steps: int = 200,
     threads: int | None = None,
 ) -> Optimum:
-    """Make spots or wavefronts small over chosen variables.
+    """Minimise spots or wavefronts over chosen variables.
 
-    A trust-region least-squares solver takes the exact derivatives of every ray. Variables are scaled by what they do,
-    so that a conic constant and a coefficient of r^8 are on one footing. Compensators (focus, tilt of the camera)
-    are variables like all others.
+    A trust-region least-squares solver with exact derivatives of every ray. Variables are scaled by their effects, so
+    that a conic constant and a coefficient of r^8 are comparable. Compensators (focus, tilt of the camera) are
+    variables like all others.
 
     Parameters
     ----------
-    telescope : Telescope
-        Where to start.
+    telescope, fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`, but for 6 rings of pupil points by default.
     variables : iterable of str or Parameter
-        What is free, see :mod:`~pachon.design.parameters.parameters`.
+        Free parameters, see :mod:`~pachon.design.parameters.parameters`.
     merit : {"spots", "wavefront"} or Merit
-        What to make small: rms spot radius, or rms wavefront without piston and tilt.
-    fields : array_like or Quantity, shape [n_field, 2], optional
-        Field angles [rad]; five from the axis to the edge by default.
-    wavelengths : array_like or Quantity, optional
-        Vacuum wavelengths [m]; the telescope's own by default.
+        Merit function: rms spot radius, or rms wavefront without piston and tilt.
     bounds : mapping of str to (low, high), optional
-        Limits of variables, in what :meth:`Parameter.value` counts: of a radius or conic the value itself, of a motion
-        the change.
+        Limits of variables: of the value itself for a shape or index, of the change for a motion.
     targets : sequence of FocalLength and Target
-        Numbers to be held.
-    field_weights, wavelength_weights : array_like, optional
+        Further numbers to be reached.
+    field_weights : array_like, shape [n_field], optional
         Weights in the mean square; equal by default.
     reference : {"centroid", "chief"}
-        What spots are measured from.
+        Origin of the landing points.
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
-        Wavefronts to be reached [m], in place of none (:func:`wavefronts` gives those of a telescope).
-    sampling, count :
-        Points of the pupil, see :func:`~pachon.wavefront.pupil_sampling.pupil_sampling`.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
+        Target wavefronts [m], such as those of :func:`wavefronts`; zero by default.
     tolerance : float
         Relative change of the sum of squares, or of the variables, at which the solver stops.
     max_steps : int
-        Most evaluations of the merit.
-    threads : int, optional
-        Number of threads; all processors by default.
-
-    Returns
-    -------
-    Optimum
+        Largest number of evaluations of the merit.
 
     Raises
     ------
     DomainError
-        If a variable has no effect at all, a bound excludes the start, or no ray reaches the image.
+        If a variable has no effect, a bound excludes the start, or no ray reaches the image.
     ConfigError, UnknownNameError
         If a merit or variable does not exist.
     """
     chosen = parse_parameters(variables, telescope)
-    rays = beams(
-        telescope, fields, wavelengths, field_weights, wavelength_weights, sampling, count, projection, threads
+    rays = Beams.of(
+        telescope,
+        fields,
+        wavelengths,
+        field_weights=field_weights,
+        wavelength_weights=wavelength_weights,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
     )
     wanted = merit if not isinstance(merit, str) else _merit(merit, telescope, rays, reference, goal)
     problem = _Problem(telescope, chosen, wanted, tuple(targets))
@@ -203,7 +197,7 @@ def optimize(
     history = [float(np.linalg.norm(start))]
 
     def jacobian(scaled: np.ndarray) -> np.ndarray:
-        # The solver asks for derivatives at the start and wherever it has arrived.
+        # Called at the start and after each step.
         values, change = problem.linear(scaled * scale)
         if scaled.any():
             history.append(float(np.linalg.norm(values)))
@@ -215,7 +209,7 @@ def optimize(
         jac=jacobian,
         bounds=(low / scale, high / scale),
         method="trf",
-        # The first steps may do this much: variables that work against each other need more than they bring.
+        # Generous first steps: variables that compensate each other move far for little effect.
         x_scale=float(max(_FIRST_STEP * history[0], np.finfo(float).tiny)),
         ftol=tolerance,
         xtol=tolerance,
@@ -252,14 +246,17 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
     telescope : Telescope
         The telescope.
     rays : Beams
-        Which, from :func:`beams` with the arguments that :func:`optimize` is given.
+        Rays, as :meth:`Beams.of` returns them for the arguments of :func:`optimize`.
     """
     columns = ParameterColumns.at(telescope, ())
 
     def lit(block: WavefrontBlock) -> np.ndarray:
         return np.where(block.status == RayStatus.OK, block.value, np.nan)
 
-    return np.stack([np.concatenate(rays.wavefronts(columns, float(w)).map(lit)) for w in rays.wavelengths], axis=1)
+    request = rays.request
+    return np.stack(
+        [np.concatenate(FieldWavefronts(columns, request, float(w)).map(lit)) for w in request.wavelengths], axis=1
+    )
 
 
 class _Problem:
@@ -279,7 +276,7 @@ class _Problem:
         return apply(self.telescope, dict(zip(self.variables, changes, strict=True)))
 
     def residuals(self, changes: np.ndarray) -> np.ndarray:
-        """Return all residuals [m]; NaN, which makes the solver step back, where there is no such telescope."""
+        """Return all residuals [m]; NaN, for a shorter step, where the telescope is not valid."""
         try:
             telescope = self._at(changes)
             return np.concatenate([self.merit.residuals(telescope), *(t.residuals(telescope) for t in self.targets)])
@@ -346,7 +343,7 @@ def _bounds(
 
 
 def _checked_effect(variables: tuple[Parameter, ...], slopes: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return the rms effect of each variable per unit [m]; one that has none is refused."""
+    """Return the rms effect of each variable per unit [m]; raise if one has none."""
     effect = np.linalg.norm(slopes, axis=0)
     for parameter, value, size in zip(variables, effect, terms, strict=True):
         if not value > NO_EFFECT * size:
@@ -357,16 +354,16 @@ def _checked_effect(variables: tuple[Parameter, ...], slopes: np.ndarray, terms:
 def _covariance(
     values: np.ndarray, slopes: np.ndarray, variables: tuple[Parameter, ...]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the covariance of the variables, and the combinations that nothing tells apart."""
+    """Return the covariance of the variables, and the combinations without effect."""
     norm = np.linalg.norm(slopes, axis=0)
     norm = np.where(norm > 0, norm, 1.0)
     _, sizes, modes = np.linalg.svd(slopes / norm, full_matrices=False)
-    blind = sizes < _COLLINEAR * sizes[0]
-    inverse = np.where(blind, 0.0, 1.0 / np.where(blind, 1.0, sizes))
+    flat = sizes < _COLLINEAR * sizes[0]
+    inverse = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, sizes))
     spread = (modes.T * inverse) / norm[:, None]
     noise = float(values @ values) / max(1, len(values) - len(variables))
     combinations = []
-    for mode in modes[blind]:
+    for mode in modes[flat]:
         # In natural units, the largest part 1.
         parts = mode / norm
         main = np.flatnonzero(np.abs(mode) > 0.05)

@@ -1,4 +1,4 @@
-"""The file that a sensitivity matrix is kept in: FITS, or a table that people read."""
+"""Files of sensitivity matrices: FITS or ECSV."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .sensitivity import Sensitivity
 
 
 def write_sensitivity(path: Path, result: Sensitivity) -> None:
-    """Write a sensitivity matrix; the end of the name says how.
+    """Write a sensitivity matrix, in the format of the suffix.
 
     ``.fits``: images MATRIX [field, zernike, parameter] and ZERNIKES [field, zernike], tables FIELDS and PARAMETERS.
     ``.ecsv``: a row for each field point and Zernike term, a column for each parameter.
@@ -29,11 +29,12 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
     Raises
     ------
     ConfigError
-        If the name ends otherwise.
+        If the suffix is another.
     ProductError
         If the file cannot be written.
     """
     x, y = np.rad2deg(result.fields.T)
+    names, units = result.parameters.names, ["" if unit == "1" else unit for unit in result.parameters.units]
     if path.suffix == ".ecsv":
         n_field, n_zernike, _ = result.matrix.shape
         places = [np.repeat(v, n_zernike) for v in (x, y)]
@@ -43,12 +44,8 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
             "noll": (np.tile(np.arange(1, n_zernike + 1), n_field), "", "Noll index of the annular Zernike term"),
             "zernike": (result.zernikes.ravel(), "m", "the term of the telescope as it is"),
         }
-        for i, parameter in enumerate(result.parameters):
-            columns[parameter.address] = (
-                result.matrix[:, :, i].ravel(),
-                _metres_per(parameter.unit),
-                "derivative of the term",
-            )
+        for i, (name, unit) in enumerate(zip(names, units, strict=True)):
+            columns[name] = (result.matrix[:, :, i].ravel(), _metres_per(unit), "derivative of the term")
         meta = {
             "creator": f"pachon {VERSION}",
             "telescope": result.telescope,
@@ -60,11 +57,10 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
     if path.suffix != ".fits":
         raise ConfigError(f"--out {path}: expected a name that ends in .fits or .ecsv")
     fields = {"X": (x, "deg", "field angle"), "Y": (y, "deg", "field angle")}
-    width = max(len(p.address) for p in result.parameters)
     listed = fits.BinTableHDU.from_columns(
         [
-            fits.Column(name="ADDRESS", array=[p.address for p in result.parameters], format=f"{width}A"),
-            fits.Column(name="UNIT", array=[p.unit for p in result.parameters], format="8A"),
+            fits.Column(name="ADDRESS", array=list(names), format=f"{max(map(len, names))}A"),
+            fits.Column(name="UNIT", array=units, format="8A"),
         ],
         name="PARAMETERS",
     )
@@ -82,6 +78,8 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
 
 
 def _metres_per(unit: str) -> str:
-    """Return the unit of metres per a unit of a parameter, as astropy writes it: m, rad, 1/m, m^-5 or none."""
+    """Return metres per unit of a parameter, in the spelling of astropy."""
     known = {"": "m", "m": "", "rad": "m / rad", "1/m": "m2"}
-    return known[unit] if unit in known else f"m{1 - int(unit.removeprefix('m^'))}"
+    if unit.startswith("m^"):
+        return f"m{1 - int(unit.removeprefix('m^'))}"
+    return known.get(unit, f"m / {unit}")

@@ -1,4 +1,4 @@
-"""Targets: numbers that an optimisation pulls towards a value, beside its merit."""
+"""Targets: numbers that an optimisation holds at a value, in addition to its merit."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import field_direction, parallel_rays
 from .jacobian import ParameterColumns
 
-#: Angle [rad] between the two chief rays that tell the focal length: distortion enters as its square.
+#: Angle [rad] between the two chief rays of the focal length; distortion enters as its square.
 _SMALL_FIELD = 1e-4
 
 
 @dataclass(frozen=True)
 class FocalLength:
-    """Focal length: distance on the detector of two chief rays by the axis over the tangent of their angle.
+    """Focal length: distance on the detector of two chief rays near the axis over the tangent of their angle.
 
-    It is the scale of the detector where that is, which differs from the paraxial focal length where it is not in the
-    paraxial focus.
+    This is the scale on the detector. It differs from the paraxial focal length if the detector is not in the paraxial
+    focus.
 
     Parameters
     ----------
     value : float
-        The focal length that is wanted [m].
+        Wanted focal length [m].
     weight : float
-        A focal length that is off by 1 mm counts as `weight` times 1 mm of rms spot or wavefront.
+        An error of 1 mm counts as `weight` times 1 mm of rms spot or wavefront.
     wavelength : float, optional
         Vacuum wavelength [m]; the telescope's own by default.
     """
@@ -58,18 +58,18 @@ class FocalLength:
 
 @dataclass(frozen=True)
 class Target:
-    """Any number that a telescope has, with derivatives from central differences.
+    """Any property of a telescope, with derivatives from central differences.
 
     Parameters
     ----------
     function : callable
-        Takes a telescope, returns a number [m, or whatever `weight` turns into m].
+        Function of a telescope that returns the number.
     value : float
-        What it should be.
+        Wanted value.
     weight : float
-        Factor that makes it comparable with the rms spot or wavefront [m].
+        Factor from the number to an rms spot or wavefront [m].
     step : float
-        Change of the wavefront or spots [m] that a variable's step for the differences is to make.
+        Effect on wavefront or spots [m] of the step of a variable for the differences.
     """
 
     function: Callable[[Telescope], float]

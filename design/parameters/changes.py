@@ -1,4 +1,4 @@
-"""Changes of a telescope as files and command lines give them: with the unit in the name, ``M2.dz_um: 10``."""
+"""Changes of a telescope in files and command lines, with the unit in the name: ``M2.dz_um: 10``."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telesco
     telescope : Telescope
         The telescope; it stays as it is.
     changes : mapping of str to float
-        Change of each parameter: its address (:mod:`.parameters`), an underscore and the unit of the
-        value. A length takes m, mm, um or nm, an angle rad, mrad, urad, arcsec or deg; all else has no ending, and is
-        in SI: ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.conic``, ``L1_entrance.n``.
+        Change of each parameter by its address (:mod:`.parameters`), an underscore and the unit of the value: m, mm, um
+        or nm for a length, rad, mrad, urad, arcsec or deg for an angle. Other parameters have no ending and are in SI:
+        ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.conic``, ``L1_entrance.n``.
 
     Raises
     ------
     ConfigError
-        If the unit is missing, or is none of what the parameter is.
+        If the unit is missing, or does not fit the parameter.
     PachonError
         As :func:`~pachon.design.parameters.parameters.apply`.
     """
@@ -41,7 +41,7 @@ def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telesco
 
 
 def parse_change(telescope: Telescope, name: str) -> tuple[Parameter, float]:
-    """Return the parameter that a name with a unit means, and its SI value for a value of one."""
+    """Return the parameter of a name with a unit, and the size of that unit in SI."""
     address, _, ending = name.rpartition("_")
     if address and ending in (*_LENGTHS, *_ANGLES) and "." in address:
         parameter = Parameter.parse(address, telescope)

@@ -1,8 +1,8 @@
-"""Named degrees of freedom: the vector that active optics moves, applied to a telescope in one call.
+"""Named degrees of freedom of active optics: a vector of motions and bending modes.
 
-A degree of freedom is a linear combination of parameters of the telescope (:mod:`~.parameters`) and of
-figures that its mirrors take on, Zernike terms or maps on grids. So a vector of parameters is a matrix times the vector
-of degrees of freedom, and derivatives by the latter are those by the former times the same matrix.
+A degree of freedom is a linear combination of parameters of the telescope (:mod:`~.parameters`) and of surface
+deformations, Zernike terms or maps on grids. So a vector of parameters is a matrix times the vector of degrees of
+freedom, and derivatives with respect to the latter are those with respect to the former times the same matrix.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ...models.telescope import Telescope
 from ..optimize.sensitivity import Sensitivity, sensitivity
 from .parameters import Parameter, apply, parse_parameters
 
-#: What a unit may measure; values are counted in these.
+#: Base units of values.
 _SI = (u.m, u.rad, u.K, u.dimensionless_unscaled)
 
 
 def unit_size(text: str) -> float:
-    """Return one of a unit in m, rad, K or as a pure number.
+    """Return the size of a unit in m, rad, K or as a pure number.
 
     Raises
     ------
     ConfigError
-        If it is no unit of these.
+        If it is not a unit of length, angle or temperature.
     """
     try:
         unit = u.Unit("" if text == "1" else text)
@@ -41,18 +41,18 @@ def unit_size(text: str) -> float:
 
 
 @dataclass(frozen=True)
-class Freedom:
+class DegreeOfFreedom:
     """One degree of freedom.
 
     Attributes
     ----------
     name : str
-        Its name.
+        Name.
     unit : str
-        Unit of its values: "um", "arcsec", "K", "1"...
+        Unit of the values: "um", "arcsec", "K", "1"...
     of : mapping of str to float
-        Address of each thing that it moves, ``<surface or group>.<parameter>`` or ``<figure>.<term>``, and by how much:
-        in the address's own SI unit per SI unit of the degree of freedom.
+        Coefficients by address, ``<surface or group>.<parameter>`` or ``<deformation>.<mode>``: SI unit of the address
+        per SI unit of the degree of freedom.
     """
 
     name: str
@@ -61,17 +61,17 @@ class Freedom:
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A figure that surfaces can take on: what is added to the sag of each of them.
+class SurfaceDeformation:
+    """Bending modes of surfaces, which add to their sag.
 
     Attributes
     ----------
     name : str
-        Its name, which addresses begin with.
+        Name, the first part of addresses.
     surfaces : tuple of str
-        Surfaces that take it on. A figure of M1 and M3, cast in one piece, is the same function of x and y on both.
+        Deformed surfaces. A deformation of M1 and M3, cast in one piece, is the same function of x and y on both.
     shape : Shape
-        The figure with all its terms zero: a ``ZernikeSag`` or ``GridModes``.
+        Modes with zero amplitude: a ``ZernikeSag`` or ``GridModes``.
     """
 
     name: str
@@ -85,37 +85,40 @@ class DegreesOfFreedom:
 
     Parameters
     ----------
-    freedoms : tuple of Freedom
-        In the order of the vector.
-    figures : tuple of Figure
-        Figures that they refer to.
+    members : tuple of DegreeOfFreedom
+        Degrees of freedom in the order of the vector.
+    deformations : tuple of SurfaceDeformation
+        Surface deformations in their addresses.
     name, description, source : str
-        What they are, and where they come from.
+        Name, description and origin of the set.
 
     Raises
     ------
     ConfigError
-        If there are none, a name occurs twice, or a unit is none.
+        If there are no members, a name occurs twice, or a unit is unknown.
     """
 
-    freedoms: tuple[Freedom, ...]
-    figures: tuple[Figure, ...] = ()
+    members: tuple[DegreeOfFreedom, ...]
+    deformations: tuple[SurfaceDeformation, ...] = ()
     name: str = ""
     description: str = ""
     source: str = ""
 
     def __post_init__(self) -> None:
-        if not self.freedoms:
+        if not self.members:
             raise ConfigError("degrees_of_freedom = []: expected at least one")
-        for kind, names in (("degree of freedom", self.names), ("figure", tuple(f.name for f in self.figures))):
+        for kind, names in (
+            ("degree of freedom", self.names),
+            ("deformation", tuple(d.name for d in self.deformations)),
+        ):
             for name in names:
                 if names.count(name) > 1:
                     raise ConfigError(f"{kind} {name!r} occurs more than once: expected unique names")
-        for freedom in self.freedoms:
+        for member in self.members:
             try:
-                unit_size(freedom.unit)
+                unit_size(member.unit)
             except ConfigError as error:
-                raise ConfigError(f"degree of freedom {freedom.name!r}: {error}") from None
+                raise ConfigError(f"degree of freedom {member.name!r}: {error}") from None
 
     @classmethod
     def of_parameters(cls, telescope: Telescope, addresses: Iterable[str | Parameter]) -> DegreesOfFreedom:
@@ -128,25 +131,27 @@ class DegreesOfFreedom:
         """
         found = parse_parameters(addresses, telescope)
         return cls(
-            tuple(Freedom(p.address, p.unit if p.unit in ("m", "rad") else "1", {p.address: 1.0}) for p in found)
+            tuple(
+                DegreeOfFreedom(p.address, p.unit if p.unit in ("m", "rad") else "1", {p.address: 1.0}) for p in found
+            )
         )
 
     def __len__(self) -> int:
-        return len(self.freedoms)
+        return len(self.members)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names in the order of the vector."""
-        return tuple(freedom.name for freedom in self.freedoms)
+        return tuple(member.name for member in self.members)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the vector's values."""
-        return tuple(freedom.unit for freedom in self.freedoms)
+        """Units of the values."""
+        return tuple(member.unit for member in self.members)
 
     @cached_property
-    def sizes(self) -> np.ndarray:
-        """One of each unit in SI, shape [n]."""
+    def unit_sizes(self) -> np.ndarray:
+        """Sizes of the units in SI, shape [n]."""
         return np.array([unit_size(unit) for unit in self.units])
 
     def select(self, names: Iterable[str]) -> DegreesOfFreedom:
@@ -155,12 +160,12 @@ class DegreesOfFreedom:
         Raises
         ------
         UnknownNameError
-            If there is none of a name.
+            If a name does not exist.
         """
-        return replace(self, freedoms=tuple(self.freedoms[self.place(name)] for name in names))
+        return replace(self, members=tuple(self.members[self.index(name)] for name in names))
 
-    def place(self, name: str) -> int:
-        """Return the place of a degree of freedom in the vector."""
+    def index(self, name: str) -> int:
+        """Return the index of a degree of freedom in the vector."""
         if name not in self.names:
             raise unknown_name(f"degree of freedom{f' of {self.name}' if self.name else ''}", name, self.names)
         return self.names.index(name)
@@ -171,7 +176,7 @@ class DegreesOfFreedom:
         Parameters
         ----------
         values : array_like, shape [n], or mapping of str to float or Quantity
-            Numbers in the units of the degrees of freedom. In a mapping those that are not named are zero.
+            Numbers in the units of the degrees of freedom; zero for those that a mapping leaves out.
 
         Raises
         ------
@@ -183,13 +188,13 @@ class DegreesOfFreedom:
         if isinstance(values, Mapping):
             vector = np.zeros(len(self))
             for name, value in values.items():
-                place = self.place(name)
+                i = self.index(name)
                 if isinstance(value, u.Quantity):
                     try:
-                        value = value.to_value("" if self.units[place] == "1" else self.units[place])
+                        value = value.to_value("" if self.units[i] == "1" else self.units[i])
                     except u.UnitConversionError:
-                        raise DomainError(f"{name} = {value}: expected a unit like {self.units[place]}") from None
-                vector[place] = value
+                        raise DomainError(f"{name} = {value}: expected a unit like {self.units[i]}") from None
+                vector[i] = value
         else:
             vector = np.asarray(values, dtype=np.float64)
             if vector.shape != (len(self),):
@@ -204,9 +209,9 @@ class DegreesOfFreedom:
     def apply(self, telescope: Telescope, values: Any) -> Telescope:
         """Return the telescope with a vector of degrees of freedom applied.
 
-        All figures are added to the surfaces first, whose order does not matter; then other parameters change; then
-        bodies move, groups before what they contain, each turned about its vertex (a group about its pivot) and then
-        shifted. Contributions of several degrees of freedom to one parameter are summed before.
+        Deformations are added to the surfaces first, then other parameters change, then bodies move, groups before
+        their members: each rotates about its vertex (a group about its pivot) and then shifts. Contributions of several
+        degrees of freedom to one parameter are summed before.
 
         Parameters
         ----------
@@ -218,26 +223,22 @@ class DegreesOfFreedom:
         Raises
         ------
         UnknownNameError, ConfigError, DomainError
-            If a value is wrong, or the telescope lacks what a degree of freedom moves.
+            If a value is wrong, or the telescope lacks a surface or term of a degree of freedom.
         """
         vector = self.vector(values)
-        used = (
-            self.select([name for name, value in zip(self.names, vector, strict=True) if value])
-            if any(vector)
-            else None
-        )
-        if used is None:
+        if not vector.any():
             return telescope
-        prepared, parameters, matrix = used.combination(telescope)
+        used = self.select(name for name, value in zip(self.names, vector, strict=True) if value)
+        prepared, parameters, matrix = used.parameter_matrix(telescope)
         return apply(prepared, dict(zip(parameters, matrix @ vector[vector != 0.0], strict=True)))
 
-    def combination(self, telescope: Telescope) -> tuple[Telescope, tuple[Parameter, ...], np.ndarray]:
-        """Return what the degrees of freedom are made of.
+    def parameter_matrix(self, telescope: Telescope) -> tuple[Telescope, tuple[Parameter, ...], np.ndarray]:
+        """Return the matrix from degrees of freedom to parameters.
 
         Returns
         -------
         prepared : Telescope
-            The same optics, with the figures that are referred to at zero.
+            The same optics, with the deformations at zero amplitude.
         parameters : tuple of Parameter
             Parameters of that telescope.
         matrix : ndarray, shape [n_parameter, n]
@@ -246,66 +247,70 @@ class DegreesOfFreedom:
         Raises
         ------
         UnknownNameError, ConfigError, DomainError
-            If the telescope lacks what a degree of freedom moves.
+            If the telescope lacks a surface or term of a degree of freedom.
         """
-        homes = {figure.name: figure for figure in self.figures}
-        places: dict[str, list[tuple[str, Shape]]] = {}
-        prepared = telescope
+        bending = _Bending({d.name: d for d in self.deformations}, telescope)
         rows: dict[str, np.ndarray] = {}
-        for column, (freedom, size) in enumerate(zip(self.freedoms, self.sizes, strict=True)):
-            for address, weight in freedom.of.items():
-                target, _, term = address.partition(".")
+        for column, (member, size) in enumerate(zip(self.members, self.unit_sizes, strict=True)):
+            for address, weight in member.of.items():
                 try:
-                    found = [address]
-                    if target in homes:
-                        figure = homes[target]
-                        if target in (*telescope.surface_names, *telescope.groups):
-                            raise ConfigError(f"figure {target!r} has the name of a surface: expected another name")
-                        if term not in figure.shape.parameters:
-                            raise unknown_name(f"term of figure {target}", term, figure.shape.parameters)
-                        if target not in places:
-                            # A figure of its own on each surface, whatever the surface has already.
-                            places[target] = [(s, figure.shape) for s in figure.surfaces]
-                            for surface in figure.surfaces:
-                                prepared = prepared.with_deformation(surface, figure.shape)
-                        found = [f"{s}.{_last(prepared.surface(s).shape, shape, term)}" for s, shape in places[target]]
-                    parse_parameters(found, prepared)
+                    found = bending.addresses(address)
+                    parse_parameters(found, bending.telescope)
                 except PachonError as error:
-                    raise error.within(subject=f"degree of freedom {freedom.name!r}") from None
+                    raise error.within(subject=f"degree of freedom {member.name!r}") from None
                 for one in found:
                     rows.setdefault(one, np.zeros(len(self)))[column] += weight * size
-        return prepared, parse_parameters(rows, prepared), np.array(list(rows.values()))
+        return bending.telescope, parse_parameters(rows, bending.telescope), np.array(list(rows.values()))
 
     def sensitivity(
         self, telescope: Telescope, fields: Any = None, wavelength: Any = None, **options: Any
     ) -> Sensitivity:
-        """Return how the wavefront's Zernike coefficients answer to the degrees of freedom.
+        """Return the sensitivity matrix of the wavefront to the degrees of freedom.
 
         Parameters
         ----------
-        telescope : Telescope
-            The telescope.
-        fields, wavelength, **options :
-            As for :func:`~pachon.design.optimize.sensitivity.sensitivity`.
+        telescope, fields, wavelength, **options
+            As in :func:`~pachon.design.optimize.sensitivity.sensitivity`.
 
         Returns
         -------
         Sensitivity
             In metres of wavefront per unit of each degree of freedom, in the order of the vector.
         """
-        prepared, parameters, matrix = self.combination(telescope)
+        prepared, parameters, matrix = self.parameter_matrix(telescope)
         found = sensitivity(prepared, parameters, fields, wavelength, **options)
-        names = tuple(
-            Parameter(f.name, f.name, f.name, "motion", "" if f.unit == "1" else f.unit) for f in self.freedoms
-        )
-        return replace(found, parameters=names, matrix=found.matrix @ matrix)
+        return replace(found, parameters=self, matrix=found.matrix @ matrix)
 
 
-def _last(shape: Shape, part: Shape, term: str) -> str:
-    """Return the name, within a sum, of a term of a part: the last part that is the given one, at zero."""
+class _Bending:
+    """A telescope whose surfaces get deformations, at zero amplitude, when an address refers to them."""
+
+    def __init__(self, deformations: dict[str, SurfaceDeformation], telescope: Telescope) -> None:
+        self.telescope, self._deformations = telescope, deformations
+        self._added: set[str] = set()
+
+    def addresses(self, address: str) -> list[str]:
+        """Return the addresses of parameters for one that may refer to a deformation."""
+        target, _, mode = address.partition(".")
+        if target not in self._deformations:
+            return [address]
+        surfaces, shape = self._deformations[target].surfaces, self._deformations[target].shape
+        if target in (*self.telescope.surface_names, *self.telescope.groups):
+            raise ConfigError(f"deformation {target!r} has the name of a surface: expected another name")
+        if mode not in shape.parameters:
+            raise unknown_name(f"mode of deformation {target}", mode, shape.parameters)
+        if target not in self._added:
+            self._added.add(target)
+            for surface in surfaces:
+                self.telescope = self.telescope.with_deformation(surface, shape)
+        return [f"{name}.{_term(self.telescope.surface(name).shape, shape, mode)}" for name in surfaces]
+
+
+def _term(shape: Shape, part: Shape, mode: str) -> str:
+    """Return the name of a mode of a part within a sum; of equal parts the last."""
     if not isinstance(shape, Sum):
-        return term
-    for name in (term, *(f"part{i}.{term}" for i in range(len(shape.parts), 0, -1))):
+        return mode
+    for name in (mode, *(f"part{i}.{mode}" for i in range(len(shape.parts), 0, -1))):
         if name in shape.parameters and shape.place(name)[0] is part:
             return name
-    raise unknown_name("term", term, shape.parameters)
+    raise unknown_name("term", mode, shape.parameters)

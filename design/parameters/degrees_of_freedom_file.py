@@ -34,7 +34,7 @@ from ...models.io.yaml.values import Names, Number, PositiveNumber, Text, rows
 from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.modes import GridModes
 from ...models.shapes.shape import Shape
-from .degrees_of_freedom import DegreesOfFreedom, Figure, Freedom
+from .degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
 
 #: Those that come with the package, by the file that they are in.
 BUNDLED = {"lsst": "lsst_degrees_of_freedom.yaml"}
@@ -128,12 +128,12 @@ class DegreesOfFreedomFile(Section):
 
 def _read(path: Path) -> DegreesOfFreedom:
     file = validated(DegreesOfFreedomFile, read_mapping(path), str(path), PrescriptionError)
-    freedoms = tuple(Freedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
-    figures = []
+    members = tuple(DegreeOfFreedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
+    deformations = []
     for name, section in file.figures.items():
         with error_context(file=path, key=f"figures.{name}"):
-            figures.append(Figure(name, section.surfaces, section.shape(path.parent)))
+            deformations.append(SurfaceDeformation(name, section.surfaces, section.shape(path.parent)))
     try:
-        return DegreesOfFreedom(freedoms, tuple(figures), file.name, file.description, file.source)
+        return DegreesOfFreedom(members, tuple(deformations), file.name, file.description, file.source)
     except ConfigError as error:
         raise PrescriptionError(str(error), file=path) from None

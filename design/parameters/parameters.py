@@ -1,53 +1,54 @@
-"""Parameters: what of a telescope may change, addressed by a text such as "M2.dx", "M1.conic" or "L1_entrance.n".
+"""Parameters of a telescope, with addresses such as "M2.dx", "M1.conic" or "L1_entrance.n".
 
-========================== ======================================== ======
-address                    what it is                               unit
-========================== ======================================== ======
-``M2.dx`` ``dy`` ``dz``    shift along the axes of the telescope    m
-``M2.rx`` ``ry`` ``rz``    tilt about the body's own axes           rad
-``M1.radius`` ``conic``    a figure that the shape has              its own
-``M1.a6`` ``M1.Z5``        a power or Zernike term, added if absent m^-5, m
-``silica.n``               index of a medium, wherever it is
-``L1_entrance.n``          index of the medium behind one surface
-========================== ======================================== ======
+========================== ============================================ ======
+address                    meaning                                      unit
+========================== ============================================ ======
+``M2.dx`` ``dy`` ``dz``    shift along the axes of the telescope        m
+``M2.rx`` ``ry`` ``rz``    tilt about the axes of the body              rad
+``M1.radius`` ``conic``    a term of the shape                          its own
+``M1.a6`` ``M1.Z5``        a power or Zernike term, added if absent     m^-5, m
+``silica.n``               refractive index of a medium, wherever it is
+``L1_entrance.n``          refractive index behind one surface
+========================== ============================================ ======
 
-Shift and tilt are those of :meth:`Telescope.perturbed`, of a surface or a group. *A value is always a change*: zero
-leaves the telescope as it is. Where several bodies move, groups go before what they contain.
+Shift and tilt are those of :meth:`Telescope.perturbed`, of a surface or a group. *Values are changes*: zero leaves the
+telescope as it is. Where several bodies move, groups go before their members.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError, unknown_name
 from ...models.media.changed_index import with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
 from ...models.telescope import Telescope, rotation_matrix
-from .surface_deformation import figure_unit, with_figure
+from .shape_terms import shape_with_term, term_unit
 
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One thing that may change.
+    """One parameter.
 
     Attributes
     ----------
     address : str
-        Its text.
+        Address.
     target : str
         Name of the surface, group or medium.
     name : str
-        What of it: a motion, a figure, or "n".
-    kind : {"motion", "figure", "index"}
-        Which of these it is.
+        A motion, a term of the shape, or "n".
+    kind : {"motion", "shape", "index"}
+        Kind of the parameter.
     unit : str
         Unit of its values; empty for a pure number.
     """
@@ -55,28 +56,28 @@ class Parameter:
     address: str
     target: str
     name: str
-    kind: Literal["motion", "figure", "index"]
+    kind: Literal["motion", "shape", "index"]
     unit: str
 
     @classmethod
     def parse(cls, text: str, telescope: Telescope) -> Parameter:
-        """Return the parameter that an address names.
+        """Return the parameter at an address.
 
         Parameters
         ----------
         text : str
             The address.
         telescope : Telescope
-            The telescope that it is to be found in.
+            Telescope with the parameter.
 
         Raises
         ------
         UnknownNameError
-                If there is no such surface, group, medium or figure.
+            If there is no such surface, group, medium or term.
         ConfigError
-            If it is no address at all.
+            If the text is not an address.
         DomainError
-            If a figure cannot be had: a Zernike term on a surface without rims.
+            If a term cannot be added: a Zernike term on a surface without rims.
         """
         media = _media(telescope)
         bodies = (*telescope.surface_names, *telescope.groups, *media)
@@ -100,12 +101,12 @@ class Parameter:
         surface = telescope.surface(target)
         if name == "n":
             if surface.interaction != Interaction.REFRACT:
-                raise DomainError(f"parameter {text!r}: expected a refracting surface, which a medium begins behind")
+                raise DomainError(f"parameter {text!r}: expected a refracting surface")
             return cls(text, target, name, "index", "")
-        return cls(text, target, name, "figure", figure_unit(with_figure(surface, name), name))
+        return cls(text, target, name, "shape", term_unit(shape_with_term(surface, name), name))
 
     def value(self, telescope: Telescope) -> float:
-        """Return what the telescope has now: a figure's value, the index at the default wavelength; 0 of a motion."""
+        """Return the present value: of a term, or of the index at the default wavelength; 0 for a motion."""
         if self.kind == "motion":
             return 0.0
         if self.kind == "index":
@@ -115,15 +116,57 @@ class Parameter:
         return float(surface.shape.parameters.get(self.name, 0.0))
 
 
+class Variables(Protocol):
+    """Named changes of a telescope in a fixed order: parameters or degrees of freedom."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the order of the vector."""
+        ...
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the values; "1" for a pure number."""
+        ...
+
+    def apply(self, telescope: Telescope, values: Any) -> Telescope:
+        """Return the telescope with a vector of changes applied, each in its unit."""
+        ...
+
+
+@dataclass(frozen=True)
+class ParameterVector:
+    """Parameters in a fixed order, with their addresses for names."""
+
+    parameters: tuple[Parameter, ...]
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Addresses in the order of the vector."""
+        return tuple(p.address for p in self.parameters)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the values; "1" for a pure number."""
+        return tuple(p.unit or "1" for p in self.parameters)
+
+    def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
+        """Return the telescope with a vector of changes applied, each in the unit of its parameter."""
+        return apply(telescope, dict(zip(self.parameters, np.asarray(values, dtype=np.float64), strict=True)))
+
+
 def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> tuple[Parameter, ...]:
     """Return the parameters of a list of addresses; ``M1.Z4-22`` stands for Z4, Z5 ... Z22, ``M2.*`` for six motions.
 
     Raises
     ------
     ConfigError
-        If the list is empty or names a parameter twice, or a text is no address.
+        If the list is empty or has a parameter twice, or a text is not an address.
     UnknownNameError
-        If there is no such surface, group or figure.
+        If there is no such surface, group or term.
     """
     found: list[Parameter] = []
     for text in texts:
@@ -151,7 +194,7 @@ def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> 
 
 
 def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
-    """Return five motions (all but the turn about the axis) of every body: outermost groups, and mirrors in none.
+    """Return five motions (without rotation about the axis) of every body: outermost groups and mirrors in no group.
 
     The first mirror is left out: the others are aligned to it.
     """
@@ -163,28 +206,28 @@ def usual_parameters(telescope: Telescope) -> tuple[Parameter, ...]:
     return parse_parameters([f"{b}.{m}" for b in bodies or telescope.surface_names[:1] for m in MOTIONS[:5]], telescope)
 
 
-def with_figures(telescope: Telescope, parameters: Iterable[Parameter]) -> Telescope:
-    """Return the telescope with every figure that parameters name, zero where it was not there: the same optics."""
-    for target, shape in figured_shapes(telescope, parameters).items():
+def with_shape_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> Telescope:
+    """Return the same optics with all shape terms of the parameters, zero where they are new."""
+    for target, shape in shapes_with_terms(telescope, parameters).items():
         if shape is not telescope.surface(target).shape:
             telescope = telescope.with_shape(target, shape)
     return telescope
 
 
-def figured_shapes(telescope: Telescope, parameters: Iterable[Parameter]) -> dict[str, Shape]:
-    """Return the shapes of the surfaces whose figures parameters name, with all of these figures, by surface."""
+def shapes_with_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> dict[str, Shape]:
+    """Return the shapes of the surfaces with shape parameters, all of their terms included, by surface."""
     shapes: dict[str, Shape] = {}
     names: dict[str, list[str]] = {}
     for parameter in parameters:
-        if parameter.kind == "figure":
+        if parameter.kind == "shape":
             names.setdefault(parameter.target, []).append(parameter.name)
-    for target, figures in names.items():
+    for target, terms in names.items():
         surface = telescope.surface(target)
         known = set(surface.shape.parameters)
         # The highest Zernike term, or power, makes room for those below it.
-        for name in sorted(figures, key=lambda name: (len(name), name), reverse=True):
+        for name in sorted(terms, key=lambda name: (len(name), name), reverse=True):
             if name not in known:
-                surface = replace(surface, shape=with_figure(surface, name))
+                surface = replace(surface, shape=shape_with_term(surface, name))
                 known = set(surface.shape.parameters)
         shapes[target] = surface.shape
     return shapes
@@ -203,17 +246,17 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
     Raises
     ------
     DomainError
-        If a value is not a finite number, or what it leads to cannot be.
+        If a value is not finite, or the result is not a valid telescope.
     UnknownNameError, ConfigError
         As :meth:`Parameter.parse`.
     """
     parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
     changes = _finite(parameters, values.values())
-    telescope = with_figures(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
+    telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
     for parameter, change in zip(parameters, changes, strict=True):
         if not change:
             continue
-        if parameter.kind == "figure":
+        if parameter.kind == "shape":
             shape = telescope.surface(parameter.target).shape
             value = shape.parameters[parameter.name] + change
             telescope = telescope.with_shape(parameter.target, shape.with_parameter(parameter.name, value))
@@ -240,9 +283,9 @@ def _media(telescope: Telescope) -> set[str]:
 
 
 def index_surfaces(telescope: Telescope, target: str) -> list[int]:
-    """Return the indices of the surfaces behind which light is in the medium that an index parameter is about.
+    """Return the indices of the surfaces with the medium of an index parameter behind them.
 
-    Behind one refracting surface, and those after it up to the next that refracts; or, of a medium, all such.
+    One refracting surface, and those after it up to the next that refracts; for a medium, all such runs.
     """
     found: list[int] = []
     inside = False
@@ -265,12 +308,12 @@ def _with_index(telescope: Telescope, target: str, change: float) -> Telescope:
 def _body_motions(
     telescope: Telescope, parameters: Iterable[Parameter], values: Iterable[float]
 ) -> list[tuple[str, np.ndarray]]:
-    """Return each body that may move with its shift [m] and tilt [rad], in the order in which they are applied."""
+    """Return each body with its shift [m] and tilt [rad], in the order of application."""
     motions: dict[str, np.ndarray] = {}
     for parameter, value in zip(parameters, values, strict=True):
         if parameter.kind == "motion":
             motions.setdefault(parameter.target, np.zeros(6))[MOTIONS.index(parameter.name)] = value
-    # A stable sort: bodies of one size stay in the order in which they were named.
+    # A stable sort: bodies of one size stay in their order.
     return sorted(motions.items(), key=lambda item: -len(_members(telescope, item[0])))
 
 
@@ -279,14 +322,14 @@ def _members(telescope: Telescope, body: str) -> tuple[str, ...]:
 
 
 def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.ndarray) -> np.ndarray:
-    """Return how each surface moves with each parameter, at given values of all.
+    """Return the twist (velocity and rotation) of each surface per unit of each parameter.
 
     Parameters
     ----------
     telescope : Telescope
-        The telescope that the values are changes of.
+        Telescope before the changes.
     parameters : tuple of Parameter
-        All that change.
+        All parameters that change.
     values : ndarray, shape [n_parameter]
         Their changes.
 
@@ -294,7 +337,7 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
     -------
     ndarray, shape [n_parameter, n_surface, 6]
         Velocity of the point of the surface's frame at the telescope's origin, and angular velocity: a point ``x`` of
-        surface ``s`` moves by ``v + w x x`` per unit of the parameter. Zero for figures and indices.
+        surface ``s`` moves by ``v + w x x`` per unit of the parameter. Zero for shapes and indices.
     """
     result = np.zeros((len(parameters), len(telescope.surfaces), 6))
     names = telescope.surface_names
@@ -304,11 +347,11 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
         places = [names.index(m) for m in members]
         surface = telescope.surface(members[0])
         pivot, axes = (np.array(v) for v in telescope.group_frames.get(body, (surface.vertex, surface.rotation)))
-        turn = axes @ rotation_matrix(tilt) @ axes.T
-        # Vector product with a vector from the left: a turn about where the pivot has gone to.
+        rotation = axes @ rotation_matrix(tilt) @ axes.T
+        # Matrix of the vector product from the left: rotation about the shifted pivot.
         x, y, z = pivot + shift
         about = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        # Those that moved before: a body whose frame went along turns about where it went, with it.
+        # Bodies that moved before: a member of a moved group rotates about its moved pivot, with it.
         for row, parameter in enumerate(parameters):
             if parameter.kind == "motion" and result[row, places].any():
                 larger = telescope.groups.get(parameter.target, ())
@@ -318,8 +361,8 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
                     if along:
                         result[row, place, :3] = v - np.cross(w, shift)
                     else:
-                        w = turn @ w
-                        result[row, place, :3] = turn @ v + np.cross(w, turn @ pivot - pivot - shift)
+                        w = rotation @ w
+                        result[row, place, :3] = rotation @ v + np.cross(w, rotation @ pivot - pivot - shift)
                         result[row, place, 3:] = w
         for row, parameter in enumerate(parameters):
             if parameter.kind != "motion" or parameter.target != body:
@@ -328,7 +371,7 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
             if axis < 3:
                 result[row, places, axis] = 1.0
                 continue
-            # R = Rx Ry Rz: the axis of each factor is turned by those before it.
+            # R = Rx Ry Rz: the axis of each factor is rotated by those before it.
             earlier = np.where(np.arange(3) < axis - 3, tilt, 0.0)
             w = axes @ rotation_matrix(earlier)[:, axis - 3]
             result[row, places, :3] = about @ w

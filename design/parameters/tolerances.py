@@ -1,4 +1,4 @@
-"""Tolerances: how far each degree of freedom may be off, and random draws within them."""
+"""Tolerances of degrees of freedom, and random draws within them."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ DISTRIBUTIONS = ("uniform", "normal", "truncated")
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far one degree of freedom may be off.
+    """Tolerance of one degree of freedom.
 
     Parameters
     ----------
     name : str
         Name of the degree of freedom, or address of the parameter.
     size : float
-        "uniform": largest deviation, to either side. Else the standard deviation (of the normal distribution before it
-        is truncated). In the unit of the degree of freedom.
+        Largest deviation to either side ("uniform"), or standard deviation of the normal distribution before
+        truncation. In the unit of the degree of freedom.
     distribution : {"uniform", "normal", "truncated"}
-        How deviations are distributed.
+        Distribution of the deviations.
     limit : float, optional
-        Where a truncated distribution ends, to either side, in the same unit.
+        Largest deviation of a truncated distribution, in the same unit.
 
     Raises
     ------
     ConfigError
-        If there is no such distribution, or a limit is given to one that is not truncated, or missing.
+        If the distribution is unknown, or a limit is missing or not needed.
     DomainError
         If a number is not positive and finite.
     """
@@ -68,20 +68,19 @@ class Tolerance:
         return self.size / np.sqrt(3.0) if self.distribution == "uniform" else self.size
 
     def draw(self, seed: int, n: int) -> np.ndarray:
-        """Return ``n`` deviations, shape [n]; the first of more are those of fewer, whatever else is drawn."""
-        share = stream(seed, "tolerance", self.name).uniform(size=n)
+        """Return ``n`` deviations, shape [n]; the first ones do not depend on ``n`` or on other tolerances."""
+        uniform = stream(seed, "tolerance", self.name).uniform(size=n)
         if self.distribution == "uniform":
-            return self.size * (2.0 * share - 1.0)
+            return self.size * (2.0 * uniform - 1.0)
         low = 0.0 if self.limit is None else ndtr(-self.limit / self.size)
-        # A generator may hand out 0, which no normal deviation belongs to.
-        return self.size * ndtri(np.maximum(low + (1.0 - 2.0 * low) * share, np.finfo(float).tiny))
+        # The generator may return 0, where the normal quantile is infinite.
+        return self.size * ndtri(np.maximum(low + (1.0 - 2.0 * low) * uniform, np.finfo(float).tiny))
 
 
 def draw(tolerances: Iterable[Tolerance], seed: int, n: int = 1) -> np.ndarray:
     """Draw deviations within tolerances.
 
-    Each tolerance has a random stream of its own, by its name: leaving one out, or drawing more, leaves the others as
-    they were.
+    Each tolerance has a random stream of its own, by its name, so the draws of the others do not depend on it.
 
     Parameters
     ----------

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...design.optimize.merit import SpotMerit
-from ...design.optimize.optimize import beams, optimize
+from ...design.optimize.merit import Beams, SpotMerit
+from ...design.optimize.optimize import optimize
 from ...design.parameters.changes import parse_change
 from ...pipeline.experiment import Experiment
 from ...wavefront.chief_rays import fields_at
@@ -58,7 +58,7 @@ def compensated(
     places = (centers[:, None] + each * camera.half_size).reshape(-1, 2)
     wavelength = float(experiment.wavelengths[len(experiment.wavelengths) // 2])
     fields = fields_at(telescope, places, wavelength, threads=threads)
-    rays = beams(telescope, fields, [wavelength], count=_RINGS, threads=threads)
+    rays = Beams.of(telescope, fields, [wavelength], n_pupil=_RINGS, threads=threads)
     merit = SpotMerit(telescope, rays, heights=experiment.focal_plane.height(*places.T))
     found = optimize(
         telescope, [p for p, _ in chosen], merit, fields, [wavelength], tolerance=_TOLERANCE, threads=threads

@@ -8,8 +8,8 @@ import pytest
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.jacobian import ParameterColumns
-from pachon.design.optimize.merit import SpotMerit, WavefrontMerit
-from pachon.design.optimize.optimize import beams, optimize, wavefronts
+from pachon.design.optimize.merit import Beams, SpotMerit, WavefrontMerit
+from pachon.design.optimize.optimize import optimize, wavefronts
 from pachon.design.optimize.targets import FocalLength, Target
 from pachon.design.parameters.parameters import apply, parse_parameters
 from pachon.models.first_order import first_order
@@ -27,7 +27,7 @@ def paul_baker():
 
 @pytest.mark.parametrize("kind", ["spots", "spots from chief", "wavefront", "wavefront to a goal"])
 def test_derivatives_of_merits(paul_baker, slope, kind):
-    rays = beams(paul_baker, FIELDS, [5e-7, 7e-7], [1.0, 2.0, 1.0], None, "rings", 3)
+    rays = Beams.of(paul_baker, FIELDS, [5e-7, 7e-7], field_weights=[1.0, 2.0, 1.0], sampling="rings", n_pupil=3)
     if kind.startswith("spots"):
         merit = SpotMerit(paul_baker, rays, "chief" if "chief" in kind else "centroid")
     else:
@@ -49,7 +49,7 @@ def test_derivatives_of_merits(paul_baker, slope, kind):
 
 def test_spot_merit_is_the_rms_radius(paul_baker):
     moved = apply(paul_baker, {"Detector.dz": 2e-4})
-    rays = beams(moved, FIELDS, None, None, None, "square", 16)
+    rays = Beams.of(moved, FIELDS, sampling="square", n_pupil=16)
     total = 0.0
     for field in FIELDS:
         launched = pachon.launch_rays(moved, field, moved.default_wavelength, rays.pupil.points.T)
@@ -68,7 +68,7 @@ def test_a_misaligned_lsst_is_recovered_from_its_wavefronts(lsst_r):
     for seed in (1, 2, 3):
         tolerance = np.array([5e-4, 5e-4, 5e-5, 1e-4, 1e-4] * 2)
         truth = np.random.default_rng(seed).normal(size=10) * tolerance
-        measured = wavefronts(apply(lsst_r, dict(zip(HEXAPODS, truth, strict=True))), beams(lsst_r, fields))
+        measured = wavefronts(apply(lsst_r, dict(zip(HEXAPODS, truth, strict=True))), Beams.of(lsst_r, fields))
         found = optimize(lsst_r, HEXAPODS, "wavefront", fields, goal=measured, tolerance=1e-14)
         # Wavefronts are good to 1e-14 m; the motion that shows least makes 2e-4 m of wavefront per m.
         assert np.abs(found.changes - truth).max() < 1e-9

@@ -9,7 +9,7 @@ from astropy import units as u
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
-from pachon.design.parameters.parameters import apply, with_figures
+from pachon.design.parameters.parameters import apply, with_shape_terms
 from pachon.models.shapes.grid import GridSag
 from pachon.models.shapes.mesh import MeshSurface
 from pachon.models.zernike_polynomials import annular_zernikes
@@ -79,9 +79,9 @@ def test_the_terms_are_those_of_the_fit(lsst_r, result, zernikes):
 
 @pytest.mark.parametrize("address", list(STEPS))
 def test_matrix_against_central_differences(lsst_r, result, zernikes, slope, address):
-    column = [p.address for p in result.parameters].index(address)
-    # Zernike figures take their rims from the aperture, so they are put on before it is taken off.
-    start = bare(with_figures(lsst_r, [result.parameters[column]]))
+    column = result.parameters.names.index(address)
+    # Zernike terms take their rims from the aperture, so they are added before it is removed.
+    start = bare(with_shape_terms(lsst_r, [result.parameters.parameters[column]]))
     numeric = slope(lambda h: zernikes(apply(start, {address: h})), STEPS[address])
     matrix = result.matrix[:, :, column]
     assert np.abs(matrix).max() > 1e-5
@@ -91,17 +91,17 @@ def test_matrix_against_central_differences(lsst_r, result, zernikes, slope, add
 
 
 def test_nodes_of_a_grid(lsst_r, pupil, slope):
-    """One node of a measured figure: the sag around it alone, against the wavefront itself."""
+    """One node of a measured deformation: the sag around it alone, against the wavefront itself."""
     axis = np.linspace(-1.8, 1.8, 31)
-    figured = lsst_r.with_deformation("M2", GridSag(axis, axis, np.zeros((31, 31))))
+    deformed = lsst_r.with_deformation("M2", GridSag(axis, axis, np.zeros((31, 31))))
     address = "M2.node[18,26]"
     field, w = FIELDS[1], lsst_r.default_wavelength
-    found = sensitivity(figured, [address, "M2.Z6"], FIELDS[1:2], sampling=pupil).matrix[0]
+    found = sensitivity(deformed, [address, "M2.Z6"], FIELDS[1:2], sampling=pupil).matrix[0]
     terms = annular_zernikes(28, *(pupil.points.T / 4.18), lsst_r.pupil_obscuration)
-    lit = pachon.wavefront_opd(figured, field, w, pupil.points.T).lit
+    lit = pachon.wavefront_opd(deformed, field, w, pupil.points.T).lit
 
     def zernikes(h):
-        changed = apply(bare(figured), {address: h})
+        changed = apply(bare(deformed), {address: h})
         opd = pachon.wavefront_opd(changed, field, w, pupil.points.T).value
         return np.linalg.lstsq(terms[:, lit].T, opd[lit], rcond=None)[0]
 
@@ -141,7 +141,7 @@ def test_defocus_of_a_slow_paraboloid(paraboloid):
 def test_modes_show_what_cannot_be_told_apart(lsst_r):
     found = sensitivity(lsst_r, ["M1.radius", "M1.curvature", "Camera.dz"], FIELDS)
     values, modes = found.modes()
-    # Radius and curvature are one figure.
+    # Radius and curvature are one parameter.
     assert values[-1] < 1e-12 * values[0]
     assert np.abs(modes[-1][2]) < 1e-6
     assert np.allclose(np.abs(modes[-1][:2]), np.sqrt(0.5))
@@ -193,8 +193,8 @@ def test_summary_and_picture(result, tmp_path):
 
 def test_fields_and_quantities(lsst_r):
     assert field_rings(lsst_r).shape == (31, 2)
-    one = sensitivity(lsst_r, ["M2.dz"], [[0.0, 1.0]] * u.deg, 500 * u.nm, n_zernike=6, count=6)
-    two = sensitivity(lsst_r, ["M2.dz"], np.deg2rad([[0.0, 1.0]]), 5e-7, n_zernike=6, count=6)
+    one = sensitivity(lsst_r, ["M2.dz"], [[0.0, 1.0]] * u.deg, 500 * u.nm, n_zernike=6, n_pupil=6)
+    two = sensitivity(lsst_r, ["M2.dz"], np.deg2rad([[0.0, 1.0]]), 5e-7, n_zernike=6, n_pupil=6)
     assert np.array_equal(one.matrix, two.matrix)
 
 
@@ -205,7 +205,7 @@ def test_fields_and_quantities(lsst_r):
         (dict(parameters=[]), ConfigError, "at least one"),
         (dict(fields=[[0.1, 0.0]]), DomainError, "deg"),
         (dict(n_zernike=0), DomainError, "n_zernike"),
-        (dict(sampling="square", count=4), DomainError, "n_zernike = 28"),
+        (dict(sampling="square", n_pupil=4), DomainError, "n_zernike = 28"),
         (dict(sampling="hexagons"), ConfigError, "hexagons"),
     ],
 )

@@ -7,13 +7,16 @@ import batoid
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.table import Table
 
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, PrescriptionError, UnknownNameError
 from pachon.design.optimize.sensitivity import sensitivity
-from pachon.design.parameters.degrees_of_freedom import DegreesOfFreedom, Figure, Freedom, unit_size
+from pachon.design.optimize.sensitivity_file import write_sensitivity
+from pachon.design.parameters.degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation, unit_size
 from pachon.design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+from pachon.design.parameters.parameters import apply
 from pachon.design.parameters.thermal import thermal
 from pachon.models.io.grid_file import write_grid
 from pachon.models.shapes.freeform import ZernikeSag
@@ -40,14 +43,14 @@ def waves(term, scale=1.0):
 @pytest.fixture(scope="module")
 def maps():
     """Two modes of M1 and M3 on one grid, and two that move several things at once."""
-    modes = Figure("bend", ("M1", "M3"), GridModes({"B1": waves(1), "B2": waves(2)}))
-    zernikes = Figure("print", ("M2",), ZernikeSag((0.0,) * 11, 1.71, 0.9))
-    freedoms = (
-        Freedom("first", "um", {"bend.B1": 1.0}),
-        Freedom("second", "um", {"bend.B2": 1.0, "print.Z11": -0.2, "M2.dz": 3.0}),
-        Freedom("tilt", "arcsec", {"Camera.rx": 1.0, "M2.rx": -0.5, "M2.dy": 6.0}),
+    modes = SurfaceDeformation("bend", ("M1", "M3"), GridModes({"B1": waves(1), "B2": waves(2)}))
+    zernikes = SurfaceDeformation("print", ("M2",), ZernikeSag((0.0,) * 11, 1.71, 0.9))
+    members = (
+        DegreeOfFreedom("first", "um", {"bend.B1": 1.0}),
+        DegreeOfFreedom("second", "um", {"bend.B2": 1.0, "print.Z11": -0.2, "M2.dz": 3.0}),
+        DegreeOfFreedom("tilt", "arcsec", {"Camera.rx": 1.0, "M2.rx": -0.5, "M2.dy": 6.0}),
     )
-    return DegreesOfFreedom(freedoms, (modes, zernikes), "maps")
+    return DegreesOfFreedom(members, (modes, zernikes), "maps")
 
 
 def test_the_bundled_vector(dof):
@@ -130,7 +133,7 @@ def test_maps_against_batoid(lsst_r, maps, annulus_points):
 
 def test_maps_from_files(tmp_path, lsst_r, maps):
     for mode in ("B1", "B2"):
-        write_grid(maps.figures[0].shape.modes[mode], tmp_path / f"{mode}.fits")
+        write_grid(maps.deformations[0].shape.modes[mode], tmp_path / f"{mode}.fits")
     (tmp_path / "modes.yaml").write_text(
         "name: maps\n"
         "figures:\n"
@@ -150,7 +153,8 @@ def test_sensitivity_is_central_differences(lsst_r, maps):
     fields = np.array([[0.0, 0.0], [0.01, 0.02]])
     found = maps.sensitivity(lsst_r, fields, n_zernike=15)
     assert found.matrix.shape == (2, 15, 3)
-    assert [(p.address, p.unit) for p in found.parameters] == [("first", "um"), ("second", "um"), ("tilt", "arcsec")]
+    assert found.parameters.names == ("first", "second", "tilt")
+    assert found.parameters.units == ("um", "um", "arcsec")
     for i, step in enumerate((0.05, 0.05, 2.0)):
         # Fourth order; the same rays stay lit. The rounding of the paths is 1e-14 m over changes of 1e-7 m.
         ends = []
@@ -162,7 +166,31 @@ def test_sensitivity_is_central_differences(lsst_r, maps):
         assert np.abs(difference - found.matrix[..., i]).max() < 1e-6 * np.abs(difference).max()
 
 
-def test_figures_beside_those_that_a_surface_has(lsst_r, dof, annulus_points):
+@pytest.mark.parametrize("addresses", [None, ["M2.dz", "Camera.rx", "M1.Z5"]])
+def test_parameters_of_a_sensitivity_can_be_applied(lsst_r, maps, addresses):
+    fields = np.array([[0.0, 0.0], [0.01, 0.02]])
+    if addresses is None:
+        found, values = maps.sensitivity(lsst_r, fields, n_zernike=11), np.array([0.02, -0.01, 0.3])
+    else:
+        found, values = sensitivity(lsst_r, addresses, fields, n_zernike=11), np.array([1e-7, 1e-6, -2e-8])
+    moved = found.parameters.apply(lsst_r, values)
+    assert moved == (
+        maps.apply(lsst_r, values) if addresses is None else apply(lsst_r, dict(zip(addresses, values, strict=True)))
+    )
+    change = sensitivity(moved, ["M2.dz"], fields, n_zernike=11).zernikes - found.zernikes
+    # To first order.
+    assert np.abs(change).max() > 1e-9
+    assert found.matrix @ values == pytest.approx(change, abs=1e-3 * np.abs(change).max())
+
+
+def test_tables_of_sensitivities_have_units_of_degrees_of_freedom(lsst_r, maps, tmp_path):
+    write_sensitivity(tmp_path / "matrix.ecsv", maps.sensitivity(lsst_r, [[0.0, 0.01]], n_zernike=4))
+    table = Table.read(tmp_path / "matrix.ecsv")
+    assert table["first"].unit == u.m / u.um
+    assert table["tilt"].unit == u.m / u.arcsec
+
+
+def test_deformations_beside_those_that_a_surface_has(lsst_r, dof, annulus_points):
     """Bending twice is bending by the sum, though the mirror has a Zernike sag, of other rims, already."""
     pupil = annulus_points(60)
     start = lsst_r.with_deformation("M1", ZernikeSag((0, 0, 0, 0, 2e-7, 1e-7), 4.18, 2.558))
@@ -185,16 +213,16 @@ def test_the_camera_rotator(lsst_r):
     on_still, on_turned = (t.surfaces[-1].to_local(still.position) for t in (lsst_r, turned))
     back = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     assert np.abs(on_turned - on_still @ back.T).max() < 1e-13
-    # A figure of a lens, and the CCDs, go with it.
-    figure = ZernikeSag((0, 0, 0, 0, 3e-7, 0, 1e-7), 0.775)
-    asked = lsst_r.with_deformation("L1_entrance", figure).perturbed("Camera", tilt=(0.0, 0.0, angle))
+    # A deformation of a lens, and the CCDs, go with it.
+    deformation = ZernikeSag((0, 0, 0, 0, 3e-7, 0, 1e-7), 0.775)
+    asked = lsst_r.with_deformation("L1_entrance", deformation).perturbed("Camera", tilt=(0.0, 0.0, angle))
     cos, sin = np.cos(angle), np.sin(angle)
     field = (
         np.arctan(cos * np.tan(FIELD[0]) - sin * np.tan(FIELD[1])),
         np.arctan(sin * np.tan(FIELD[0]) + cos * np.tan(FIELD[1])),
     )
     x, y = np.array(pupil)
-    one = pachon.wavefront_opd(lsst_r.with_deformation("L1_entrance", figure), FIELD, WAVELENGTH, pupil)
+    one = pachon.wavefront_opd(lsst_r.with_deformation("L1_entrance", deformation), FIELD, WAVELENGTH, pupil)
     other = pachon.wavefront_opd(asked, field, WAVELENGTH, (cos * x - sin * y, sin * x + cos * y))
     assert np.abs(one.value - other.value).max() < 1e-13
     ccds = pachon.FocalPlane.flat("lsst")
@@ -325,18 +353,20 @@ def test_bad_files(tmp_path, old, new, words):
 
 
 @pytest.mark.parametrize(
-    ("figure", "of", "words"),
+    ("deformation", "of", "words"),
     [
-        ("f", "f.Z9", "unknown term of figure f"),
+        ("f", "f.Z9", "unknown mode of deformation f"),
         ("f", "f", "unknown term|expected"),
         ("M2", "M2.Z1", "has the name of a surface"),
         ("f", "M9.dz", "M9"),
         ("f", "M2.dq", "dq"),
     ],
 )
-def test_bad_combinations(lsst_r, figure, of, words):
+def test_bad_combinations(lsst_r, deformation, of, words):
     shape = ZernikeSag((0.0,) * 4, 1.0)
-    dof = DegreesOfFreedom((Freedom("one", "um", {of: 1.0}),), (Figure(figure, ("M1",), shape),))
+    dof = DegreesOfFreedom(
+        (DegreeOfFreedom("one", "um", {of: 1.0}),), (SurfaceDeformation(deformation, ("M1",), shape),)
+    )
     with pytest.raises(PachonError, match=f"degree of freedom 'one'.*({words})"):
         dof.apply(lsst_r, [1.0])
 

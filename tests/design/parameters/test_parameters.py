@@ -10,9 +10,9 @@ from pachon.design.parameters.parameters import (
     parse_parameters,
     twists,
     usual_parameters,
-    with_figures,
+    with_shape_terms,
 )
-from pachon.design.parameters.surface_deformation import figure_polynomial, figure_unit
+from pachon.design.parameters.shape_terms import term_polynomial, term_unit
 from pachon.models.shapes.freeform import XYPolynomial, ZernikeSag
 from pachon.models.shapes.shape import Conic, EvenAsphere, Sum
 
@@ -22,12 +22,12 @@ from pachon.models.shapes.shape import Conic, EvenAsphere, Sum
     [
         ("M2.dx", "motion", "m"),
         ("Camera.rz", "motion", "rad"),
-        ("M1.radius", "figure", "m"),
-        ("M1.curvature", "figure", "1/m"),
-        ("M1.conic", "figure", ""),
-        ("M1.a6", "figure", "m^-5"),
-        ("L1_exit.a4", "figure", "m^-3"),
-        ("M1.Z5", "figure", "m"),
+        ("M1.radius", "shape", "m"),
+        ("M1.curvature", "shape", "1/m"),
+        ("M1.conic", "shape", ""),
+        ("M1.a6", "shape", "m^-5"),
+        ("L1_exit.a4", "shape", "m^-3"),
+        ("M1.Z5", "shape", "m"),
         ("L1_entrance.n", "index", ""),
         ("silica.n", "index", ""),
     ],
@@ -87,9 +87,9 @@ def test_values_are_changes(lsst_r):
     shape = changed.surface("M1").shape
     assert isinstance(shape, Sum)
     assert shape.parameters["conic"] == pytest.approx(-1.205, abs=1e-15)
-    figure = shape.parts[1]
+    added = shape.parts[1]
     # Over the rims of the mirror's own aperture.
-    assert figure == ZernikeSag((0.0,) * 4 + (2e-6, 0.0, 1e-6), 4.18, 2.558)
+    assert added == ZernikeSag((0.0,) * 4 + (2e-6, 0.0, 1e-6), 4.18, 2.558)
     w = 620e-9
     glass = lsst_r.surface("L1_entrance").medium_after.index(w)
     assert changed.surface("L1_entrance").medium_after.index(w) - glass == pytest.approx(1e-4, abs=1e-15)
@@ -161,21 +161,21 @@ def test_twists_are_the_derivatives_of_frames(lsst_r, slope):
 )
 def test_polynomials_are_the_derivatives_of_the_sag(shape, name):
     x, y = np.random.default_rng(1).uniform(-1, 1, (2, 20))
-    polynomial = figure_polynomial(shape, name)
+    polynomial = term_polynomial(shape, name)
     f, fx, fy = shape.sag_derivative(name, x, y)
     assert np.allclose(polynomial.value(x, y), f, atol=1e-14)
     assert np.allclose(polynomial.gradient(x, y), (fx, fy), atol=1e-13)
 
 
 def test_what_is_no_polynomial():
-    assert figure_polynomial(Conic(3.0, 0.0), "radius") is None
-    assert figure_unit(XYPolynomial(((2, 1, 0.1),)), "x2y1") == "m^-2"
-    assert figure_unit(XYPolynomial(((1, 0, 0.1),)), "x1y0") == ""
+    assert term_polynomial(Conic(3.0, 0.0), "radius") is None
+    assert term_unit(XYPolynomial(((2, 1, 0.1),)), "x2y1") == "m^-2"
+    assert term_unit(XYPolynomial(((1, 0, 0.1),)), "x1y0") == ""
 
 
-def test_with_figures_changes_no_sag(lsst_r):
+def test_new_terms_change_no_sag(lsst_r):
     parameters = parse_parameters(["M1.Z4-11", "M1.a12", "L1_exit.a4", "L1_exit.conic"], lsst_r)
-    present = with_figures(lsst_r, parameters)
+    present = with_shape_terms(lsst_r, parameters)
     for p in parameters:
         assert p.name in present.surface(p.target).shape.parameters
     x = np.linspace(-0.7, 0.7, 9)

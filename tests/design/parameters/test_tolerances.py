@@ -133,10 +133,10 @@ def test_contributions_add_in_squares(lsst_r):
 def test_compensators_are_where_an_optimisation_puts_them(lsst_r):
     tolerances = [Tolerance("M2.dz", 20e-6), Tolerance("M2.rx", 2e-5)]
     free = ["Camera.dz", "Camera.rx"]
-    found = monte_carlo(lsst_r, tolerances, n=2, seed=9, fields=FIELDS, compensators=free, method="traced", count=6)
+    found = monte_carlo(lsst_r, tolerances, n=2, seed=9, fields=FIELDS, compensators=free, method="traced", n_pupil=6)
     for values, moves, merit in zip(found.deviations, found.moves, found.merit, strict=True):
         moved = lsst_r.perturbed("M2", shift=(0, 0, values[0]), tilt=(values[1], 0, 0))
-        best = optimize(moved, free, "wavefront", FIELDS, count=6)
+        best = optimize(moved, free, "wavefront", FIELDS, n_pupil=6)
         # Linear compensation of deviations this small, against the solver's: the merit is flat about its least.
         assert merit == pytest.approx(best.history[-1], rel=1e-3)
         assert moves == pytest.approx(best.changes, rel=0.02, abs=2e-7)

@@ -1,4 +1,4 @@
-"""Figures of a surface by name: made where they are not there yet, and as polynomials where they are polynomials."""
+"""Terms of the shape of a surface by name: added where absent, and as polynomials where they are."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from ...models.shapes.shape import EvenAsphere, Rotational, Shape, Sum
 from ...models.surface import Surface
 
 
-def with_figure(surface: Surface, name: str) -> Shape:
-    """Return the shape of a surface as one that has a figure, which is zero where it was not there before.
+def shape_with_term(surface: Surface, name: str) -> Shape:
+    """Return the shape of a surface with a term, which is zero if it is new.
 
-    A Zernike term goes to the Zernike sag of the surface; where there is none, it is added, over the rims of the
-    surface's aperture. Even powers of a conic of revolution are added too.
+    A Zernike term extends the Zernike sag of the surface; without one, it is added over the rims of the aperture. Even
+    powers are added to a conic of revolution.
 
     Parameters
     ----------
     surface : Surface
         The surface.
     name : str
-        Name of the figure: "radius", "conic", "a6", "Z5"...
+        Name of the term: "radius", "conic", "a6", "Z5"...
 
     Raises
     ------
     UnknownNameError
-        If there is no such figure.
+        If there is no such term.
     DomainError
-        If a Zernike term is asked for on a surface without rims, or a number is out of range.
+        If a Zernike term is added to a surface without rims, or a number is out of range.
     """
     shape = surface.shape
     if name in shape.parameters:
@@ -55,14 +55,14 @@ def with_figure(surface: Surface, name: str) -> Shape:
                 terms = part.coefficients + (0.0,) * (int(power[1]) // 2 - 1 - len(part.coefficients))
                 asphere = EvenAsphere(1.0 / part.curvature, part.conic, terms)
                 return _sum((*parts[:i], asphere, *parts[i + 1 :]))
-    raise unknown_name(f"figure of {surface.name}", name, [*shape.parameters, "Z4"])
+    raise unknown_name(f"shape term of {surface.name}", name, [*shape.parameters, "Z4"])
 
 
-def figure_polynomial(shape: Shape, name: str) -> PolarPolynomial | None:
-    """Return what a unit of a figure adds to the sag, if that is a polynomial of x and y [m]; None if it is not."""
+def term_polynomial(shape: Shape, name: str) -> PolarPolynomial | None:
+    """Return the change of sag [m] per unit of a term, if it is a polynomial of x and y; else None."""
     if isinstance(shape, Sum):
         part, inner = shape.place(name)
-        return figure_polynomial(part, inner)
+        return term_polynomial(part, inner)
     if isinstance(shape, ZernikeSag):
         return _zernike_term(int(name[1:]), shape.outer_radius, shape.inner_radius)
     if isinstance(shape, XYPolynomial):
@@ -78,11 +78,11 @@ def _zernike_term(j: int, outer_radius: float, inner_radius: float) -> PolarPoly
     return from_zernikes((0.0,) * (j - 1) + (1.0,), outer_radius, inner_radius)
 
 
-def figure_unit(shape: Shape, name: str) -> str:
-    """Return the unit of a figure; empty for a pure number."""
+def term_unit(shape: Shape, name: str) -> str:
+    """Return the unit of a term; empty for a pure number."""
     if isinstance(shape, Sum):
         part, inner = shape.place(name)
-        return figure_unit(part, inner)
+        return term_unit(part, inner)
     powers = [int(n) for n in re.findall(r"\d+", name)] if re.fullmatch(r"a\d+|x\d+y\d+", name) else []
     if powers:
         return {0: "", 1: "m"}.get(1 - sum(powers), f"m^{1 - sum(powers)}")
@@ -101,5 +101,5 @@ def _rims(surface: Surface) -> tuple[float, float]:
     if isinstance(aperture, Annulus) and not (aperture.x or aperture.y):
         return aperture.outer, aperture.inner
     raise DomainError(
-        f"surface {surface.name}: expected a round aperture, or a Zernike sag, to say over which rims a Zernike term is"
+        f"surface {surface.name}: expected a round aperture, or a Zernike sag, for the rims of a Zernike term"
     )
