@@ -31,7 +31,7 @@ def test_derivatives_of_merits(paul_baker, slope, kind):
     if kind.startswith("spots"):
         merit = SpotMerit(paul_baker, rays, "chief" if "chief" in kind else "centroid")
     else:
-        goal = 1e-7 * np.random.default_rng(3).normal(size=(3, 2, len(rays.pupil)))
+        goal = 1e-7 * np.random.default_rng(3).normal(size=(3, 2, len(rays.request.pupil)))
         merit = WavefrontMerit(paul_baker, rays, goal if "goal" in kind else None)
     parameters = parse_parameters(["M2.dx", "M3.rx", "M2.radius", "M1.conic", "Detector.dz"], paul_baker)
     start = np.array([1e-4, 1e-5, 1e-3, 1e-3, 1e-4])
@@ -52,7 +52,7 @@ def test_spot_merit_is_the_rms_radius(paul_baker):
     rays = Beams.of(moved, FIELDS, sampling="square", n_pupil=16)
     total = 0.0
     for field in FIELDS:
-        launched = pachon.launch_rays(moved, field, moved.default_wavelength, rays.pupil.points.T)
+        launched = pachon.launch_rays(moved, field, moved.default_wavelength, rays.request.pupil.points.T)
         end = pachon.trace(moved, launched)
         landing = end.position[end.status == RayStatus.OK, :2]
         total += np.mean(np.sum((landing - landing.mean(axis=0)) ** 2, axis=1)) / len(FIELDS)
