@@ -99,9 +99,9 @@ def _show(result: Study) -> None:
             rows.append((f"{case.stars} stars, {case}", *(f"{found[key]:.1e}" for key in _COLUMNS)))
     Rows(("model", *_COLUMNS.values()), rows, _CAPTION).show()
     if result.problems:
-        console.print(f"{len(result.problems)} ways could not be fitted, such as {_example(result)}", style="dim")
+        console.print(f"{len(result.problems)} models could not be fitted, such as {_example(result)}", style="dim")
     if chosen is None:
-        console.print(f"no way to model {plan.base.stars} stars could be fitted")
+        console.print(f"no model of {plan.base.stars} stars could be fitted")
         return
     error = result.metrics[chosen]["error_rms_e_away"]
     console.print(

@@ -85,14 +85,16 @@ class Given:
         return options.field_list([self.field_deg] if isinstance(self.field_deg, str) else self.field_deg)
 
     @cached_property
-    def wavelength(self) -> float | None:
-        """The one wavelength [m]; None where none is given."""
-        return None if self.wavelength_nm is None else self.wavelength_nm * 1e-9
-
-    @cached_property
-    def wavelengths(self) -> np.ndarray | None:
-        """The wavelengths [m]; None where none are given."""
+    def wavelength(self) -> Any:
+        """The wavelength or wavelengths [m]; None where none is given."""
+        if isinstance(self.wavelength_nm, float):
+            return self.wavelength_nm * 1e-9
         return options.wavelength_list(self.telescope, self.wavelength_nm, self.across_band)
+
+    @property
+    def where(self) -> tuple[Telescope, Any, Any]:
+        """Telescope, field angles and wavelengths: the first arguments of most functions."""
+        return self.telescope, self.fields, self.wavelength
 
     @property
     def how(self) -> dict[str, Any]:
@@ -103,7 +105,7 @@ class Given:
     def images(self) -> int:
         """The number of images, over fields and wavelengths; five fields by default."""
         count = 5 if self.fields is None else len(self.fields)
-        return count if self.wavelengths is None else count * len(self.wavelengths)
+        return count if self.wavelength is None else count * len(self.wavelength)
 
     @contextmanager
     def stage(self, title: str, total: int | None) -> Iterator[Callable[[int], None]]:
@@ -143,20 +145,7 @@ def design_command(
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
         name = compute.__name__
-        first: dict[str, tuple[Any, Any]] = {"model": (options.Model, inspect.Parameter.empty)}
-        first["field_deg"] = (options.FieldsDeg, None)
-        first["wavelength_nm"] = (options.WavelengthsNm if band else options.WavelengthNm, None)
-        if band:
-            first["across_band"] = (options.AcrossBand, None)
-        _, *given = inspect.signature(compute, eval_str=True).parameters.values()
-        own = {p.name: (p.annotation, p.default) for p in given}
-        last = {
-            "projection": (options.Projection, "zemax"),
-            "lenient": (options.Lenient, False),
-            "picture": (picture, None),
-            "threads": (options.Threads, None),
-            "as_json": (options.Json, False),
-        }
+        parameters, own = _parameters(compute, band, picture)
 
         def command(picture: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
@@ -166,11 +155,7 @@ def design_command(
             path = picture or Path(f"{outcome.stem or f'{name}_{shared.telescope.name}'}.png")
             _deliver(outcome, outcome.table or rows, path, kind, as_json)
 
-        # Keyword-only, so that an option without a default may follow one that has a default.
-        parameters = [
-            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
-            for key, (annotation, default) in {**first, **own, **last}.items()
-        ]
+        # Typer reads the options of a command from its signature.
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters}
         command.__doc__ = inspect.getdoc(compute)
@@ -178,6 +163,28 @@ def design_command(
         return compute
 
     return build
+
+
+def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[list[inspect.Parameter], list[str]]:
+    """Return the parameters of a command, shared and own, and the names of its own."""
+    _, *own = inspect.signature(compute, eval_str=True).parameters.values()
+    one = {"wavelength_nm": (options.WavelengthNm, None)}
+    several = {"wavelength_nm": (options.WavelengthsNm, None), "across_band": (options.AcrossBand, None)}
+    taken: dict[str, tuple[Any, Any]] = {
+        "model": (options.Model, inspect.Parameter.empty),
+        "field_deg": (options.FieldsDeg, None),
+        **(several if band else one),
+        **{p.name: (p.annotation, p.default) for p in own},
+        "projection": (options.Projection, "zemax"),
+        "lenient": (options.Lenient, False),
+        "picture": (picture, None),
+        "threads": (options.Threads, None),
+        "as_json": (options.Json, False),
+    }
+    # Keyword-only, so that an option without a default may follow one that has a default.
+    kind = inspect.Parameter.KEYWORD_ONLY
+    parameters = [inspect.Parameter(key, kind, annotation=a, default=d) for key, (a, d) in taken.items()]
+    return parameters, [p.name for p in own]
 
 
 def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: str, as_json: bool) -> None:

@@ -32,8 +32,7 @@ def distortion(
     from ...design.metrics.distortion import distortion as compute
 
     reference = "centroid" if centroid else "chief"
-    where = given.telescope, given.fields, given.wavelength
-    return Outcome(compute(*where, reference=reference, **given.how), _distortion_rows)
+    return Outcome(compute(*given.where, reference=reference, **given.how), _distortion_rows)
 
 
 def _distortion_rows(result: Any) -> Rows:
@@ -100,8 +99,8 @@ def footprint(
     """
     from ...design.metrics.footprint import footprint as compute
 
-    where = given.telescope, surface or None, given.fields, given.wavelength
-    return Outcome(compute(*where, **given.how), _footprint_rows)
+    telescope, *where = given.where
+    return Outcome(compute(telescope, surface or None, *where, **given.how), _footprint_rows)
 
 
 def _footprint_rows(result: Any) -> Rows:
@@ -144,9 +143,9 @@ def draw(
     from ...design.layout import layout
 
     if glb is None:
-        return Outcome(layout(given.telescope, given.fields, given.wavelength, **given.how))
+        return Outcome(layout(*given.where, **given.how))
     if glb.suffix.lower() != ".glb":
         raise ConfigError(f"--glb = {str(glb)!r}: expected a name that ends in .glb")
-    result = layout(given.telescope, given.fields, given.wavelength, **given.how)
+    result = layout(*given.where, **given.how)
     write_bytes(glb, result.glb())
     return Outcome(result, notes=[f"model: {glb.resolve()}"])

@@ -55,12 +55,11 @@ def psf(
     if huygens and pupil_points is not None:
         raise ConfigError("--huygens and --pupil-points: expected one of them")
     how: dict[str, Any] = dict(pixel=None if pixel_um is None else pixel_um * 1e-6, pixels=pixels, **given.how)
-    where = given.telescope, given.fields, given.wavelengths
     with given.stage("diffraction images", given.images) as progress:
         if huygens:
-            result = huygens_psf(*where, progress=progress, **how)
+            result = huygens_psf(*given.where, progress=progress, **how)
         else:
-            result = fft_psf(*where, n_pupil=pupil_points, progress=progress, **how)
+            result = fft_psf(*given.where, n_pupil=pupil_points, progress=progress, **how)
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -100,10 +99,9 @@ def ee(
     from ...design.images.encircled_energy import encircled_energy
 
     kind, total = ("geometric", None) if geometric else ("diffraction", given.images)
-    where = given.telescope, given.fields, given.wavelengths
     with given.stage("encircled energy", total) as progress:
         how = dict(pixels=pixels, n_pupil=None if geometric else pupil_points, **given.how)
-        return encircled_energy(*where, kind=kind, progress=progress, **how)
+        return encircled_energy(*given.where, kind=kind, progress=progress, **how)
 
 
 @design_command(
@@ -127,9 +125,8 @@ def mtf(
     """
     from ...design.images.mtf import mtf as compute
 
-    where = given.telescope, given.fields, given.wavelengths
     with given.stage("modulation transfer", given.images) as progress:
-        return compute(*where, n_pupil=pupil_points, progress=progress, **given.how)
+        return compute(*given.where, n_pupil=pupil_points, progress=progress, **given.how)
 
 
 @design_command(

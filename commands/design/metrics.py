@@ -42,8 +42,7 @@ def spots(
     """
     from ...design.metrics.spots import spots as compute
 
-    where = given.telescope, given.fields, given.wavelengths
-    return compute(*where, sampling=sampling, n_pupil=rays, **given.how)
+    return compute(*given.where, sampling=sampling, n_pupil=rays, **given.how)
 
 
 @design_command(
@@ -83,7 +82,7 @@ def focus(
     if range_um is not None and not range_um[0] < range_um[1]:
         raise ConfigError(f"--range-um = {range_um[0]:g} {range_um[1]:g}: expected the lower height first")
     heights = None if range_um is None else np.linspace(*range_um, steps) * 1e-6
-    return through_focus(given.telescope, given.fields, given.wavelengths, heights, **given.how)
+    return through_focus(*given.where, heights, **given.how)
 
 
 @design_command()
@@ -176,4 +175,4 @@ def rays(given: Given) -> Study:
     """
     from ...design.metrics.principal_rays import principal_rays
 
-    return principal_rays(given.telescope, given.fields, given.wavelength, **given.how)
+    return principal_rays(*given.where, **given.how)

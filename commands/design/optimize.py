@@ -62,8 +62,8 @@ def sensitivity(
         raise ConfigError(f"--out {out}: expected a name that ends in .fits or .ecsv")
     if parameters is not None and degrees_of_freedom is not None:
         raise ConfigError("--parameters and --degrees-of-freedom are both given: expected one of them")
-    telescope = given.telescope
-    where, how = (given.fields, given.wavelength), dict(n_zernike=zernikes, **given.how)
+    telescope, *where = given.where
+    how = dict(n_zernike=zernikes, **given.how)
     if degrees_of_freedom is not None:
         result = load_degrees_of_freedom(degrees_of_freedom).sensitivity(telescope, *where, **how)
     else:
@@ -109,13 +109,12 @@ def optimize(
     from ...design.optimize.targets import FocalLength
     from ...models.io.prescription import save_telescope
 
-    telescope = given.telescope
+    telescope, *where = given.where
     result = compute(
         telescope,
         name_list(variables, "--variables"),
         merit,
-        given.fields,
-        given.wavelengths,
+        *where,
         bounds=dict(_bounds(text) for text in bounds or ()),
         targets=() if focal_length is None else (FocalLength(focal_length),),
         **given.how,
