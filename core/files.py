@@ -84,6 +84,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
-        # Nine digits say all that there is to say, and hide that sums of other machines differ in the last bits.
+        # Nine digits are enough, and equal on machines whose sums differ in the last bits.
         return float(f"{value:.9g}") if np.isfinite(value) else None
     return value

@@ -1,4 +1,4 @@
-"""Ctrl-C that is never lost: Python drops an interrupt that arrives while an object is being cleared away."""
+"""Reliable Ctrl-C: Python drops an interrupt that arrives while an object is deleted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all pictures share: drawing without global state, one style, the palette, the bytes of a PNG."""
+"""Basics of plotting: figures without global state, style, palette, bytes of a picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _STYLE = {
     "svg.hashsalt": "pachon",
 }
 _DPI = 150
-#: What each format would say of itself, left out: equal pictures are equal bytes.
+#: Metadata of each format, left out: equal pictures have equal bytes.
 _NAMELESS: dict[str, dict[str, Any]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},

@@ -1,4 +1,4 @@
-"""What a run says while it works: bars on a terminal, plain lines elsewhere, always on standard error."""
+"""Progress display: bars on a terminal, plain lines elsewhere, always on standard error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rich.text import Text
 
 
 class Stage:
-    """One stage of a run, on its way.
+    """One stage of a run in progress.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Stage:
     task : TaskID, optional
         The bar of this stage.
     say : bool
-        Whether to write lines: nobody sees bars.
+        Whether to write lines in place of bars.
     check : callable
         Called whenever something is done; may raise.
     """
@@ -46,18 +46,18 @@ class Stage:
         self._start = time.perf_counter()
 
     def advance(self, count: int = 1) -> None:
-        """Tell that so many more items are done."""
+        """Advance by a number of items."""
         self._check()
         if self._bars is not None and self._task is not None:
             self._bars.advance(self._task, count)
 
     def line(self, text: str) -> None:
-        """Write one line, where there are no bars to see."""
+        """Write one line, unless there are bars."""
         if self._say:
             print(text, file=sys.stderr, flush=True)
 
     def step(self, name: str, done: int, total: int) -> None:
-        """Write that one more part is done, and for how long the rest will take, where there are no bars to see."""
+        """Write that one more part is done, and the time left, unless there are bars."""
         seconds = time.perf_counter() - self._start
         left = seconds / done * (total - done)
         rest = (
@@ -69,7 +69,7 @@ class Stage:
 
 
 class _Rate(ProgressColumn):
-    """How many items are done in a second, or in a minute where they take long."""
+    """Items per second, or per minute where they take long."""
 
     def render(self, task: Task) -> Text:
         return Text("" if not task.speed else _rate(task.speed), style="progress.data.speed")
@@ -80,12 +80,12 @@ def _rate(per_second: float) -> str:
 
 
 class Reporter:
-    """Tell how far a run has come, and keep how long each stage took.
+    """Progress display of a run, and the time that each stage takes.
 
     Parameters
     ----------
     quiet : bool
-        Say nothing at all.
+        Whether to print nothing.
     check : callable, optional
         Called at every step that is reported, to stop the run by raising an exception.
     """
@@ -107,9 +107,9 @@ class Reporter:
         Parameters
         ----------
         title : str
-            What is being done.
+            Name of the stage.
         total : int, optional
-            Number of items; without it the stage shows that it runs, not how far it is.
+            Number of items; without it the bar has no length.
         """
         self._check()
         start = time.perf_counter()

@@ -1,7 +1,7 @@
-"""What a run keeps of one CCD, and the FITS file that holds it.
+"""Product of one CCD: stars, stamps and PSF models, and their FITS file.
 
-Whatever comes after a CCD is done, correlations, summary and report, reads this file and nothing else: a run that was
-interrupted and resumed sees exactly what an uninterrupted one does.
+Correlations, summary and report are computed from these files alone, so a resumed run and an uninterrupted one have the
+same input.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Stars:
 
 @dataclass(frozen=True)
 class HoldoutStars(Stars):
-    """Places without an observed star, where the PSF is known without noise.
+    """Noise-free PSFs at positions without an observed star.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class ObservedStars(Stars):
 
 @dataclass(frozen=True)
 class CcdProduct:
-    """All that a run keeps of one CCD.
+    """Stars, stamps and PSF models of one CCD.
 
     Attributes
     ----------
@@ -220,13 +220,13 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
     Parameters
     ----------
     folder : Path
-        Where to write.
+        Folder of the run.
     product : CcdProduct
-        What to write.
+        Product of the CCD.
     stamp : Stamp
-        Where it comes from.
+        Origin of the product.
     cards : list of (keyword, value, comment)
-        What all CCDs of the run share: telescope, band, exposure.
+        Cards of the run: telescope, band, exposure.
 
     Raises
     ------
@@ -261,14 +261,14 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
     path : Path
         File to read.
     stamp : Stamp, optional
-        What the product must carry.
+        Expected stamp.
     holdout_images : bool
-        Whether to keep the noise-free PSFs, by far the largest part; without, there are none of them.
+        Whether to read the stamps of the noise-free PSFs, by far the largest part of the file.
 
     Raises
     ------
     ProductError
-        If there is no such file, it is damaged, or it carries another stamp.
+        If the file is missing or damaged, or has another stamp.
     """
     hdus = read_fits(path)
     header = hdus[0].header

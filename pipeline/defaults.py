@@ -27,7 +27,7 @@ from .simulate.screen_cover import check_screens
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
 DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
 _WAVELENGTHS = 5
-# The optics alone are seen as the paper's Fig. 8 has them: without charge diffusion, which would hide most of their
+# The optics alone as in Fig. 8 of Jee & Tyson 2011: without charge diffusion, which would dilute most of their
 # ellipticity, and on pixels fine enough for a weight of 0.3".
 _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "pixel_um": 10.0, "stamp": 31, "diffusion_pixels": 0.4}
 _OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "pixel_um": 2.5, "stamp": 61, "diffusion_pixels": 0.0}

@@ -1,4 +1,4 @@
-"""From a configuration to the telescope, focal plane and atmosphere that it names, with every default filled in."""
+"""Telescope, focal plane and atmosphere of a configuration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from .defaults import given, resolve
 
 @dataclass(frozen=True)
 class Experiment:
-    """All that a run needs to compute any CCD.
+    """Telescope, focal plane, atmosphere and settings of a run.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class Experiment:
     atmosphere : Atmosphere or None
         Turbulence; None for the optics alone.
     aberration : ResidualWavefront or None
-        What active optics leaves uncorrected; None for nothing.
+        Residual aberration of the active optics; None without.
     site : Site
-        Where the telescope stands.
+        Site of the telescope.
     atmosphere_only : bool
-        Whether stars are seen through a beam without aberrations, from the same places on the sky: without what the
-        design of the telescope, the heights and active optics do.
+        Whether an ideal telescope replaces the optics, at the same field angles: without the aberrations of the design,
+        the CCD heights and the active optics.
     """
 
     config: Configuration
@@ -177,10 +177,10 @@ class Experiment:
 
     @cached_property
     def config_hash(self) -> str:
-        """SHA-256 of all that decides the bytes of a CCD's product.
+        """SHA-256 of all settings that affect the product of a CCD.
 
-        The list of CCDs is left out, since no CCD depends on which others are asked for; a file that the configuration
-        names counts by its content, not by where it lies.
+        The list of CCDs is left out, since no CCD depends on the others. A file named in the configuration counts by
+        its content, not by its path.
         """
         content = self.config.as_dict()
         del content["ccds"]

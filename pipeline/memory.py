@@ -1,4 +1,4 @@
-"""How much memory a run will need, so that one that will not fit is refused before anything is computed."""
+"""Memory that a run needs, checked before anything is computed."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _STAMP_BYTES = 48
 
 
 def screen_bytes(experiment: Experiment) -> int:
-    """Return how much memory the screens of an experiment take."""
+    """Return the memory of the screens of an experiment [bytes]."""
     return 0 if experiment.atmosphere is None else experiment.atmosphere.screen_bytes(experiment.screen_kinds)
 
 
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
-    """Return about how much memory a run takes at its peak.
+    """Return an estimate of the peak memory of a run [bytes].
 
     Parameters
     ----------
     experiment : Experiment
-        What is to be computed.
+        Experiment of the run.
     threads : int, optional
         Number of threads; all processors by default.
     """
@@ -42,12 +42,12 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
 
 
 def check_memory(experiment: Experiment, threads: int | None = None) -> None:
-    """Refuse a run that needs more memory than there is.
+    """Raise an error if a run needs more memory than is available.
 
     Raises
     ------
     ConfigError
-        Naming the key that asks for most of it, what is needed and what is free.
+        With the key that takes most of it, the memory needed and the memory free.
     """
     free, needed = available_bytes(), needed_bytes(experiment, threads)
     if free is None or needed <= free:

@@ -1,4 +1,4 @@
-"""A whole run, stage by stage: what is computed in which order, and what is left in the folder."""
+"""A whole run: CCDs, correlations, focal plane, report."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..core.version import VERSION
 from .ccd_product import product_path, read_product, write_product
 from .config import Configuration
 from .experiment import Experiment
-from .measure.summary import correlations, run_figures
+from .measure.summary import correlations, run_metrics
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
 from .run_folder import SUMMARY_NAME, claim_folder, finished_ccds, stamp_of
@@ -36,20 +36,20 @@ _MESH_CELLS = 16
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to.
+    """Result of a run.
 
     Attributes
     ----------
     folder : Path
-        Where its files are.
+        Folder of the products.
     report : Path
-        The report.
+        Path of the report.
     summary : dict
         The content of ``summary.json``.
     kept, computed : tuple of str
         CCDs that were done before, and those done now.
     not_modelled : dict of str to str
-        CCDs whose PSF cannot be modelled, and why not. No figure counts them.
+        CCDs whose PSF cannot be modelled, each with the reason. They enter no metric.
     """
 
     folder: Path
@@ -79,7 +79,7 @@ def run(
     config : Configuration or Experiment
         Configuration, or the experiment made from it.
     folder : Path
-        Where to put the products; made if it is not there.
+        Folder of the products, made where missing.
     resume : bool
         Keep CCDs that are finished already, and add to them.
     strict : bool
@@ -88,7 +88,7 @@ def run(
     threads : int, optional
         Number of threads; all processors by default.
     reporter : Reporter, optional
-        Who tells how far the run is; nobody by default.
+        Progress display; silent by default.
 
     Raises
     ------
@@ -124,10 +124,10 @@ def run(
         raise DomainError(f"none of {len(failed)} CCDs can be modelled; CCD {name}: {reason}")
     with reporter.stage("correlations"):
         stamp = stamp_of(experiment)
-        # Pictures and figures need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
+        # Plots and metrics need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)
-        summary = {**_origin(experiment), **run_figures(products, correlated), "not_modelled": failed}
+        summary = {**_origin(experiment), **run_metrics(products, correlated), "not_modelled": failed}
         write_json(folder / SUMMARY_NAME, summary)
     with reporter.stage("focal plane"):
         _write_focal_plane(experiment, folder)
@@ -154,7 +154,7 @@ def _write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> N
 
 
 def _origin(experiment: Experiment) -> dict[str, Any]:
-    """Return what says where a summary comes from."""
+    """Return version, hash, seed and configuration for the summary."""
     stamp = stamp_of(experiment)
     return {
         "pachon": stamp.version,
@@ -182,7 +182,7 @@ def _write_focal_plane(experiment: Experiment, folder: Path) -> None:
 
 
 def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:
-    """Return what differs from run to run, and is kept out of every other product for that reason."""
+    """Return times and machine, which differ between runs and so stand in a file of their own."""
     return {
         "pachon": VERSION,
         "seconds": reporter.seconds,
@@ -195,7 +195,7 @@ def _timings(reporter: Reporter, threads: int | None) -> dict[str, Any]:
 
 
 def _peak_memory() -> float:
-    """Return the most memory that this process has held [bytes]; NaN where the system does not say."""
+    """Return the peak memory of this process [bytes]; NaN where it is unknown."""
     if sys.platform == "win32":
         return float("nan")
     import resource

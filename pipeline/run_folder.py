@@ -1,4 +1,4 @@
-"""The folder of a run: whose it is, and which of its CCDs are done."""
+"""Folder of a run: its configuration, and the CCDs that are finished."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 
 
 def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
-    """Make the folder of a run, or make sure that what is in it is of the same configuration, and write config.yaml.
+    """Make the folder of a run or check that its content is of the same configuration, and write config.yaml.
 
     A run may be resumed with more CCDs than before, since no CCD depends on the others.
 
@@ -25,7 +25,7 @@ def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     folder : Path
         Folder of the run.
     experiment : Experiment
-        What is to be computed.
+        Experiment of the run.
     resume : bool
         Whether finished CCDs are to be kept.
 
@@ -73,7 +73,7 @@ def _refuse_other(folder: Path, before: Configuration, now: Configuration, resum
 
 
 def finished_ccds(folder: Path, experiment: Experiment) -> tuple[str, ...]:
-    """Return the CCDs of a run whose products are whole and of this configuration."""
+    """Return the CCDs of a run with complete products of this configuration."""
     stamp = stamp_of(experiment)
     return tuple(name for name in experiment.config.ccds or () if _is_whole(product_path(folder, name), stamp))
 
@@ -89,5 +89,5 @@ def _is_whole(path: Path, stamp: Stamp) -> bool:
 
 
 def stamp_of(experiment: Experiment) -> Stamp:
-    """Return what the products of an experiment carry."""
+    """Return the stamp of the products of an experiment."""
     return Stamp(experiment.config_hash, experiment.config.seed)

@@ -14,7 +14,7 @@ from ...core.units import ARCMIN, radians
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
 EXACT_LIMIT = 10_000
-"""Most stars whose pairs are all counted one by one unless told otherwise: a second on one core."""
+"""Largest number of stars whose pairs are counted exactly by default: a second on one core."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,17 @@ class Correlation:
     def r_arcmin(self) -> np.ndarray:
         """Separation [arcmin]."""
         return self.r / ARCMIN
+
+    def as_dict(self) -> dict[str, np.ndarray]:
+        """Return separations, correlations, errors and pairs by the names of the products."""
+        return {
+            "r_arcmin": self.r_arcmin,
+            "xi_plus": self.xi_plus,
+            "xi_minus": self.xi_minus,
+            "error_plus": self.error_plus,
+            "error_minus": self.error_minus,
+            "pairs": self.n_pairs,
+        }
 
     def within(self, separations: str) -> np.ndarray:
         """Return the bins of a range of :data:`SEPARATION_RANGES`, the upper end excluded, [n_bins] bool."""
@@ -121,14 +132,14 @@ def shear_correlation(
 
     .. math:: \sigma^2 = \frac{n - 1}{n} \sum_{k=1}^{n} (\xi_k - \bar\xi)^2
 
-    where xi_k is the correlation without the stars of patch k, neither among themselves nor with others. It sees what
-    the stars of a CCD have in common, such as the error of its PSF model, and nothing that is common to patches.
+    where xi_k is the correlation without the stars of patch k, neither among themselves nor with others. It
+    includes errors common to the stars of a CCD, such as that of its PSF model, but none common to several patches.
 
     Parameters
     ----------
     x, y : array or Quantity
-        Positions [rad], the axes to which e1 and e2 refer (e1 > 0 along x, e2 > 0 along x = y). Swapping one of them
-        changes the sign of e2 and spoils xi-.
+        Positions [rad], the axes to which e1 and e2 refer (e1 > 0 along x, e2 > 0 along x = y). Flipping one of them
+        changes the sign of e2 and invalidates xi-.
     e1, e2 : array
         Ellipticities. A star with NaN in position or ellipticity is left out.
     min_sep, max_sep : float or Quantity
@@ -212,7 +223,7 @@ def shear_correlation(
 
 
 def jackknife_error(left: np.ndarray) -> np.ndarray:
-    """Return standard errors from what comes out without each patch in turn.
+    """Return standard errors from leave-one-out values.
 
     Parameters
     ----------

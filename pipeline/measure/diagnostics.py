@@ -1,7 +1,7 @@
-"""What a weak-lensing person asks of a finished run: residuals of ellipticity and size, correlations, rho statistics.
+"""Diagnostics of a finished run: residuals of ellipticity and size, correlations, rho statistics.
 
-Residuals at the stars that a model was fitted to flatter it; what a galaxy sees is the residual where no star is. Each
-is never without the other, nor without the residual of each star at the model fitted without it.
+Residuals at the fitted stars underestimate the error of a model for galaxies, which is that of holdout positions. Both
+are always given, and the leave-one-out residuals of the stars.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from ...core.products import Stamp, described_table, write_ecsv
 from ..ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
 from ..experiment import Experiment
-from ..report.diagnostics_plots import residual_map, rho_figure
-from ..report.statistics_plots import correlation_figure
+from ..report.diagnostics_plots import residual_plot, rho_plot
+from ..report.statistics_plots import correlation_plot
 from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from .correlation import Correlation
 from .rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
-from .summary import correlations, patches, separation_bins
+from .summary import correlations, finite_mean, patches, separation_bins
 
 #: Residuals: at the stars, of stars left out, away from them.
 RESIDUALS = ("residual", "left_out", "away")
@@ -48,11 +48,11 @@ class Diagnostics:
     Attributes
     ----------
     folder : Path
-        Where the files are.
+        Folder of the diagnostics.
     files : tuple of str
-        Their names.
+        Names of the files.
     missing : dict of str to str
-        CCDs of the configuration that have no product, or one that cannot be read, and why.
+        CCDs without a readable product, each with the reason.
     table : Table
         A row for each CCD: means and rms of the residuals.
     overall : dict
@@ -77,8 +77,8 @@ class Diagnostics:
         return {
             "all": self.overall,
             "ccd": {row["ccd"]: {k: row[k] for k in self.table.colnames[1:]} for row in self.table},
-            "correlation": {kind: correlation_dict(c) for kind, c in self.correlations.items()},
-            "rho": {kind: {name: correlation_dict(c) for name, c in rho.items()} for kind, rho in self.rho.items()},
+            "correlation": {kind: c.as_dict() for kind, c in self.correlations.items()},
+            "rho": {kind: {name: c.as_dict() for name, c in rho.items()} for kind, rho in self.rho.items()},
             "missing": self.missing,
             "files": list(self.files),
         }
@@ -92,7 +92,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     folder : Path
         Folder of a run, finished or not.
     out : Path, optional
-        Where to write; a folder ``diagnostics`` within the run's by default.
+        Folder of the diagnostics; ``diagnostics`` within the run's by default.
     strict : bool
         Whether a CCD without a product, or with one that cannot be read, is an error; else it is reported and left out.
 
@@ -137,9 +137,9 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     everything = {f"{kind} {name}": c for kind, r in rho.items() for name, c in r.items()}
     write_ecsv(out / "rho.ecsv", correlation_columns(everything), {"what": "rho statistics 1 to 5", **meta})
     figures = {name: columns[name][0] for name in columns}
-    write_bytes(out / "residuals.png", residual_map(experiment.camera, figures))
-    write_bytes(out / "correlations.png", correlation_figure(correlated))
-    write_bytes(out / "rho.png", rho_figure(rho))
+    write_bytes(out / "residuals.png", residual_plot(experiment.camera, figures))
+    write_bytes(out / "correlations.png", correlation_plot(correlated))
+    write_bytes(out / "rho.png", rho_plot(rho))
     files = ("ccds.ecsv", "correlations.ecsv", "rho.ecsv", "residuals.png", "correlations.png", "rho.png")
     table = described_table(columns, meta)
     result = Diagnostics(out, (*files, "diagnostics.json"), missing, table, overall, correlated, rho)
@@ -148,7 +148,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
 
 
 def _product(folder: Path, name: str, stamp: Stamp) -> CcdProduct:
-    """Return the product of a CCD; the error without one gives the reason, where the run has left one."""
+    """Return the product of a CCD, or raise the reason for its absence from the summary of the run."""
     path = product_path(folder, name)
     if path.exists():
         return read_product(path, stamp, holdout_images=False)
@@ -176,19 +176,14 @@ def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
     """Return means and rms of the residuals of some CCDs together."""
     e = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
     figures = {
-        f"mean_e1_{kind}": _mean(e[0]),
-        f"mean_e2_{kind}": _mean(e[1]),
-        f"rms_e_{kind}": float(np.sqrt(_mean(e**2))),
+        f"mean_e1_{kind}": finite_mean(e[0]),
+        f"mean_e2_{kind}": finite_mean(e[1]),
+        f"rms_e_{kind}": float(np.sqrt(finite_mean(e**2))),
     }
     if kind in SIZED:
         growth = np.concatenate([_growth(p.stars(kind)) for p in products])
-        figures |= {f"mean_dt_{kind}": _mean(growth), f"rms_dt_{kind}": float(np.sqrt(_mean(growth**2)))}
+        figures |= {f"mean_dt_{kind}": finite_mean(growth), f"rms_dt_{kind}": float(np.sqrt(finite_mean(growth**2)))}
     return figures
-
-
-def _mean(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else np.nan
 
 
 def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, str, str]]:
@@ -229,7 +224,7 @@ def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlatio
 
 def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tuple[np.ndarray, str, str]]:
     """Return correlations as the columns of one table, one after the other, by the name of each."""
-    each = [correlation_dict(c) for c in correlated.values()]
+    each = [c.as_dict() for c in correlated.values()]
 
     def together(key: str) -> np.ndarray:
         return np.concatenate([c[key] for c in each])
@@ -244,16 +239,4 @@ def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tupl
         "xi_minus": (together("xi_minus"), "", "mean of Re(e e' exp(-4 i phi))"),
         "error_minus": (together("error_minus"), "", f"standard error by {by}"),
         "pairs": (together("pairs"), "", "pairs of stars"),
-    }
-
-
-def correlation_dict(correlation: Correlation) -> dict[str, np.ndarray]:
-    """Return what is written of a correlation."""
-    return {
-        "r_arcmin": correlation.r_arcmin,
-        "xi_plus": correlation.xi_plus,
-        "xi_minus": correlation.xi_minus,
-        "error_plus": correlation.error_plus,
-        "error_minus": correlation.error_minus,
-        "pairs": correlation.n_pairs,
     }

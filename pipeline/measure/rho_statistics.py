@@ -1,4 +1,4 @@
-r"""Rho statistics: what the errors of a PSF model do to the correlation of galaxy shapes.
+r"""Rho statistics: the effect of the errors of a PSF model on the correlation of galaxy shapes.
 
 With e and T the ellipticity and the size of the true PSF (of the stars, or of a PSF known without noise), and with
 ``de = e - e_model`` and ``dT = T - T_model``, averaged over pairs at a separation theta:
@@ -35,7 +35,7 @@ class RhoStatistics:
     Parameters
     ----------
     rho1, rho2, rho3, rho4, rho5 : Correlation
-        As the module says. All of the same stars in the same bins.
+        As in the module docstring, all of the same stars in the same bins.
     """
 
     rho1: Correlation
@@ -67,8 +67,7 @@ def rho_statistics(
 ) -> RhoStatistics:
     """Compute the rho statistics 1 to 5 of a PSF model (Rowe 2010; Jarvis et al. 2016, sec. 3.4).
 
-    Residuals of stars that the model was fitted to flatter it; those of stars left out, or of truth where no star is,
-    do not.
+    Residuals at the fitted stars underestimate the error of the model; leave-one-out and holdout residuals do not.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with
 
 
 class ShapeFlag(IntFlag):
-    """Why a shape cannot be used; zero means that it can.
+    """Failures of a shape measurement; zero for a good one.
 
     ``CENTROID_LEFT_STAMP``: the centroid came nearer to an edge than the rms width of the weight (or half-way to it,
     where the weight is wider than that). ``NO_FLUX``: the weighted sum is not positive, or a pixel is not finite.
@@ -353,7 +353,7 @@ def _stack(images: Any) -> np.ndarray:
 
 
 def _positive(value: Any, name: str) -> float:
-    """Return a positive finite number, or say which argument was not one."""
+    """Return a positive finite number, or raise the error that names the argument."""
     if np.size(value) != 1 or not (np.isfinite(value) and value > 0.0):
         raise DomainError(f"{name} = {value}: expected one positive number")
     return float(value)

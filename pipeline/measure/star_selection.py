@@ -1,4 +1,4 @@
-"""Which stars are fit to model the PSF: those without neighbours, cosmic rays and saturated cores."""
+"""Selection of stars without neighbours, cosmic rays and saturated cores."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FEWEST = 3
 
 
 class StarFlag(IntFlag):
-    """Why a star is not to be used; zero means that it is.
+    """Defects of a star; zero for a good one.
 
     ``UNUSABLE``: a pixel is not finite, or there is no light to scale the median star to.
     """
@@ -39,7 +39,7 @@ class StarFlag(IntFlag):
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What was found in n stars.
+    """Defects found in n stars.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Selection:
 
     @property
     def good(self) -> np.ndarray:
-        """Whether nothing was found, [n] bool."""
+        """Stars without defects, [n] bool."""
         return self.flags == 0
 
     def keep(self, least: int = 1) -> np.ndarray:
@@ -68,17 +68,17 @@ class Selection:
         Raises
         ------
         DomainError
-            If fewer are good: one line with what the others have.
+            If fewer are good, with the number of stars of each defect.
         """
         left = int(self.good.sum())
         if left < least:
             raise DomainError(
-                f"{left} of {len(self.flags)} stars left ({told_flags(self.flags)}): expected at least {least}"
+                f"{left} of {len(self.flags)} stars left ({defect_counts(self.flags)}): expected at least {least}"
             )
         return self.good
 
 
-def told_flags(flags: np.ndarray) -> str:
+def defect_counts(flags: np.ndarray) -> str:
     """Return how many stars have each flag, in words: ``3 neighbour, 1 cosmic ray``."""
     return ", ".join(
         f"{int(((flags & flag) > 0).sum())} {str(flag.name).lower().replace('_', ' ')}"
@@ -90,14 +90,14 @@ def told_flags(flags: np.ndarray) -> str:
 def flag_stars(
     stamps: Any, noise: Any, *, gain: float = 1.0, saturation: float | None = None, threshold: float = 6.0
 ) -> Selection:
-    """Find stars that differ from the median star as no change of the PSF within a CCD would have it.
+    """Flag stars with neighbours, cosmic rays and saturated cores by comparison with the median star.
 
-    A star's residual is what is left of it less the median star, scaled to its wings, held against noise, the photons
-    of the star itself and an allowance for the change of the PSF. A *cosmic ray* is a pixel that holds more of the
-    residual in the 3 x 3 pixels around it than the peak of a star could. A *neighbour* is a place where the residual,
-    without cosmic rays, matches a star (matched filter); in the core of a bright star the allowance hides those that
-    only stretch it. A *saturated* core lacks a fifth of the light that the wings promise, or reaches the
-    given level, which finds far more of them.
+    The residual of a star is its stamp less the median star scaled to its wings. It is compared with the noise, the
+    photon noise of the star and an allowance for the variation of the PSF over a CCD. A *cosmic ray* is a pixel that
+    holds more of the residual in the 3 x 3 pixels around it than the peak of a star could. A *neighbour* is a place
+    where the residual, without cosmic rays, matches a star (matched filter); in the core of a bright star the allowance
+    hides those that only stretch it. A *saturated* core lacks a fifth of the light that the wings promise, or reaches
+    the given level, which finds far more of them.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def flag_stars(
     saturation : float, optional
         Level from which on a pixel is saturated.
     threshold : float
-        Least significance of what is found [standard deviations].
+        Least significance of a defect [standard deviations].
 
     Returns
     -------
@@ -142,7 +142,7 @@ def flag_stars(
     peak = star.max()
     wings, core = (star > _WINGS[0] * peak) & (star < _WINGS[1] * peak), star > _CORE * peak
     block = ndimage.uniform_filter(star, 3, mode="constant") * 9.0
-    share = min(_SHARPER * peak / block[np.unravel_index(star.argmax(), star.shape)], 0.9)
+    fraction = min(_SHARPER * peak / block[np.unravel_index(star.argmax(), star.shape)], 0.9)
     allowance = _PSF_CHANGE * np.sqrt(np.maximum(star, 0.0) * peak)
     scales = np.median(images[:, wings] / star[wings], axis=1)
     flags[usable & ~(scales > 0.0)] = StarFlag.UNUSABLE
@@ -162,7 +162,7 @@ def flag_stars(
             flags[i] |= StarFlag.SATURATED
             masks[i] |= core
             continue  # whatever else its residual shows is the lost core
-        struck = _sharp_pixels(residual, variance, share, threshold)
+        struck = _sharp_pixels(residual, variance, fraction, threshold)
         if struck.any():
             flags[i] |= StarFlag.COSMIC_RAY
             masks[i] = struck
@@ -187,13 +187,13 @@ def _scale_error(variance: np.ndarray, star: np.ndarray, wings: np.ndarray) -> f
     return float(np.sqrt(0.5 * np.pi * (variance[wings] / star[wings] ** 2).mean() / wings.sum()))
 
 
-def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, share: float, threshold: float) -> np.ndarray:
+def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, threshold: float) -> np.ndarray:
     """Return the pixels of cosmic rays: sharp ones, and what is bright beside them."""
     ones = np.ones((3, 3))
     around = ndimage.convolve(residual, ones, mode="nearest")  # as if it went on: an edge is no sharp pixel
     around_variance = ndimage.convolve(variance, ones, mode="nearest")
-    excess = residual - share * around
-    error = np.sqrt((1.0 - 2.0 * share) * variance + share**2 * around_variance)
+    excess = residual - fraction * around
+    error = np.sqrt((1.0 - 2.0 * fraction) * variance + fraction**2 * around_variance)
     sharp = excess > threshold * error
     if not sharp.any():
         return sharp

@@ -1,4 +1,4 @@
-"""Figures that sum up a run: correlations over all CCDs, and what is said of each CCD and of all together."""
+"""Metrics of a run: correlations over all CCDs, and metrics of each CCD and of all together."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ...core.units import ARCMIN, ARCSEC
 from ..ccd_product import CcdProduct, Stars
 from .correlation import SEPARATION_RANGES, Correlation, shear_correlation
 
-#: What is correlated: truth and truth - model where no star is, observed and observed - model at the stars.
+#: Ellipticities that are correlated; ``truth`` and ``away`` (noise-free - model) are of the holdout positions.
 CORRELATED = ("truth", "observed", "residual", "away")
 #: Pairs are counted from here on [arcmin].
 SHORTEST_ARCMIN = 0.5
@@ -22,15 +22,15 @@ def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] = CORRELAT
     """Correlate ellipticities and residuals over all CCDs (Jee & Tyson 2011, Fig. 14).
 
     Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
-    between CCDs cancels whatever the error of the model is; residuals away from the stars are what a galaxy sees. Both
-    are always given. Errors are by jackknife over the CCDs where there are two or more.
+    between CCDs cancels for any error of the model. Those at holdout positions apply to galaxies. Both are always
+    given. Errors are by jackknife over the CCDs where there are two or more.
 
     Parameters
     ----------
     products : sequence of CcdProduct
         CCDs.
     kinds : sequence of str
-        What is correlated, of :data:`~pachon.pipeline.ccd_product.KINDS`.
+        Ellipticities, of :data:`~pachon.pipeline.ccd_product.KINDS`.
     """
     bins = separation_bins(products)
     result = {}
@@ -57,8 +57,8 @@ def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
     return {"min_sep": SHORTEST_ARCMIN * ARCMIN, "max_sep": longest, "n_bins": bins}
 
 
-def ccd_figures(product: CcdProduct) -> dict[str, Any]:
-    """Return the figures of one CCD; keys end in their unit."""
+def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
+    """Return the metrics of one CCD; keys end in their unit."""
     truth, observed = product.holdout, product.observed
     field = np.array([np.median(truth.field_x), np.median(truth.field_y)])
     return {
@@ -71,8 +71,8 @@ def ccd_figures(product: CcdProduct) -> dict[str, Any]:
         "stars_with_defects": int((observed.defects != 0).sum()),
         "pixels_rejected": product.model.n_rejected,
         "fwhm_arcsec": _median(truth.fwhm) / ARCSEC,
-        "mean_e_truth": _mean(np.hypot(truth.e1, truth.e2)),
-        "mean_e_observed": _mean(np.hypot(observed.e1, observed.e2)),
+        "mean_e_truth": finite_mean(np.hypot(truth.e1, truth.e2)),
+        "mean_e_observed": finite_mean(np.hypot(observed.e1, observed.e2)),
         "rms_residual_at_stars": _rms(observed.residual_e1, observed.residual_e2),
         "rms_residual_left_out": _rms(observed.e1 - observed.leave_one_out_e1, observed.e2 - observed.leave_one_out_e2),
         "rms_residual_away": _rms(truth.residual_e1, truth.residual_e2),
@@ -82,13 +82,13 @@ def ccd_figures(product: CcdProduct) -> dict[str, Any]:
     }
 
 
-def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, Any]:
+def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, Any]:
     """Return the metrics of a run: of each CCD, of all together, and the correlations.
 
     ``xi_plus_..._short`` is the mean of xi+ over pairs closer than 10 arcmin, ``xi_plus_..._long`` over those from 10
     to 180 arcmin.
     """
-    each = {p.name: ccd_figures(p) for p in products}
+    each = {p.name: ccd_metrics(p) for p in products}
     truth = [p.holdout for p in products]
     observed = [p.observed for p in products]
 
@@ -105,9 +105,9 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
         "fwhm_arcsec": _median(fwhm),
         "fwhm_min_arcsec": float(np.nanmin(fwhm)),
         "fwhm_max_arcsec": float(np.nanmax(fwhm)),
-        "mean_e_truth": _mean(np.hypot(column(truth, "e1"), column(truth, "e2"))),
+        "mean_e_truth": finite_mean(np.hypot(column(truth, "e1"), column(truth, "e2"))),
         "max_e_truth": float(np.nanmax(np.hypot(column(truth, "e1"), column(truth, "e2")))),
-        "mean_e_observed": _mean(np.hypot(column(observed, "e1"), column(observed, "e2"))),
+        "mean_e_observed": finite_mean(np.hypot(column(observed, "e1"), column(observed, "e2"))),
         "rms_residual_at_stars": _rms(column(observed, "residual_e1"), column(observed, "residual_e2")),
         "rms_residual_left_out": _rms(
             column(observed, "e1") - column(observed, "leave_one_out_e1"),
@@ -123,21 +123,12 @@ def run_figures(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
     return {
         "all": together,
         "ccd": each,
-        "correlation": {
-            kind: {
-                "r_arcmin": c.r_arcmin,
-                "xi_plus": c.xi_plus,
-                "xi_minus": c.xi_minus,
-                "error_plus": c.error_plus,
-                "error_minus": c.error_minus,
-                "pairs": c.n_pairs,
-            }
-            for kind, c in correlated.items()
-        },
+        "correlation": {kind: c.as_dict() for kind, c in correlated.items()},
     }
 
 
-def _mean(values: np.ndarray) -> float:
+def finite_mean(values: np.ndarray) -> float:
+    """Return the mean of the finite values; NaN where there are none."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if finite.size else np.nan
 

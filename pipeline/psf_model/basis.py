@@ -91,7 +91,7 @@ def shapelets(
     Raises
     ------
     ConfigError
-        If the stamps have too few pixels to tell the shapelets apart.
+        If the stamps have too few pixels for independent shapelets.
     """
     if scale is None:
         scale = _best_scale(mean + deviations, min(count, _FOR_SCALE), shape)
@@ -166,7 +166,7 @@ def _best_scale(stars: np.ndarray, count: int, shape: tuple[int, int]) -> float:
     values = [left(t) for t in tried]
     best = int(np.argmin(values))
     if not np.isfinite(values[best]):
-        _unit_sum_shapelets(count, shape, width)  # says what is wrong
+        _unit_sum_shapelets(count, shape, width)  # raises the error
     low, high = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_a, at_b = left(a), left(b)

@@ -1,4 +1,4 @@
-"""From stamps to what a PSF model interpolates: outliers out, masked pixels filled, a basis chosen."""
+"""Stamps in a basis: outliers rejected, masked pixels filled, stars projected on components."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .basis import Basis, pixel_grid, principal_components, shapelets
-from .masked_pixels import fill_unseen, mean_and_flux
+from .masked_pixels import fill_masked, mean_and_flux
 from .outliers import find_outliers, restore_predicted
 
 
@@ -22,7 +22,7 @@ class Description:
     coefficients : ndarray, shape [n_stars, k]
         Projections of the stars.
     unexplained : ndarray, shape [n_stars]
-        Sum over pixels of the square of what the basis leaves.
+        Sum of squares over pixels of the residual of the basis.
     rejected : ndarray of bool, shape [n_stars, n_pixels]
         Outliers.
     """
@@ -54,8 +54,8 @@ def describe(
     masked : array of bool
         [n_stars, ny, nx] pixels not to be used.
     terms : array
-        Of the polynomials at the stars, [n_stars, n_terms]; they vouch for stars that stand out as the others foresee,
-        and fill what single pixels have not seen.
+        Of the polynomials at the stars, [n_stars, n_terms]; they keep stars whose deviation the others predict, and
+        fill masked pixels.
     basis, count, scale, clip_sigma, max_iterations, replacement
         As in :meth:`~pachon.pipeline.psf_model.model.PsfModel.fit`.
     """
@@ -76,7 +76,7 @@ def describe(
     by_mean = rejected & (replacement == "mean")
     unseen = unseen | (rejected & ~by_mean)
     if unseen.any():
-        stars = fill_unseen(mean + deviations, unseen, by_mean, terms)
+        stars = fill_masked(mean + deviations, unseen, by_mean, terms)
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
     if basis == "pixels":

@@ -71,7 +71,7 @@ def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, sh
         kernel = ConstantKernel(variance, near[0]) * RBF(length, near[1]) + WhiteKernel(noise, near[2])
         process = GaussianProcessRegressor(kernel, alpha=0.0)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a parameter on its bound is an answer: no noise, or nothing but noise
+            warnings.simplefilter("ignore")  # a parameter may end on its bound: no noise, or noise only
             process.fit(points, rest[:, group] / np.sqrt(power))
         found = process.kernel_
         result[group] = (power * found.k1.k1.constant_value, found.k1.k2.length_scale, power * found.k2.noise_level)

@@ -9,7 +9,7 @@ from ...core.errors import DomainError
 # Passes end when no pixel changes by more of the brightest pixel than this.
 _CONVERGED = 1e-12
 _MOST_PASSES = 100
-# Stars that did not see a pixel are predicted only along the directions that the others determine: an eigenvalue of
+# Stars in which a pixel is masked are predicted only along the directions that the others determine: an eigenvalue of
 # 1 - H under this would enlarge noise by more than seven.
 _LEAST_ROOM = 0.02
 
@@ -34,12 +34,12 @@ def mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray,
     return mean, flux
 
 
-def fill_unseen(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Fill unseen pixels with what the polynomial through the stars that saw them predicts.
+def fill_masked(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Fill masked pixels with the polynomial through the stars in which they are good.
 
-    A filled pixel then has no say in the interpolation over the CCD: with the hat matrix H of all stars, the values f
-    of the stars b that did not see a pixel lie on the polynomial of the others, g, if f = H_bb f + H_bg y. Filling
-    changes the sum of a star, and so its flux and the mean, so all are iterated.
+    A filled pixel then has no influence on the interpolation over the CCD: with the hat matrix H of all stars, the
+    values f of the stars b in which a pixel is masked lie on the polynomial of the others, g, if f = H_bb f + H_bg y.
+    Filling changes the sum of a star, and so its flux and the mean, so all are iterated.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def fill_unseen(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, ter
     for _ in range(_MOST_PASSES):
         filled = stars.copy()
         for j, bad, good, predictor in predictors:
-            middle = stars[good, j].mean()  # so that a star of whom the others know nothing gets their mean
+            middle = stars[good, j].mean()  # a star that the others do not determine gets their mean
             filled[bad, j] = middle + predictor @ (stars[good, j] - middle)
         filled = np.where(replaced, filled.mean(axis=0), filled)
         filled /= filled.sum(axis=1)[:, None]

@@ -125,8 +125,8 @@ class PsfModel:
         weights : array, optional
             [n] of the stars in the polynomials.
         masks : array of bool, optional
-            [n, ny, nx], True for pixels that are not to be used, whatever they hold. The polynomial through the stars
-            that saw the pixel stands for them, so that they have no say.
+            [n, ny, nx], True for pixels to ignore. They are replaced by the polynomial through the stars in which the
+            pixel is good, so that they have no influence on the fit.
         n_components : int or str, optional
             Components to keep, 20 where left out: principal ones at most n - 1, of shapelets those of sum zero.
             ``auto`` takes :attr:`cross_validated_components` of up to 65; :attr:`elbow` is the alternative. None for
@@ -144,8 +144,8 @@ class PsfModel:
         max_iterations : int
             Most passes of the rejection.
         replacement : str
-            What stands for rejected pixels: the ``mean`` of the stars, as in the paper, or as for masked ones the
-            ``polynomial`` of the others, so that they have no say.
+            Replacement of rejected pixels: the ``mean`` of the stars, as in the paper, or as for masked ones the
+            ``polynomial`` of the others.
 
         Raises
         ------
@@ -231,7 +231,7 @@ class PsfModel:
 
     @property
     def cross_validated_components(self) -> int:
-        """Number of components that predicts the stars left out best, 0 to k; k where that cannot be told."""
+        """Number of components with the least leave-one-out error, 0 to k; k where the error is not finite."""
         curve = self.leave_one_out_curve
         return int(np.argmin(curve)) if np.isfinite(curve).all() else self.n_components
 

@@ -18,7 +18,7 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
 
     A pixel's deviation is held against three standard deviations in quadrature: that of the pixel over the stars,
     that of the star over its pixels, and an allowance for the PSF's change within the CCD. The first is taken from
-    the 80th percentile, which unlike the median knows of the few stars in the corners, where the PSF differs most;
+    the 80th percentile, which unlike the median includes the few stars in the corners, where the PSF differs most;
     three times what the median gives bounds it, should more than a fifth of the stars be hit in that pixel. Mean and
     fluxes come from the pixels not rejected, and all pixels are judged anew until nothing changes. Stars are scaled
     to the mean by least squares: the sum over a thousand pixels of sky noise would be off by far more than the star's
@@ -59,7 +59,7 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
 
 
 def restore_predicted(values: np.ndarray, mean: np.ndarray, rejected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Take back the rejections of stars that deviate from the mean just as the other stars say they should.
+    """Restore rejected stars whose deviation from the mean the other stars predict.
 
     Where the PSF changes by much, a star in a corner of the CCD may stand out from the mean. A smooth change is
     foreseen by the polynomial in position through the other stars, in all of the star's rejected pixels, to a tenth

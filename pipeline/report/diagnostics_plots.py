@@ -1,4 +1,4 @@
-"""Figures of the diagnostics: residuals of each CCD over the focal plane, and rho statistics against separation."""
+"""Plots of the diagnostics: residuals of each CCD over the focal plane, and rho statistics against separation."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _RHO_STYLES = {
 }
 
 
-def residual_map(camera: Camera, figures: Mapping[str, np.ndarray]) -> bytes:
+def residual_plot(camera: Camera, figures: Mapping[str, np.ndarray]) -> bytes:
     """Draw the residuals of each CCD: rms and mean ellipticity above, mean size below; the same scale across a row.
 
     Parameters
     ----------
     camera : Camera
-        Where the CCDs lie.
+        Camera.
     figures : mapping of str to array
         Columns of the table of CCDs, see :func:`~pachon.pipeline.measure.diagnostics.diagnose`.
     """
@@ -94,7 +94,7 @@ def residual_map(camera: Camera, figures: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _largest(values: np.ndarray) -> float:
-    """Return what few CCDs exceed, which would leave no contrast to the others; one where that is zero."""
+    """Return the 98th percentile of finite values, or one where it is zero."""
     finite = values[np.isfinite(values)]
     largest = float(np.quantile(finite, 0.98)) if finite.size else 0.0
     return largest if largest > 0.0 else 1.0
@@ -110,7 +110,7 @@ def _draw_ccds(axes: Axes, camera: Camera, indices: list[int], values: np.ndarra
     draw_outlines(axes, camera, range(len(camera)), "0.75", 0.4)
 
 
-def rho_figure(rho: Mapping[str, RhoStatistics]) -> bytes:
+def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
     """Draw the rho statistics (as Jarvis et al. 2016 group them): at the stars above, where no star is below.
 
     Parameters

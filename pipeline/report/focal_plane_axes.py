@@ -1,6 +1,6 @@
-"""What figures of the focal plane share: whiskers, CCD outlines, what each colour means.
+"""Elements of plots over the focal plane: whiskers, CCD outlines, colours of the quantities.
 
-Figures are in the detector's frame as the telescope's frame has it: x to the right, y up, in millimetres.
+Plots are in the detector's frame as the telescope's frame has it: x to the right, y up, in millimetres.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_of
 from ...models.camera.camera import Camera
 
-#: One colour for one thing, in every figure: blue and red for observed and residual are the paper's.
+#: Colour of each quantity in every plot; blue and red for observed and residual as in Jee & Tyson 2011.
 TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
 
 

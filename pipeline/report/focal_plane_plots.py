@@ -1,4 +1,4 @@
-"""Figures over the focal plane: heights of the CCDs, and whiskers of the ellipticity on top of them."""
+"""Plots over the focal plane: heights of the CCDs, and whiskers of the ellipticity."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MANY = 30
 _MOST_WHISKERS = 200
 
 
-def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
+def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
     """Draw the heights of all CCDs, the used ones framed and named (Jee & Tyson 2011, Fig. 7).
 
     Parameters
@@ -63,7 +63,7 @@ def heights_figure(focal_plane: FocalPlane, used: Sequence[str], field_radius: f
         return png_bytes(figure)
 
 
-def whiskers_figure(
+def whiskers_plot(
     products: Sequence[CcdProduct], focal_plane: FocalPlane, field_radius: float, kinds: Sequence[str] | None = None
 ) -> bytes:
     """Draw whiskers of truth, observed stars and residual over the CCDs of the run, all on one scale (Figs. 8, 11, 12).
@@ -86,7 +86,7 @@ def whiskers_figure(
     low, high = centers.min(axis=0) - half - pad, centers.max(axis=0) + half + pad
     limits = (low[0], high[0], low[1], high[1])
     key = _common_key(products)
-    # The key is as long as a third of a CCD's half side, or what can still be seen of it over the whole field.
+    # The key is a third of the half side of a CCD long, but never too short to be legible.
     scale = max(0.33 * half, 0.012 * float(max(high - low))) / key
     across = (high[0] - low[0]) / (high[1] - low[1])
     with styled():
@@ -116,7 +116,7 @@ def whiskers_figure(
         return png_bytes(figure)
 
 
-def close_up_figure(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> bytes:
+def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> bytes:
     """Draw whiskers of some CCDs large, one a row: truth, observed, residual at the stars and away from them."""
     camera = focal_plane.camera
     kinds = ("truth", "observed", "residual", "away")
@@ -161,7 +161,7 @@ _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": A
 
 
 def _titled(title: str, products: Sequence[CcdProduct], kind: str, most: int) -> str:
-    """Return a title that says so where not every star has its whisker."""
+    """Return a title, with a note where not every star has a whisker."""
     step = max(_step(product.stars(kind), most) for product in products)
     return title if step == 1 else f"{title} (one star in {step})"
 

@@ -1,4 +1,4 @@
-"""What a telescope is made of: its lens table and its first-order figures, as numbers and as text."""
+"""Lens table and first-order properties of a telescope, as numbers and as text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ...models.shapes.shape import Rotational
 from ...models.surface import Surface
 from ...models.telescope import Telescope
 
-#: Figures that only a centred telescope has.
+#: First-order properties, which only a centred telescope has.
 FIRST_ORDER_KEYS = (
     "focal_length_m",
     "f_number",
@@ -39,9 +39,9 @@ def list_models() -> list[dict[str, Any]]:
 
 
 def describe(telescope: Telescope) -> dict[str, Any]:
-    """Return the lens table and the first-order figures of a telescope; keys end in their unit.
+    """Return the lens table and the first-order properties of a telescope; keys end in their unit.
 
-    A telescope whose surfaces do not share one axis, as built or folded, has no first-order figures: they are None.
+    The first-order properties of a telescope whose surfaces do not share one axis, as built or folded, are None.
     """
     first: dict[str, float | None] = dict.fromkeys(FIRST_ORDER_KEYS)
     with contextlib.suppress(DomainError):
@@ -147,7 +147,7 @@ def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the first-order figures as text: what, and its value with unit."""
+    """Return the first-order properties as text: name, and value with unit."""
     d = description
     if d["focal_length_m"] is None:
         lens, image = [("first-order figures", "none: the surfaces do not share one axis")], []

@@ -21,9 +21,9 @@ class Picture:
     png : bytes
         The picture.
     shows : str
-        What is to be seen on it.
+        Caption.
     paper : str
-        What the paper shows in its place, with the figure's number; empty where it has none.
+        The corresponding figure of Jee & Tyson 2011; empty where there is none.
     """
 
     title: str
@@ -38,7 +38,7 @@ class Picture:
 
 
 def render(template: str, **content: Any) -> str:
-    """Return a page made from one of the templates; a name that the template needs and is not given is an error."""
+    """Return a page made from one of the templates; a missing name is an error."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,

@@ -1,4 +1,4 @@
-"""Figures of PSFs as images: eigen-PSFs and their eigenvalues, and stars observed, modelled and left over."""
+"""Plots of PSFs: eigen-PSFs and their eigenvalues, and stamps of stars, their models and residuals."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from .focal_plane_axes import AWAY, OBSERVED, TRUTH
 from .tables import percent
 
 
-def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
+def eigen_psf_plot(product: CcdProduct, noise_free: bool) -> bytes:
     """Draw the mean PSF and the eigen-PSFs of one CCD (Jee & Tyson 2011, Fig. 9).
 
     Parameters
     ----------
     product : CcdProduct
         The CCD.
-    truth : bool
+    noise_free : bool
         Whether to draw the components of the noise-free PSFs, or of the observed stars.
     """
-    model = product.noise_free_model if truth else product.model
+    model = product.noise_free_model if noise_free else product.model
     count = min(model.n_components, 20)
     columns = 7
     rows = -(-(count + 1) // columns)
@@ -42,7 +42,7 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
             edge = float(np.abs(component).max())
             image = axes.imshow(component / edge, extent=extent, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
             axes.set_title(f"n = {k + 1}: {percent(model.explained_variance[k])}", fontsize=8)
-        # Beyond three times the width of the PSF there is nothing to see.
+        # Beyond three times the FWHM there is no structure.
         shown = min(extent[1], 3.0 * float(np.nanmedian(product.holdout.fwhm)) / ARCSEC)
         panels[0].set_xlim(-shown, shown)
         panels[0].set_ylim(-shown, shown)
@@ -55,7 +55,7 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
         if image is not None:
             bar = figure.colorbar(image, ax=list(panels), fraction=0.015, pad=0.01, aspect=40)
             bar.set_label("eigen-PSF, each over its largest magnitude")
-        kind = "noise-free PSFs" if truth else "observed stars"
+        kind = "noise-free PSFs" if noise_free else "observed stars"
         figure.suptitle(
             f"{product.name}: mean and eigen-PSFs of {model.n_stars} {kind}; "
             f"{model.n_components} components hold {percent(model.explained)} of the variance",
@@ -64,8 +64,8 @@ def eigen_figure(product: CcdProduct, truth: bool) -> bytes:
         return png_bytes(figure)
 
 
-def spectrum_figure(products: Sequence[CcdProduct]) -> bytes:
-    """Draw the eigenvalues of all CCDs, of observed stars and of noise-free PSFs, and where the model cuts them off."""
+def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
+    """Draw the eigenvalues of all CCDs, of observed stars and of noise-free PSFs, and the number kept."""
     with styled():
         figure = new_figure(10.0, 4.2)
         left, right = figure.subplots(1, 2)
@@ -102,8 +102,8 @@ def spectrum_figure(products: Sequence[CcdProduct]) -> bytes:
         return png_bytes(figure)
 
 
-def stamps_figure(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
-    """Draw observed stars, the model at their places, and what is left in units of the noise.
+def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
+    """Draw observed stars, the model at their places, and the residuals in units of the noise.
 
     Parameters
     ----------

@@ -12,10 +12,10 @@ from ..config import ReconstructionConfig, to_yaml
 from ..defaults import noise_free_components
 from ..experiment import Experiment
 from ..measure.correlation import Correlation
-from .focal_plane_plots import close_up_figure, heights_figure, whiskers_figure
+from .focal_plane_plots import close_up_plot, heights_plot, whiskers_plot
 from .page import Picture, render
-from .psf_plots import eigen_figure, spectrum_figure, stamps_figure
-from .statistics_plots import correlation_figure, scatter_figure
+from .psf_plots import eigen_psf_plot, spectrum_plot, stamps_plot
+from .statistics_plots import correlation_plot, scatter_plot
 from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
@@ -29,9 +29,9 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
     Parameters
     ----------
     experiment : Experiment
-        What was run.
+        Experiment of the run.
     summary : dict
-        Figures, as in ``summary.json``.
+        Metrics, as in ``summary.json``.
     pictures : sequence of Picture
         Pictures, as :func:`draw_pictures` gives them.
     """
@@ -73,7 +73,7 @@ def draw_pictures(
     pictures = [
         Picture(
             "Focal plane",
-            heights_figure(plane, [p.name for p in products], radius),
+            heights_plot(plane, [p.name for p in products], radius),
             "Height of every CCD surface over the nominal focal plane, positive towards the sky. Steps between CCDs "
             "and rafts, tilts and the ripple within a CCD (the potato chip) come from the height budget, each term "
             "from its own random stream. The same surface as a mesh: focal_plane.glb.",
@@ -81,7 +81,7 @@ def draw_pictures(
         ),
         Picture(
             "Whiskers over the field",
-            whiskers_figure(products, plane, radius),
+            whiskers_plot(products, plane, radius),
             "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
             "panels share one scale, given by the key above their right corner, so lengths can be compared. The "
             "pattern follows the heights behind it: whiskers jump where the CCD border is a step. Residuals at the "
@@ -94,7 +94,7 @@ def draw_pictures(
         ),
         Picture(
             "Whiskers close up",
-            close_up_figure(close, plane),
+            close_up_plot(close, plane),
             "The CCD closest to the axis, one half-way out and the farthest one. The last column is what a galaxy "
             "sees: the error of the model at places where there was no star to fit.",
             "The paper notes a small-scale variation even within a CCD, from tilt and potato chip, and so fits "
@@ -102,7 +102,7 @@ def draw_pictures(
         ),
         Picture(
             "Eigen-PSFs of the noise-free PSFs",
-            eigen_figure(close[0], truth=True),
+            eigen_psf_plot(close[0], noise_free=True),
             f"Mean PSF of one CCD and its first {min(components, 20)} principal components, each with the part of the "
             "variance along it. Order and signs are fixed, so that runs can be compared.",
             "Fig. 9: components of 4000 PSFs of the atmosphere alone. The first resemble shapelets; structure gets "
@@ -110,13 +110,13 @@ def draw_pictures(
         ),
         Picture(
             OBSERVED_COMPONENTS,
-            eigen_figure(close[0], truth=False),
+            eigen_psf_plot(close[0], noise_free=False),
             "The same CCD, from the stars that were observed: components beyond the first few are noise.",
             "The paper keeps 20 components for observed stars too.",
         ),
         Picture(
             "How many components are needed",
-            spectrum_figure(products),
+            spectrum_plot(products),
             "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
             "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
             "is the elbow, the point farthest below the straight line from the first eigenvalue to the last.",
@@ -125,14 +125,14 @@ def draw_pictures(
         ),
         Picture(
             "Ellipticity before and after",
-            scatter_figure(products),
+            scatter_plot(products),
             "Left as in the paper: ellipticity of the observed stars, and what is left when the model is subtracted. "
             "Right: the same for the noise-free PSFs at places where no star was fitted.",
             "Fig. 13: residuals (red) far more compact than observed stars (blue), centred on zero.",
         ),
         Picture(
             "Correlation of the ellipticity",
-            correlation_figure(correlated),
+            correlation_plot(correlated),
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
             f"{errors}, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
             "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
@@ -143,7 +143,7 @@ def draw_pictures(
         ),
         Picture(
             "Stars",
-            stamps_figure(close),
+            stamps_plot(close),
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
             "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
             "only that noise is left. A bright star can show more: mean and components are fitted without weights, "

@@ -1,4 +1,4 @@
-"""Figures of ellipticities as numbers: their scatter, and their correlation against separation."""
+"""Plots of ellipticities: their scatter, and their correlation against separation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LABELS = {
 }
 
 
-def scatter_figure(products: Sequence[CcdProduct]) -> bytes:
+def scatter_plot(products: Sequence[CcdProduct]) -> bytes:
     """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
     panels: tuple[tuple[str, Sequence[Stars], str, str, str, str], ...] = (
         ("at the observed stars", [p.observed for p in products], OBSERVED, RESIDUAL, "observed", "observed - model"),
@@ -57,7 +57,7 @@ def _draw_cloud(axes: Axes, stars: Sequence[Stars], keys: tuple[str, str], color
     axes.plot([], [], "o", color=color, markersize=3.0, label=f"{name}: rms {rms:.2g}")
 
 
-def correlation_figure(correlated: dict[str, Correlation]) -> bytes:
+def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
     """Draw xi+ and xi- against separation (Jee & Tyson 2011, Fig. 14): filled symbols positive, open ones negative."""
     with styled():
         figure = new_figure(11.5, 5.4)

@@ -1,4 +1,4 @@
-"""The figures of a run as tables that people read, on the terminal and in the report, in an astronomer's units."""
+"""Metrics of a run as tables for the terminal and the report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAMES = {
 
 
 def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the figures of a run: what, and its value with unit."""
+    """Return the metrics of a run: name, and value with unit."""
     figures = summary["all"]
     rows = [
         ("CCDs", f"{figures['ccds']}"),

@@ -23,16 +23,16 @@ from ..measure.shapes import measure_shapes
 from .photometry import limiting_magnitude
 from .star_field import StarField, make_star_field
 
-#: An observed star is drawn on a stamp so many pixels larger than the one kept: room to shift it onto a pixel's centre.
+#: Pixels by which the stamp of an observed star is larger than the final one: room to centre it on a pixel.
 _SHIFT_ROOM = 10
-#: Stars keep this many pixels from the rim: a ray that meets a CCD 20 um higher up lands micrometres farther in or out.
+#: Distance of all stars from the edge of the CCD [pixel]: its height moves a star by micrometres.
 _RIM = 2
-#: Observed stars keep this many pixels from the edge of the CCD, so that the whole stamp lies on it.
+#: Distance of observed stars from the edge of the CCD [pixel], so that the whole stamp lies on it.
 _MARGIN = 20
-#: Sets magnitude limits until the PSF is known; positions do not depend on it.
+#: FWHM for provisional magnitude limits; positions do not depend on it.
 _PROVISIONAL_FWHM = 0.6 * ARCSEC
-#: Focal ratio of the paraboloid that stands for a telescope without aberrations: 1.75 deg from the axis its astigmatism
-#: is 1e-3 arcsec, and e stays under 3e-4, the stretch that a flat field has from tangents in place of angles.
+#: Focal ratio of the paraboloid that serves as ideal telescope: 1.75 deg from the axis its astigmatism is 1e-3 arcsec,
+#: and e stays below 3e-4, the distortion of a tangent projection.
 _PLAIN_RATIO = 1e5
 
 
@@ -60,18 +60,18 @@ class NoiseFreeStars:
 
 @dataclass(frozen=True)
 class CcdExposure:
-    """The stars of one CCD as the telescope shows them, before noise.
+    """Noise-free images of the stars of one CCD.
 
     Attributes
     ----------
     name : str
         Name of the CCD.
     places : StarField
-        Positions of the stars; their magnitudes are provisional.
+        Positions of the stars, with provisional magnitudes.
     holdout : NoiseFreeStars
         PSFs at positions without an observed star, each centred on a pixel.
     observed : NoiseFreeStars
-        PSFs of the stars that will be observed, where they fall on their pixels.
+        PSFs of the observed stars, at their sub-pixel positions.
     """
 
     name: str
@@ -81,14 +81,14 @@ class CcdExposure:
 
 
 def holdout_positions(experiment: Experiment, name: str) -> np.ndarray:
-    """Return the places of a CCD where a run has noise-free PSFs [m], shape [n, 2]; they depend on the seed alone."""
+    """Return the holdout positions of a CCD [m], shape [n, 2]; they depend on the seed alone."""
     return ccd_stars(experiment, name, _PROVISIONAL_FWHM).holdout
 
 
 def expose_places(experiment: Experiment, positions: np.ndarray, threads: int | None = None) -> NoiseFreeStars:
     """Make noise-free PSFs at positions on the detector [m], shape [n, 2], of any CCDs.
 
-    A star stands where the chief ray of the middle wavelength lands, at the centre of a pixel.
+    The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel.
 
     Raises
     ------
@@ -140,8 +140,9 @@ def _expose_holdout(
 ) -> NoiseFreeStars:
     """Make noise-free PSFs whose centroid is the centre of a pixel.
 
-    The atmosphere moves a star by a part of a pixel. The engine draws the truth at the place that undoes this; it is
-    not shifted as observed stars are: a shift of an image that is not quite band-limited rings along rows and columns.
+    The atmosphere moves a star by a fraction of a pixel. The engine draws these PSFs at the position that compensates
+    the shift. They are not resampled as observed stars are: an image that is not quite band-limited then rings along
+    rows and columns.
     """
 
     def seen_at(images: np.ndarray, pixel_scale: float) -> np.ndarray:
@@ -165,7 +166,7 @@ def _expose(
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
-    seen = _seen_through(experiment)
+    seen = _optics(experiment)
     psfs = make_psfs(
         seen.telescope,
         fields,
@@ -195,8 +196,8 @@ class _Seen(NamedTuple):
     magnification: float
 
 
-def _seen_through(experiment: Experiment) -> _Seen:
-    """Return what stars are seen through, and how much larger than on the camera's CCDs their images are."""
+def _optics(experiment: Experiment) -> _Seen:
+    """Return the optics of the exposure, and the scale of its images relative to the camera's."""
     telescope = experiment.telescope
     if not experiment.atmosphere_only:
         return _Seen(telescope, experiment.focal_plane, experiment.aberration, 1.0)
@@ -206,7 +207,7 @@ def _seen_through(experiment: Experiment) -> _Seen:
 
 
 def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, float]:
-    """Return the edges (xmin, xmax, ymin, ymax) of a CCD [m], less the rim that no star comes into."""
+    """Return the edges (xmin, xmax, ymin, ymax) of a CCD [m], less the margin without stars."""
     camera = experiment.camera
     x, y = map(float, camera.centers[camera.ccd_index(name)])
     half = camera.half_size - _RIM * camera.pixel_size
@@ -214,7 +215,7 @@ def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, flo
 
 
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
-    """Draw the stars of one CCD, the faintest still of the wanted S/N where the least light arrives."""
+    """Draw the stars of one CCD, the faintest of the S/N limit where vignetting is strongest."""
     config = experiment.config
     band, exposure = config.band or "r", config.atmosphere.exposure_s
     return make_star_field(

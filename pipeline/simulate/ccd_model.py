@@ -17,16 +17,17 @@ from .photometry import effective_fwhm, signal_to_noise
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
-    """Look at the stars of one CCD through noise, and model the PSF from what was seen.
+    """Add noise to the stars of one CCD, and model the PSF from them.
 
     Parameters
     ----------
     experiment : Experiment
         Telescope, focal plane, atmosphere and settings.
     exposure : CcdExposure
-        The stars.
+        Noise-free stars.
     noisy : bool
-        Without noise, what stands out is the PSF: no pixel is rejected, as for the truth.
+        Whether the stars have noise and defects. Without noise no pixel is rejected: deviations from the mean are the
+        variation of the PSF.
 
     Raises
     ------
@@ -37,7 +38,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     name, places, truth, observed = exposure.name, exposure.places, exposure.holdout, exposure.observed
     holdout_images = truth.image.astype(np.float64)
     truth_shapes = measure_shapes(holdout_images, truth.pixel_scale, experiment.weight_fwhm)
-    # Places do not depend on the limits of magnitude, which in turn need to know how much light the stars lose.
+    # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
     width = effective_fwhm(truth.image, truth.pixel_scale)
     stars = ccd_stars(experiment, name, width, least_light=float(observed.lit_fraction.min()))
     electrons = stars.electrons * observed.lit_fraction
@@ -59,7 +60,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         extent=places.bounds,
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
-    # Noise-free stars have no outliers: what stands out there is the PSF.
+    # Noise-free stars have no outliers: deviations from the mean are the variation of the PSF.
     noise_free_model = PsfModel.fit(
         holdout_images,
         places.holdout,

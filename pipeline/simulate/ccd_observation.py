@@ -1,4 +1,4 @@
-"""What the camera sees of the stars of a CCD: noise, defects, centred stamps, and which of them make a model."""
+"""Observation of the stars of a CCD: noise, defects, centred stamps, and the selection for the PSF model."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, measure_shapes
-from ..measure.star_selection import StarFlag, flag_stars, told_flags
+from ..measure.star_selection import StarFlag, defect_counts, flag_stars
 from .photometry import instrument_noise, sky_electrons_per_pixel
 from .stamps import center_stamps, observe_stamps
-from .star_defects import spoil_stamps
+from .star_defects import add_defects
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Observation:
     shapes : Shapes
         Of the stamps; e and size are NaN where a defect was found.
     defects : ndarray of int, shape [n]
-        :class:`~pachon.pipeline.measure.star_selection.StarFlag` bits that were found; 0 where nobody looked.
+        :class:`~pachon.pipeline.measure.star_selection.StarFlag` bits of the defects found; 0 without a search.
     used : ndarray of bool, shape [n]
-        Whether a model is to be fitted to the star.
+        Whether the star is good enough for the PSF model.
     """
 
     noise: tuple[float, float]
@@ -41,16 +41,16 @@ class Observation:
     used: np.ndarray
 
     def require(self, least: int) -> None:
-        """Refuse a CCD of which fewer stars can be used.
+        """Raise an error if fewer stars can be used.
 
         Raises
         ------
         DomainError
-            One line with what the others have.
+            With the number of stars of each defect.
         """
         left = int(self.used.sum())
         if left < least:
-            counts = told_flags(self.defects)
+            counts = defect_counts(self.defects)
             raise DomainError(
                 f"{left} of {len(self.used)} stars left{f' ({counts})' if counts else ''}: expected at least {least}"
             )
@@ -59,12 +59,12 @@ class Observation:
 def observe_ccd(
     experiment: Experiment, name: str, images: np.ndarray, pixel_scale: float, electrons: np.ndarray, *, noisy: bool
 ) -> Observation:
-    """Look at the stars of a CCD.
+    """Observe the stars of a CCD.
 
     Parameters
     ----------
     experiment : Experiment
-        Says what noise, defects and selection there are.
+        Settings of noise, defects and selection.
     name : str
         Name of the CCD, in the key of its random streams.
     images : array
@@ -74,7 +74,7 @@ def observe_ccd(
     electrons : array
         [n] electrons of each star.
     noisy : bool
-        Whether there are noise and defects at all.
+        Whether there are noise and defects.
     """
     config = experiment.config
     seconds = config.atmosphere.exposure_s
@@ -82,7 +82,7 @@ def observe_ccd(
     seen, full_well = images.astype(np.float64), None
     if noisy:
         clean = observe_stamps(seen, electrons, sky, noise, _stream(experiment, "noise", name))
-        seen, full_well = _spoilt(experiment, name, clean, seen)
+        seen, full_well = _with_defects(experiment, name, clean, seen)
     first = measure_shapes(seen, pixel_scale, experiment.weight_fwhm)
     stamps = center_stamps(seen, first.x, first.y, size=experiment.stamp_size)
     shapes = measure_shapes(stamps, pixel_scale, experiment.weight_fwhm)
@@ -91,7 +91,7 @@ def observe_ccd(
         centred = center_stamps(seen, first.x, first.y, size=experiment.stamp_size, normalize=False)
         defects = flag_stars(centred, np.hypot(np.sqrt(sky), noise)).flags
         if full_well is not None:
-            # Before they are shifted, pixels tell whether they are full.
+            # Pixels are compared with the full well before they are shifted.
             defects = np.where((seen >= full_well).any(axis=(1, 2)), defects | StarFlag.SATURATED, defects)
         e1, e2, size = (np.where(defects == 0, v, np.nan) for v in (shapes.e1, shapes.e2, shapes.size))
         shapes = replace(shapes, e1=e1, e2=e2, size=size)
@@ -99,15 +99,15 @@ def observe_ccd(
     return Observation((sky, noise), stamps, shapes, defects, used)
 
 
-def _spoilt(
+def _with_defects(
     experiment: Experiment, name: str, stamps: np.ndarray, images: np.ndarray
 ) -> tuple[np.ndarray, float | None]:
-    """Return the stamps [electrons] with the defects that are asked for, and where pixels are full, if any are."""
+    """Return the stamps [electrons] with the defects of the configuration, and the full well where any saturate."""
     stars = experiment.config.stars
     if not (stars.neighbours or stars.cosmic_rays or stars.saturated):
         return stamps, None
     full_well = _full_well(stamps, stars.saturated)
-    spoilt, _ = spoil_stamps(
+    spoilt, _ = add_defects(
         stamps,
         images,
         _stream(experiment, "defects", name),
@@ -129,7 +129,7 @@ def _full_well(stamps: np.ndarray, fraction: float) -> float | None:
 
 
 def _stream(experiment: Experiment, what: str, name: str) -> np.random.Generator:
-    """Return the random stream of a CCD's noise or defects: each visit has its own, and the first the plain one."""
+    """Return the random stream of a CCD's noise or defects, another one for each visit."""
     config = experiment.config
     visit = (config.atmosphere.epoch,) if config.atmosphere.epoch else ()
     return stream(config.seed, what, name, *visit)

@@ -3,6 +3,12 @@
 Zero points, dark sky, extinction, instrument noise and the signal-to-noise formula are those of SMTN-002 ("Calculating
 LSST limiting magnitudes and SNR", throughputs v1.9, airmass 1), whose conventions go back to Ivezic et al. 2019
 (ApJ 873, 111).
+
+Arguments of the same name have the same meaning throughout. Magnitudes are AB above the atmosphere; `band` is a
+:class:`Band` or its name, `exposure` a time [s], `fwhm` the effective FWHM of a star (that of the Gaussian with as many
+noise-equivalent pixels) and `pixel_scale` the side of a pixel, both [rad] or a Quantity; `sky` is a brightness
+[AB mag/arcsec^2], by default the dark sky of the band. A value that is not positive and finite raises
+:class:`~pachon.core.errors.DomainError`, an unknown band :class:`~pachon.core.errors.UnknownNameError`.
 """
 
 from __future__ import annotations
@@ -69,13 +75,7 @@ BANDS = {
 
 
 def band_named(band: str | Band) -> Band:
-    """Return the band of this name (a band is returned as it is).
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such band.
-    """
+    """Return the band of a name; a band is returned as it is."""
     if isinstance(band, Band):
         return band
     if band not in BANDS:
@@ -84,34 +84,14 @@ def band_named(band: str | Band) -> Band:
 
 
 def electrons(magnitude: Any, band: str | Band, exposure: float) -> np.ndarray:
-    """Return the electrons that a star gives in one exposure.
-
-    Parameters
-    ----------
-    magnitude : float or array
-        AB magnitude above the atmosphere.
-    band : str or Band
-        Filter.
-    exposure : float
-        Exposure time [s].
-
-    Returns
-    -------
-    array
-        Electrons on the detector, at airmass 1.
-
-    Raises
-    ------
-    DomainError, UnknownNameError
-        If the exposure is not positive or the band does not exist.
-    """
+    """Return the electrons of a star in one exposure, at airmass 1."""
     band = band_named(band)
     exposure = _positive("exposure", exposure, "s")
     return exposure * 10.0 ** (0.4 * (band.zero_point - np.asarray(magnitude, dtype=np.float64)))
 
 
 def magnitude_of(counts: Any, band: str | Band, exposure: float) -> np.ndarray:
-    """Return the AB magnitude of a star that gives this many electrons (the inverse of :func:`electrons`)."""
+    """Return the AB magnitude of a number of electrons: the inverse of :func:`electrons`."""
     band = band_named(band)
     exposure = _positive("exposure", exposure, "s")
     counts = np.asarray(counts, dtype=np.float64)
@@ -123,21 +103,10 @@ def magnitude_of(counts: Any, band: str | Band, exposure: float) -> np.ndarray:
 def sky_electrons_per_pixel(
     band: str | Band, exposure: float, pixel_scale: Any = PIXEL_SCALE, *, sky: float | None = None
 ) -> float:
-    """Return the electrons that the sky gives to one pixel.
+    """Return the electrons of the sky in one pixel.
 
-    Sky brightness is defined at the telescope's pupil, so the sky is not dimmed by the atmosphere as a star is: the
-    zero point without the atmosphere, ``zero_point + extinction``, applies (SMTN-002, "Sky Counts").
-
-    Parameters
-    ----------
-    band : str or Band
-        Filter.
-    exposure : float
-        Exposure time [s].
-    pixel_scale : float or Quantity
-        Side of a pixel [rad].
-    sky : float, optional
-        Sky brightness [AB mag/arcsec^2], the dark sky of the band where left out.
+    Sky brightness is defined at the pupil of the telescope, so the atmosphere does not dim the sky as it does a star:
+    the zero point without the atmosphere, ``zero_point + extinction``, applies (SMTN-002, "Sky Counts").
     """
     band = band_named(band)
     exposure = _positive("exposure", exposure, "s")
@@ -147,20 +116,12 @@ def sky_electrons_per_pixel(
 
 
 def instrument_noise(exposure: float) -> float:
-    """Return the noise of one pixel in one exposure without any light [e-]: read noise and dark current (SMTN-002)."""
+    """Return the rms of read noise and dark current in one pixel and exposure [e-] (SMTN-002)."""
     return float(np.sqrt(READ_NOISE**2 + DARK_CURRENT * _positive("exposure", exposure, "s")))
 
 
 def effective_pixels(fwhm: Any, pixel_scale: Any = PIXEL_SCALE) -> float:
-    """Return the noise-equivalent number of pixels under a star, ``2.266 (FWHM/pixel)^2`` (SMTN-002).
-
-    Parameters
-    ----------
-    fwhm : float or Quantity
-        Effective FWHM, that of the Gaussian with the same number of noise-equivalent pixels [rad].
-    pixel_scale : float or Quantity
-        Side of a pixel [rad].
-    """
+    """Return the noise-equivalent number of pixels of a star, ``2.266 (FWHM/pixel)^2`` (SMTN-002)."""
     fwhm = _positive("fwhm", radians(fwhm, "fwhm"), "rad")
     pixel = _positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad")
     return float(2.266 * (fwhm / pixel) ** 2)
@@ -185,23 +146,7 @@ def signal_to_noise(
     pixel_scale: Any = PIXEL_SCALE,
     sky: float | None = None,
 ) -> np.ndarray:
-    """Return the signal-to-noise ratio of PSF photometry, ``C / sqrt(C + n_eff (sky + noise^2))`` (SMTN-002).
-
-    Parameters
-    ----------
-    magnitude : float or array
-        AB magnitude above the atmosphere.
-    band : str or Band
-        Filter.
-    exposure : float
-        Exposure time [s].
-    fwhm : float or Quantity
-        Effective FWHM of the star [rad].
-    pixel_scale : float or Quantity
-        Side of a pixel [rad].
-    sky : float, optional
-        Sky brightness [AB mag/arcsec^2], the dark sky of the band where left out.
-    """
+    """Return the S/N of PSF photometry, ``C / sqrt(C + n_eff (sky + noise^2))`` (SMTN-002)."""
     counts = electrons(magnitude, band, exposure)
     return counts / np.sqrt(counts + _footprint_variance(band, exposure, fwhm, pixel_scale, sky))
 
@@ -215,13 +160,7 @@ def limiting_magnitude(
     pixel_scale: Any = PIXEL_SCALE,
     sky: float | None = None,
 ) -> float:
-    """Return the magnitude at which a star has this signal-to-noise ratio (:func:`signal_to_noise` solved for C).
-
-    Raises
-    ------
-    DomainError
-        If the ratio, the exposure, the FWHM or the pixel scale is not positive.
-    """
+    """Return the magnitude of a star of a signal-to-noise ratio: :func:`signal_to_noise` solved for C."""
     square = _positive("snr", snr, "a ratio") ** 2
     variance = _footprint_variance(band, exposure, fwhm, pixel_scale, sky)
     counts = 0.5 * (square + np.sqrt(square**2 + 4.0 * square * variance))
@@ -237,15 +176,15 @@ def saturation_magnitude(
     sky: float | None = None,
     full_well: float = FULL_WELL,
 ) -> float:
-    """Return the magnitude at which the brightest pixel of a star, centred on it, reaches the full well.
+    """Return the magnitude at which the central pixel of a star reaches the full well [e-].
 
-    The star is taken to be a Gaussian of this FWHM; a turbulent PSF has more light in its wings and so a lower peak,
-    which makes the limit a safe one.
+    The star is a Gaussian centred on the pixel. A turbulent PSF has more light in its wings and a lower peak, so the
+    limit is a safe one.
 
     Raises
     ------
     DomainError
-        If an argument is not positive, or the sky alone fills the well.
+        If the sky alone fills the well.
     """
     sigma = _positive("fwhm", radians(fwhm, "fwhm"), "rad") / np.sqrt(8.0 * np.log(2.0))
     pixel = _positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad")
@@ -264,7 +203,7 @@ def _footprint_variance(band: str | Band, exposure: float, fwhm: Any, pixel_scal
 
 
 def _positive(name: str, value: Any, unit: str) -> float:
-    """Return a positive finite number, or say which argument was not one."""
+    """Return a positive finite number, or raise the error that names the argument."""
     try:
         number = float(value)
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Whether periodic screens are long enough for what a run looks at, so that no turbulence is seen twice."""
+"""Length of the phase screens that the field of view and the wind cross during an exposure."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..config import Configuration
 
 
 def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> np.ndarray:
-    """Return how long a piece of each layer is seen from the chosen CCDs during the exposure, along x or y [m].
+    """Return the length of each layer crossed by the light to the chosen CCDs during the exposure [m].
 
-    It is what the wind blows past, whichever way it goes, and what the field of view and the pupil cover at the
+    Sum of the drift by the wind, in any direction, and of the extent of field of view and pupil along x or y at the
     distance of the layer.
 
     Parameters
@@ -28,7 +28,7 @@ def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, s
     config : Configuration
         Resolved configuration.
     telescope, camera, site
-        What it names.
+        Models of the configuration.
 
     Returns
     -------
@@ -45,12 +45,12 @@ def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, s
 
 
 def check_screens(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> None:
-    """Refuse screens that come round under the chosen CCDs.
+    """Raise an error if a periodic screen repeats within the light to the chosen CCDs.
 
     Raises
     ------
     ConfigError
-        Naming the layer and how long the screens must be.
+        With the layer and the screen length that it takes.
     """
     air = config.atmosphere
     if not air.enabled or not ENGINES[config.psf.engine].screens:

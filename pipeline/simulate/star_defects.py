@@ -1,4 +1,4 @@
-"""What spoils real stars, to be put into made ones: neighbours, cosmic rays, saturated cores."""
+"""Defects of simulated stars: neighbours, cosmic rays, saturated cores."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ...core.errors import DomainError
 from ..measure.star_selection import StarFlag
 
 
-def spoil_stamps(
+def add_defects(
     stamps: Any,
     psf_images: Any,
     rng: np.random.Generator,
@@ -20,10 +20,10 @@ def spoil_stamps(
     cosmic_rays: float = 0.0,
     full_well: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Put defects into observed stars.
+    """Inject defects into simulated stars.
 
-    Each star draws the same numbers whatever its defects: raising a fraction spoils more stars and leaves those
-    spoiled before as they were.
+    Each star draws the same numbers whatever its defects: a larger fraction adds defects to more stars and
+    leaves the others unchanged.
 
     Parameters
     ----------
@@ -32,26 +32,26 @@ def spoil_stamps(
     psf_images : array
         [n, ny, nx] noise-free stars of unit sum: the shape of a star's neighbour.
     rng : numpy.random.Generator
-        The stream to draw from.
+        Random stream.
     neighbours : float
         Fraction of the stars with a neighbour of 0.1 to 1 times the star's light, anywhere on the stamp but within 4
         pixels of its centre, with its own photon noise.
     cosmic_rays : float
         Fraction of the stars crossed by a straight track of 2 to 8 pixels of 500 to 5000 electrons each.
     full_well : float, optional
-        Electrons at which a pixel is full; what comes after is lost.
+        Electrons at which a pixel saturates.
 
     Returns
     -------
     images : array
         [n, ny, nx] electrons.
     flags : array of int
-        [n] :class:`~pachon.pipeline.measure.star_selection.StarFlag` bits of what was put in.
+        [n] :class:`~pachon.pipeline.measure.star_selection.StarFlag` bits of the injected defects.
 
     Raises
     ------
     DomainError
-        If the shapes differ, or a fraction is not one.
+        If the shapes differ, or a fraction lies outside 0 to 1.
     """
     images, shapes = (np.array(a, dtype=np.float64) for a in (stamps, psf_images))
     if images.ndim != 3 or images.shape != shapes.shape:

@@ -1,4 +1,4 @@
-"""Stars of one CCD: noise-free places that hold the truth, and the observed stars with their magnitudes."""
+"""Stars of one CCD: holdout positions, and observed stars with their magnitudes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class StarField:
 
     @property
     def holdout_pixel(self) -> np.ndarray:
-        """Positions of the truth stars [pixel] on the CCD, [n, 2]."""
+        """Holdout positions [pixel] on the CCD, [n, 2]."""
         return self.to_pixel(self.holdout)
 
     @property
@@ -92,8 +92,8 @@ def make_star_field(
 ) -> StarField:
     """Draw the stars of one CCD.
 
-    Every attribute of every CCD has its own random stream, named after the CCD: the stars depend neither on which other
-    CCDs are asked for nor on how many stars follow, and truth and observed stars not on each other.
+    Every attribute of every CCD has its own random stream, named after the CCD. The stars do not depend on the other
+    CCDs of a run, and the first n of them not on how many follow.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def make_star_field(
     bounds : tuple of float or Quantity
         (xmin, xmax, ymin, ymax) of the CCD on the focal plane [m].
     n_holdout : int
-        Places at which the PSF is known without noise, uniform over the CCD.
+        Holdout positions, uniform over the CCD.
     n_observed : int
         Observed stars, uniform over the CCD but for the margin, counts per magnitude going as 10^(0.2 m).
     seed : int

@@ -25,7 +25,7 @@ from ...pipeline.ccd_product import KINDS, CcdProduct
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import correlations, run_figures
+from ...pipeline.measure.summary import correlations, run_metrics
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
@@ -133,7 +133,7 @@ def _without_images(product: CcdProduct) -> CcdProduct:
 
 
 def _metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
-    together = run_figures(products, correlated)["all"]
+    together = run_metrics(products, correlated)["all"]
     e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
     metrics = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
     metrics |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...core.units import ARCSEC
 from ...pipeline.measure.shapes import fwhm, measure_shapes
-from ...pipeline.measure.summary import ccd_figures
+from ...pipeline.measure.summary import ccd_metrics
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...wavefront.chief_rays import fields_at
@@ -65,7 +65,7 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     """
     name = scene.plan.ccds[0]
     exposure = expose_ccd(scene.camera_experiment, name, threads=scene.threads)
-    found = ccd_figures(model_ccd(scene.camera_experiment, exposure, noisy=False))
+    found = ccd_metrics(model_ccd(scene.camera_experiment, exposure, noisy=False))
     return {
         f"reconstruction {name} {key.replace('_', ' ')}": float(found[key])
         for key in ("mean_e_truth", "rms_residual_at_stars", "rms_residual_away")

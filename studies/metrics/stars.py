@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
 from ...pipeline.measure.correlation import SEPARATION_RANGES
-from ...pipeline.measure.summary import correlations, run_figures
+from ...pipeline.measure.summary import correlations, run_metrics
 from ...pipeline.psf_model.polynomial import design_matrix
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
@@ -109,7 +109,7 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     simulated = simulate_ccds(experiment, partial(model_ccd, experiment), threads=scene.threads)
     products = list(simulated.results.values())
     found = correlations(products)
-    together = run_figures(products, found)["all"]
+    together = run_metrics(products, found)["all"]
     metrics = {
         f"xi_{kind}_{name}": found[kind].mean_xi_plus(name)
         for kind in ("residual", "away")

@@ -16,7 +16,7 @@ from ...pipeline.ccd_product import CcdProduct, product_path, read_product
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import Correlation
-from ...pipeline.measure.summary import correlations, run_figures
+from ...pipeline.measure.summary import correlations, run_metrics
 from ...pipeline.run import run
 from ...pipeline.run_folder import finished_ccds, stamp_of
 
@@ -184,4 +184,4 @@ class Bench:
         stamp = stamp_of(experiment)
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)
-        return PipelineRun(experiment, products, correlated, run_figures(products, correlated))
+        return PipelineRun(experiment, products, correlated, run_metrics(products, correlated))

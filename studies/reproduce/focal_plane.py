@@ -11,7 +11,7 @@ from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS
 from ...pipeline.report.focal_plane_axes import OBSERVED
-from ...pipeline.report.focal_plane_plots import heights_figure
+from ...pipeline.report.focal_plane_plots import heights_plot
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
 
@@ -46,7 +46,7 @@ def heights(bench: Bench) -> Reproduced:
     }
     agrees = measured["fraction_beyond_10_um"] < 0.05 and measured["largest_um"] > 5.0
     return Reproduced(
-        {"": heights_figure(plane, (), bench.field_radius)},
+        {"": heights_plot(plane, (), bench.field_radius)},
         {"": EcsvData(columns, {"budget": "simulated", **measured})},
         f"{100 * measured['fraction_beyond_10_um']:.1f} % of the area more than 10 µm off, at most"
         f" {measured['largest_um']:.1f} µm; {measured['peak_to_valley_um']:.1f} µm peak to valley,"

@@ -8,10 +8,10 @@ import numpy as np
 
 from ...core.products import image_hdu, table_hdu
 from ...pipeline.ccd_product import CcdProduct
-from ...pipeline.report.focal_plane_plots import whiskers_figure
-from ...pipeline.report.psf_plots import eigen_figure, spectrum_figure
+from ...pipeline.report.focal_plane_plots import whiskers_plot
+from ...pipeline.report.psf_plots import eigen_psf_plot, spectrum_plot
 from ...pipeline.report.report import closest_middle_farthest
-from ...pipeline.report.statistics_plots import correlation_figure, scatter_figure
+from ...pipeline.report.statistics_plots import correlation_plot, scatter_plot
 from ...pipeline.report.tables import percent
 from .bench import Bench
 from .figure import Columns, EcsvData, FitsData, Reproduced, figure
@@ -55,7 +55,7 @@ def eigen_psfs(bench: Bench) -> Reproduced:
         table_hdu("EIGENVAL", values),
     ]
     return Reproduced(
-        {"": eigen_figure(product, truth=True), "_eigenvalues": spectrum_figure(products)},
+        {"": eigen_psf_plot(product, noise_free=True), "_eigenvalues": spectrum_plot(products)},
         {"": FitsData(hdus, [("CCD", product.name, ""), ("NPSF", model.n_stars, "noise-free PSFs")])},
         f"{model.n_components} components hold {percent(worst)} of the variance of the noise-free PSFs on the worst of"
         f" {len(products)} CCDs, {percent(float(np.median(explained)))} on the median one; observed stars: elbow at"
@@ -85,7 +85,7 @@ def whiskers_of_stars(bench: Bench) -> Reproduced:
     e = np.concatenate([np.hypot(p.holdout.e1, p.holdout.e2) for p in made.products])
     mean, largest = float(np.nanmean(e)), float(np.nanmax(e))
     alike, ratio = _against_optics(bench)
-    png = whiskers_figure(made.products, made.experiment.focal_plane, bench.field_radius, ("truth",))
+    png = whiskers_plot(made.products, made.experiment.focal_plane, bench.field_radius, ("truth",))
     return Reproduced(
         {"": png},
         {"": EcsvData(_star_columns(made.products, "truth"), {"what": "noise-free PSFs"})},
@@ -129,7 +129,7 @@ def whiskers_of_residual(bench: Bench) -> Reproduced:
     """Show whiskers of the residual, at the stars and at holdout positions (Fig. 12)."""
     made = bench.pipeline
     figures = made.summary["all"]
-    png = whiskers_figure(made.products, made.experiment.focal_plane, bench.field_radius, ("residual", "away"))
+    png = whiskers_plot(made.products, made.experiment.focal_plane, bench.field_radius, ("residual", "away"))
     at, away = figures["rms_residual_at_stars"], figures["rms_residual_away"]
     observed = _rms(made.products, "observed", ("e1", "e2"))
     return Reproduced(
@@ -170,7 +170,7 @@ def scatter(bench: Bench) -> Reproduced:
         columns[key] = (np.concatenate([getattr(s, key) for s in stars]), "", "observed - model")
     centred = max(abs(m) for m in mean) < 3.0 * error
     return Reproduced(
-        {"": scatter_figure(products)},
+        {"": scatter_plot(products)},
         {"": EcsvData(columns, {"what": "observed stars"})},
         f"rms of a component {100 * before:.2f} % before, {100 * after:.2f} % after; mean residual"
         f" ({1e4 * mean[0]:+.1f}, {1e4 * mean[1]:+.1f})e-4, its error {1e4 * error:.1f}e-4",
@@ -215,7 +215,7 @@ def correlation(bench: Bench) -> Reproduced:
     largest, error = float(np.abs(c.xi_plus[inside][worst])), float(c.error_plus[inside][worst])
     reached = abs(at) < 1e-7 and 1e-5 < raw < 9e-5
     return Reproduced(
-        {"": correlation_figure(correlated)},
+        {"": correlation_plot(correlated)},
         {"": EcsvData(columns, {"what": "correlation of the ellipticity, TreeCorr", "ccds": len(made.products)})},
         f"from 10' to 3°: {raw:.1e} before; {at:+.0e} after, at the stars (one bin at most {largest:.0e}, its error"
         f" {error:.0e}); {away:+.0e} away from the stars, {near:.0e} there within 10'",

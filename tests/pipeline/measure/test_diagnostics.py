@@ -14,7 +14,7 @@ from pachon.pipeline.measure import diagnostics
 from pachon.pipeline.measure.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.measure.rho_statistics import rho_statistics
 from pachon.pipeline.measure.shapes import measure_shapes
-from pachon.pipeline.report.diagnostics_plots import residual_map, rho_figure
+from pachon.pipeline.report.diagnostics_plots import residual_plot, rho_plot
 
 CCDS = ("R22_S11", "R24_S12")
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -125,7 +125,7 @@ def test_same_bytes_again(finished_run, diagnosed, tmp_path):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    for name in ("residual_map", "correlation_figure", "rho_figure"):
+    for name in ("residual_plot", "correlation_plot", "rho_plot"):
         monkeypatch.setattr(diagnostics, name, lambda *_: b"")
 
 
@@ -220,11 +220,11 @@ def test_pictures_of_ccds_without_figures(diagnosed):
             figures[name] = figures[name].copy()
             figures[name][0] = np.nan
     camera = load_camera("lsst")
-    assert residual_map(camera, figures).startswith(b"\x89PNG")
+    assert residual_plot(camera, figures).startswith(b"\x89PNG")
     for name in figures:
         if name.startswith(("mean", "rms")):
             figures[name][:] = 0.0
-    assert residual_map(camera, figures).startswith(b"\x89PNG")
+    assert residual_plot(camera, figures).startswith(b"\x89PNG")
 
 
 def test_picture_of_a_perfect_model():
@@ -232,4 +232,4 @@ def test_picture_of_a_perfect_model():
     x, y, e1, e2 = rng.uniform(0.0, 0.01, (4, 50))
     size = np.full(50, 0.3)
     rho = rho_statistics(x, y, e1, e2, size, e1, e2, size, min_sep=1e-3, max_sep=0.01, n_bins=4)
-    assert rho_figure({"residual": rho, "away": rho}).startswith(b"\x89PNG")
+    assert rho_plot({"residual": rho, "away": rho}).startswith(b"\x89PNG")

@@ -5,7 +5,7 @@ from pachon.core.errors import DomainError
 from pachon.pipeline.measure.star_selection import StarFlag, flag_stars
 from pachon.pipeline.psf_model.model import PsfModel
 from pachon.pipeline.simulate.stamps import observe_stamps
-from pachon.pipeline.simulate.star_defects import spoil_stamps
+from pachon.pipeline.simulate.star_defects import add_defects
 
 SIZE, GRID = 31, 128
 SKY, READ = 400.0, 9.0
@@ -47,7 +47,7 @@ def test_good_stars_stay():
 def test_defects_are_found_and_named(kind):
     for seed in (0, 1, 2):
         stamps, shapes, _ = observed(seed)
-        spoiled, flags = spoil_stamps(stamps, shapes, np.random.default_rng(100 + seed), **{kind: 0.2})
+        spoiled, flags = add_defects(stamps, shapes, np.random.default_rng(100 + seed), **{kind: 0.2})
         assert 2 <= np.count_nonzero(flags) <= 16
         found = flag_stars(spoiled, NOISE)
         hit = flags > 0
@@ -69,7 +69,7 @@ def test_masks_hold_the_cosmic_ray():
 def test_saturated_cores():
     stamps, shapes, _ = observed(5)
     full = 0.4 * stamps.max()
-    clipped, flags = spoil_stamps(stamps, shapes, np.random.default_rng(0), full_well=full)
+    clipped, flags = add_defects(stamps, shapes, np.random.default_rng(0), full_well=full)
     assert np.count_nonzero(flags) >= 2
     np.testing.assert_array_equal(flag_stars(clipped, NOISE, saturation=full).flags, flags)
     # Without the level, from the shape: a fifth, and 0.08 for what width alone does, and noise.
@@ -90,7 +90,7 @@ def test_unusable_stars_and_none_left():
     assert selection.keep(10).sum() == 10
     with pytest.raises(DomainError, match=r"^10 of 12 stars left \(2 unusable\): expected at least 11$"):
         selection.keep(11)
-    hit, _ = spoil_stamps(stamps[6:], shapes[6:], np.random.default_rng(0), cosmic_rays=1.0)
+    hit, _ = add_defects(stamps[6:], shapes[6:], np.random.default_rng(0), cosmic_rays=1.0)
     with pytest.raises(DomainError, match=r"^0 of 6 stars left \(.*6 cosmic ray\): expected at least 1$"):
         flag_stars(hit, NOISE).keep()
 
@@ -100,7 +100,7 @@ def test_model_without_the_flagged_stars():
     ratios = []
     for seed in range(4):
         stamps, shapes, places = observed(seed)
-        spoiled, flags = spoil_stamps(stamps, shapes, np.random.default_rng(50 + seed), neighbours=0.1)
+        spoiled, flags = add_defects(stamps, shapes, np.random.default_rng(50 + seed), neighbours=0.1)
         elsewhere = np.random.default_rng(9).uniform(200.0, 3800.0, (50, 2))
         truth = psf(elsewhere)
 
@@ -117,12 +117,12 @@ def test_model_without_the_flagged_stars():
 
 def test_more_defects_leave_the_earlier_ones():
     stamps, shapes, _ = observed(7)
-    few, some = spoil_stamps(stamps, shapes, np.random.default_rng(1), neighbours=0.1, cosmic_rays=0.1)
-    more, many = spoil_stamps(stamps, shapes, np.random.default_rng(1), neighbours=0.1, cosmic_rays=0.5)
+    few, some = add_defects(stamps, shapes, np.random.default_rng(1), neighbours=0.1, cosmic_rays=0.1)
+    more, many = add_defects(stamps, shapes, np.random.default_rng(1), neighbours=0.1, cosmic_rays=0.5)
     assert not (some & ~many).any()
     same = some == many
     np.testing.assert_array_equal(few[same], more[same])
-    nothing, none = spoil_stamps(stamps, shapes, np.random.default_rng(1))
+    nothing, none = add_defects(stamps, shapes, np.random.default_rng(1))
     assert nothing.tobytes() == stamps.tobytes()
     assert not none.any()
 
@@ -142,8 +142,8 @@ def test_bad_arguments():
         flag_stars(stamps[:2], NOISE)
     rng = np.random.default_rng(0)
     with pytest.raises(DomainError, match="have shapes"):
-        spoil_stamps(stamps, shapes[:2], rng)
+        add_defects(stamps, shapes[:2], rng)
     with pytest.raises(DomainError, match=r"neighbours = 1\.5"):
-        spoil_stamps(stamps, shapes, rng, neighbours=1.5)
+        add_defects(stamps, shapes, rng, neighbours=1.5)
     with pytest.raises(DomainError, match="full_well = -1"):
-        spoil_stamps(stamps, shapes, rng, full_well=-1.0)
+        add_defects(stamps, shapes, rng, full_well=-1.0)

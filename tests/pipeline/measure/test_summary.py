@@ -5,7 +5,7 @@ import pytest
 
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.measure.correlation import Correlation
-from pachon.pipeline.measure.summary import run_figures
+from pachon.pipeline.measure.summary import run_metrics
 
 ARCMIN = np.deg2rad(1 / 60)
 
@@ -20,7 +20,7 @@ def correlation(r_arcmin, xi_plus, n_pairs):
 def test_long_separations_are_those_from_10_to_180_arcmin(finished_run):
     products = [read_product(finished_run / "ccd_R22_S11.fits")]
     found = correlation([1.0, 9.9, 10.1, 100.0, 181.0, 210.0], [4.0, 8.0, 1.0, 2.0, 50.0, 60.0], [1, 3, 2, 2, 5, 5])
-    metrics = run_figures(products, {"truth": found})["all"]
+    metrics = run_metrics(products, {"truth": found})["all"]
     assert metrics["xi_plus_truth_short"] == pytest.approx((4.0 + 3 * 8.0) / 4)
     assert metrics["xi_plus_truth_long"] == pytest.approx(1.5)
     assert np.isnan(metrics["error_xi_plus_truth_long"])
