@@ -1,4 +1,4 @@
-"""First-order figures and Seidel sums of a centred telescope, from a paraxial trace.
+"""First-order properties and Seidel sums of a centred telescope, from a paraxial trace.
 
 The trace unfolds the telescope along the light: ``s`` runs with the incoming light (``s = -z``), so a thickness is
 negative after an odd number of mirrors, and so is the index ``n``. At each surface of curvature ``c`` (along ``s``)::
@@ -26,7 +26,7 @@ from .telescope import Telescope
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """First-order figures of a telescope.
+    """First-order properties of a telescope.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class _Trace:
 
 
 def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
-    """Return the first-order figures of a centred telescope.
+    """Return the first-order properties of a centred telescope.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
 
 
 def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np.ndarray:
-    """Return the paraxial radius that light of a field angle fills on each surface.
+    """Return the paraxial radius of the light of a field angle on each surface.
 
     Parameters
     ----------
@@ -194,16 +194,16 @@ def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | Non
     u, ub = trace.u.T
     a, b = n * (h * c + u), n * (hb * c + ub)
     lagrange = n * (u * hb - ub * h)
-    bend = trace.u_after[:, 0] / n2 - u / n
+    change = trace.u_after[:, 0] / n2 - u / n
     flat, square = 1 / n2 - 1 / n, 1 / n2**2 - 1 / n**2
-    s1, s2, s3 = -(a**2) * h * bend, -a * b * h * bend, -(b**2) * h * bend
+    s1, s2, s3 = -(a**2) * h * change, -a * b * h * change, -(b**2) * h * change
     s4 = -(lagrange**2) * c * flat
     # This form of the fifth sum stays finite where the marginal ray meets the surface at right angles (a = 0).
     s5 = -(b**3) * h * square + b * hb * c * (2 * h * b - hb * a) * flat
-    # The figure k c^3 + 8 a_4 of each surface; along s it changes sign.
-    figure = -8 * np.array([s.shape.fourth_order for s in trace.surfaces]) * (n2 - n)
-    aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * figure
-    contributions = np.stack([s1, s2, s3, s4, s5]) + aspheric
+    # Aspheric term k c^3 + 8 a_4 of each surface; along s it changes sign.
+    aspheric = -8 * np.array([s.shape.fourth_order for s in trace.surfaces]) * (n2 - n)
+    from_aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * aspheric
+    contributions = np.stack([s1, s2, s3, s4, s5]) + from_aspheric
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
 
 

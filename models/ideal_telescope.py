@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from .surface import Annulus, Conic, Interaction, Plane, Surface
+from .aperture import Annulus
+from .shapes.shape import Conic, Plane
+from .surface import Interaction, Surface
 from .telescope import VACUUM, Telescope
 
 

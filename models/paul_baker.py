@@ -42,8 +42,10 @@ import math
 from dataclasses import replace
 
 from ..core.errors import DomainError
+from .aperture import Annulus, Circle
 from .first_order import footprints
-from .surface import Annulus, Aperture, Circle, Conic, Interaction, Plane, Shape, Sphere, Surface
+from .shapes.shape import Conic, Plane, Sphere
+from .surface import Aperture, Interaction, Shape, Surface
 from .telescope import VACUUM, Telescope
 
 COPLANAR = 2.0 - math.sqrt(3.0)

@@ -1,4 +1,4 @@
-"""One optical surface: its shape, its clear aperture, its place and what it does to light."""
+"""One optical surface: shape, clear aperture, place and interaction with light."""
 
 from __future__ import annotations
 
@@ -10,15 +10,9 @@ from typing import Any, cast
 import numpy as np
 
 from ..core.errors import PrescriptionError
-from .aperture import Annulus as Annulus
 from .aperture import Aperture
-from .aperture import Circle as Circle
 from .media.medium import Medium
-from .shapes.shape import Conic as Conic
-from .shapes.shape import EvenAsphere as EvenAsphere
-from .shapes.shape import Plane as Plane
 from .shapes.shape import Shape
-from .shapes.shape import Sphere as Sphere
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -26,12 +20,12 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Interaction(IntEnum):
-    """What a surface does to a ray."""
+    """Interaction of a surface with a ray."""
 
     MIRROR = 0
     REFRACT = 1
     DETECTOR = 2
-    #: Crossed without being bent: a baffle plane, a stop, a dummy surface.
+    #: Crossed without refraction: a baffle plane, a stop, a dummy surface.
     PASS = 3
     #: Thin phase screen on the plane z = 0: the shape is a map of optical path [m], which is added to the path of the
     #: ray; its slopes are added to the ray's components along x and y, times the index.
@@ -47,15 +41,15 @@ class Surface:
     name : str
         Name, unique within its telescope.
     interaction : Interaction
-        Mirror, refracting interface, detector, or a surface that rays cross as they are.
+        Mirror, refracting interface, detector, surface without effect, or phase screen.
     shape : Shape
-        Shape in the surface's own frame; of a phase screen, its map of optical path.
+        Shape in the surface's own frame; for a phase screen, the map of optical path [m].
     vertex : tuple of float, shape (3,)
         Vertex in the telescope frame [m].
     medium_after : Medium
-        Medium that light travels in once it has left the surface.
+        Medium of the light behind the surface.
     aperture : Aperture, optional
-        Clear region in the surface's own x, y; None is unbounded.
+        Clear region in the surface's own x, y; None for an unbounded one.
     rotation : nested tuple of float, shape (3, 3)
         Rotation matrix; its columns are the surface's axes in the telescope frame.
     """
@@ -69,6 +63,11 @@ class Surface:
     rotation: Matrix = IDENTITY
 
     def __post_init__(self) -> None:
+        for key, kind in (("interaction", Interaction), ("shape", Shape), ("medium_after", Medium)):
+            if not isinstance(getattr(self, key), kind):
+                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected an object of {kind.__name__}")
+        if self.aperture is not None and not isinstance(self.aperture, Aperture):
+            raise PrescriptionError(f"aperture = {self.aperture!r}: expected an aperture or None")
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
         axes = np.array(self.rotation, dtype=np.float64)
@@ -111,9 +110,9 @@ def move_frame(vertex: Vector, axes: Matrix, *, rotation: Any, about: Any, shift
     """Return a frame (origin [m] and axes as columns) rotated about a point [m], then shifted [m]."""
     rotation, about, shift = np.asarray(rotation, dtype=np.float64), np.asarray(about), np.asarray(shift)
     if np.array_equal(rotation, np.eye(3)):
-        # A pure shift leaves the figures of the frame untouched by rounding.
+        # Without a rotation the axes keep their exact values.
         x, y, z = (float(v) for v in np.array(vertex) + shift)
         return (x, y, z), axes
     x, y, z = (float(v) for v in rotation @ (np.array(vertex) - about) + about + shift)
-    turned = rotation @ np.array(axes)
-    return (x, y, z), cast(Matrix, tuple(tuple(float(v) for v in row) for row in turned))
+    rotated = rotation @ np.array(axes)
+    return (x, y, z), cast(Matrix, tuple(tuple(float(v) for v in row) for row in rotated))

@@ -1,4 +1,4 @@
-"""A telescope: its surfaces in the order light meets them, its pupil, and what field and wavelengths it covers.
+"""A telescope: surfaces in the order of the light, entrance pupil, field of view and wavelengths.
 
 Telescope frame: right-handed, origin at the vertex of the primary, +z along the optical axis towards the sky.
 """
@@ -23,7 +23,7 @@ from .surface import Interaction, Matrix, Surface, Vector, move_frame
 from .wavelengths import check_wavelength_range, wavelengths_within
 
 VACUUM = ConstantIndex(1.0)
-#: Surfaces that leave light in the medium that it came through.
+#: Interactions without a change of medium.
 _STAYING = {Interaction.MIRROR: "mirror", Interaction.PASS: "baffle", Interaction.PHASE: "phase screen"}
 
 
@@ -48,9 +48,9 @@ class Telescope:
     Parameters
     ----------
     name, source, version, description : str
-        What the prescription is and where its figures come from.
+        Name, source, version and description of the prescription.
     surfaces : tuple of Surface
-        Surfaces in the order that light meets them.
+        Surfaces in the order of the light.
     stop_z : float
         Height of the plane of the entrance pupil [m], telescope frame; pupil coordinates are given in this plane.
     pupil_diameter : float
@@ -64,7 +64,7 @@ class Telescope:
     field_radius : float
         Radius of the field of view [rad].
     field_limit : float
-        Largest field angle that the model can be asked for [rad].
+        Largest field angle that the model covers [rad].
     wavelength_range : tuple of float, shape (2,)
         Vacuum wavelengths covered [m].
     default_wavelength : float
@@ -179,7 +179,7 @@ class Telescope:
 
     @cached_property
     def surface_names(self) -> tuple[str, ...]:
-        """Names of the surfaces in the order that light meets them."""
+        """Names of the surfaces in the order of the light."""
         return tuple(s.name for s in self.surfaces)
 
     def surface(self, name: str) -> Surface:

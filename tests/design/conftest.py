@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from pachon.models.surface import Circle, Conic, Interaction, Plane, Surface
+from pachon.models.aperture import Circle
+from pachon.models.shapes.shape import Conic, Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 
 

@@ -12,10 +12,11 @@ from pachon.core.plotting import png_bytes
 from pachon.design.layout import layout
 from pachon.design.layout_meshes import surface_mesh, tubes
 from pachon.design.layout_parts import outer_radius, surface_section
-from pachon.models.aperture import Complement, Intersection, Polygon, Rectangle, Union, Vane
+from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction
-from pachon.models.surface import Annulus, Circle, Conic, Interaction, Plane, Surface
+from pachon.models.shapes.shape import Conic, Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
 
 

@@ -6,7 +6,8 @@ from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order, footprints, seidel_sums
 from pachon.models.io.prescription import load_telescope
 from pachon.models.media.medium import ConstantIndex
-from pachon.models.surface import Conic, EvenAsphere, Interaction, Plane, Surface
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 
 LSST_NAMES = [f"lsst_v3.3_{band}" for band in "ugrizy"]

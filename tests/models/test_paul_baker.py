@@ -5,10 +5,11 @@ import pytest
 from conic_trace import fan_coefficients, land
 
 from pachon.core.errors import DomainError
+from pachon.models.aperture import Circle
 from pachon.models.first_order import first_order, seidel_sums
 from pachon.models.io.prescription import load_telescope
 from pachon.models.paul_baker import COPLANAR, paul_baker
-from pachon.models.surface import Circle, Conic, Sphere
+from pachon.models.shapes.shape import Conic, Sphere
 
 DESIGN = paul_baker()
 COMPRESSIONS = [0.2, COPLANAR, 0.3, (3 - math.sqrt(5)) / 2, 0.45]

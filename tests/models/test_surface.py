@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PrescriptionError
+from pachon.models.aperture import Annulus, Circle
 from pachon.models.media.medium import ConstantIndex
-from pachon.models.surface import Annulus, Circle, Conic, EvenAsphere, Interaction, Plane, Sphere, Surface
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
+from pachon.models.surface import Interaction, Surface
 
 X, Y = np.random.default_rng(1).uniform(-1.5, 1.5, (2, 200))
 R2 = X**2 + Y**2

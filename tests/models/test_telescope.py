@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 
+import pachon
 from pachon.core.errors import DomainError, PrescriptionError, UnknownNameError
 from pachon.models.io.prescription import load_telescope
 from pachon.models.surface import Interaction
@@ -153,3 +154,46 @@ def test_a_mirror_stays_in_its_medium():
     fields = {name: getattr(LSST, name) for name in LSST.__dataclass_fields__}
     with pytest.raises(PrescriptionError, match="surface 'M1': expected a mirror to stay in the medium"):
         type(LSST)(**(fields | {"surfaces": (odd, *LSST.surfaces[1:])}))
+
+
+def test_a_telescope_of_public_names_focuses_the_axis():
+    """A paraboloid of radius 4 m has its focus 2 m above the vertex."""
+    vacuum = pachon.ConstantIndex(1.0)
+    mirror = pachon.Surface(
+        "M1", pachon.Interaction.MIRROR, pachon.Conic(4.0, -1.0), (0, 0, 0), vacuum, pachon.Circle(0.5)
+    )
+    detector = pachon.Surface("D", pachon.Interaction.DETECTOR, pachon.Plane(), (0, 0, 2), vacuum)
+    telescope = pachon.Telescope(
+        name="paraboloid",
+        surfaces=(mirror, detector),
+        stop_z=0.0,
+        pupil_diameter=1.0,
+        pupil_obscuration=0.0,
+        launch_distance=5.0,
+        reference_sphere_radius=2.0,
+        field_radius=0.01,
+        field_limit=0.02,
+        wavelength_range=(3e-7, 1e-6),
+        default_wavelength=5e-7,
+    )
+    assert pachon.first_order(telescope).focal_length == pytest.approx(2.0, rel=1e-15)
+    result = pachon.trace(telescope, pachon.launch_rays(telescope, (0, 0), 5e-7, ([0.1, -0.3], [0.2, 0.0])))
+    assert isinstance(result, pachon.TraceResult)
+    # Rounding of 5 m.
+    assert np.allclose(result.position, [0.0, 0.0, 2.0], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"shape": 4.0}, "shape = 4.0: expected an object of Shape"),
+        ({"medium_after": 1.5}, "medium_after = 1.5: expected an object of Medium"),
+        ({"interaction": "mirror"}, "interaction = 'mirror': expected an object of Interaction"),
+        ({"aperture": 0.5}, "aperture = 0.5: expected an aperture or None"),
+    ],
+)
+def test_arguments_of_a_surface_of_another_kind_are_refused(wrong, message):
+    vacuum = pachon.ConstantIndex(1.0)
+    right = {"shape": pachon.Plane(), "medium_after": vacuum, "interaction": pachon.Interaction.MIRROR}
+    with pytest.raises(PrescriptionError, match=message):
+        pachon.Surface(name="M1", vertex=(0.0, 0.0, 0.0), **right | wrong)

@@ -12,7 +12,8 @@ from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Po
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction
-from pachon.models.surface import Conic, Interaction, Plane, Sphere, Surface
+from pachon.models.shapes.shape import Conic, Plane, Sphere
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.pupil_optics import trace_pupils

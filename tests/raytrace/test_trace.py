@@ -10,8 +10,10 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
+from pachon.models.aperture import Circle
 from pachon.models.media.medium import ConstantIndex
-from pachon.models.surface import Circle, Conic, Interaction, Plane, Sphere, Surface
+from pachon.models.shapes.shape import Conic, Plane, Sphere
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import Telescope
 from pachon.raytrace.kernels.packet import LANES
 from pachon.raytrace.rays import Rays, RayStatus, field_direction

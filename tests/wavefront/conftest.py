@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pachon.models.aperture import Annulus
-from pachon.models.surface import Interaction, Plane, Surface
+from pachon.models.shapes.shape import Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.psf.engine import PsfInputs

@@ -12,7 +12,7 @@ from pachon.core.errors import ConfigError, DomainError
 from pachon.design.images.diffraction import fft_psf, huygens_psf, lattice_sum, wavelet_sum
 from pachon.design.images.wavelets import lattice_wavelets, traced_wavelets
 from pachon.design.metrics.spots import spots
-from pachon.models.surface import Circle
+from pachon.models.aperture import Circle
 from pachon.wavefront.opd import wavefront_opd
 from pachon.wavefront.pupil_sampling import gauss_annulus
 

@@ -8,7 +8,8 @@ from pachon.core.errors import DomainError, UnknownNameError
 from pachon.design.metrics.ghost_paths import fresnel_reflectivity, ghost_pairs, ghost_path
 from pachon.design.metrics.ghosts import ghosts
 from pachon.models.media.medium import ConstantIndex
-from pachon.models.surface import Conic, Interaction, Plane, Surface
+from pachon.models.shapes.shape import Conic, Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 from pachon.raytrace.rays import RayStatus
 

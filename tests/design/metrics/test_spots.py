@@ -11,7 +11,7 @@ from pachon.core.plotting import png_bytes
 from pachon.design.metrics.field_zernikes import wavefront_zernikes
 from pachon.design.metrics.spots import spots
 from pachon.models.aperture import Circle
-from pachon.models.surface import Conic
+from pachon.models.shapes.shape import Conic
 from pachon.wavefront.bundles import RAYS_AT_ONCE, bundle_blocks, trace_bundles
 from pachon.wavefront.pupil_sampling import PupilSampling
 from pachon.wavefront.request import field_points

@@ -13,7 +13,7 @@ from pachon.design.optimize.optimize import optimize, wavefronts
 from pachon.design.optimize.targets import FocalLength, Target
 from pachon.design.parameters.parameters import apply, parse_parameters
 from pachon.models.first_order import first_order
-from pachon.models.surface import Conic
+from pachon.models.shapes.shape import Conic
 from pachon.raytrace.rays import RayStatus
 
 FIELDS = np.deg2rad([[0.0, 0.0], [0.0, 0.2], [0.3, 0.2]])

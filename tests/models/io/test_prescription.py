@@ -6,10 +6,12 @@ import pytest
 import yaml
 
 from pachon.core.errors import PrescriptionError, UnknownNameError
+from pachon.models.aperture import Annulus, Circle
 from pachon.models.io.prescription import DATA, bundled_names, load_telescope, save_telescope
 from pachon.models.io.yaml.writer import telescope_to_yaml
 from pachon.models.media.medium import ConstantIndex, Sellmeier
-from pachon.models.surface import Annulus, Circle, Conic, EvenAsphere, Interaction, Plane, Sphere
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
+from pachon.models.surface import Interaction
 from pachon.models.telescope import rotation_matrix
 
 LSST_NAMES = [f"lsst_v3.3_{band}" for band in "ugrizy"]

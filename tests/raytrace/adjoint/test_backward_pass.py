@@ -10,7 +10,8 @@ from pachon.core.errors import DomainError
 from pachon.models.aperture import Circle
 from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.mesh import MeshSurface
-from pachon.models.surface import Conic, Interaction, Plane, Surface
+from pachon.models.shapes.shape import Conic, Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
 from pachon.raytrace.adjoint.adjoint_matrix import column_table, polynomial_terms
 from pachon.raytrace.adjoint.backward_pass import OutputGradient, backward_pass, landing_gradient, position_gradient

@@ -10,7 +10,8 @@ import pachon
 from pachon.core.errors import ConfigError, DomainError
 from pachon.models.aperture import Circle, Complement, Vane
 from pachon.models.obstruction import Obstruction
-from pachon.models.surface import Interaction, Plane, Surface
+from pachon.models.shapes.shape import Plane
+from pachon.models.surface import Interaction, Surface
 from pachon.pipeline.config import Configuration
 from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import field_direction
