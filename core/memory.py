@@ -1,4 +1,4 @@
-"""How much memory there is, so that what will not fit is refused before the system ends the process without a word."""
+"""Free memory, so that a job too large is refused before the system ends the process."""
 
 from __future__ import annotations
 
@@ -7,38 +7,38 @@ from pathlib import Path
 
 from .errors import DomainError
 
-# Where control groups are mounted, and what their files are called: version 2, then version 1.
+# Files of control groups: version 2, then version 1.
 _UNIFIED = ("memory.max", "memory.current", "inactive_file")
 _LEGACY = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 
 
 def available_bytes(root: Path = Path("/")) -> int | None:
-    """Return how many bytes this process may still take without swapping.
+    """Return the bytes that this process may still take without swapping.
 
-    On Linux it is the least of what the machine has available and what every control group that the process is in
-    leaves (containers and batch systems set their limits there); cached files, which the kernel drops when it must,
-    count as free.
+    On Linux it is the least of the machine's available memory and of the room left in each control group of the process
+    (containers and batch systems set their limits there). Cached files, which the kernel drops when it must, count as
+    free.
 
     Parameters
     ----------
     root : Path
-        Where ``proc`` and ``sys`` are.
+        Folder of ``proc`` and ``sys``.
 
     Returns
     -------
     int or None
-        None where the system does not say.
+        None on systems without these files.
     """
     return min((*_machine(root), *_groups(root)), default=None)
 
 
 def require_bytes(needed: int, what: str) -> None:
-    """Refuse what needs more memory than there is.
+    """Raise an error if a job needs more memory than is free.
 
     Raises
     ------
     DomainError
-        If it is known that so much is not available: one line that starts with what needs it.
+        If less is known to be free; the line starts with ``what``.
     """
     free = available_bytes()
     if free is not None and needed > free:
@@ -46,7 +46,7 @@ def require_bytes(needed: int, what: str) -> None:
 
 
 def readable(count: float) -> str:
-    """Return a number of bytes in MB or GB, for people."""
+    """Return a number of bytes in MB or GB."""
     size, unit = (count / 1e9, "GB") if count >= 0.95e9 else (count / 1e6, "MB")
     return f"{size:.0f} {unit}" if size >= 9.95 else f"{size:.1f} {unit}"
 
@@ -76,7 +76,7 @@ def _groups(root: Path) -> Iterator[int]:
 
 
 def _left(folder: Path, limit_name: str, used_name: str, cached_key: str) -> Iterator[int]:
-    """Return what one group leaves, if it has a limit."""
+    """Return the room left in one group, if it has a limit."""
     limit, used = (next(iter(_lines(folder / name)), "").strip() for name in (limit_name, used_name))
     if limit.isdigit() and used.isdigit():
         cached = [int(w[1]) for w in (line.split() for line in _lines(folder / "memory.stat")) if w[0] == cached_key]

@@ -38,6 +38,7 @@ from .models.first_order import seidel_sums as seidel_sums
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
+from .models.io.site_file import load_site as load_site
 from .models.media.air import Air as Air
 from .models.media.changed_index import ChangedIndex as ChangedIndex
 from .models.media.dispersion import Dispersion as Dispersion
@@ -63,6 +64,7 @@ from .models.shapes.shape import Plane as Plane
 from .models.shapes.shape import Shape as Shape
 from .models.shapes.shape import Sphere as Sphere
 from .models.shapes.shape import Sum as Sum
+from .models.site import Site as Site
 from .models.surface import Interaction as Interaction
 from .models.surface import Surface as Surface
 from .models.telescope import Telescope as Telescope
@@ -105,6 +107,7 @@ from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
 from .wavefront.chief_rays import fields_at as fields_at
 from .wavefront.opd import wavefront_opd as wavefront_opd
 from .wavefront.opd import wavefront_opds as wavefront_opds
+from .wavefront.psf.psf import Psfs as Psfs
 from .wavefront.psf.psf import make_psfs as make_psfs
 from .wavefront.pupil_sampling import PupilSampling as PupilSampling
 from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling

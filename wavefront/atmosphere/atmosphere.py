@@ -190,9 +190,9 @@ class Atmosphere(LayerScreens):
         return atmosphere
 
     def at_times(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
-        """Return the same turbulence at other times: an atmosphere that shares the kept screens with this one.
+        """Return the same turbulence at other times, with shared screens.
 
-        Screens that either has made are kept for both, and :meth:`release` of either forgets them for both.
+        Screens made by either are kept for both, and :meth:`release` of either frees them for both.
 
         Parameters
         ----------
@@ -221,7 +221,7 @@ class Atmosphere(LayerScreens):
         return self._through_the_same_screens(exposure=exposure, times=middles)
 
     def at_altitudes(self, altitudes: ArrayLike) -> Atmosphere:
-        """Return the same layers at other altitudes: an atmosphere that shares the kept screens with this one.
+        """Return the same layers at other altitudes, with shared screens.
 
         Parameters
         ----------
@@ -240,7 +240,7 @@ class Atmosphere(LayerScreens):
         return self._through_the_same_screens(altitudes=heights)
 
     def _through_the_same_screens(self, **changes: Any) -> Atmosphere:
-        """Return a changed atmosphere that shares the kept screens: nothing that decides them may change."""
+        """Return a changed atmosphere with shared screens: nothing that determines them may change."""
         other = replace(self, **changes)
         object.__setattr__(other, "_cache", self._cache)
         return other

@@ -19,7 +19,7 @@ from .screens import phase_screen, slope_screen, working_bytes
 from .spline import evaluate
 from .turbulence import slope_variance
 
-#: Distance over which rays feel the slope of the low screens [m]: a gradient proper lets waves of a metre bend light
+#: Baseline of the slopes of the low screens [m]: a gradient proper lets waves of a metre bend light
 #: more than they do where it interferes over baselines of some tenths of a metre.
 SLOPE_LAG = 0.2
 # Larger screens, of 17 GB and more, would fill the memory.
@@ -75,7 +75,7 @@ class LayerScreens(Layers):
         return self.screen_size, self.screen_length, (0.0, self.cutoff)
 
     def screen_bytes(self, scales: Iterable[str]) -> int:
-        """Return how much memory the kept screens of some scales take, and the making of the last of them."""
+        """Return the memory of the screens of some scales, and of the making of the last of them [bytes]."""
         grids = [self._band(scale) for scale in scales]
         kept = sum(4 * self.layer_count * size * size for size, _, _ in grids)
         return kept + max((working_bytes(*grid) for grid in grids), default=0)
@@ -90,11 +90,11 @@ class LayerScreens(Layers):
         layer : int
             Index of the layer.
         stencil : str
-            How it will be read, one of :data:`.STENCILS`; the modes are the same for all.
+            Interpolation that the samples are made for, one of :data:`.STENCILS`; the modes are the same for all.
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
         out : ndarray, optional
-            Where to write the screen: float32, shape [screen_size, screen_size].
+            Array for the screen: float32, shape [screen_size, screen_size].
 
         Returns
         -------
@@ -127,7 +127,7 @@ class LayerScreens(Layers):
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
         out : ndarray, optional
-            Where to write the slopes: int32, shape [screen_size, screen_size].
+            Array for the slopes: int32, shape [screen_size, screen_size].
 
         Returns
         -------
@@ -139,7 +139,7 @@ class LayerScreens(Layers):
         )
 
     def _drawing(self, layer: int, scale: str) -> dict[str, Any]:
-        """Return what decides one screen."""
+        """Return the arguments that determine one screen."""
         if not 0 <= layer < self.layer_count:
             raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
         size, length, band = self._band(scale)
@@ -155,7 +155,7 @@ class LayerScreens(Layers):
         }
 
     def screens(self, kind: str, threads: int | None = None) -> np.ndarray:
-        """Return the screens of all layers, made once and kept for whoever asks next.
+        """Return the screens of all layers, made at the first call and kept.
 
         Parameters
         ----------
@@ -197,14 +197,14 @@ class LayerScreens(Layers):
             return self._cache[kind]
 
     def release(self) -> None:
-        """Forget the kept screens; they come back, byte for byte, when next asked for."""
+        """Free the kept screens; the next call makes the same ones again."""
         with _cache_lock:
             self._cache.clear()
 
     def path(self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low") -> np.ndarray:
         """Return the path through one screen at screen coordinates, by plain NumPy.
 
-        The screen is made anew at every call: this is the reference for the engines, not a tool for production.
+        The screen is made anew at every call: a reference for the engines, slow.
 
         Parameters
         ----------

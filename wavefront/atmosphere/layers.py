@@ -28,7 +28,7 @@ class Layers:
         return len(self.altitudes)
 
     def pupil_centers(self, direction: np.ndarray, time: ArrayLike = 0.0) -> np.ndarray:
-        """Return where the light through the pupil's centre crosses each layer, in the coordinates of its screens.
+        """Return the intersections of light through the pupil's centre with each layer, in screen coordinates.
 
         Parameters
         ----------
@@ -49,7 +49,7 @@ class Layers:
     def screen_coordinates(
         self, x: ArrayLike, y: ArrayLike, layer: int, *, field: tuple[float, float] = (0.0, 0.0), time: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return where light that meets the pupil at ``(x, y)`` crosses a layer.
+        """Return the intersection of light that meets the pupil at ``(x, y)`` with a layer.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ def checked_layers(
 
 
 def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.ndarray:
-    """Return how far layers are along a line of sight [m].
+    """Return the distances of layers along a line of sight [m].
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.
 
 
 def check_drift(distances: np.ndarray, speeds: np.ndarray, exposure: float, length: float) -> None:
-    """Refuse an exposure in which a layer comes round on its periodic screen."""
+    """Raise an error if a layer drifts once around its periodic screen."""
     layer = int(np.argmax(speeds))
     drift = float(speeds[layer]) * exposure
     if drift >= length:

@@ -2,8 +2,8 @@ r"""Periodic phase screens: random von Karman optical path over a band of wavenu
 
 A screen is :math:`\psi(x) = \sum_k a_k e^{i k \cdot x}` over the modes of a periodic square, with
 :math:`\langle|a_k|^2\rangle = W(\nu) / L^2` (spectrum :math:`W` of the path, side :math:`L`). A wave gains the phase
-:math:`2 \pi \psi / \lambda`; a ray that comes down through the screen bends by the gradient of :math:`\psi`, with the
-plus sign, in the slopes of its travel; :func:`slope_screen` gives that gradient. Sample ``[j, i]`` lies at
+:math:`2 \pi \psi / \lambda`; a ray through the screen is deflected by the gradient of :math:`\psi`, with the plus
+sign, in the slopes of its travel; :func:`slope_screen` gives that gradient. Sample ``[j, i]`` lies at
 ``x = i * pixel``, ``y = j * pixel``.
 
 Only the modes of the band are drawn, and the Fourier transform skips what they leave empty, so a screen of 8192 x 8192
@@ -30,7 +30,7 @@ _ROW_BLOCK = 128
 
 
 def band_modes(size: int, length: float, band: tuple[float, float]) -> tuple[int, np.ndarray]:
-    """Return which modes of a screen lie in a band.
+    """Return the modes of a screen that lie in a band.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def band_modes(size: int, length: float, band: tuple[float, float]) -> tuple[int
 
 
 def working_bytes(size: int, length: float, band: tuple[float, float]) -> int:
-    """Return about how much memory the making of a screen takes for a while, beside the screen itself.
+    """Return the approximate working memory for one screen, beside the screen itself [bytes].
 
     Arguments are those of :func:`band_modes`.
     """
@@ -132,14 +132,14 @@ def phase_screen(
     weight : float
         Fraction of the turbulence that this screen holds; its amplitude goes with the square root.
     stencil : str
-        How the screen will be read, one of :data:`~.spline.STENCILS`.
+        Interpolation that the samples are made for, one of :data:`~.spline.STENCILS`.
     fixed_modulus : bool
         Give every mode its rms modulus and a random phase only, after Jee & Tyson 2011, eq. 2, in place of a Gaussian
         complex amplitude. Such a field is not Gaussian.
     threads : int, optional
         Number of threads; all processors by default.
     out : ndarray, optional
-        Where to write the screen: float32, shape [size, size].
+        Array for the screen: float32, shape [size, size].
 
     Returns
     -------
@@ -179,10 +179,10 @@ def slope_screen(
     unit : float
         Slope of one count [rad]; slopes beyond 32767 counts are held there.
     lag : float
-        Distance over which light feels the slope [m]: each mode of wavenumber k is multiplied by
+        Baseline of the slopes [m]: each mode of wavenumber k is multiplied by
         ``sin(k lag / 2) / (k lag / 2)``, which makes a gradient the mean slope over so long a baseline.
     out : ndarray, optional
-        Where to write the slopes: int32, shape [size, size].
+        Array for the slopes: int32, shape [size, size].
 
     Returns
     -------

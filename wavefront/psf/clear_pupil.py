@@ -1,4 +1,4 @@
-"""Rings and spokes over an annular pupil, and how much of each spoke the apertures of a telescope leave clear."""
+"""Rings and spokes over an annular pupil, and the part of each spoke that the apertures leave clear."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .clear_pupil_kernels import find_edges
 
 # Spokes to a ring: the phase of a blur goes round the pupil some three times faster than across its ring.
 _SPOKES_TO_A_RING = 3.2
-# Polynomials of a higher degree along the ring than these have say nothing new.
+# More rings, of polynomials of a higher degree, add nothing.
 _MOST_RINGS = 12
 # Rays on a spoke from which the rims of apertures are found, by parabolas.
 _EDGE_RINGS = 3
@@ -36,8 +36,8 @@ class SpokePupil:
     ----------
     radius : ndarray, shape [n_ring]
         Rising radii of the rings [m].
-    share : ndarray, shape [n_ring]
-        Part of the pupil within each ring, 0 to 1.
+    fraction : ndarray, shape [n_ring]
+        Fraction of the pupil's area within each ring.
     quadrature : ndarray, shape [n_ring]
         Weights of the rings, of sum 1.
     unit : ndarray, shape [n_spoke, 2]
@@ -45,24 +45,24 @@ class SpokePupil:
     """
 
     radius: np.ndarray
-    share: np.ndarray
+    fraction: np.ndarray
     quadrature: np.ndarray
     unit: np.ndarray
 
     @classmethod
     def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
-        """Return about so many points of an annulus of given diameter [m] and linear obscuration."""
+        """Return approximately ``count`` points of an annulus of given diameter [m] and linear obscuration."""
         if not count >= 10:
             raise DomainError(f"n_pupil = {count!r}: expected at least 10 pupil points")
         n_ring = min(math.ceil(math.sqrt(count / _SPOKES_TO_A_RING)), _MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
         node = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])
-        share = 0.5 * (node + 1.0)
+        fraction = 0.5 * (node + 1.0)
         angle = 2.0 * math.pi * (np.arange(n_spoke) + 0.5) / n_spoke
         return cls(
-            radius=0.5 * diameter * np.sqrt(obscuration**2 + (1.0 - obscuration**2) * share),
-            share=share,
+            radius=0.5 * diameter * np.sqrt(obscuration**2 + (1.0 - obscuration**2) * fraction),
+            fraction=fraction,
             quadrature=1.0 / (n_ring * (n_ring - 1) * legendre(node) ** 2),
             unit=np.stack([np.cos(angle), np.sin(angle)], axis=-1),
         )
@@ -87,7 +87,7 @@ class SpokePupil:
 def clear_edges(
     telescope: Telescope, direction: np.ndarray, unit: np.ndarray, wavelength: float, threads: int | None = None
 ) -> np.ndarray:
-    """Return between which radii of the entrance pupil light passes all apertures.
+    """Return the radii of the entrance pupil between which light passes all apertures.
 
     On each spoke the clear part is taken to be one piece, as it is where apertures are discs and rings about the light:
     spiders, other apertures and obstructions are refused.

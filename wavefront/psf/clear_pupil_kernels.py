@@ -1,4 +1,4 @@
-"""The kernel that finds which part of a pupil the apertures of a telescope leave clear."""
+"""The kernel that finds the clear part of a pupil."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ def squared_distance(
 
 @wp.func
 def within(a: wp.float64, b: wp.float64, c: wp.float64, square: wp.float64):
-    """Where the parabola through the values a, b, c at 0, 1, 2 lies below a square: from and to, equal if nowhere."""
+    """Interval of 0 to 2 in which the parabola through a, b, c at 0, 1, 2 lies below a square; empty: equal ends."""
     zero = wp.float64(0.0)
     two = wp.float64(2.0)
     half = wp.float64(0.5)
     low = zero
     high = zero
-    bend = half * (a - two * b + c)
-    slope = b - a - bend
+    curvature = half * (a - two * b + c)
+    slope = b - a - curvature
     start = a - square
-    # A NaN fails both comparisons; a squared distance that runs linearly bends upwards, and how little does not matter.
-    if bend > zero:
-        inner = slope * slope - wp.float64(4.0) * bend * start
+    # A NaN fails both comparisons; a linear squared distance may have any small curvature.
+    if curvature > zero:
+        inner = slope * slope - wp.float64(4.0) * curvature * start
         if inner > zero:
             # The two roots without the difference of near-equal numbers.
             far = -half * (slope + wp.where(slope < zero, -wp.sqrt(inner), wp.sqrt(inner)))
-            one = far / bend
+            one = far / curvature
             other = wp.where(far == zero, zero, start / far)
             low = wp.clamp(wp.min(one, other), zero, two)
             high = wp.clamp(wp.max(one, other), zero, two)
-    elif bend <= zero:
+    elif curvature <= zero:
         end = c - square
         if start < zero and end < zero:
             high = two
@@ -68,10 +68,10 @@ def find_edges(
     n_spoke: wp.int32,
     edges: wp.array3d(dtype=wp.float64),
 ):
-    """Find between which radii one spoke of the pupil of one star is clear.
+    """Find the radii between which one spoke of the pupil of one star is clear.
 
-    Where a ray crosses a surface is nearly linear in its place in the pupil, so the square of its distance from the
-    centre of the aperture there is a parabola along the spoke: three rays tell where it passes the rim.
+    The intersection of a ray with a surface is nearly linear in its place in the pupil. So the square of its distance
+    from the centre of the aperture is a parabola along the spoke: three rays determine its intersection with the rim.
 
     Arguments: position [surface, 3, (star * 3 + ring) * n_spoke + spoke]: telescope frame [m]; radius [3] of the rays
     in the pupil, at equal steps [m]; edges [star, spoke, 2]: inner and outer radius, the same where all is dark.

@@ -3,7 +3,7 @@ r"""The fast PSF engine: geometric optics for the long waves of the atmosphere, 
 Each pair of a pupil point and a time step is a ray. Its angle is the gradient of the low screens where it crosses them;
 the Jacobian of the star turns that into a displacement on its CCD, to which the traced transverse aberration of the
 optics is added. All rays of a star are binned on a fine grid, at every wavelength from one pass over the atmosphere.
-What geometric optics leaves out multiplies the transform of that image: the ensemble average of the high modes (the
+Filters multiply the transform of that image: the ensemble average of the high modes (the
 "second kick" of Peterson et al. 2015, as a filter), diffraction by the annular pupil, charge diffusion, the pixel, and
 a phase ramp for atmospheric dispersion and the place within the pixel.
 
@@ -11,8 +11,8 @@ The filter of the atmosphere is chosen so that the mean over many exposures is r
 :math:`D(b)` of the whole atmosphere and the variance :math:`g` of one component of the low gradient, rays alone give
 :math:`\exp(-g b^2 / 2)` (both in radians of phase), so the rest is :math:`\exp(-D_{rest}/2)` with
 :math:`D_{rest} = D - g b^2`. It starts as the structure function of the high modes does, and falls below that where low
-modes already bend over a baseline, which makes plain geometric optics blur too much. Where the rays have
-left little light it would turn round and fall without end: from its maximum on it is held. That leaves the mean FWHM in
+modes are curved over a baseline, which makes plain geometric optics blur too much. Beyond its maximum, where the
+rays have left little light, :math:`D_{rest}` would fall without end; it is held there. That leaves the mean FWHM in
 the r band 0.1 % too wide for a cut-off of 1/r0 and 0.5 % for 1.4/r0 (plain high modes as the filter: 1.0 and 2.1 %).
 """
 
@@ -52,7 +52,7 @@ _TABLE_SIZE = 4096
 
 
 def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
-    """Return the structure function that rays through the low modes leave to the filter.
+    """Return the structure function of the filter, beside rays through the low modes.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ class FastPsfEngine(PsfEngine):
         """Return the filtered sum over wavelengths of the transforms of each star, shape [n_star, ky, kx]."""
         n_star, _, n_row, n_column = spectra.shape
         shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)
-        # The deposit has its origin in the middle cell; the first pixel of the stamp is wanted in the first.
+        # The deposit has its origin in the middle cell; the first pixel of the stamp belongs in the first.
         middle = self._plane.middle * self._plane.pixel_size - self._grid_size // 2 * self._cell
         shift = shift + (offsets * self._plane.pixel_size + middle)[:, None, :]
         combined = np.empty((n_star, n_row, n_column), dtype=np.complex64)

@@ -1,4 +1,4 @@
-r"""The long-exposure PSF engine: what an endless exposure would show, through the optics, without a random number.
+r"""The long-exposure PSF engine: the mean over all turbulence of PSFs of the optics, without random numbers.
 
 The mean transfer function over all turbulence is a product (Roddier 1981, sec. 4): of :math:`e^{-D(b)/2}` with the
 von Karman structure function of the whole atmosphere, of the detector, and of the optics,
@@ -40,10 +40,10 @@ PUPIL_POINTS = 80
 #: Side of the periodic image over that of the stamp: wings that come round make the edge of a stamp of 6 arcsec 1.4
 #: times as bright as it should be, and change ellipticities by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
 GRID_MARGIN = 1.25
-# What atmosphere and detector leave of a frequency that is left out; with pixels of 10 um all of these together make
+# Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all make
 # 2e-6 of the peak of the image.
 _NEGLIGIBLE = 1e-5
-# What they may leave of a baseline as long as the pupil's ring is wide, where the strips along its rims would meet.
+# Largest coherence at a baseline as long as the pupil's ring is wide, where the strips along its rims would meet.
 _LARGEST_LEFT = 1e-3
 # Stars of one batch, fewer where the room for their waves would fill more than this many bytes.
 _BATCH, _BATCH_BYTES = 256, 1 << 24
@@ -96,7 +96,7 @@ class LongExposureEngine(PsfEngine):
         return coherence(structure_function(baseline, self._r0, self._outer_scale), self._wavelengths[:, None])
 
     def _choose_frequencies(self) -> None:
-        """Choose the largest frequency worth adding up."""
+        """Choose the largest frequency of the sums."""
         width = self._width
         step = self._baselines()
         largest = math.ceil(width / step.min())
@@ -112,12 +112,12 @@ class LongExposureEngine(PsfEngine):
                 f" {width:.3g} m, the width of the pupil's ring; r0 = {self._r0:.3g} m leaves"
                 f" {beyond.max():.2g} (use engine = 'wave')"
             )
-        wanted = np.flatnonzero((left > _NEGLIGIBLE).any(axis=0))
+        strong = np.flatnonzero((left > _NEGLIGIBLE).any(axis=0))
         #: Largest frequency along either axis, in steps of one over the period.
-        self._reach = int(count[wanted[-1]]) if wanted.size else 1
+        self._reach = int(count[strong[-1]]) if strong.size else 1
 
     def _tabulate_filter(self) -> None:
-        """Tabulate what multiplies the strips and points of the pupil: the atmosphere, and what strips leave out."""
+        """Tabulate the filter of the points and strips of the pupil: the atmosphere, and the overlap of strips."""
         # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
         baseline = np.linspace(0.0, 1.5 * self._reach * self._baselines().max(), _TABLE_SIZE)
         # Strips as wide as half the baseline overlap a little: to third order in the baseline, less than 1e-3.
@@ -135,7 +135,7 @@ class LongExposureEngine(PsfEngine):
         reach, plane = self._reach, self._plane
         n_row, n_packet = reach + 1, -(-(reach + 1) // LANES)
         row, column = np.arange(n_row), np.arange(n_packet * LANES)
-        # Rows 0 to n that a packet of columns needs, of a disc of frequencies.
+        # Rows 0 to n of a disc of frequencies, for each packet of columns.
         self._rows = (np.sqrt(reach**2 - column[::LANES] ** 2).astype(int) + 1).astype(np.int32)
         k = 2.0 * math.pi / self.period
         inside = column**2 + row[:, None] ** 2 <= reach**2
@@ -183,7 +183,7 @@ class LongExposureEngine(PsfEngine):
             [
                 warp_array(pupil.radius, wp.float64),
                 warp_array(pupil.inverse, wp.float64),
-                warp_array(pupil.share, wp.float64),
+                warp_array(pupil.fraction, wp.float64),
                 warp_array(pupil.quadrature, wp.float64),
                 warp_array(pupil.unit, wp.vec2d),
                 warp_array(edges, wp.float64),

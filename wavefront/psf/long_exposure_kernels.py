@@ -52,7 +52,7 @@ def place_points(
     first: wp.int32,
     radius: wp.array(dtype=wp.float64),
     inverse: wp.array2d(dtype=wp.float64),
-    share: wp.array(dtype=wp.float64),
+    fraction: wp.array(dtype=wp.float64),
     quadrature: wp.array(dtype=wp.float64),
     unit: wp.array(dtype=wp.vec2d),
     edges: wp.array3d(dtype=wp.float64),
@@ -67,10 +67,10 @@ def place_points(
     cut: wp.array3d(dtype=wp.float32),
     lean: wp.array4d(dtype=wp.float32),
 ):
-    """Lay the points of one spoke over the clear pupil of one star, and find what a baseline cuts off at its ends.
+    """Lay the points of one spoke over the clear pupil of one star, and find the strips cut off its ends.
 
-    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m]; share
-    [ring]: part of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]:
+    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m];
+    fraction [ring] of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]:
     direction; edges [star, spoke, 2] [m]; displacement [star, wave, ring * n_spoke + spoke, 2] of the traced points
     [m]; landed [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion
     [wave] [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of
@@ -98,7 +98,7 @@ def place_points(
         light[star, point] = wp.float32(0.0)
         if clear:
             light[star, point] = wp.float32(half * span * angle * quadrature[ring] / area[star])
-        at = wp.sqrt(start + span * share[ring])
+        at = wp.sqrt(start + span * fraction[ring])
         end = wp.where(ring == 0, 0, 1)
         rim = end * n_spoke + spoke
         outermost = ring == 0 or ring == n_ring - 1
@@ -187,11 +187,11 @@ def transform_pupils(
 ):
     """Add up the transfer functions of one star's wavelengths, over columns m and rows +n and -n of frequencies.
 
-    Arguments: place, light, cut, lean as ``place_points`` leaves them; wavelength [wave] [m]; rows [packet of columns]
-    that are wanted; metric [star, 3]: xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against the
-    baseline; per_step [wave]: samples of the table per step of frequency, for a unit Jacobian; along_x, along_y [star,
-    point, packet, 2]: room for cosines and sines; at_y: along_y as plain numbers [star, ...]; spectrum [star, 4, row,
-    packet]: real and imaginary parts at +n, and at -n.
+    Arguments: place, light, cut, lean as ``place_points`` leaves them; wavelength [wave] [m]; rows [packet of
+    columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against
+    the baseline; per_step [wave]: samples of the table per step of frequency, for a unit Jacobian; along_x, along_y
+    [star, point, packet, 2]: room for cosines and sines; at_y: along_y as plain numbers [star, ...]; spectrum [star,
+    4, row, packet]: real and imaginary parts at +n, and at -n.
     """
     star = first + wp.tid()
     n_wave = place.shape[1]

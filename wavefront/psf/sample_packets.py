@@ -24,7 +24,7 @@ def to_packets(values: np.ndarray, dtype: Any, fill: str = "edge") -> np.ndarray
     dtype : numpy dtype
         Type of the packets.
     fill : {"edge", "constant"}
-        What fills the last packet up: copies of the last value, or zeros.
+        Filling of the last packet: copies of the last value, or zeros.
     """
     missing = -values.shape[-1] % LANES
     padding = [(0, 0)] * (values.ndim - 1) + [(0, missing)]

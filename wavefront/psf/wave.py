@@ -50,7 +50,7 @@ LARGEST_SPACING = 0.02
 #: Largest distance of pupil points [m] for the optics alone, which vary over metres: what limits it is the image, which
 #: repeats itself after lambda / spacing (3" at 0.04 m), and the rim of the pupil.
 LARGEST_SPACING_OPTICS = 0.04
-# What charge diffusion may leave of longer baselines for a grid without padding.
+# Largest transfer function of charge diffusion at longer baselines for a grid without padding.
 _NEGLIGIBLE = 1e-4
 
 
@@ -168,7 +168,7 @@ class WavePsfEngine(PsfEngine):
         return rows.reshape(len(values), line, self._packets, LANES)
 
     def _screen_places(self, field: np.ndarray) -> np.ndarray:
-        """Return where the first lattice point is seen on each screen at each time [pixels], [n_time, n_screen, 2].
+        """Return the first lattice point on each screen at each time [pixels], shape [n_time, n_screen, 2].
 
         Screens are counted layer by layer, low before high.
         """
@@ -180,7 +180,7 @@ class WavePsfEngine(PsfEngine):
         return both.reshape(len(atmosphere.times), -1, 2)
 
     def _taps(self, places: np.ndarray) -> list[Any]:
-        """Return which samples of the screens the lattice lies between at one time, and their weights."""
+        """Return the samples of the screens around the lattice points at one time, and their weights."""
         sides, steps = np.tile(self._sides, len(places) // 2), np.tile(self._steps, len(places) // 2)
         start = places - sides[:, None] * np.floor(places / sides[:, None])
         whole = np.floor(start)
