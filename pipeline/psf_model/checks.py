@@ -1,4 +1,4 @@
-"""Check what a PSF model is fitted to: stars, masks, weights, positions; one clear line for what cannot be used."""
+"""Checks of the input of a PSF model: stars, masks, weights, positions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
     never = bad.all(axis=0)
     if never.any():
         y, x = np.argwhere(never)[0]
-        raise DomainError(f"masks: pixel [{y}, {x}] is masked in every star, nothing says what the PSF is there")
+        raise DomainError(f"masks: pixel [{y}, {x}] is masked in every star, so that the PSF is unknown there")
     return bad
 
 
@@ -81,7 +81,7 @@ def snr_weights(kind: str, snr: np.ndarray) -> np.ndarray | None:
     ----------
     kind : str
         ``equal``; ``snr``: S/N squared, the inverse variance of the noise; ``softened``: 1/(1/S^2 + 1/100^2), since
-        what the polynomial itself leaves is not less for brighter stars.
+        the residual of the polynomial itself does not fall with brightness.
     snr : array
         S, signal-to-noise ratio of each star, [n].
 
@@ -114,7 +114,7 @@ def as_extent(extent: Any, positions: np.ndarray) -> Extent:
 
 
 def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: np.ndarray | None = None) -> None:
-    """Refuse stars that do not determine the polynomials.
+    """Raise an error if the stars do not determine the polynomials.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: n
 
 
 def check_apart(positions: np.ndarray) -> None:
-    """Refuse two stars at one place, where a process without noise cannot pass through both."""
+    """Raise an error for two stars at one position: a noise-free process cannot pass through both."""
     pair = same_place(positions)
     if pair:
         raise DomainError(f"positions: {_pair_text(positions, pair)}; expected places apart for interpolation = 'gp'")

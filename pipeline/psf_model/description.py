@@ -60,13 +60,13 @@ def describe(
         As in :meth:`~pachon.pipeline.psf_model.model.PsfModel.fit`.
     """
     shape = images.shape[1:]
-    pixels, unseen = images.reshape(len(images), -1), masked.reshape(len(images), -1)
-    if unseen.any():
-        guess, flux = mean_and_flux(pixels, unseen)
-        pixels = np.where(unseen, flux[:, None] * guess, pixels)
+    pixels, missing = images.reshape(len(images), -1), masked.reshape(len(images), -1)
+    if missing.any():
+        guess, flux = mean_and_flux(pixels, missing)
+        pixels = np.where(missing, flux[:, None] * guess, pixels)
     rejected = np.zeros(pixels.shape, dtype=bool)
     if clip_sigma is not None:
-        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~unseen
+        rejected = find_outliers(pixels, clip_sigma, max_iterations) & ~missing
     mean, flux = mean_and_flux(pixels, rejected)
     if rejected.any():
         rejected = restore_predicted(pixels / pixels.sum(axis=1)[:, None], mean, rejected, terms)
@@ -74,9 +74,9 @@ def describe(
     deviations = np.where(rejected, 0.0, pixels / flux[:, None] - mean)
 
     by_mean = rejected & (replacement == "mean")
-    unseen = unseen | (rejected & ~by_mean)
-    if unseen.any():
-        stars = fill_masked(mean + deviations, unseen, by_mean, terms)
+    missing = missing | (rejected & ~by_mean)
+    if missing.any():
+        stars = fill_masked(mean + deviations, missing, by_mean, terms)
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
     if basis == "pixels":

@@ -1,4 +1,4 @@
-"""Pixels of stars that were not seen, and what the other pixels and the other stars say that they hold."""
+"""Masked and rejected pixels of stars, filled from the other pixels and the other stars."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray,
     return mean, flux
 
 
-def fill_masked(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def fill_masked(stars: np.ndarray, missing: np.ndarray, replaced: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Fill masked pixels with the polynomial through the stars in which they are good.
 
     A filled pixel then has no influence on the interpolation over the CCD: with the hat matrix H of all stars, the
@@ -44,8 +44,8 @@ def fill_masked(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, ter
     Parameters
     ----------
     stars : array
-        [n_stars, n_pixels] of unit sum, the unseen pixels filled with a first guess.
-    unseen : array of bool
+        [n_stars, n_pixels] of unit sum, the masked pixels filled with a first guess.
+    missing : array of bool
         [n_stars, n_pixels].
     replaced : array of bool
         [n_stars, n_pixels] that hold the mean of all stars instead.
@@ -59,8 +59,8 @@ def fill_masked(stars: np.ndarray, unseen: np.ndarray, replaced: np.ndarray, ter
     """
     q, _ = np.linalg.qr(terms)
     predictors = []
-    for j in np.flatnonzero(unseen.any(axis=0)):
-        bad = unseen[:, j]
+    for j in np.flatnonzero(missing.any(axis=0)):
+        bad = missing[:, j]
         room = np.linalg.pinv(np.eye(int(bad.sum())) - q[bad] @ q[bad].T, rcond=_LEAST_ROOM, hermitian=True)
         predictors.append((j, np.flatnonzero(bad), np.flatnonzero(~bad), room @ q[bad] @ q[~bad].T))
     for _ in range(_MOST_PASSES):

@@ -33,7 +33,7 @@ _MARGIN = 20
 _PROVISIONAL_FWHM = 0.6 * ARCSEC
 #: Focal ratio of the paraboloid that serves as ideal telescope: 1.75 deg from the axis its astigmatism is 1e-3 arcsec,
 #: and e stays below 3e-4, the distortion of a tangent projection.
-_PLAIN_RATIO = 1e5
+_IDEAL_RATIO = 1e5
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,12 @@ def expose_ccd(
         If a stage fails.
     """
     places = ccd_stars(experiment, name, _PROVISIONAL_FWHM)
-    truth = _expose_holdout(experiment, places.holdout, threads, progress)
+    holdout = _expose_holdout(experiment, places.holdout, threads, progress)
     pixel = places.observed_pixel * (places.pixel_size / experiment.pixel_size)
     size = experiment.stamp_size + _SHIFT_ROOM
     observed = _expose(experiment, places.observed, pixel - np.rint(pixel), threads, progress, size=size)
     _check_light(observed, "some of its stars")
-    return CcdExposure(name, places, truth, observed)
+    return CcdExposure(name, places, holdout, observed)
 
 
 def _expose_holdout(
@@ -145,12 +145,12 @@ def _expose_holdout(
     rows and columns.
     """
 
-    def seen_at(images: np.ndarray, pixel_scale: float) -> np.ndarray:
-        moved = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
-        return np.nan_to_num(np.stack([moved.x, moved.y], axis=1))
+    def centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
+        shapes = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
+        return np.nan_to_num(np.stack([shapes.x, shapes.y], axis=1))
 
-    nothing = np.zeros_like(positions)
-    return _expose(experiment, positions, nothing, threads, progress, size=experiment.stamp_size, recenter=seen_at)
+    zeros = np.zeros_like(positions)
+    return _expose(experiment, positions, zeros, threads, progress, size=experiment.stamp_size, recenter=centroid)
 
 
 def _expose(
@@ -166,18 +166,18 @@ def _expose(
     """Make the PSFs at positions on the detector, noise-free."""
     config, wavelengths = experiment.config, experiment.wavelengths
     fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
-    seen = _optics(experiment)
+    optics = _optics_of(experiment)
     psfs = make_psfs(
-        seen.telescope,
+        optics.telescope,
         fields,
         wavelengths,
-        focal_plane=seen.focal_plane,
+        focal_plane=optics.focal_plane,
         atmosphere=experiment.atmosphere,
-        aberration=seen.aberration,
+        aberration=optics.aberration,
         engine=config.psf.engine,
         stamp_size=size,
-        pixel_size=experiment.pixel_size * seen.magnification,
-        diffusion=experiment.diffusion * seen.magnification,
+        pixel_size=experiment.pixel_size * optics.magnification,
+        diffusion=experiment.diffusion * optics.magnification,
         jitter=experiment.jitter,
         offsets=offsets,
         recenter=recenter,
@@ -189,21 +189,21 @@ def _expose(
     return NoiseFreeStars(psfs.image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
 
 
-class _Seen(NamedTuple):
+class _Optics(NamedTuple):
     telescope: Telescope
     focal_plane: FocalPlane | None
     aberration: ResidualWavefront | None
     magnification: float
 
 
-def _optics(experiment: Experiment) -> _Seen:
+def _optics_of(experiment: Experiment) -> _Optics:
     """Return the optics of the exposure, and the scale of its images relative to the camera's."""
     telescope = experiment.telescope
     if not experiment.atmosphere_only:
-        return _Seen(telescope, experiment.focal_plane, experiment.aberration, 1.0)
-    plain = without_aberration(telescope, _PLAIN_RATIO)
-    here, there = (center_focal_length(t, experiment.wavelengths) for t in (telescope, plain))
-    return _Seen(plain, None, None, there / here)
+        return _Optics(telescope, experiment.focal_plane, experiment.aberration, 1.0)
+    ideal = without_aberration(telescope, _IDEAL_RATIO)
+    here, there = (center_focal_length(t, experiment.wavelengths) for t in (telescope, ideal))
+    return _Optics(ideal, None, None, there / here)
 
 
 def _bounds(experiment: Experiment, name: str) -> tuple[float, float, float, float]:

@@ -35,22 +35,22 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         If a stage fails.
     """
     config = experiment.config
-    name, places, truth, observed = exposure.name, exposure.places, exposure.holdout, exposure.observed
-    holdout_images = truth.image.astype(np.float64)
-    truth_shapes = measure_shapes(holdout_images, truth.pixel_scale, experiment.weight_fwhm)
+    name, places, holdout, observed = exposure.name, exposure.places, exposure.holdout, exposure.observed
+    holdout_images = holdout.image.astype(np.float64)
+    holdout_shapes = measure_shapes(holdout_images, holdout.pixel_scale, experiment.weight_fwhm)
     # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
-    width = effective_fwhm(truth.image, truth.pixel_scale)
+    width = effective_fwhm(holdout.image, holdout.pixel_scale)
     stars = ccd_stars(experiment, name, width, least_light=float(observed.lit_fraction.min()))
     electrons = stars.electrons * observed.lit_fraction
     snr = signal_to_noise(
         stars.magnitude - 2.5 * np.log10(observed.lit_fraction), stars.band, config.atmosphere.exposure_s, width
     )
-    seen = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
-    fit, used = config.reconstruction, seen.used
+    observation = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
+    fit, used = config.reconstruction, observation.used
     least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
-    seen.require(max(least, term_count(fit.order or 0)))
+    observation.require(max(least, term_count(fit.order or 0)))
     model = PsfModel.fit(
-        seen.images[used],
+        observation.images[used],
         stars.observed[used],
         basis=fit.basis,
         interpolation=fit.interpolation,
@@ -73,7 +73,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
-    at_truth, at_stars = shapes_of(model.at(places.holdout)), shapes_of(model.at(stars.observed))
+    at_holdout, at_stars = shapes_of(model.at(places.holdout)), shapes_of(model.at(stars.observed))
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     left_out = shapes_of(model.leave_one_out())
     leave_one_out_e1, leave_one_out_e2 = np.full((2, len(used)), np.nan)
@@ -81,26 +81,26 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     return CcdProduct(
         name=name,
         center=(float(x), float(y)),
-        pixel_scale=truth.pixel_scale,
-        noise=seen.noise,
+        pixel_scale=holdout.pixel_scale,
+        noise=observation.noise,
         holdout=HoldoutStars(
-            **_positions(places.holdout, truth.fields),
-            **_shapes(truth_shapes, at_truth),
-            fwhm=fwhm(truth.image, truth.pixel_scale),
+            **_positions(places.holdout, holdout.fields),
+            **_shapes(holdout_shapes, at_holdout),
+            fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
             **_positions(stars.observed, observed.fields),
-            **_shapes(seen.shapes, at_stars),
+            **_shapes(observation.shapes, at_stars),
             magnitude=stars.magnitude,
             electrons=electrons,
             snr=snr,
-            defects=seen.defects,
+            defects=observation.defects,
             used=used,
             leave_one_out_e1=leave_one_out_e1,
             leave_one_out_e2=leave_one_out_e2,
         ),
         holdout_images=holdout_images.astype(np.float32),
-        observed_images=seen.images.astype(np.float32),
+        observed_images=observation.images.astype(np.float32),
         model=model,
         noise_free_model=noise_free_model,
     )

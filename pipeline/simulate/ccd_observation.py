@@ -79,20 +79,20 @@ def observe_ccd(
     config = experiment.config
     seconds = config.atmosphere.exposure_s
     sky, noise = sky_electrons_per_pixel(config.band or "r", seconds, pixel_scale), instrument_noise(seconds)
-    seen, full_well = images.astype(np.float64), None
+    exposed, full_well = images.astype(np.float64), None
     if noisy:
-        clean = observe_stamps(seen, electrons, sky, noise, _stream(experiment, "noise", name))
-        seen, full_well = _with_defects(experiment, name, clean, seen)
-    first = measure_shapes(seen, pixel_scale, experiment.weight_fwhm)
-    stamps = center_stamps(seen, first.x, first.y, size=experiment.stamp_size)
+        clean = observe_stamps(exposed, electrons, sky, noise, _stream(experiment, "noise", name))
+        exposed, full_well = _with_defects(experiment, name, clean, exposed)
+    first = measure_shapes(exposed, pixel_scale, experiment.weight_fwhm)
+    stamps = center_stamps(exposed, first.x, first.y, size=experiment.stamp_size)
     shapes = measure_shapes(stamps, pixel_scale, experiment.weight_fwhm)
     defects = np.zeros(len(stamps), dtype=np.int32)
     if noisy and config.reconstruction.flag_stars:
-        centred = center_stamps(seen, first.x, first.y, size=experiment.stamp_size, normalize=False)
+        centred = center_stamps(exposed, first.x, first.y, size=experiment.stamp_size, normalize=False)
         defects = flag_stars(centred, np.hypot(np.sqrt(sky), noise)).flags
         if full_well is not None:
             # Pixels are compared with the full well before they are shifted.
-            defects = np.where((seen >= full_well).any(axis=(1, 2)), defects | StarFlag.SATURATED, defects)
+            defects = np.where((exposed >= full_well).any(axis=(1, 2)), defects | StarFlag.SATURATED, defects)
         e1, e2, size = (np.where(defects == 0, v, np.nan) for v in (shapes.e1, shapes.e2, shapes.size))
         shapes = replace(shapes, e1=e1, e2=e2, size=size)
     used = shapes.usable & np.isfinite(stamps).all(axis=(1, 2)) & (defects == 0)
@@ -107,7 +107,7 @@ def _with_defects(
     if not (stars.neighbours or stars.cosmic_rays or stars.saturated):
         return stamps, None
     full_well = _full_well(stamps, stars.saturated)
-    spoilt, _ = add_defects(
+    defective, _ = add_defects(
         stamps,
         images,
         _stream(experiment, "defects", name),
@@ -115,7 +115,7 @@ def _with_defects(
         cosmic_rays=stars.cosmic_rays,
         full_well=full_well,
     )
-    return spoilt, full_well
+    return defective, full_well
 
 
 def _full_well(stamps: np.ndarray, fraction: float) -> float | None:
