@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.errors import PrescriptionError
 
-#: How far the weights of a site may be from a sum of 1: published ones are rounded to three figures.
+#: How far the weights of a site may be from a sum of 1: published ones are rounded to three digits.
 WEIGHT_TOLERANCE = 5e-3
 
 

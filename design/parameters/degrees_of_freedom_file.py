@@ -3,7 +3,7 @@
 ::
 
     name: my_active_optics
-    source: where the figures come from
+    source: where the numbers come from
     figures:
       M1M3: {surfaces: [M1, M3], zernike: {outer_radius: 4.18, inner_radius: 0.55, terms: 22}}
       M2_bending: {surfaces: [M2], grids: {B1: m2_mode_1.fits, B2: m2_mode_2.fits}}
@@ -13,8 +13,8 @@
       - {name: M2_B1, unit: um, of: M2_bending.B1}
 
 Radii are in metres; a file of a grid is FITS (:mod:`~pachon.models.io.grid_file`), its path relative to this file. `of`
-is an address, or several with what one of the degree of freedom does to each: the address's SI unit per SI unit. An
-address that begins with the name of a figure is a term of it.
+is an address, or several with the change of each by one of the degree of freedom: the address's SI unit per SI unit. An
+address that begins with the name of a deformation (`figures`) is a term of it.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class GlassCatalogue:
     glasses : mapping of str to Glass
         Entries by name in capitals.
     source : str
-        Where they come from, for messages.
+        Name of the catalogue, for messages.
     """
 
     def __init__(self, glasses: Mapping[str, Glass], source: str) -> None:
@@ -119,7 +119,7 @@ class GlassCatalogue:
         return len(self._glasses)
 
     def entry(self, name: str) -> Glass:
-        """Return all that the catalogue says of a glass.
+        """Return the entry of a glass.
 
         Raises
         ------
@@ -176,11 +176,11 @@ def _read_glass(lines: list[Record]) -> Glass:
     temperature = celsius + ZERO_CELSIUS
     if not 0 < temperature <= 1000:
         raise found["TD"].error("a temperature above absolute zero and below 700 deg C as word 7")
-    return Glass(name, replace(medium, name=name), _figure(head, 3), _figure(head, 4), temperature)
+    return Glass(name, replace(medium, name=name), _index(head, 3), _index(head, 4), temperature)
 
 
-def _figure(head: Record, position: int) -> float:
-    """Return an index or Abbe number for the record; catalogues put a dash where they do not know."""
+def _index(head: Record, position: int) -> float:
+    """Return an index or Abbe number for the record; catalogues have a dash where it is unknown."""
     try:
         return head.number(position, 0.0)
     except PrescriptionError:

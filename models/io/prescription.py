@@ -34,11 +34,12 @@ from pathlib import Path
 from ...core.errors import PrescriptionError, unknown_name
 from ...core.files import write_bytes
 from ..telescope import Telescope
-from .codev.reader import read_codev
+from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
 from .yaml.reader import read_telescope
 from .yaml.writer import telescope_to_yaml
-from .zemax.reader import read_zemax
+from .zemax.file import read_zemax_file
+from .zemax.reader import read_lens
 from .zemax.writer import catalogue_path, telescope_to_zemax
 
 DATA = Path(__file__).parents[1] / "data"
@@ -55,8 +56,10 @@ BUNDLED = (
 )
 
 
+# Readers of the parts of a lens file, by its ending.
+_LENS_FILES = {".zmx": read_zemax_file, ".seq": read_codev_file}
 #: Endings of files that a telescope is read from.
-ENDINGS = (".yaml", ".yml", ".zmx", ".seq")
+ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
 
 def bundled_names() -> tuple[str, ...]:
@@ -100,10 +103,9 @@ def load_telescope(
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
         return read_telescope(path)
-    if path.suffix.lower() == ".seq":
-        return read_codev(path, lenient=lenient, glass_catalogues=glass_catalogues)
-    if path.suffix.lower() == ".zmx":
-        return read_zemax(path, lenient=lenient, glass_catalogues=glass_catalogues)
+    if path.suffix.lower() in _LENS_FILES:
+        parts = _LENS_FILES[path.suffix.lower()]
+        return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"{path}: expected a prescription file that ends in .yaml, .zmx or .seq")
     raise unknown_name("telescope", text, BUNDLED)

@@ -1,26 +1,21 @@
-"""Read a CODE V lens file (.seq): its commands are put into the terms of a Zemax file, and read as one.
+"""Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
-What is read: RDM, DIM, TITLE, EPD, FNO, NAO, WL, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, the surfaces SO S SI
+Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, the surfaces SO S SI
 (radius or curvature, thickness, glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE
-YDE ZDE ADE BDE CDE with DAR and BEN, CIR (OBS) and REX REY with ADX ADY. ADE and BDE turn to the left, CDE to the
-right (CODE V reference manual, "Decentered surfaces"), Zemax's tilts all to the right. A glass is a name
+YDE ZDE ADE BDE CDE with DAR and BEN, CIR (OBS) and REX REY with ADX ADY. ADE and BDE are left-handed, CDE is
+right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
 (N-BK7_SCHOTT), REFL, or a number (517642).
 """
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ....core.errors import error_context
-from ...telescope import Telescope
-from ..glass_catalogue import GlassCatalogue
 from ..zemax.file import Block, Findings, ZemaxFile
-from ..zemax.reader import LensReader, chosen_catalogues
 from ..zemax.text import Record, read_text
 
 UNITS = {"M": "MM", "C": "CM", "I": "IN"}
@@ -30,7 +25,7 @@ FIELDS = {
 }  # fmt: skip
 APERTURES = {"EPD": "ENPD", "FNO": "FNUM", "NAO": "OBNA"}
 POWERS = "ABCDEFG"
-#: Commands that say nothing about rays: names, variables and couplings, weights, vignetting factors of the beams,
+#: Commands without effect on rays: names, variables and couplings, weights, vignetting factors of the beams,
 #: solves, whose solution stands in the file, and drawing.
 _IGNORED = """
 LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC WTW WTF VUX VLX VUY VLY PIM CUM
@@ -40,18 +35,15 @@ IGNORED = frozenset(_IGNORED.split())
 INFINITE = 1e10
 
 
-def read_codev(
-    path: str | os.PathLike[str],
-    *,
-    lenient: bool = False,
-    glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
-) -> Telescope:
-    """Read a CODE V lens file; arguments, result and errors are those of `zemax_reader.read_zemax`."""
-    target = Path(path)
-    findings = Findings(lenient)
-    catalogues = chosen_catalogues(target, glass_catalogues)
-    with error_context(file=target):
-        return LensReader(_Translation(target, findings).file(), findings, catalogues).telescope()
+def read_codev_file(path: Path, findings: Findings) -> ZemaxFile:
+    """Return the parts of a CODE V lens file in the terms of a Zemax file.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read, or a command is malformed or, unless lenient, not understood.
+    """
+    return _Translation(path, findings).file()
 
 
 def _commands(path: Path) -> Iterator[Record]:
@@ -72,13 +64,13 @@ def _commands(path: Path) -> Iterator[Record]:
 
 
 class _Translation:
-    """Goes through the commands and collects the lines that the same lens has in a Zemax file."""
+    """Lines of the same lens in a Zemax file, collected from the commands."""
 
     def __init__(self, path: Path, findings: Findings) -> None:
         self.path, self.findings = path, findings
         self.header = Block(str(path))
         self.surfaces: list[Block] = []
-        self.figures: list[dict[str, float]] = []
+        self.values: list[dict[str, float]] = []
         self.radii = True
         self.field_type = 0.0
         self.waves: list[float] = []
@@ -89,7 +81,7 @@ class _Translation:
         for command in _commands(self.path):
             if command.keyword in ("SO", "SI") or re.fullmatch(r"S\d*", command.keyword):
                 self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
-                self.figures.append({})
+                self.values.append({})
                 current = len(self.surfaces) - 1
                 self._start(self._placed(command, current))
             elif self.surfaces:
@@ -148,10 +140,10 @@ class _Translation:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
 
     def _start(self, command: Record) -> None:
-        """Take what stands on the line that begins a surface: radius or curvature, thickness, glass."""
-        figures = self.figures[-1]
-        figures["bend"] = self._curvature(command, 0, radius=self.radii) if command.words else 0.0
-        figures["THI"] = command.number(1, 0.0)
+        """Read the line that begins a surface: radius or curvature, thickness, glass."""
+        values = self.values[-1]
+        values["CURV"] = self._curvature(command, 0, radius=self.radii) if command.words else 0.0
+        values["THI"] = command.number(1, 0.0)
         if len(command.words) > 2:
             self._glass(command, command.words[2], len(self.surfaces) - 1)
 
@@ -175,18 +167,18 @@ class _Translation:
 
     def _surface(self, command: Record, number: int) -> None:
         key, words = command.keyword, command.words
-        block, figures = self.surfaces[number], self.figures[number]
+        block, values = self.surfaces[number], self.values[number]
         if key in ("RDY", "CUY"):
-            figures["bend"] = self._curvature(command, 0, radius=key == "RDY")
+            values["CURV"] = self._curvature(command, 0, radius=key == "RDY")
         elif key == "GLA":
             self._glass(command, (words or ("AIR",))[0], number)
         elif key in ("STO", "SLB"):
             keyword = {"STO": "STOP", "SLB": "COMM"}[key]
             block.lines.append(replace(command, keyword=keyword, text=command.text.strip("'\" ")))
         elif key in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ADX", "ADY", *POWERS):
-            figures[key] = command.number(0)
+            values[key] = command.number(0)
         elif key in ("DAR", "BEN"):
-            figures[key] = 1.0
+            values[key] = 1.0
         elif key == "CIR":
             obscures = bool(words) and words[0].upper() == "OBS"
             radius = command.number(1 if obscures else 0)
@@ -197,36 +189,36 @@ class _Translation:
     def _blocks(self) -> list[Block]:
         """Return the surfaces, with coordinate breaks between them where they are tilted or decentred."""
         blocks: list[Block] = []
-        carried = self.figures[-1].get("THI", 0.0)
-        for number, (block, figures) in enumerate(zip(self.surfaces, self.figures, strict=True)):
+        carried = self.values[-1].get("THI", 0.0)
+        for number, (block, values) in enumerate(zip(self.surfaces, self.values, strict=True)):
             last = number == len(self.surfaces) - 1
-            thickness = 0.0 if last else figures.get("THI", 0.0)
+            thickness = 0.0 if last else values.get("THI", 0.0)
             # The thickness of the image is a defocus: it counts from where the surface before it leads.
             thickness += carried if number == len(self.surfaces) - 2 else 0.0
-            kind = "EVENASPH" if any(figures.get(p) for p in POWERS) else "STANDARD"
+            kind = "EVENASPH" if any(values.get(p) for p in POWERS) else "STANDARD"
             lines: list[tuple[Any, ...]] = [
                 ("TYPE", kind),
-                ("CURV", figures.get("bend", 0.0)),
-                ("CONI", figures.get("K", 0.0)),
+                ("CURV", values.get("CURV", 0.0)),
+                ("CONI", values.get("K", 0.0)),
             ]
-            lines += [("PARM", i, figures.get(p, 0.0)) for i, p in enumerate(POWERS, start=2) if figures.get(p)]
-            if "REX" in figures or "REY" in figures:
-                lines.append(("SQAP", figures.get("REX", 0.0), figures.get("REY", 0.0)))
-            if figures.get("ADX") or figures.get("ADY"):
-                lines.append(("OBDC", figures.get("ADX", 0.0), figures.get("ADY", 0.0)))
+            lines += [("PARM", i, values.get(p, 0.0)) for i, p in enumerate(POWERS, start=2) if values.get(p)]
+            if "REX" in values or "REY" in values:
+                lines.append(("SQAP", values.get("REX", 0.0), values.get("REY", 0.0)))
+            if values.get("ADX") or values.get("ADY"):
+                lines.append(("OBDC", values.get("ADX", 0.0), values.get("ADY", 0.0)))
             distance = "INFINITY" if number == 0 and abs(thickness) >= INFINITE else thickness
-            tilts = (-figures.get("ADE", 0.0), -figures.get("BDE", 0.0), figures.get("CDE", 0.0))
-            shift = (figures.get("XDE", 0.0), figures.get("YDE", 0.0))
-            depth = figures.get("ZDE", 0.0)
+            tilts = (-values.get("ADE", 0.0), -values.get("BDE", 0.0), values.get("CDE", 0.0))
+            shift = (values.get("XDE", 0.0), values.get("YDE", 0.0))
+            depth = values.get("ZDE", 0.0)
             moved = any(tilts) or any(shift) or depth
             after: list[Block] = []
-            if moved and figures.get("DAR"):
+            if moved and values.get("DAR"):
                 back = [*(-v for v in (*shift, *tilts)), 1]
                 after = [self._break(number, back, 0.0), self._break(number, [0.0] * 6, thickness - depth)]
                 distance = 0.0
-            elif moved and figures.get("BEN"):
+            elif moved and values.get("BEN"):
                 if tilts[2]:
-                    raise block.problem(f"BEN with CDE {figures['CDE']:g}: not understood")
+                    raise block.problem(f"BEN with CDE {values['CDE']:g}: not understood")
                 after, distance = [self._break(number, [0, 0, *tilts, 0], thickness)], 0.0
             if moved:
                 blocks += [self._break(number, [0.0] * 6, depth), self._break(number, [*shift, *tilts, 0], 0.0)]

@@ -1,8 +1,7 @@
-"""The parts of a Zemax lens file (.zmx), before anything is made of them: header, surfaces, and what is ignored.
+"""Parts of a Zemax lens file (.zmx): header, surfaces, and the keywords that are ignored.
 
-A file is a list of lines "KEYWORD words". A header is followed by one block a surface, which begins with SURF and
-whose lines are indented, and by merit function, tolerances and configurations, which describe work on the lens and
-not the lens.
+A file is a list of lines "KEYWORD words". The header is followed by one block for each surface, which begins with SURF
+and whose lines are indented, and by merit function, tolerances and configurations, which are not read.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ from pathlib import Path
 from ....core.errors import PrescriptionError, PrescriptionWarning
 from .text import Record, read_text, records
 
-#: Keywords of the header that say nothing about rays: notes, names of other files, analysis and display settings,
-#: weights. Vignetting factors (VDXN...) and ray aiming (RAIM) choose which rays Zemax launches, not where they go.
+#: Keywords of the header without effect on rays: notes, names of other files, analysis and display settings,
+#: weights. Vignetting factors (VDXN...) and ray aiming (RAIM) select the rays that Zemax launches, not their paths.
 _HEADER = """
 VERS MODE NAME AUTH NOTE IWDP PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN FWGT FCOM VDXN VDYN VCXN
 VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDSX VDSY WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EERA OPDX PUPD EFFL DMFS CONF
 PMAG TOTR TRAC MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE
 """
-#: Keywords of a surface that say nothing about rays: comments, coatings, scatter, drawing and tolerancing settings,
+#: Keywords of a surface without effect on rays: comments, coatings, scatter, drawing and tolerancing settings,
 #: automatic semi-diameters, and solves, variables and pick-ups, whose solution stands in the file.
 _SURFACE = """
 COMM SSID SLAB HIDE MIRR POPS COAT FIMP SCAT STRE MEMA DIAM EDGE TCED TCEC TCMM EXPN LBLK CHZN BORE PICK CCOM VCUR

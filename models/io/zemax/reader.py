@@ -1,19 +1,19 @@
-"""Read a sequential Zemax lens file (.zmx) as a telescope.
+"""Read a sequential lens file as a telescope, from its parts in the terms of Zemax.
 
 Frame: Zemax sends light along +z, a telescope along -z. The telescope's axes are those of the object space of the
-file turned by half a turn about y, ``(x, y, z) = (-X, Y, Z0 - Z)``; `Z0` is where the first surface with power lies,
+file rotated by half a turn about y, ``(x, y, z) = (-X, Y, Z0 - Z)``; `Z0` is where the first surface with power lies,
 so that its vertex is at z = 0. A field of the file at angles (tx, ty) is the field (-tx, ty) here. Coordinate breaks
 become positions and rotations of the surfaces behind them, and nothing else remains of them.
 
-What is not understood is an error that names file, surface and keyword, or with `lenient` a warning; keywords that
-cannot change what rays do are listed in `zemax_file`. The page docs/zemax.md has the tables.
+A line that is not understood is an error that names file, surface and keyword, or with `lenient` a warning; keywords
+that have no effect on rays are listed in `file`. The page docs/zemax.md has the tables.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,29 +27,33 @@ from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
 from ..yaml.media import medium_wavelengths
-from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile, read_zemax_file
+from .apertures import read_aperture
+from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
-from .shape_reader import read_aperture, read_shape
-from .system import UNITS, FirstSurfaces, read_pupil, read_wavelengths
+from .shape_reader import read_shape
+from .system import UNITS, ParaxialSurfaces, read_pupil, read_wavelengths
 
 #: Comment of the plane that the writer puts in front to carry the entrance pupil.
 PUPIL_COMMENT = "pachon entrance pupil"
 
 
-def read_zemax(
-    path: str | os.PathLike[str],
+def read_lens(
+    path: Path,
+    parts: Callable[[Path, Findings], ZemaxFile],
     *,
     lenient: bool = False,
     glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
 ) -> Telescope:
-    """Read a Zemax lens file.
+    """Read a lens file of Zemax or CODE V.
 
     Parameters
     ----------
-    path : str or path
-        The .zmx file, in UTF-16, UTF-8 or ISO 8859-1.
+    path : Path
+        The file, in UTF-16, UTF-8 or ISO 8859-1.
+    parts : callable
+        Reader of the parts of the file, in the terms of a Zemax file.
     lenient : bool
-        Warn about what is not understood and go on without it, instead of raising.
+        Warn about parts that are not understood and go on without them, instead of raising.
     glass_catalogues : iterable of GlassCatalogue or path
         Catalogues to look glasses up in, first of all; then comes one beside the file that has its name and ends in
         .agf, then the bundled one.
@@ -64,24 +68,17 @@ def read_zemax(
     PrescriptionError
         If the file cannot be read or, unless lenient, something in it is not understood.
     """
-    target = Path(path)
     findings = Findings(lenient)
-    file = read_zemax_file(target, findings)
-    catalogues = chosen_catalogues(target, glass_catalogues)
-    with error_context(file=target):
-        return LensReader(file, findings, catalogues).telescope()
+    with error_context(file=path):
+        file = parts(path, findings)
+        catalogues = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in glass_catalogues]
+        beside = path.with_suffix(".agf")
+        catalogues += [GlassCatalogue.read(beside)] if beside.is_file() else []
+        return _LensReader(file, findings, [*catalogues, GlassCatalogue.bundled()]).telescope()
 
 
-def chosen_catalogues(path: Path, given: Iterable[GlassCatalogue | str | os.PathLike[str]]) -> list[GlassCatalogue]:
-    """Return the catalogues to look glasses up in: those given, one beside the file with its name, the bundled one."""
-    catalogues = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in given]
-    beside = path.with_suffix(".agf")
-    catalogues += [GlassCatalogue.read(beside)] if beside.is_file() else []
-    return [*catalogues, GlassCatalogue.bundled()]
-
-
-class LensReader:
-    """Walks through the surfaces of a file with the frame and the medium that the light is in."""
+class _LensReader:
+    """Surfaces of a file one after the other, with the local frame and the medium of the light."""
 
     def __init__(self, file: ZemaxFile, findings: Findings, catalogues: list[GlassCatalogue]) -> None:
         self.file = file
@@ -94,7 +91,7 @@ class LensReader:
         self.origin, self.axes = np.zeros(3), np.eye(3)
         self.medium = self.first_medium = self._glass(file.surfaces[0], VACUUM)[1]
         self.surfaces: list[Surface] = []
-        self.paraxial = FirstSurfaces()
+        self.paraxial = ParaxialSurfaces()
         self.stop: Block | None = None
 
     def telescope(self) -> Telescope:
@@ -121,7 +118,7 @@ class LensReader:
         if pupil_plane:
             del self.surfaces[0]
         z0 = _first_power(self.surfaces)
-        surfaces = tuple(self._turned(s, z0) for s in self.surfaces)
+        surfaces = tuple(self._placed(s, z0) for s in self.surfaces)
         low, high = self._wavelength_range(waves.values)
         reach = max(max(abs(v) for s in surfaces for v in s.vertex), abs(pupil.z + z0), pupil.diameter)
         limit = min(max(2 * pupil.field_radius, math.radians(5.0)), math.radians(85.0))
@@ -180,16 +177,16 @@ class LensReader:
         self._move(dx, dy, tilt, backwards=values.get(6, 0.0) != 0)
 
     def _tilt(self, block: Block) -> None:
-        """Apply the tilt and decentre that a surface carries itself, before it."""
+        """Apply the tilt and decentre of a surface itself, before it."""
         for line in block.all("SCBD"):
-            figures = [line.number(i, 0.0) for i in range(len(line.words))]
-            if not any(figures[3:]):
+            numbers = [line.number(i, 0.0) for i in range(len(line.words))]
+            if not any(numbers[3:]):
                 continue
-            if figures[:3] != [1.0, 0.0, 0.0] or len(figures) < 8:
+            if numbers[:3] != [1.0, 0.0, 0.0] or len(numbers) < 8:
                 text = f"{line.shown}: only a tilt before the surface (SCBD 1 0 0) is read"
                 self.findings.report(line.problem(text))
                 continue
-            self._move(figures[3], figures[4], figures[5:8], backwards=False)
+            self._move(numbers[3], numbers[4], numbers[5:8], backwards=False)
 
     def _move(self, dx: float, dy: float, tilt: list[float], *, backwards: bool) -> None:
         """Decentre, then tilt about x, the new y, the new z [deg]; backwards: tilts first, and z before y and x."""
@@ -246,7 +243,7 @@ class LensReader:
         if name == "MIRROR":
             return True, none
         nd, vd, deviation = line.number(3, 0.0), line.number(4, 0.0), line.number(5, 0.0)
-        # The second word: 1 is a model glass, whose figures follow; its name is only a name.
+        # The second word: 1 is a model glass, defined by the numbers that follow and not by its name.
         model = line.number(1, 0.0) == 1 and nd > 1
         for catalogue in self.catalogues:
             if name in catalogue and not model:
@@ -259,7 +256,7 @@ class LensReader:
         except PrescriptionError as problem:
             raise line.problem(f"{line.shown}: {problem}") from None
 
-    def _turned(self, surface: Surface, z0: float) -> Surface:
+    def _placed(self, surface: Surface, z0: float) -> Surface:
         x, y, z = HALF_TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
         return replace(surface, vertex=(float(x), float(y), float(z)))
 

@@ -1,4 +1,4 @@
-"""Shapes and apertures of Zemax surfaces, in their own local frame (+z along the light) and in metres.
+"""Shapes of Zemax surfaces, in their own local frame (+z along the light) and in metres.
 
 The sag of each type, from the OpticStudio user guide ("Surface types"), with ``c`` CURV, ``k`` CONI, ``r^2 = x^2 +
 y^2``:
@@ -8,7 +8,7 @@ STANDARD  conic of revolution
 EVENASPH  conic + PARM 1 r^2 + PARM 2 r^4 + ... + PARM 8 r^16
 ODDASPHE  conic + PARM 1 r + PARM 2 r^2 + ... + PARM 8 r^8
 BICONICX  conics of different curvature along y (CURV, CONI) and x (radius PARM 1, conic PARM 2)
-TOROIDAL  conic in the y, z plane, turned about an axis at PARM 1; Zernike terms in XDAT
+TOROIDAL  conic in the y, z plane, revolved about an axis at PARM 1; Zernike terms in XDAT
 SZERNSAG  as EVENASPH + sum of XDAT (2 + j) Z_j(x / R, y / R), Noll, R = XDAT 2, XDAT 1 terms
 XPOLYNOM  conic + sum of XDAT (2 + i) times x, y, x^2, xy, y^2, x^3... of x / R, y / R, R = XDAT 2, XDAT 1 terms
 XASPHERE  conic + sum of XDAT (2 + i) (r / R)^(2 i), R = XDAT 2, XDAT 1 terms
@@ -23,7 +23,6 @@ import math
 
 import numpy as np
 
-from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle, Union, Vane
 from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
 from ...shapes.grid import GridSag
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
@@ -47,7 +46,7 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     unit : float
         Lens unit [m].
     findings : Findings
-        What to do about something that is not understood.
+        Treatment of lines that are not understood.
 
     Returns
     -------
@@ -195,44 +194,3 @@ def _grid(block: Block, unit: float) -> GridSag:
     # The first node is at the smallest x and the largest y, and x runs first.
     x, y = (dx * (np.arange(nx) - (nx - 1) / 2), dy * (np.arange(ny) - (ny - 1) / 2))
     return GridSag(x, y, values.reshape(ny, nx)[::-1])
-
-
-def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | None:
-    """Return the clear region of a surface [m], or None where it has none.
-
-    Semi-diameters (DIAM) clip no rays; a floating aperture (FLAP) does where its semi-diameter is fixed.
-    """
-    shift = block.last("OBDC")
-    x, y = (shift.number(0) * unit, shift.number(1) * unit) if shift else (0.0, 0.0)
-    found: list[Aperture] = []
-    for keyword in ("CLAP", "FLAP", "OBSC", "SQAP", "SQOB", "SPID"):
-        line = block.last(keyword)
-        if line is None:
-            continue
-        first, second = line.number(0, 0.0), line.number(1, 0.0)
-        if keyword == "FLAP" and block.number("DIAM", 0.0, 1) != 1:
-            continue
-        if keyword == "SPID":
-            if not (first > 0 and 0 < second <= 1000 and second == int(second)):
-                raise line.error("a width and a number of arms")
-            turns = [2 * math.pi * arm / int(second) for arm in range(int(second))]
-            found.append(Complement(Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))))
-        elif keyword in ("SQAP", "SQOB"):
-            if not (first > 0 and second > 0):
-                raise line.error("two positive half widths")
-            rectangle = Rectangle(2 * first * unit, 2 * second * unit, x, y)
-            found.append(rectangle if keyword == "SQAP" else Complement(rectangle))
-        elif keyword == "OBSC" and second == 0:
-            continue
-        elif not 0 <= first < second:
-            raise line.error("a smallest and a largest radius")
-        else:
-            ring = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
-            found.append(Complement(ring) if keyword == "OBSC" else ring)
-    for keyword in ("ELAP", "ELOB", "UDAD", "USAP", "USOB", "UDAP"):
-        for line in block.all(keyword):
-            findings.report(line.problem(f"{line.shown}: elliptical and user-defined apertures are not read"))
-            break
-    if len(found) > 1:
-        raise block.lines[0].error("one aperture in this surface")
-    return found[0] if found else None

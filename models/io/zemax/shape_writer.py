@@ -1,4 +1,4 @@
-"""The lines of a Zemax file that describe a shape: what `zemax_shapes` reads, the other way."""
+"""Lines of a Zemax file for a shape: the inverse of `shape_reader`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from ...shapes.grid import GridSag
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
 from ...zernike_polynomials import annular_zernikes
 from .shape_reader import polynomial_powers
+from .text import number_text
 
 
 def shape_lines(shape: Shape, unit: float) -> list[str]:
@@ -38,27 +39,23 @@ def shape_lines(shape: Shape, unit: float) -> list[str]:
         raise PrescriptionError(f"shape {type(base).__name__}: no type of Zemax surface has this shape")
     square, rest = _square_term(rest)
     if len(rest) > 1:
-        raise PrescriptionError("sum of several figures: no type of Zemax surface has this shape")
-    head = [f"CURV {_number(base.curvature * unit)}", f"CONI {_number(base.conic)}"]
+        raise PrescriptionError("sum of several shapes: no type of Zemax surface has this shape")
+    head = [f"CURV {number_text(base.curvature * unit)}", f"CONI {number_text(base.conic)}"]
     powers = [square, *base.coefficients]
     if len(powers) > 8:
         raise PrescriptionError(f"{len(base.coefficients)} coefficients: a Zemax surface has 7 from r^4 to r^16")
-    parameters = [f"PARM {i} {_number(a * unit ** (2 * i - 1))}" for i, a in enumerate(powers, start=1)]
+    parameters = [f"PARM {i} {number_text(a * unit ** (2 * i - 1))}" for i, a in enumerate(powers, start=1)]
     curved = any(powers)
     if not rest:
         return ["TYPE EVENASPH", *head, *parameters] if curved else ["TYPE STANDARD", *head]
-    figure = rest[0]
-    if isinstance(figure, ZernikeSag):
-        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(figure, unit)]
-    if isinstance(figure, GridSag):
-        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(figure, unit)]
-    if isinstance(figure, XYPolynomial) and not curved:
-        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(figure, unit)]
-    raise PrescriptionError(f"asphere with {type(figure).__name__}: no type of Zemax surface has this shape")
-
-
-def _number(value: float) -> str:
-    return repr(float(value) + 0.0)
+    part = rest[0]
+    if isinstance(part, ZernikeSag):
+        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(part, unit)]
+    if isinstance(part, GridSag):
+        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(part, unit)]
+    if isinstance(part, XYPolynomial) and not curved:
+        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(part, unit)]
+    raise PrescriptionError(f"asphere with {type(part).__name__}: no type of Zemax surface has this shape")
 
 
 def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[str]:
@@ -68,13 +65,13 @@ def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[st
     if isinstance(shape, OddAsphere):
         if len(shape.coefficients) > 8:
             raise PrescriptionError(f"{len(shape.coefficients)} coefficients: a Zemax surface has 8 from r^1 to r^8")
-        head = ["TYPE ODDASPHE", f"CURV {_number(unit / shape.radius)}", f"CONI {_number(shape.conic)}"]
+        head = ["TYPE ODDASPHE", f"CURV {number_text(unit / shape.radius)}", f"CONI {number_text(shape.conic)}"]
         terms = enumerate(shape.coefficients, start=1)
-        return [*head, *(f"PARM {i} {_number(a * unit ** (i - 1))}" for i, a in terms)]
+        return [*head, *(f"PARM {i} {number_text(a * unit ** (i - 1))}" for i, a in terms)]
     kind = "BICONICX" if isinstance(shape, Biconic) else "TOROIDAL"
-    lines = [f"TYPE {kind}", f"CURV {_number(unit / shape.radius_y)}", f"CONI {_number(shape.conic_y)}"]
-    lines.append(f"PARM 1 {_number(reach(shape.radius_x))}")
-    return [*lines, f"PARM 2 {_number(shape.conic_x)}"] if isinstance(shape, Biconic) else lines
+    lines = [f"TYPE {kind}", f"CURV {number_text(unit / shape.radius_y)}", f"CONI {number_text(shape.conic_y)}"]
+    lines.append(f"PARM 1 {number_text(reach(shape.radius_x))}")
+    return [*lines, f"PARM 2 {number_text(shape.conic_x)}"] if isinstance(shape, Biconic) else lines
 
 
 def _square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
@@ -88,22 +85,22 @@ def _square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
 
 def _extra(count: int, radius: float, terms: list[float], unit: float) -> list[str]:
     data = [float(count), radius / unit, *(a / unit for a in terms)]
-    return [f"XDAT {i} {_number(v)} 0 0 1 0 0" for i, v in enumerate(data, start=1)]
+    return [f"XDAT {i} {number_text(v)} 0 0 1 0 0" for i, v in enumerate(data, start=1)]
 
 
-def _zernike_lines(figure: ZernikeSag, unit: float) -> list[str]:
-    terms = list(figure.coefficients)
-    if figure.inner_radius:
+def _zernike_lines(part: ZernikeSag, unit: float) -> list[str]:
+    terms = list(part.coefficients)
+    if part.inner_radius:
         # Annular polynomials are sums of those of the full disc up to the same degree: three points for each unknown,
         # on rings that tell the degrees apart, make the solution exact but for rounding.
         size = _complete(len(terms))
         r, theta = np.meshgrid(np.sqrt(np.linspace(0.0, 1.0, 41)), np.linspace(0, 2 * np.pi, 83, endpoint=False))
         x, y = (r * np.cos(theta)).ravel(), (r * np.sin(theta)).ravel()
-        ratio = figure.inner_radius / figure.outer_radius
+        ratio = part.inner_radius / part.outer_radius
         annular = annular_zernikes(len(terms), x, y, ratio)
         disc = annular_zernikes(size, x, y)
         terms = np.linalg.lstsq(disc.T, np.array(terms) @ annular, rcond=None)[0].tolist()
-    return _extra(len(terms), figure.outer_radius, terms, unit)
+    return _extra(len(terms), part.outer_radius, terms, unit)
 
 
 def _complete(count: int) -> int:
@@ -114,8 +111,8 @@ def _complete(count: int) -> int:
     return (n + 1) * (n + 2) // 2
 
 
-def _polynomial_lines(figure: XYPolynomial, unit: float) -> list[str]:
-    found = {(i, j): a for i, j, a in figure.terms}
+def _polynomial_lines(part: XYPolynomial, unit: float) -> list[str]:
+    found = {(i, j): a for i, j, a in part.terms}
     if (0, 0) in found:
         raise PrescriptionError("polynomial of x and y with a constant term: a Zemax surface has none")
     degree = max(i + j for i, j in found)
@@ -124,11 +121,11 @@ def _polynomial_lines(figure: XYPolynomial, unit: float) -> list[str]:
     return _extra(len(powers), unit, [found.get(p, 0.0) * unit ** sum(p) for p in powers], unit)
 
 
-def _grid_lines(figure: GridSag, unit: float) -> list[str]:
-    for axis in (figure.x, figure.y):
+def _grid_lines(part: GridSag, unit: float) -> list[str]:
+    for axis in (part.x, part.y):
         if abs(axis[0] + axis[-1]) > 1e-9 * abs(axis[-1] - axis[0]):
             raise PrescriptionError("grid that is not centred on the vertex: expected one that is")
-    dx, dy = figure.step
-    lines = [f"GDAT {len(figure.x)} {len(figure.y)} {_number(dx / unit)} {_number(dy / unit)}"]
-    values = figure.values[::-1].ravel() / unit
-    return lines + [f"GARR {i} {_number(v)} 0 0 0 0" for i, v in enumerate(values, start=1)]
+    dx, dy = part.step
+    lines = [f"GDAT {len(part.x)} {len(part.y)} {number_text(dx / unit)} {number_text(dy / unit)}"]
+    values = part.values[::-1].ravel() / unit
+    return lines + [f"GARR {i} {number_text(v)} 0 0 0 0" for i, v in enumerate(values, start=1)]

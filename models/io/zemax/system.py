@@ -1,4 +1,4 @@
-"""What a Zemax file says of the lens as a whole: units, wavelengths, fields, aperture; and its paraxial pupils.
+"""System data of a Zemax file: units, wavelengths, fields, aperture; and the paraxial pupils.
 
 Like Zemax, the paraxial trace follows the surfaces along their thicknesses and ignores coordinate breaks.
 """
@@ -64,8 +64,8 @@ def read_wavelengths(header: Block) -> Wavelengths:
 
 
 @dataclass
-class FirstSurfaces:
-    """Surfaces as the paraxial trace sees them: curvatures [1/m], media, mirrors and the distance to the next [m]."""
+class ParaxialSurfaces:
+    """Surfaces of the paraxial trace: curvatures [1/m], media, mirrors and the distance to the next [m]."""
 
     rows: list[tuple[float, Medium, Medium, bool]] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
@@ -106,9 +106,9 @@ class FirstSurfaces:
 
 @dataclass(frozen=True)
 class Pupil:
-    """Where and how wide the entrance pupil is [m], the field, and the radius of the reference sphere [m].
+    """Height and diameter of the entrance pupil [m], field, and radius of the reference sphere [m].
 
-    `z` and `object_z`, where the object is, count along the light from the first surface.
+    `z` and `object_z`, the plane of the object, count along the light from the first surface.
     """
 
     z: float
@@ -119,7 +119,7 @@ class Pupil:
 
 
 def read_pupil(
-    file: ZemaxFile, surfaces: FirstSurfaces, unit: float, wavelength: float, before: Medium, findings: Findings
+    file: ZemaxFile, surfaces: ParaxialSurfaces, unit: float, wavelength: float, before: Medium, findings: Findings
 ) -> Pupil:
     """Return the paraxial entrance pupil and the field of a file.
 
@@ -127,7 +127,7 @@ def read_pupil(
     ----------
     file : ZemaxFile
         The file.
-    surfaces : FirstSurfaces
+    surfaces : ParaxialSurfaces
         Its surfaces.
     unit : float
         Lens unit [m].
@@ -136,7 +136,7 @@ def read_pupil(
     before : Medium
         Medium of the object space.
     findings : Findings
-        What to do about something that is not understood.
+        Treatment of lines that are not understood.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def read_pupil(
         If the pupil is at infinity or has no size or, unless lenient, the aperture is given twice.
     """
     header = file.header
-    # The first surface is where the walk begins: what lies between it and a break in front does not count.
+    # The trace starts at the first surface; a distance to a break in front of it does not count.
     heights, end_slope = surfaces.trace(1.0, 0.0, wavelength)
     across, _ = surfaces.trace(0.0, 1.0, wavelength)
     scale, offset = float(heights[surfaces.stop]), float(across[surfaces.stop])
@@ -168,7 +168,7 @@ def read_pupil(
 
 def _pupil_diameter(
     header: Block,
-    surfaces: FirstSurfaces,
+    surfaces: ParaxialSurfaces,
     unit: float,
     scale: float,
     focal_length: float,

@@ -36,6 +36,11 @@ def read_text(path: Path) -> str:
     return text
 
 
+def number_text(value: float) -> str:
+    """Return the shortest text that loads back equal; zero without a minus sign."""
+    return repr(float(value) + 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Record:
     """One line of a file: a keyword and what follows it.

@@ -1,8 +1,8 @@
 """Write a telescope as a sequential Zemax lens file (.zmx), with a glass catalogue (.agf) beside it where it needs one.
 
-The axes are turned as the reader turns them (see `zemax_frame`). A plane of its own in front carries the stop, so
-that the entrance pupil is where the telescope has it; the reader knows this plane by its comment. Surfaces off the
-axis or tilted stand between two coordinate breaks, of which the second undoes the first.
+The axes are rotated as by the reader (see `frame`). A plane of its own in front carries the stop, so that the entrance
+pupil is that of the telescope; the reader recognises this plane by its comment. Surfaces off the axis or tilted stand
+between two coordinate breaks, of which the second undoes the first.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle, Union, Vane
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from .apertures import aperture_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .reader import PUPIL_COMMENT
 from .shape_writer import shape_lines
+from .text import number_text
 
 MM = 1e-3
 #: AGF coefficients of a glass of constant index: Schott's formula with its first term alone.
@@ -38,7 +39,7 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     Raises
     ------
     PrescriptionError
-        If the telescope has something that a Zemax file cannot hold here: the line names surface and part.
+        If a part of the telescope has no counterpart in a Zemax file: the line names surface and part.
     """
     t = telescope
     if t.surfaces[-1].interaction != Interaction.DETECTOR:
@@ -54,17 +55,17 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
         "MODE SEQ",
         f"NAME {' '.join((t.description or t.name).split())}",
         "UNIT MM X W X CM MR CPMM",
-        f"ENPD {_number(t.pupil_diameter / MM)}",
+        f"ENPD {number_text(t.pupil_diameter / MM)}",
         "ENVD 20 1 0",
         f"FTYP 0 0 3 {len(waves)} 0 0 0",
         "XFLN 0 0 0",
-        f"YFLN 0 {_number(angles / math.sqrt(2))} {_number(angles)}",
+        f"YFLN 0 {number_text(angles / math.sqrt(2))} {number_text(angles)}",
         *(f"WAVM {i} {_micrometres(w)} 1" for i, w in enumerate(waves, start=1)),
         "PWAV 1",
     ]
     blocks = [["TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]]
     distance = (t.object_distance - t.stop_z) / MM
-    blocks[0].append(f"DISZ {_number(distance)}" if math.isfinite(distance) else "DISZ INFINITY")
+    blocks[0].append(f"DISZ {number_text(distance)}" if math.isfinite(distance) else "DISZ INFINITY")
     # The plane of the stop, in front of all; z counts along the light, from the origin.
     blocks.append(
         [f"COMM {PUPIL_COMMENT}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
@@ -73,19 +74,19 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     before = t.medium_before
     for surface in t.surfaces:
         x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex))
-        blocks[-1].append(f"DISZ {_number((z - place) / MM)}")
+        blocks[-1].append(f"DISZ {number_text((z - place) / MM)}")
         place = z
         axes = HALF_TURN @ surface.matrix @ HALF_TURN
         own = _surface_lines(surface, before, glasses)
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
         else:
-            figures = [x / MM, y / MM, *np.degrees(_tilts(axes))]
+            values = [x / MM, y / MM, *np.degrees(_tilts(axes))]
             medium = _glass_line(before, glasses)
-            blocks.append([*_break_lines(figures, 0), *medium, "DISZ 0"])
+            blocks.append([*_break_lines(values, 0), *medium, "DISZ 0"])
             blocks.append([*own, "DISZ 0"])
             if surface is not t.surfaces[-1]:
-                blocks.append([*_break_lines([-v for v in figures], 1), *_glass_line(surface.medium_after, glasses)])
+                blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.medium_after, glasses)])
         before = surface.medium_after
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
@@ -94,12 +95,8 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
 
 
-def _number(value: float) -> str:
-    return repr(float(value) + 0.0)
-
-
 def _micrometres(wavelength: float) -> str:
-    # The decimal point is moved in the figure as written, so that it comes back as it was.
+    # The decimal point of the number as written is moved, so that it loads back equal.
     return repr(float(Decimal(repr(float(wavelength))).scaleb(6)))
 
 
@@ -112,11 +109,11 @@ def _tilts(axes: np.ndarray) -> tuple[float, float, float]:
     return math.atan2(-axes[1, 2], axes[2, 2]), about_y, math.atan2(-axes[0, 1], axes[0, 0])
 
 
-def _break_lines(figures: list[float], order: int) -> list[str]:
+def _break_lines(values: list[float], order: int) -> list[str]:
     return [
         "TYPE COORDBRK",
         "CURV 0.0",
-        *(f"PARM {i} {_number(v)}" for i, v in enumerate(figures, start=1)),
+        *(f"PARM {i} {number_text(v)}" for i, v in enumerate(values, start=1)),
         f"PARM 6 {order}",
     ]
 
@@ -132,7 +129,7 @@ def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str])
         elif surface.interaction != Interaction.DETECTOR:
             lines += _glass_line(surface.medium_after, glasses)
         if surface.aperture is not None:
-            lines += _aperture_lines(rotated_aperture(surface.aperture))
+            lines += aperture_lines(rotated_aperture(surface.aperture), MM)
     except PrescriptionError as error:
         raise PrescriptionError(f"surface {surface.name}: {error}") from None
     return lines
@@ -140,36 +137,6 @@ def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str])
 
 def _glass_line(medium: Medium, glasses: dict[Medium, str]) -> list[str]:
     return [] if medium == VACUUM else [f"GLAS {glasses[medium]} 0 0 1.5 40 0 0 0 0 0 0"]
-
-
-def _aperture_lines(aperture: Aperture) -> list[str]:
-    clear = not isinstance(aperture, Complement)
-    region = aperture.part if isinstance(aperture, Complement) else aperture
-    if isinstance(region, Circle | Annulus):
-        inner, outer = (0.0, region.radius) if isinstance(region, Circle) else (region.inner, region.outer)
-        lines = [f"{'CLAP' if clear else 'OBSC'} {_number(inner / MM)} {_number(outer / MM)} 0"]
-    elif isinstance(region, Rectangle) and region.angle == 0:
-        half = f"{_number(region.width / 2 / MM)} {_number(region.height / 2 / MM)}"
-        lines = [f"{'SQAP' if clear else 'SQOB'} {half} 0"]
-    elif isinstance(region, Union) and not clear and _is_spider(region):
-        first = region.parts[0]
-        assert isinstance(first, Vane)
-        lines = [f"SPID {_number(first.width / MM)} {len(region.parts)} 0"]
-        region = Circle(1.0, first.x, first.y)
-    else:
-        raise PrescriptionError(f"aperture {type(region).__name__}: expected a disc, ring, rectangle or even spider")
-    if region.x or region.y:
-        lines.append(f"OBDC {_number(region.x / MM)} {_number(region.y / MM)}")
-    return lines
-
-
-def _is_spider(union: Union) -> bool:
-    """Return whether a union is one of equal vanes from one point, at equal angles, one of them along x."""
-    vanes = [part for part in union.parts if isinstance(part, Vane) and not part.both_ways]
-    if len(vanes) != len(union.parts) or len({(v.width, v.x, v.y) for v in vanes}) != 1:
-        return False
-    turns = np.sort(np.mod(np.array([v.angle for v in vanes]) + 1e-9, 2 * math.pi))
-    return bool(np.allclose(turns, 2 * math.pi * np.arange(len(vanes)) / len(vanes), atol=1e-8))
 
 
 def _glass_names(t: Telescope) -> dict[Medium, str]:
@@ -199,7 +166,7 @@ def _catalogue_lines(glasses: dict[Medium, str]) -> Iterator[str]:
         formula, coefficients, limits = _formula(medium, name)
         nd = float(medium.index(5.875618e-7)) if limits[0] <= 5.875618e-7 <= limits[1] else 0.0
         yield f"NM {name} {formula} 0 {nd:.6f} 0 0 0\n"
-        yield f"CD {' '.join(_number(c) for c in coefficients)}\n"
+        yield f"CD {' '.join(number_text(c) for c in coefficients)}\n"
         yield f"LD {_micrometres(limits[0])} {_micrometres(limits[1])}\n"
 
 
