@@ -1,20 +1,13 @@
-"""Bundles: the rays of many field points through the same points of the pupil, traced in one batch to the detector."""
+"""Bundles: the rays of many field points through the same pupil points, at the detector."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..models.telescope import Telescope
-from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import RayStatus, field_direction, launch_bundles
-from ..raytrace.trace import trace
+from ..raytrace.rays import RayStatus
 from .reference_sphere import path_to_sphere
-
-#: Rays in one block of :func:`bundle_blocks`: 15 doubles each, so some 60 MB.
-RAYS_AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -32,8 +25,8 @@ class Bundles:
     status : ndarray of int32, shape [n_field, n_pupil]
         A :class:`~pachon.raytrace.rays.RayStatus` each.
     chief_position, chief_direction : ndarray, shape [n_field, 3]
-        The ray through the centre of the entrance pupil; vignetting does not stop it. Where it does not reach the
-        detector, its position is NaN.
+        The ray through the centre of the entrance pupil, vignetting ignored. Where it does not reach the detector,
+        its position is NaN.
     chief_path : ndarray, shape [n_field]
         Its optical path [m].
     index : float
@@ -99,67 +92,3 @@ class Bundles:
 
 def _at_height(position: np.ndarray, direction: np.ndarray, height: float) -> np.ndarray:
     return position[..., :2] + height * direction[..., :2] / direction[..., 2:]
-
-
-def trace_bundles(
-    telescope: Telescope,
-    fields: np.ndarray,
-    wavelength: float,
-    pupil: np.ndarray,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> Bundles:
-    """Trace the rays of many field points through the same pupil points to the detector.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    fields : ndarray, shape [n_field, 2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
-    pupil : ndarray, shape [n_pupil, 2]
-        Entrance-pupil coordinates [m].
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
-    """
-    directions = field_direction(fields[:, 0], fields[:, 1], projection)
-    # The chief ray goes along as one more point of the pupil.
-    rays = launch_bundles(telescope, directions, wavelength, np.concatenate([pupil, np.zeros((1, 2))]))
-    end = trace(telescope, rays, threads=threads)
-    detector = telescope.surfaces[-1]
-    position = detector.to_local(end.position).reshape(len(fields), -1, 3)
-    direction = (end.direction @ detector.matrix).reshape(len(fields), -1, 3)
-    path, status = end.path_length.reshape(len(fields), -1), end.status.reshape(len(fields), -1)
-    return Bundles(
-        position=position[:, :-1],
-        direction=direction[:, :-1],
-        path=path[:, :-1],
-        status=status[:, :-1],
-        chief_position=np.where(status[:, -1:] <= RayStatus.VIGNETTED, position[:, -1], np.nan),
-        chief_direction=direction[:, -1],
-        chief_path=path[:, -1],
-        index=float(refractive_indices(telescope, wavelength)[-2]),
-        wavelength=wavelength,
-    )
-
-
-def bundle_blocks(
-    telescope: Telescope,
-    fields: np.ndarray,
-    wavelength: float,
-    pupil: np.ndarray,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> Iterator[tuple[slice, Bundles]]:
-    """Yield the bundles of some fields at a time, so that memory does not grow with the number of fields.
-
-    Parameters are those of :func:`trace_bundles`; each block comes with the slice of the fields it belongs to.
-    """
-    step = max(1, RAYS_AT_ONCE // (len(pupil) + 1))
-    for first in range(0, len(fields), step):
-        part = slice(first, min(first + step, len(fields)))
-        yield part, trace_bundles(telescope, fields[part], wavelength, pupil, projection, threads)

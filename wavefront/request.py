@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +12,14 @@ from numpy.typing import ArrayLike
 from ..core.errors import DomainError
 from ..core.units import metres, radians
 from ..models.telescope import Telescope
-from ..raytrace.rays import Rays, field_direction, launch_bundles
-from .bundles import Bundles, bundle_blocks, trace_bundles
+from ..raytrace.pack.surfaces import refractive_indices
+from ..raytrace.rays import Rays, RayStatus, field_direction, launch_bundles
+from ..raytrace.trace import trace
+from .bundles import Bundles
 from .pupil_sampling import PupilSampling, pupil_sampling
 
+#: Rays in one part of a request: 15 doubles each, so some 60 MB.
+RAYS_AT_ONCE = 1 << 19
 #: Radii of the default field points over the radius of the field; for the LSST 0, 0.5, 1, 1.5 and 1.75 degrees.
 _RADII = np.array([0.0, 2.0, 4.0, 6.0, 7.0]) / 7.0
 
@@ -143,12 +147,31 @@ class Request:
     def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
         """Trace the rays of one wavelength [m] to the detector; through other pupil points [m] if these are given."""
         points = self.pupil.points if pupil is None else pupil
-        return trace_bundles(self.telescope, self.fields, wavelength, points, self.projection, self.threads)
+        # The chief ray is traced as one more point of the pupil.
+        rays = self.launch(wavelength, np.concatenate([points, np.zeros((1, 2))]))
+        end = trace(self.telescope, rays, threads=self.threads)
+        n, detector = len(self.fields), self.telescope.surfaces[-1]
+        position = detector.to_local(end.position).reshape(n, -1, 3)
+        direction = (end.direction @ detector.matrix).reshape(n, -1, 3)
+        path, status = end.path_length.reshape(n, -1), end.status.reshape(n, -1)
+        return Bundles(
+            position=position[:, :-1],
+            direction=direction[:, :-1],
+            path=path[:, :-1],
+            status=status[:, :-1],
+            chief_position=np.where(status[:, -1:] <= RayStatus.VIGNETTED, position[:, -1], np.nan),
+            chief_direction=direction[:, -1],
+            chief_path=path[:, -1],
+            index=float(refractive_indices(self.telescope, wavelength)[-2]),
+            wavelength=wavelength,
+        )
 
-    def blocks(self, wavelength: float) -> Iterator[tuple[slice, Bundles]]:
-        """Trace the rays of one wavelength [m], a block of field points at a time: see :func:`bundle_blocks`."""
-        points = self.pupil.points
-        return bundle_blocks(self.telescope, self.fields, wavelength, points, self.projection, self.threads)
+    def parts(self) -> Iterator[tuple[slice, Request]]:
+        """Yield slices of the field points and their requests, which bound the memory for many field points."""
+        step = max(1, RAYS_AT_ONCE // (len(self.pupil) + 1))
+        for first in range(0, len(self.fields), step):
+            part = slice(first, min(first + step, len(self.fields)))
+            yield part, replace(self, fields=self.fields[part])
 
 
 def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.ndarray:

@@ -26,8 +26,9 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...wavefront.bundles import Bundles, trace_bundles
-from ...wavefront.pupil_sampling import PupilSampling, ring_annulus
+from ...wavefront.bundles import Bundles
+from ...wavefront.pupil_sampling import CHIEF_RAY, PupilSampling, ring_annulus
+from ...wavefront.request import Request
 from ..metrics.principal_rays import PrincipalRays
 from ..metrics.spots import SpotDiagram
 
@@ -135,7 +136,8 @@ def traced_wavelets(
     step = _STEP * 0.5 * telescope.pupil_diameter
     points = sampling.points
     beside = (points, points + np.array([step, 0.0]), points + np.array([0.0, step]))
-    bundle = trace_bundles(telescope, field[None], wavelength, np.concatenate(beside), projection, threads)
+    request = Request.of(telescope, field, wavelength, sampling=sampling, projection=projection, threads=threads)
+    bundle = request.bundles(wavelength, np.concatenate(beside))
     opd, cosine = _at_reference(telescope, bundle, center)
     here, along_x, along_y = cosine.reshape(3, -1, 2)
     jacobian = np.abs(_cross(along_x - here, along_y - here)) / step**2
@@ -192,9 +194,10 @@ def lattice_wavelets(
     """
     radius = 0.5 * telescope.pupil_diameter
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
 
     def rays(points: np.ndarray) -> tuple[Bundles, np.ndarray, np.ndarray]:
-        bundle = trace_bundles(telescope, field[None], wavelength, points, projection, threads)
+        bundle = request.bundles(wavelength, points)
         opd, cosine = _at_reference(telescope, bundle, center)
         return bundle, opd, cosine @ rotation
 

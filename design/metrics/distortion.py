@@ -12,7 +12,6 @@ from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...wavefront.bundles import RAYS_AT_ONCE, trace_bundles
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..result import FieldResult
@@ -156,8 +155,8 @@ def distortion(
         raise DomainError(f"{field_label(lost)}: no light reaches the detector")
     scale, rotation, offset = _similarity(slopes, position)
     near = _NEAR_AXIS * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    chief = trace_bundles(telescope, near, request.wavelength, np.zeros((1, 2)), "gnomonic", threads)
-    ends = chief.chief_landing()
+    beside = replace(request, fields=near, projection="gnomonic")
+    ends = beside.bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
     jacobian = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * _NEAR_AXIS)
     return Distortion(
         request=request,
@@ -190,9 +189,7 @@ def field_lattice(telescope: Telescope, across: int) -> np.ndarray:
 def _landing(request: Request, reference: str) -> np.ndarray:
     if reference == "chief":
         return request.bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
-    step = max(1, RAYS_AT_ONCE // len(request.pupil))
-    parts = (request.fields[first : first + step] for first in range(0, len(request.fields), step))
-    return np.concatenate([spot_diagram(replace(request, fields=part)).reference_point for part in parts])
+    return np.concatenate([spot_diagram(some).reference_point for _, some in request.parts()])
 
 
 def _similarity(slopes: np.ndarray, position: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

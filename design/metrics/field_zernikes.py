@@ -18,7 +18,6 @@ from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
 from ...core.units import field_label, radians
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
-from ...wavefront.bundles import RAYS_AT_ONCE
 from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus
 from ...wavefront.request import Request
@@ -223,13 +222,11 @@ def wavefront_zernikes(
     x, y = request.unit_pupil.T
     terms = annular_zernikes(int(jmax), x, y, telescope.pupil_obscuration).T
     coefficients, residual = np.empty((len(points), int(jmax))), np.empty(len(points))
-    step = max(1, RAYS_AT_ONCE // len(sample))
-    for first in range(0, len(points), step):
-        part = slice(first, first + step)
-        optics = trace_pupils(telescope, points[part], w, sample.points, projection=projection, threads=threads)
+    for part, some in request.parts():
+        optics = trace_pupils(telescope, some.fields, w, sample.points, projection=projection, threads=threads)
         value = -optics.path[:, 0]
         used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
-        coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, points[part], pupil)
+        coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, some.fields, pupil)
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil)
 
 

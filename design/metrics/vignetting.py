@@ -124,10 +124,11 @@ def vignetting(
     )
     everywhere = replace(request, fields=np.concatenate([np.zeros((1, 2)), request.fields]))
     quarters = np.empty((len(everywhere.fields), 4))
-    for some, bundles in everywhere.blocks(request.wavelength):
-        quarters[some] = bundles.lit.reshape(len(bundles.lit), -1, 4).mean(axis=1)
+    for part, some in everywhere.parts():
+        lit = some.bundles(request.wavelength).lit
+        quarters[part] = lit.reshape(len(lit), -1, 4).mean(axis=1)
         if progress is not None:
-            progress(some.stop - some.start)
+            progress(len(lit))
     fraction = quarters.mean(axis=1)
     if not fraction[0] > 0:
         raise DomainError(f"telescope {telescope.name}: expected one with light on the axis; all of it is vignetted")

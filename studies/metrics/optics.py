@@ -8,8 +8,8 @@ from ...design.images.encircled_energy import encircled_energy
 from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...design.metrics.spots import spots
 from ...design.metrics.vignetting import vignetting
-from ...wavefront.bundles import trace_bundles
 from ...wavefront.opd import wavefront_opd
+from ...wavefront.request import Request
 from .metric import Metric, MetricTable
 from .scene import Scene, one_digit
 
@@ -41,7 +41,8 @@ def opd(scene: Scene) -> dict[str, float]:
 @OPTICS.group("landing", Metric("landing", "mm", "path"))
 def landing(scene: Scene) -> dict[str, float]:
     """Return where rays of the middle wavelength land; pupil point (0, 0) is the chief ray."""
-    bundles = trace_bundles(scene.telescope, scene.fields, scene.middle, scene.pupil, threads=scene.threads)
+    request = Request.of(scene.telescope, scene.fields, scene.middle, threads=scene.threads)
+    bundles = request.bundles(scene.middle, scene.pupil)
     points = np.concatenate([bundles.chief_landing()[:, None], bundles.landing()], axis=1) * 1e3
     return {
         f"landing {axis} field {_pair(place)} pupil {_pair(point)}": float(value)

@@ -16,7 +16,7 @@ from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from ...pipeline.measure.summary import SHORTEST_ARCMIN
 from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_places, holdout_positions
-from ...wavefront.bundles import trace_bundles
+from ...wavefront.request import Request
 from .plan import Plan, make_plan
 
 # Change of a path by rounding, over the length of the path.
@@ -73,9 +73,8 @@ class Scene:
     @cached_property
     def length_tolerance(self) -> float:
         """Change of a path or a landing point by rounding [m]."""
-        path = trace_bundles(
-            self.telescope, np.zeros((1, 2)), self.telescope.default_wavelength, self.pupil, threads=self.threads
-        ).chief_path
+        axis = Request.of(self.telescope, np.zeros((1, 2)), threads=self.threads)
+        path = axis.bundles(axis.wavelength, self.pupil).chief_path
         if not np.isfinite(path).all():
             raise DomainError("no ray reaches the detector on the axis")
         return one_digit(_ROUNDING * float(path[0]))

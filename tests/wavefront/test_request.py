@@ -49,8 +49,8 @@ def test_rays_and_bundles_are_those_of_its_points(lsst_r):
     np.testing.assert_allclose(
         bundles.landing(), lsst_r.surfaces[-1].to_local(end.position)[:, :2].reshape(2, -1, 2), atol=1e-15
     )
-    for part, block in request.blocks(request.wavelength):
-        np.testing.assert_array_equal(block.path, bundles.path[part])
+    for part, some in request.parts():
+        np.testing.assert_array_equal(some.bundles(request.wavelength).path, bundles.path[part])
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,8 @@ from pachon.design.metrics.field_zernikes import wavefront_zernikes
 from pachon.design.metrics.spots import spots
 from pachon.models.aperture import Circle
 from pachon.models.shapes.shape import Conic
-from pachon.wavefront.bundles import RAYS_AT_ONCE, bundle_blocks, trace_bundles
 from pachon.wavefront.pupil_sampling import PupilSampling
-from pachon.wavefront.request import field_points
+from pachon.wavefront.request import RAYS_AT_ONCE, Request, field_points
 
 
 def test_a_paraboloid_is_perfect_on_its_axis(paraboloid):
@@ -142,10 +141,11 @@ def test_quantities_threads_and_blocks_change_nothing(lsst_r):
     assert np.array_equal(again.displacement, plain.displacement, equal_nan=True)
     pupil = np.zeros((RAYS_AT_ONCE // 2 - 1, 2))
     fields = np.deg2rad([[0.0, 0.1 * i] for i in range(5)])
-    blocks = list(bundle_blocks(lsst_r, fields, 600e-9, pupil))
-    assert [part for part, _ in blocks] == [slice(0, 2), slice(2, 4), slice(4, 5)]
-    whole = trace_bundles(lsst_r, fields, 600e-9, pupil[:3])
-    pieces = np.concatenate([b.position[:, :3] for _, b in blocks])
+    request = Request.of(lsst_r, fields, 600e-9, sampling=PupilSampling(pupil, np.ones(len(pupil))))
+    parts = list(request.parts())
+    assert [part for part, _ in parts] == [slice(0, 2), slice(2, 4), slice(4, 5)]
+    whole = request.bundles(600e-9, pupil[:3])
+    pieces = np.concatenate([some.bundles(600e-9).position[:, :3] for _, some in parts])
     assert np.array_equal(pieces, whole.position)
 
 
