@@ -76,14 +76,24 @@ def test_stores_that_are_none_are_refused(tmp_path):
         SweepStore(tmp_path / "empty.db")
 
 
-def test_a_full_disk_is_one_line_and_loses_nothing(store):
+def test_a_full_disk_is_one_line_and_loses_nothing(store, monkeypatch):
     store.write(result(0))
-    pages = store._connection.execute("PRAGMA page_count").fetchone()[0]
-    # SQLite says "database or disk is full" when it may take no more pages, as it does when the disk has none.
-    store._connection.execute(f"PRAGMA max_page_count = {pages}")
-    with pytest.raises(ProductError, match=r"full; what was computed before is kept, go on with --resume"):
-        store.write(result(1, **{f"x{i}": 0.1 for i in range(40_000)}))
-    assert store.results()[0] == result(0)
+    connect = sqlite3.connect
+
+    def connect_to_full_disk(*arguments, **keywords):
+        # SQLite says "database or disk is full" when it may take no more pages, as it does when the disk has none.
+        connection = connect(*arguments, **keywords)
+        pages = connection.execute("PRAGMA page_count").fetchone()[0]
+        connection.execute(f"PRAGMA max_page_count = {pages}")
+        return connection
+
+    monkeypatch.setattr(sqlite3, "connect", connect_to_full_disk)
+    with (
+        SweepStore(store.path) as full,
+        pytest.raises(ProductError, match=r"full; what was computed before is kept, go on with --resume"),
+    ):
+        full.write(result(1, **{f"x{i}": 0.1 for i in range(40_000)}))
+    assert store.results() == [result(0)]
 
 
 @pytest.mark.parametrize("ending", ["ecsv", "csv", "fits", "parquet"])
