@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
-from .inputs import interruptible
+from .interrupt import interruptible
 from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
 
 app = typer.Typer()

@@ -20,7 +20,7 @@ from typer import Option
 from ..core.errors import PachonError
 from ..core.version import VERSION
 from . import baseline, design, diagnostics, reproduce, run, study, sweep, telescope
-from .inputs import InterruptedRunError
+from .interrupt import InterruptedRunError
 
 # The error of bad arguments is a class of typer or of click, depending on the version of typer.
 _UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from .inputs import configured_experiment, interruptible
+from .inputs import configured_experiment
+from .interrupt import interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, name_list, one_name_list
 from .tables import Rows, wide_console
 

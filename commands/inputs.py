@@ -1,10 +1,9 @@
-"""The way in: telescopes and configurations from files and options, and the interrupt of long commands."""
+"""Telescopes and experiments from files and options."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,26 +12,8 @@ import typer
 from ..core.errors import PachonError
 
 if TYPE_CHECKING:
-    from ..core.progress import Reporter
     from ..models.telescope import Telescope
     from ..pipeline.experiment import Experiment
-
-
-class InterruptedRunError(Exception):
-    """A command ended by Ctrl-C; the text names the place of the finished parts."""
-
-
-@contextmanager
-def interruptible(quiet: bool, finished: str = "") -> Iterator[Reporter]:
-    """Yield the reporter of a long command, which Ctrl-C ends with one line that names the finished parts."""
-    from ..core.interrupt import remembered_interrupts
-    from ..core.progress import Reporter
-
-    try:
-        with remembered_interrupts() as check:
-            yield Reporter(quiet, check)
-    except KeyboardInterrupt:
-        raise InterruptedRunError(f"interrupted; {finished}" if finished else "interrupted") from None
 
 
 def configured_experiment(config: Path | None, **options: object) -> Experiment:

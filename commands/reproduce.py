@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from typer import Argument, Option
 
-from .inputs import interruptible
+from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import wide_console
 

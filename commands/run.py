@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
-from .inputs import configured_experiment, interruptible
+from .inputs import configured_experiment
+from .interrupt import interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
 from .tables import Rows, plain_table, wide_console
 

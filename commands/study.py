@@ -9,7 +9,8 @@ import typer
 from typer import Option
 
 from ..core.errors import ConfigError
-from .inputs import configured_experiment, interruptible
+from .inputs import configured_experiment
+from .interrupt import interruptible
 from .options import Config, Json, Quiet, Threads, TruthStars, name_list, one_name_list
 from .tables import Rows, wide_console
 

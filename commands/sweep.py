@@ -12,7 +12,7 @@ from typer import Argument, Option
 
 from ..core.errors import ConfigError
 from .default_group import DefaultGroup
-from .inputs import interruptible
+from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows
 

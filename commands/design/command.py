@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import typer
 
 from .. import options
-from ..inputs import interruptible, load_model
+from ..inputs import load_model
+from ..interrupt import interruptible
 from ..tables import Column, Rows
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The command line: what it prints where, exit statuses, and one clear line for every kind of bad input."""
+"""The command line: output streams, exit statuses, and one clear line for every kind of bad input."""
 
 import json
 import os
@@ -114,7 +114,7 @@ def test_a_bad_atmosphere_is_one_line_and_status_2(capsys, in_folder, config, la
 
 
 @pytest.mark.parametrize("command", ["run", "attribute"])
-def test_what_a_file_asks_for_in_vain_names_the_file(capsys, in_folder, command):
+def test_errors_of_values_in_a_file_name_the_file(capsys, in_folder, command):
     (in_folder / "mine.yaml").write_text("ccds: R22_S1l\n")
     line = refused(capsys, command, "mine.yaml", "--out", "out")
     assert line.startswith("pachon: error: mine.yaml: ")
@@ -143,14 +143,14 @@ def test_info_lists_models_and_shows_one(capsys):
     assert main(["info", "--json"]) == 0
     assert [m["name"] for m in json.loads(capsys.readouterr().out)["models"]] == list(bundled_names())
     assert main(["info", "lsst_v3.3_r", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    # Published figures of the LSST: f/1.23, 10.3 m, 3.5 degrees of field.
-    assert figures["f_number"] == pytest.approx(1.23, abs=0.01)
-    assert figures["focal_length_m"] == pytest.approx(10.3, abs=0.05)
+    metrics = json.loads(capsys.readouterr().out)
+    # Published properties of the LSST: f/1.23, 10.3 m, 3.5 degrees of field.
+    assert metrics["f_number"] == pytest.approx(1.23, abs=0.01)
+    assert metrics["focal_length_m"] == pytest.approx(10.3, abs=0.05)
     # 206265 arcsec/rad over the focal length in um.
-    assert figures["plate_scale_arcsec_per_um"] == pytest.approx(0.206265 / figures["focal_length_m"], rel=1e-5)
-    assert figures["field_radius_deg"] == 1.75
-    assert [s["name"] for s in figures["surfaces"]][:3] == ["M1", "M2", "M3"]
+    assert metrics["plate_scale_arcsec_per_um"] == pytest.approx(0.206265 / metrics["focal_length_m"], rel=1e-5)
+    assert metrics["field_radius_deg"] == 1.75
+    assert [s["name"] for s in metrics["surfaces"]][:3] == ["M1", "M2", "M3"]
     assert main(["info", "lsst_v3.3_r"]) == 0
     table = capsys.readouterr().out
     assert "19.835" in table
@@ -166,16 +166,16 @@ def test_opd_writes_a_picture_and_prints_its_zernikes(capsys, in_folder):
     first = picture.read_bytes()
     assert first.startswith(b"\x89PNG")
     assert main([*arguments, "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert len(figures["zernike_nm"]) == 28
+    metrics = json.loads(capsys.readouterr().out)
+    assert len(metrics["zernike_nm"]) == 28
     # On the y axis of the field the wavefront is symmetric in x: no tilt or coma along x.
-    assert abs(figures["zernike_nm"][1]) < 1e-3
-    assert abs(figures["zernike_nm"][7]) < 1e-3
-    assert abs(figures["zernike_nm"][2]) > 100.0
+    assert abs(metrics["zernike_nm"][1]) < 1e-3
+    assert abs(metrics["zernike_nm"][7]) < 1e-3
+    assert abs(metrics["zernike_nm"][2]) > 100.0
     assert picture.read_bytes() == first
 
 
-def test_run_prints_its_metrics_and_where_the_report_is(capsys, monkeypatch, finished_run, tmp_path):
+def test_run_prints_its_metrics_and_the_path_of_the_report(capsys, monkeypatch, finished_run, tmp_path):
     monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
     folder = tmp_path / "copied"
     shutil.copytree(finished_run, folder)

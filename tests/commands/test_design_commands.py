@@ -39,7 +39,7 @@ def model_of(command):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_json_is_all_there_is_and_the_picture_has_its_name(capsys, in_folder, command):
+def test_json_is_the_only_output_and_the_picture_has_its_name(capsys, in_folder, command):
     model, wavelength = model_of(command)
     assert main([command, model, *COMMANDS[command][0], "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
@@ -50,7 +50,7 @@ def test_json_is_all_there_is_and_the_picture_has_its_name(capsys, in_folder, co
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_table_and_where_the_picture_is(capsys, in_folder, command):
+def test_the_table_and_the_path_of_the_picture(capsys, in_folder, command):
     options, words = COMMANDS[command]
     assert main([command, model_of(command)[0], *options, "-o", "picture.svg"]) == 0
     out = capsys.readouterr().out
@@ -63,7 +63,7 @@ def test_a_table_and_where_the_picture_is(capsys, in_folder, command):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_teaches_by_example(capsys, command):
+def test_help_has_examples(capsys, command):
     assert main([command, "--help"]) == 0
     out = capsys.readouterr().out
     assert f"pachon {command} " in out.partition("Examples")[2]
@@ -74,9 +74,9 @@ def test_help_teaches_by_example(capsys, command):
 def test_spots_across_the_band_and_over_fields(capsys, in_folder):
     fields = ["--field-deg", "0", "--field-deg", "0.3,0.4"]
     assert main(["spots", "lsst_v3.3_r", *fields, "--across-band", "3", "--json", "-o", "s.pdf"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["field_deg"] == [[0.0, 0.0], [0.3, 0.4]]
-    assert figures["wavelength_nm"] == pytest.approx([545, 624, 703])
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["field_deg"] == [[0.0, 0.0], [0.3, 0.4]]
+    assert metrics["wavelength_nm"] == pytest.approx([545, 624, 703])
     assert (in_folder / "s.pdf").read_bytes().startswith(MAGIC["pdf"])
 
 
@@ -109,8 +109,8 @@ def test_maps_and_double_zernikes(capsys, in_folder):
     assert main(["zernikes", "paul_baker", "--jmax", "6", "--map", "-o", "map.png"]) == 0
     assert "4 defocus" in capsys.readouterr().out
     assert main(["zernikes", "paul_baker", "--jmax", "6", "--double", "6", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert np.shape(figures["double_zernike_nm"]) == (6, 6)
+    metrics = json.loads(capsys.readouterr().out)
+    assert np.shape(metrics["double_zernike_nm"]) == (6, 6)
     assert (in_folder / "double_zernikes_paul_baker.png").exists()
 
 
@@ -133,17 +133,17 @@ def test_the_model_in_three_dimensions(capsys, in_folder):
 
 
 def test_coatings(capsys, in_folder):
-    figures = []
+    metrics = []
     for options in (["0.01"], ["Filter_exit=0.01", "--reflectivity", "Filter_entrance=0.01"]):
         arguments = ["ghosts", "lsst_v3.3_r", "--rays", "1000", "--json", "--reflectivity", *options]
         assert main([*arguments, "--detector-reflectivity", "0"]) == 0
-        figures.append(json.loads(capsys.readouterr().out))
-    for found in figures:
+        metrics.append(json.loads(capsys.readouterr().out))
+    for found in metrics:
         first = [
             a == "Filter_exit" and b == "Filter_entrance" for a, b in zip(found["first"], found["second"], strict=True)
         ]
         assert np.array(found["flux"])[first] == pytest.approx(1e-4, rel=0.02)
-    assert figures[0]["total_flux"] < figures[1]["total_flux"]
+    assert metrics[0]["total_flux"] < metrics[1]["total_flux"]
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ def store(tmp_path):
     with SweepStore(path) as opened:
         for i in range(299):
             failed = i == 3
-            figures = None if failed else {"rms_e": 0.01 * i}
-            opened.write(PointResult(i, figures, "no light" if failed else None, 0.5, "here"))
+            metrics = None if failed else {"rms_e": 0.01 * i}
+            opened.write(PointResult(i, metrics, "no light" if failed else None, 0.5, "here"))
     return path
 
 
