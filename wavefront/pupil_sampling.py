@@ -84,10 +84,8 @@ def ring_annulus(radius: float, obscuration: float, rings: int) -> PupilSampling
 
     Parameters
     ----------
-    radius : float
-        Outer radius [m].
-    obscuration : float
-        Inner over outer radius.
+    radius, obscuration
+        As in :func:`gauss_annulus`.
     rings : int
         Number of rings.
     """
@@ -112,10 +110,8 @@ def spiral_annulus(radius: float, obscuration: float, count: int) -> PupilSampli
 
     Parameters
     ----------
-    radius : float
-        Outer radius [m].
-    obscuration : float
-        Inner over outer radius.
+    radius, obscuration
+        As in :func:`gauss_annulus`.
     count : int
         Number of points.
     """
@@ -131,10 +127,8 @@ def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampl
 
     Parameters
     ----------
-    radius : float
-        Outer radius [m].
-    obscuration : float
-        Inner over outer radius.
+    radius, obscuration
+        As in :func:`gauss_annulus`.
     across : int
         Cells across the diameter.
     """

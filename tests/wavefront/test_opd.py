@@ -108,7 +108,7 @@ def test_mirror_symmetry(lsst_r):
     assert np.array_equal(opd.lit, opd.lit[:, ::-1])
 
 
-def test_waves_and_figures(lsst_r):
+def test_waves_and_statistics(lsst_r):
     opd = pachon.wavefront_opd(lsst_r, (0.0, 0.02), 620e-9, grid=24)
     lit = opd.value[opd.lit]
     assert np.allclose(opd.waves[opd.lit], lit / 620e-9)
@@ -122,6 +122,15 @@ def test_waves_and_figures(lsst_r):
     assert degrees.field == pytest.approx((0.0, np.deg2rad(1.0)))
 
 
+def test_a_dark_map_has_no_rms(lsst_r):
+    # In the shadow of the hole of M1 no light passes at all.
+    opd = pachon.wavefront_opd(lsst_r, (0.0, 0.01), 620e-9, ([0.0, 0.5], [0.1, 0.0]))
+    assert not opd.lit.any()
+    assert np.isnan(opd.rms)
+    with pytest.raises(DomainError, match="no light passes"):
+        _ = opd.without_tilt
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -130,6 +139,8 @@ def test_waves_and_figures(lsst_r):
         (dict(grid=8, pupil=([3.0], [0.0])), ConfigError, "one of them"),
         (dict(grid=8, sphere_radius=-1.0), DomainError, "sphere_radius"),
         (dict(grid=8, field=(0.1, 0.0)), DomainError, "2.5 deg"),
+        (dict(grid=8, field=[[0.0, 0.0], [0.0, 0.01]]), DomainError, "expected two angles"),
+        (dict(grid=8, projection="tan"), ConfigError, "expected one of zemax, gnomonic, postel"),
     ],
 )
 def test_bad_arguments(lsst_r, change, error, words):
