@@ -107,12 +107,14 @@ def read_fits(path: Path) -> fits.HDUList:
             for hdu in hdus:
                 place = hdu.fileinfo()
                 if not _checksum_holds(data[place["hdrLoc"] : place["datLoc"] + place["datSpan"]]):
-                    raise ProductError(f"{path}: damaged ({hdu.name} does not match its checksum)")
+                    raise ProductError(f"damaged ({hdu.name} does not match its checksum)", file=path)
                 hdu.data  # noqa: B018 - reads it now, within the checks
             if len(hdus) != hdus[0].header["NPARTS"]:
-                raise ProductError(f"{path}: cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}")
+                raise ProductError(
+                    f"cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}", file=path
+                )
         except (AstropyWarning, OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise ProductError(f"{path}: damaged or no FITS product ({' '.join(str(error).split())})") from None
+            raise ProductError(f"damaged or no FITS product ({' '.join(str(error).split())})", file=path) from None
     return hdus
 
 

@@ -273,7 +273,7 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
     hdus = read_fits(path)
     header = hdus[0].header
     if stamp is not None and not stamp.matches(header):
-        raise ProductError(f"{path}: was made with another version, configuration or seed")
+        raise ProductError("was made with another version, configuration or seed", file=path)
     try:
         return CcdProduct(
             name=header["CCD"],
@@ -288,7 +288,7 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
             noise_free_model=PsfModel.from_hdus(hdus, _NOISE_FREE_MODEL),
         )
     except KeyError as error:
-        raise ProductError(f"{path}: no product of a CCD ({' '.join(str(error).split())})") from None
+        raise ProductError(f"no product of a CCD ({' '.join(str(error).split())})", file=path) from None
 
 
 def _image(hdu: fits.ImageHDU) -> np.ndarray:

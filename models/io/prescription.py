@@ -107,7 +107,7 @@ def load_telescope(
         parts = _LENS_FILES[path.suffix.lower()]
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
-        raise PrescriptionError(f"{path}: expected a prescription file that ends in .yaml, .zmx or .seq")
+        raise PrescriptionError("expected a prescription file that ends in .yaml, .zmx or .seq", file=path)
     raise unknown_name("telescope", text, BUNDLED)
 
 

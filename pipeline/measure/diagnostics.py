@@ -104,17 +104,17 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     """
     path = folder / CONFIG_NAME
     if not path.exists():
-        raise ProductError(f"{folder}: expected the folder of a run, there is no {CONFIG_NAME} in it")
+        raise ProductError(f"expected the folder of a run, there is no {CONFIG_NAME} in it", file=folder)
     config = load_configuration(path)
     try:
         experiment = Experiment.from_config(config)
     except PachonError as error:
-        raise ProductError(f"{path}: no configuration that pachon run wrote ({error})") from None
+        raise ProductError(f"no configuration that pachon run wrote ({error})", file=path) from None
     if experiment.config != config:
-        raise ProductError(f"{path}: no configuration that pachon run wrote (defaults are not filled in)")
+        raise ProductError("no configuration that pachon run wrote (defaults are not filled in)", file=path)
     stamp, names = stamp_of(experiment), config.ccds or ()
     if not any(product_path(folder, name).exists() for name in names):
-        raise ProductError(f"{folder}: none of its {len(names)} CCDs is finished")
+        raise ProductError(f"none of its {len(names)} CCDs is finished", file=folder)
     products, missing = [], {}
     for name in names:
         try:

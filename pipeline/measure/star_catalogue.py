@@ -73,12 +73,12 @@ def load_stars(
         hdus = _fits(path, data)
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
         if not tables:
-            raise ProductError(f"{path}: has no table, expected one with columns {x}, {y}")
+            raise ProductError(f"has no table, expected one with columns {x}, {y}", file=path)
         columns = {name: np.asarray(tables[0].data[name]) for name in tables[0].columns.names}
     elif data.lstrip().startswith(b"# %ECSV"):
         columns = _ecsv(path, data)
     else:
-        raise ProductError(f"{path}: neither FITS nor ECSV, expected a table of stars")
+        raise ProductError("neither FITS nor ECSV, expected a table of stars", file=path)
 
     cube = _cube(Path(images), _fits(Path(images), _bytes(Path(images)))) if images is not None else None
     names = {name.lower(): name for name in columns}
@@ -94,7 +94,7 @@ def load_stars(
     positions = np.stack([_numbers(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
     stamps = _numbers(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
     if len(stamps) != len(positions):
-        raise ProductError(f"{path}: {len(positions)} stars in the table, {len(stamps)} stamps in the images")
+        raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
     return StarCutouts(stamps, positions)
 
 
@@ -115,10 +115,10 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
             for hdu in hdus:
                 hdu.data  # noqa: B018 - reads it now, within the checks
         except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise ProductError(f"{path}: damaged or not FITS ({' '.join(str(error).split())})") from None
+            raise ProductError(f"damaged or not FITS ({' '.join(str(error).split())})", file=path) from None
     cut = [str(w.message) for w in told if "truncated" in str(w.message).lower()]
     if cut:
-        raise ProductError(f"{path}: cut short ({' '.join(cut[0].split())})")
+        raise ProductError(f"cut short ({' '.join(cut[0].split())})", file=path)
     return hdus
 
 
@@ -127,7 +127,7 @@ def _ecsv(path: Path, data: bytes) -> dict[str, np.ndarray]:
     try:
         table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
     except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, YamlParseError) as error:
-        raise ProductError(f"{path}: damaged or no ECSV table ({' '.join(str(error).split())})") from None
+        raise ProductError(f"damaged or no ECSV table ({' '.join(str(error).split())})", file=path) from None
     columns = {}
     for name in table.colnames:
         values = table[name]
@@ -149,7 +149,7 @@ def _cube(path: Path, hdus: fits.HDUList) -> np.ndarray:
     """Return the first image of three axes of a file that must have one."""
     cube = _first_cube(hdus)
     if cube is None:
-        raise ProductError(f"{path}: has no image of three axes, expected the stamps [n, ny, nx]")
+        raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=path)
     return cube
 
 

@@ -359,7 +359,7 @@ class PsfModel:
         try:
             return cls.from_hdus(hdus, name)
         except ProductError as error:
-            raise ProductError(f"{path}: {error}") from None
+            raise ProductError(str(error), file=path) from None
 
     def _leave_one_out_residuals(self) -> np.ndarray:
         """Return coefficient minus its prediction by the other stars, [n, k]."""

@@ -184,7 +184,7 @@ def updated_baseline(
     metrics = dict(baseline.figures)
     for d in check.out:
         if d.found is None:
-            raise ConfigError(f"{path}: figures.{d.name}: {d.problem}; remove its line, or save the baseline anew")
+            raise ConfigError(f"figures.{d.name}: {d.problem}; remove its line, or save the baseline anew", file=path)
         update = {"value": rounded(d.found, d.tolerance), "checked_against": None}
         metrics[d.name] = metrics[d.name].model_copy(update=update)
     _, telescope, experiment = _subject(path, baseline, None, None)

@@ -60,16 +60,16 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_mapping)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
+        raise ConfigError("no such file", file=path) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+        raise ConfigError(f"cannot be read ({error.strerror})", file=path) from None
     except json.JSONDecodeError as error:
-        raise ConfigError(f"{path}: no JSON (line {error.lineno}, column {error.colno}: {error.msg})") from None
+        raise ConfigError(f"no JSON (line {error.lineno}, column {error.colno}: {error.msg})", file=path) from None
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: no JSON ({error})") from None
+        raise ConfigError(f"no JSON ({error})", file=path) from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
-        raise ConfigError(f"{path}: format = {found!r}: expected {FORMAT!r}, as pachon baseline save writes it")
+        raise ConfigError(f"format = {found!r}: expected {FORMAT!r}, as pachon baseline save writes it", file=path)
     if content.get("version") != VERSION:
         raise ConfigError(
             f"{path}: version = {content.get('version')!r}: expected {VERSION}; "
@@ -79,7 +79,7 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     for name, figure in baseline.figures.items():
         if figure.reason not in baseline.reasons:
             known = ", ".join(baseline.reasons)
-            raise ConfigError(f"{path}: figures.{name}.reason = {figure.reason!r}: expected one of {known}")
+            raise ConfigError(f"figures.{name}.reason = {figure.reason!r}: expected one of {known}", file=path)
     return baseline
 
 

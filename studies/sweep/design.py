@@ -121,17 +121,17 @@ def _from_table(path: Path) -> list[Point]:
     try:
         table = Table.read(path, format="ascii.ecsv")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; expected an ECSV table of points") from None
+        raise ConfigError("no such file; expected an ECSV table of points", file=path) from None
     except Exception as error:
         # Readers of astropy raise many kinds of errors for files that are no tables.
-        raise ConfigError(f"{path}: no ECSV table ({' '.join(str(error).split())[:120]})") from None
+        raise ConfigError(f"no ECSV table ({' '.join(str(error).split())[:120]})", file=path) from None
     if not len(table):
-        raise ConfigError(f"{path}: no rows; expected at least one point")
+        raise ConfigError("no rows; expected at least one point", file=path)
     points = []
     for number, row in enumerate(table):
         point = {name: row[name].item() if hasattr(row[name], "item") else row[name] for name in table.colnames}
         for name, value in point.items():
             if np.ma.is_masked(row[name]) or (isinstance(value, float) and not np.isfinite(value)):
-                raise ConfigError(f"{path}: row {number}, {name} = {row[name]}: expected a value")
+                raise ConfigError(f"row {number}, {name} = {row[name]}: expected a value", file=path)
         points.append(point)
     return points

@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
 from ...pipeline.config import digest
@@ -120,21 +120,22 @@ def _with_path(section: Any, key: str, folder: Path) -> Any:
 def read_sweep(content: dict[str, Any], source: str) -> SweepFile:
     """Return the sweep that plain mappings describe; `source` names them in error messages."""
     sweep = validated(SweepFile, content, source)
-    _check(sweep, source)
+    with error_context(file=source):
+        _check(sweep)
     return sweep
 
 
-def _check(sweep: SweepFile, source: str) -> None:
+def _check(sweep: SweepFile) -> None:
     """Check values that depend on each other."""
     table = sweep.design.kind == "table"
     if table and sweep.design.file is None:
-        raise ConfigError(f"{source}: design.file is missing: kind table expects the path of an ECSV table of points")
+        raise ConfigError("design.file is missing: kind table expects the path of an ECSV table of points")
     if not table and sweep.design.file is not None:
-        raise ConfigError(f"{source}: design.file = {sweep.design.file}: expected with kind table only")
+        raise ConfigError(f"design.file = {sweep.design.file}: expected with kind table only")
     if not table and not sweep.parameters:
-        raise ConfigError(f"{source}: parameters = {{}}: expected at least one parameter to vary")
+        raise ConfigError("parameters = {}: expected at least one parameter to vary")
     for name, parameter in sweep.parameters.items():
-        place = f"{source}: parameters.{name}"
+        place = f"parameters.{name}"
         given = [key for key in ("values", "range", "normal") if getattr(parameter, key) is not None]
         if len(given) != 1 and not table:
             found = " and ".join(given) or "none of them"
@@ -147,6 +148,5 @@ def _check(sweep: SweepFile, source: str) -> None:
         if parameter.normal is not None and not parameter.normal[1] > 0:
             raise ConfigError(f"{place}.normal = {list(parameter.normal)}: expected a standard deviation above 0")
         if parameter.nominal is None and sweep.design.kind == "one_at_a_time":
-            raise ConfigError(
-                f"{place}.nominal is missing: one at a time needs the value that others are varied around"
-            )
+            text = "one at a time needs the value that others are varied around"
+            raise ConfigError(f"{place}.nominal is missing: {text}")

@@ -55,13 +55,13 @@ class SweepStore:
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
-            raise ProductError(f"{path}: no such file; expected the store of a sweep, such as pachon sweep makes")
+            raise ProductError("no such file; expected the store of a sweep, such as pachon sweep makes", file=path)
         self.path = path
         with self._guarded():
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
-            raise ProductError(f"{path}: store of format {about.get('format')}: expected {FORMAT}")
+            raise ProductError(f"store of format {about.get('format')}: expected {FORMAT}", file=path)
         self.about = about
 
     def __enter__(self) -> SweepStore:
@@ -246,4 +246,4 @@ def _problem(path: Path, error: sqlite3.Error) -> ProductError:
         return DamagedStoreError(
             f"damaged, or no store of a sweep ({text}); pachon sweep export saves what it can", file=path
         )
-    return ProductError(f"{path}: {text}")
+    return ProductError(text, file=path)

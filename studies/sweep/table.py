@@ -121,7 +121,7 @@ def salvage(path: Path, out: Path) -> int:
         for number, parameters, metrics in readable_rows(path)
     ]
     if not rows:
-        raise ProductError(f"{path}: nothing can be read of it; was it a store of a sweep?")
+        raise ProductError("nothing can be read of it; was it a store of a sweep?", file=path)
     kind = _format(out)
     table = Table(meta={"what": f"saved from {path.name}"})
     for part in range(3):
@@ -134,7 +134,7 @@ def salvage(path: Path, out: Path) -> int:
 
 def _format(path: Path) -> str:
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{path}: expected a file that ends in {', '.join(FORMATS)}")
+        raise ConfigError(f"expected a file that ends in {', '.join(FORMATS)}", file=path)
     return FORMATS[path.suffix.lower()]
 
 
@@ -177,7 +177,7 @@ def _encoded(table: Table, kind: str, path: Path) -> bytes:
         import pyarrow
         from pyarrow import parquet
     except ImportError:
-        raise ConfigError(f"{path}: Parquet needs the package pyarrow: pip install 'pachon[parquet]'") from None
+        raise ConfigError("Parquet needs the package pyarrow: pip install 'pachon[parquet]'", file=path) from None
     arrays = {name: pyarrow.array(np.asarray(table[name]).tolist()) for name in table.colnames}
     parquet.write_table(pyarrow.table(arrays), data)
     return data.getvalue()
