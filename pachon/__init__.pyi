@@ -7,8 +7,8 @@ from .design.images.encircled_energy import encircled_energy as encircled_energy
 from .design.images.encircled_energy import energy_curve as energy_curve
 from .design.images.mtf import Mtf as Mtf
 from .design.images.mtf import mtf as mtf
-from .design.layout import Layout as Layout
-from .design.layout import layout as layout
+from .design.layout.layout import Layout as Layout
+from .design.layout.layout import layout as layout
 from .design.metrics.distortion import Distortion as Distortion
 from .design.metrics.distortion import distortion as distortion
 from .design.metrics.field_zernikes import DoubleZernikes as DoubleZernikes

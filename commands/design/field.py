@@ -140,7 +140,7 @@ def draw(
     - `pachon draw my_lens.zmx --field-deg 0 --field-deg 10`
     """
     from ...core.files import write_bytes
-    from ...design.layout import layout
+    from ...design.layout.layout import layout
 
     if glb is None:
         return Outcome(layout(*given.where, **given.how))

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Rectangle
 
 from ...core.plotting import new_figure, png_bytes, styled
-from ...design.layout_parts import outer_radius, ray_paths, surface_section
+from ...design.layout.sections import outer_radius, ray_paths, surface_section
 from ...models.camera.camera import Camera
 from ...models.first_order import first_order
 from ...models.surface import Surface

@@ -9,9 +9,9 @@ import trimesh
 
 import pachon
 from pachon.core.plotting import png_bytes
-from pachon.design.layout import layout
-from pachon.design.layout_meshes import surface_mesh, tubes
-from pachon.design.layout_parts import outer_radius, surface_section
+from pachon.design.layout.layout import layout
+from pachon.design.layout.meshes import surface_mesh, tubes
+from pachon.design.layout.sections import outer_radius, surface_section
 from pachon.models.aperture import Annulus, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.obstruction import Obstruction

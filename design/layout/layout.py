@@ -1,4 +1,4 @@
-"""The layout of a telescope: its surfaces in section, cut to their apertures, and rays of some fields through it."""
+"""Layout of a telescope: sections of its surfaces, cut to their apertures, and rays of some fields."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
-from ..models.surface import Interaction
-from ..models.telescope import Telescope
-from ..wavefront.request import Request
-from .drawing import field_text
-from .layout_parts import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
+from ...models.surface import Interaction
+from ...models.telescope import Telescope
+from ...wavefront.request import Request
+from ..drawing import field_text
+from .sections import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
 
 if TYPE_CHECKING:
     import trimesh
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Rays of a field in section, on either side of the axis, and around the pupil in three dimensions.
+#: Rays of a field on either side of the axis, and around the pupil.
 _FAN, _SPOKES = 5, 12
-#: How far light is drawn above the telescope.
+#: Length of the rays above the telescope, over its height.
 _ABOVE = 0.08
 _RAYS = (BLUE, GREY, RED, ORANGE, PURPLE, "#2a9d6f")
 _GLASS, _GLASS_RIM, _MIRROR, _DETECTOR, _BAFFLE = "#bfe3f2", "#3f7d99", "#1a1a1a", "#0b6b3a", "#6b4a2b"
-#: Lenses and detector get a panel of their own where they are less than this part of the whole.
+#: Lenses and detector have a panel of their own below this fraction of the whole size.
 _SMALL = 0.4
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A telescope as it is drawn.
+    """Sections and rays of a telescope.
 
     Attributes
     ----------
@@ -43,15 +43,15 @@ class Layout:
     wavelength : float
         Vacuum wavelength [m].
     reach : dict of str to float
-        Distance from its own z axis to which each surface is drawn [m].
+        Radius to which each surface is drawn [m].
     profiles : dict of str to ndarray, shape [n, 3]
-        Each surface in its own section x = 0 [m], telescope frame; NaN breaks the line. Of baffles, what blocks.
+        Section x = 0 of each surface [m], telescope frame; NaN breaks the line. Of baffles, the blocking part.
     lenses : tuple of Lens
         Pieces of glass.
     fans : tuple of ndarray, shape [n_ray, n_point, 3]
-        Rays of each field that arrive, through the points x = 0 of the pupil, from above the telescope on [m].
+        Arriving rays of each field through the line x = 0 of the pupil, from above the telescope on [m].
     bundles : tuple of ndarray, shape [n_ray, n_point, 3]
-        The same of rays all around the pupil.
+        Arriving rays of each field all around the pupil [m].
     """
 
     telescope: Telescope
@@ -65,13 +65,13 @@ class Layout:
 
     @property
     def size(self) -> np.ndarray:
-        """Extent along x, y and z of everything but the rays in front [m], shape [3]; x is that of y."""
+        """Extent of the surfaces along x, y and z [m], shape [3]; the first is that of y."""
         points = np.concatenate([p[np.isfinite(p).all(axis=1)] for p in self.profiles.values()])
         width, height = (float(v) for v in np.ptp(points[:, 1:], axis=0))
         return np.array([width, width, height])
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures by name, units in the names; lists run over the surfaces."""
+        """Return the results by name and unit; lists run over the surfaces."""
         surfaces = self.telescope.surfaces
         return {
             "telescope": self.telescope.name,
@@ -89,7 +89,7 @@ class Layout:
         }
 
     def plot(self) -> Figure:
-        """Draw the section of the telescope with its rays and, where they are small beside it, its lenses."""
+        """Draw the section of the telescope with its rays and, if they are small, its lenses in another panel."""
         drawing = _Drawing(self)
         surfaces = self.telescope.surfaces
         names = [s.name for s in surfaces if np.isfinite(self.profiles[s.name]).all(axis=1).any()]
@@ -122,7 +122,7 @@ class Layout:
 
     def scene(self) -> trimesh.Scene:
         """Return mirrors, lenses, baffles, obstructions and rays as a scene of meshes [m], y up, for a GLB file."""
-        from .layout_meshes import layout_scene
+        from .meshes import layout_scene
 
         size = float(self.size.max())
         return layout_scene(self.telescope, self.lenses, self.reach, self.fields, self.bundles, size)
@@ -182,7 +182,7 @@ def layout(
 
 
 class _Drawing:
-    """Coordinates of a drawing: (y, z) upright, or (-z, y) where the telescope is long."""
+    """Coordinates of a drawing: (y, z) upright, or (-z, y) for a long telescope."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -228,7 +228,7 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
         if surface.interaction == Interaction.REFRACT and surface.name in in_glass:
             continue
         if surface.interaction == Interaction.PASS and not beams:
-            # Baffles stand in the light on its way to the mirrors, beside the lenses at most in the drawing.
+            # Baffles stand in front of the mirrors, not among the lenses.
             continue
         color, width = {
             Interaction.MIRROR: (_MIRROR, 2.2),
@@ -256,20 +256,19 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
 def _labels(
     drawing: _Drawing, named: set[str], scale: float, limits: tuple[np.ndarray, np.ndarray]
 ) -> list[tuple[str, np.ndarray]]:
-    """Return names, each with the rim of what it belongs to; those of the surfaces of a lens are one."""
+    """Return names with the rims of their surfaces; the surfaces of a lens have one name."""
     layout = drawing.layout
     parts: dict[str, list[str]] = {}
     covered: set[str] = set()
     for lens in layout.lenses:
         if {lens.front, lens.back} <= named:
-            # Cemented lenses share a surface, and then each name stands alone.
+            # Cemented lenses have a common surface: then each name stands alone.
             shared = {lens.front, lens.back} & covered
             parts[lens.name if not shared else lens.back] = [n for n in (lens.front, lens.back) if n not in shared]
             covered |= {lens.front, lens.back}
     for surface in layout.telescope.surfaces:
         if surface.name in named - covered:
             parts[surface.name] = [surface.name]
-    # Without a word in common the names of both surfaces are written.
     found = []
     for name, members in parts.items():
         points = np.concatenate([drawing(layout.profiles[m]) for m in members]) * scale
@@ -285,7 +284,7 @@ def _labels(
 
 
 def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) -> None:
-    """Write names in a column at the right, or a row above where it lies, far enough apart, with lines to surfaces."""
+    """Write names in a column at the right or a row above, far enough apart, with lines to the surfaces."""
     if not labels:
         return
     side = 0 if lying else 1
@@ -311,10 +310,10 @@ def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) 
 
 
 def _apart(wanted: np.ndarray, step: float, low: float, high: float) -> np.ndarray:
-    """Return ascending places near those wanted, at least a step apart and within bounds where there is room."""
+    """Return ascending positions near those wanted, a step apart and within bounds where there is room."""
     step = min(step, (high - low) / max(len(wanted) - 1, 1))
     places = np.clip(wanted, low, high)
-    # Groups that are too close are spread about their middle, and joined with what they then touch.
+    # Groups that are too close spread about their middle and merge with neighbours.
     groups = [[float(p), 1] for p in places]
     merged = True
     while merged:
@@ -330,7 +329,7 @@ def _apart(wanted: np.ndarray, step: float, low: float, high: float) -> np.ndarr
 
 
 def _cut(triangles: np.ndarray) -> np.ndarray:
-    """Return the segments in which triangles [n, 3, 3] cross the plane x = 0, shape [k, 2, 3]."""
+    """Return the intersections of triangles [n, 3, 3] with the plane x = 0, segments of shape [k, 2, 3]."""
     start, end = triangles, np.roll(triangles, -1, axis=1)
     before, after = start[..., 0], end[..., 0]
     crosses = (before < 0) != (after < 0)
@@ -342,7 +341,7 @@ def _cut(triangles: np.ndarray) -> np.ndarray:
 
 
 def _signed_label(field: np.ndarray) -> str:
-    """Return a field as text; on the y axis with its sign, as both sides are drawn."""
+    """Return a field as text; on the y axis with its sign."""
     x, y = np.rad2deg(field)
     if abs(x) < 1e-9:
         return "on the axis" if abs(y) < 1e-9 else f"field {y:+.4g}°"

@@ -1,4 +1,4 @@
-"""The layout of a telescope as meshes in three dimensions, for a GLB file."""
+"""Meshes of the layout of a telescope, for a GLB file."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from ..models.aperture import Annulus, Circle
-from ..models.surface import Interaction, Surface
-from ..models.telescope import Telescope
-from .layout_parts import Lens, clear_region
+from ...models.aperture import Annulus, Circle
+from ...models.surface import Interaction, Surface
+from ...models.telescope import Telescope
+from .sections import Lens, clear_region
 
 #: Points of a surface along the radius and around.
 _RINGS, _SPOKES = 24, 120

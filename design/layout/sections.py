@@ -1,4 +1,4 @@
-"""Sections of surfaces, pieces of glass and paths of rays: the parts that a layout is drawn from."""
+"""Sections of surfaces, pieces of glass and paths of rays, in metres."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
-from ..models.surface import Interaction, Surface
-from ..models.telescope import Telescope
-from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import RayStatus, launch_rays
-from ..raytrace.trace import trace
+from ...models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
+from ...models.surface import Interaction, Surface
+from ...models.telescope import Telescope
+from ...raytrace.pack.surfaces import refractive_indices
+from ...raytrace.rays import RayStatus, launch_rays
+from ...raytrace.trace import trace
 
 #: Points of a surface in section.
 _POINTS = 241
 #: A medium of at least this index is drawn as glass.
 _GLASS = 1.05
-#: How far a surface without an aperture reaches beyond the light.
+#: Radius of a surface without an aperture, over that of the light.
 _BEYOND = 1.03
-#: A baffle that blocks all around is drawn to this many times its clear radius.
+#: Outer radius of a baffle without an outer rim, over its clear radius.
 _RIM = 1.12
 
 
@@ -32,9 +32,9 @@ class Lens:
     Attributes
     ----------
     name : str
-        What the names of both surfaces have in common, or both names.
+        Common part of the names of both surfaces, or both names.
     front, back : str
-        The surfaces, in the order that light meets them.
+        The surfaces in the order of the light.
     index : float
         Refractive index of the glass.
     """
@@ -54,29 +54,21 @@ def ray_paths(
     projection: str = "zemax",
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return the ways of the rays that arrive, from a height in front of the telescope to the detector.
+    """Return the paths of the rays that arrive, from a height in front of the telescope to the detector.
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    field : (tx, ty)
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
-    pupil : (px, py)
-        Entrance-pupil coordinates [m].
+    telescope, field, wavelength, pupil, projection
+        As in :func:`~pachon.raytrace.rays.launch_rays`.
     top : float
-        Height that the rays come from [m].
-    projection : str
-        Meaning of the field angles.
+        Height at which the paths start [m].
     threads : int, optional
         Number of threads; all processors by default.
 
     Returns
     -------
     ndarray, shape [n_ray, n_surface + 1, 3]
-        Where each starts and where it meets the surfaces [m], telescope frame.
+        Start and intersections with the surfaces [m], telescope frame.
     """
     rays = launch_rays(telescope, (field[0], field[1]), wavelength, pupil, projection)
     met = trace(telescope, rays, "all", threads=threads)
@@ -86,14 +78,14 @@ def ray_paths(
 
 
 def surface_section(surface: Surface, reach: float) -> np.ndarray:
-    """Return points along a surface in its own section x = 0, cut to its aperture.
+    """Return points along the section x = 0 of a surface, cut to its aperture.
 
     Parameters
     ----------
     surface : Surface
-        The surface; of a baffle, what blocks light is returned.
+        The surface; of a baffle, the blocking part counts.
     reach : float
-        Distance from its z axis to go to [m].
+        Radius of the section [m].
 
     Returns
     -------
@@ -107,7 +99,7 @@ def surface_section(surface: Surface, reach: float) -> np.ndarray:
 
     y = np.linspace(-reach, reach, _POINTS)
     here = solid(y)
-    # Where it begins and ends is found by halving the step in which it does.
+    # Ends by bisection.
     ends = np.flatnonzero(here[1:] != here[:-1])
     low, high = y[ends].copy(), y[ends + 1].copy()
     for _ in range(40):
@@ -127,12 +119,12 @@ def clear_region(aperture: Aperture | None, x: np.ndarray, y: np.ndarray) -> np.
     """Return True where light passes an aperture, rims included; everywhere if there is none."""
     if aperture is None:
         return np.ones(np.broadcast(x, y).shape, dtype=bool)
-    # Rims of circles do not count, and surfaces are drawn just up to them.
+    # Apertures exclude their rims, to which surfaces are drawn.
     return aperture.contains((1.0 - 1e-9) * x, (1.0 - 1e-9) * y)
 
 
 def outer_radius(region: Aperture | None) -> float:
-    """Return a distance from the origin beyond which nothing of a region lies [m]; infinite where it has no end."""
+    """Return the radius of a circle about the origin that holds a region [m]; infinite if there is none."""
     if isinstance(region, Circle):
         return region.radius + float(np.hypot(region.x, region.y))
     if isinstance(region, Annulus):
@@ -149,7 +141,7 @@ def outer_radius(region: Aperture | None) -> float:
 
 
 def even_edges(telescope: Telescope, lenses: tuple[Lens, ...], reach: dict[str, float]) -> dict[str, float]:
-    """Return the reaches with surfaces that have no rim of their own going as far as the other one of their lens."""
+    """Return radii with surfaces without rims as large as the other surface of their lens."""
     found = dict(reach)
     for lens in lenses:
         both = max(found[lens.front], found[lens.back])
@@ -162,7 +154,7 @@ def even_edges(telescope: Telescope, lenses: tuple[Lens, ...], reach: dict[str, 
 
 
 def drawn_radii(telescope: Telescope, fields: np.ndarray, wavelength: float, threads: int | None) -> dict[str, float]:
-    """Return how far each surface is drawn: to its rim, or as far as the light of all fields goes."""
+    """Return the radius to which each surface is drawn [m]: its rim, or the light of all fields."""
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
     angle = 2.0 * np.pi * np.arange(16) / 16
     radius = 0.5 * telescope.pupil_diameter
@@ -173,7 +165,7 @@ def drawn_radii(telescope: Telescope, fields: np.ndarray, wavelength: float, thr
         )
         for k, met in enumerate(trace(telescope, rays, "all", threads=threads)):
             local = telescope.surfaces[k].to_local(met.position)
-            # Light that is stopped on its way need not be drawn, but it tells where nothing else does.
+            # Vignetted light counts too, where there is nothing else.
             away = np.hypot(local[:, 0], local[:, 1])
             lit[k] = max(lit[k], float(np.nanmax(away, initial=0.0)) if np.isfinite(away).any() else 0.0)
     found = {}
@@ -200,7 +192,7 @@ def find_lenses(telescope: Telescope, wavelength: float) -> tuple[Lens, ...]:
 
 
 def _common_name(first: str, second: str) -> str:
-    """Return what two names begin with, up to a mark between words; both names where that is nothing."""
+    """Return the common first word of two names; both names if there is none."""
     for mark in "_- .":
         head = first.partition(mark)[0]
         if mark in first and mark in second and head and head == second.partition(mark)[0]:

@@ -1,0 +1,1 @@
+"""Layout of a telescope: sections, rays and meshes."""
