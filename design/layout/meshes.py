@@ -78,11 +78,7 @@ def layout_scene(
         if name in glass or surface.interaction == Interaction.PHASE:
             continue
         look = {Interaction.MIRROR: "mirror", Interaction.DETECTOR: "detector", Interaction.PASS: "baffle"}
-        add(
-            _unused(scene, name),
-            surface_mesh(surface, reach[name]),
-            _LOOKS[look.get(surface.interaction, "glass")],
-        )
+        add(_unused(scene, name), surface_mesh(surface, reach[name]), _LOOKS[look.get(surface.interaction, "glass")])
     for obstruction in telescope.obstructions:
         add(_unused(scene, obstruction.name), obstruction.mesh, _LOOKS["baffle"])
     radius = 0.5 * _RAY * size

@@ -204,13 +204,7 @@ def ghosts(
         raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 400")
     where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
     request = Request.of(
-        telescope,
-        where,
-        wavelength,
-        sampling="spiral",
-        n_pupil=int(n_pupil),
-        projection=projection,
-        threads=threads,
+        telescope, where, wavelength, sampling="spiral", n_pupil=int(n_pupil), projection=projection, threads=threads
     )
     coatings = Coatings(telescope, reflectivity, detector_reflectivity)
     pairs = ghost_pairs(telescope)

@@ -13,15 +13,7 @@ from ...core.plotting import BLUE, RED, styled
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import (
-    bare_frame,
-    draw_circle,
-    draw_scale_bar,
-    field_text,
-    panel_grid,
-    round_length,
-    wavelength_colors,
-)
+from ..drawing import bare_frame, draw_circle, draw_scale_bar, field_text, panel_grid, round_length, wavelength_colors
 from ..result import FieldResult
 from .principal_rays import principal_rays_of
 

@@ -11,7 +11,7 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.adjoint_matrix import AdjointMatrix, column_table, polynomial_terms
 from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
 from ...raytrace.adjoint.forward_pass import ForwardPass
-from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS, SphereAdjoint
+from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS
 from ...wavefront.reference_sphere import sphere_distance_derivatives
 from ..parameters.parameters import Parameter, apply, index_surfaces, shapes_with_terms, twists
 from ..parameters.shape_terms import term_polynomial
@@ -106,47 +106,9 @@ class ParameterColumns:
         return cls(moved, parameters, table, listed, other_terms, count, total[first:])
 
     def adjoints(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
-        """Return the weighted columns of the adjoint matrix, shape [n_output, n_column, n].
-
-        Parameters
-        ----------
-        forward : ForwardPass
-            Rays through ``self.telescope``.
-        gradient : OutputGradient
-            The outputs.
-        threads : int, optional
-            Number of threads.
-        """
+        """Return the weighted columns of the adjoint matrix of a forward pass, shape [n_output, n_column, n]."""
         matrix = backward_pass(forward, gradient, self.table, polynomials=self.polynomials, threads=threads)
         return self._with_other_terms(matrix, self.intermediate + SPHERE_COLUMNS)
-
-    def to_spheres(
-        self,
-        directions: np.ndarray,
-        indices: np.ndarray,
-        pupil: np.ndarray,
-        center: np.ndarray,
-        path: np.ndarray,
-        *,
-        lit_only: bool = False,
-    ) -> SphereAdjoint:
-        """Return the adjoints of rays from field points to their reference spheres, for :meth:`of_path`.
-
-        Parameters are those of :class:`~pachon.raytrace.adjoint.sphere_adjoint.SphereAdjoint`.
-        """
-        return SphereAdjoint(
-            self.telescope,
-            directions,
-            indices,
-            pupil,
-            center,
-            path,
-            self.telescope.reference_sphere_radius,
-            self.table,
-            self.intermediate,
-            self.polynomials,
-            lit_only=lit_only,
-        )
 
     def of_path(self, matrix: AdjointMatrix) -> np.ndarray:
         """Return the columns of optical paths to reference spheres, shape [n_column, n_field, n_pupil].
@@ -207,22 +169,8 @@ def _polynomial_weights(found: dict[int, PolarPolynomial], n: int, scale: float)
 def sphere_gradient(forward: ForwardPass, center: np.ndarray, radius: float) -> tuple[OutputGradient, np.ndarray]:
     """Return the gradient of the optical path to reference spheres, one output, and that path.
 
-    Parameters
-    ----------
-    forward : ForwardPass
-        Rays traced to the image.
-    center : ndarray, shape [3, n]
-        Centre of the sphere of each ray [m], telescope frame. The derivative of the path with respect to it is the
-        opposite of that with respect to the position.
-    radius : float
-        Radius of the spheres [m].
-
-    Returns
-    -------
-    gradient : OutputGradient
-        One output.
-    path : ndarray, shape [n]
-        Optical path to the sphere [m].
+    Centres of the spheres have shape [3, n] [m], telescope frame. The derivative of the path with respect to them is
+    the opposite of that with respect to the position.
     """
     n = forward.indices[-2]
     distance, by_position, by_direction = sphere_distance_derivatives(

@@ -200,13 +200,7 @@ def monte_carlo(
 
     fields = field_rings(telescope) if fields is None else fields
     rays = Beams.of(
-        telescope,
-        fields,
-        wavelengths,
-        sampling=sampling,
-        n_pupil=n_pupil,
-        projection=projection,
-        threads=threads,
+        telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     )
     judge: Merit = MERITS[merit](telescope, rays)
     prepared, parameters, matrix = dof.parameter_matrix(telescope)

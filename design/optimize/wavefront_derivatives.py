@@ -15,6 +15,7 @@ from ...core.threads import thread_count
 from ...core.units import field_label
 from ...raytrace.adjoint.backward_pass import OutputGradient, position_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
+from ...raytrace.adjoint.sphere_adjoint import SphereAdjoint
 from ...raytrace.rays import RayStatus, parallel_rays
 from ...wavefront.request import Request
 from .jacobian import ParameterColumns, sphere_gradient
@@ -112,12 +113,7 @@ class FieldWavefronts:
     """
 
     def __init__(
-        self,
-        columns: ParameterColumns,
-        request: Request,
-        wavelength: float,
-        *,
-        lit_only: bool = False,
+        self, columns: ParameterColumns, request: Request, wavelength: float, *, lit_only: bool = False
     ) -> None:
         telescope, fields, light = columns.telescope, request.fields, request.directions
         self._columns, self._threads = columns, thread_count(request.threads)
@@ -126,8 +122,18 @@ class FieldWavefronts:
         if not chief.arrived.all():
             raise DomainError(f"{field_label(fields[~chief.arrived][0])}: the chief ray does not reach the image")
         gradient, path = sphere_gradient(chief, chief.position, telescope.reference_sphere_radius)
-        self._rays = columns.to_spheres(
-            light, chief.indices, request.pupil.points, chief.position, path, lit_only=lit_only
+        self._rays = SphereAdjoint(
+            telescope,
+            light,
+            chief.indices,
+            request.pupil.points,
+            chief.position,
+            path,
+            telescope.reference_sphere_radius,
+            columns.table,
+            columns.intermediate,
+            columns.polynomials,
+            lit_only=lit_only,
         )
         # Landing points and paths together, four outputs.
         axes, zero = position_gradient(chief), np.zeros((3, len(fields)))
