@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from astropy import units as u
+from pydantic import ValidationError
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, PachonError
+from pachon.pipeline.config import Configuration
 from pachon.pipeline.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.chief_rays import fields_at
@@ -211,10 +213,23 @@ def test_no_stars_and_no_light(lsst_r):
         assert dark.image[1].sum() == pytest.approx(1.0, abs=1e-5)
 
 
+def test_configurations_offer_every_engine():
+    for engine in ENGINES:
+        assert Configuration.model_validate({"psf": {"engine": engine}}).psf.engine == engine
+    with pytest.raises(ValidationError, match=" ".join(["Input should be", *map(repr, ENGINES)]).replace(" ", ".*")):
+        Configuration.model_validate({"psf": {"engine": "exact"}})
+
+
 @pytest.mark.parametrize(
     ("options", "error", "named"),
     [
         ({"engine": "exact"}, ConfigError, "engine = 'exact': expected one of fast, wave"),
+        (
+            {"pupil_spacing": 0.1},
+            ConfigError,
+            "pupil_spacing = 0.1: not an option of engine = 'fast', which takes n_pupil",
+        ),
+        ({"engine": "wave", "n_pupil": 80}, ConfigError, "n_pupil = 80: not an option of engine = 'wave', which takes"),
         ({"projection": "mercator"}, ConfigError, "projection"),
         ({"wavelengths": []}, DomainError, "wavelengths"),
         ({"wavelengths": [-1e-7]}, DomainError, "wavelengths"),
