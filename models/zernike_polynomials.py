@@ -140,7 +140,7 @@ def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscurati
 
 
 def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
-    """Return the radial polynomials of azimuthal order m as powers of rho^2, what stands beside rho^m.
+    """Return the radial polynomials of azimuthal order m as powers of rho^2, without the factor rho^m.
 
     Parameters
     ----------

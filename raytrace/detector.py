@@ -67,7 +67,7 @@ def land_on_ccds(
     center = focal_plane.camera.centers[ccd]
     t = np.zeros(len(p))
     for _ in range(STEPS):
-        # The CCD of the first crossing is kept, so a ray near an edge cannot jump to and fro between two tiles.
+        # The CCD of the first intersection is kept, so a ray near an edge cannot alternate between two CCDs.
         dx = p[:, 0] + t * d[:, 0] - center[:, 0]
         dy = p[:, 1] + t * d[:, 1] - center[:, 1]
         slope = focal_plane.surfaces.gradient(ccd, dx, dy)

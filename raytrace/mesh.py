@@ -47,8 +47,8 @@ def land_on_mesh(
 ) -> MeshLanding:
     """Carry rays from the nominal detector surface to a mesh given in the detector's own frame.
 
-    ``wp.Mesh`` works in single precision, so it is asked only *which* facet a ray meets; the crossing with the plane
-    of that facet is then computed in double precision.
+    ``wp.Mesh`` works in single precision and only finds the facet of each ray; the intersection with the plane of that
+    facet is then computed in double precision.
 
     Parameters
     ----------

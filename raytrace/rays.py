@@ -1,4 +1,4 @@
-"""Rays and where they start: a plane wave from a point of the field, through given points of the entrance pupil."""
+"""Launch of rays: plane waves from points of the field through given points of the entrance pupil."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .kernels import surface as surface_kernels
 
 
 class RayStatus(IntEnum):
-    """What became of a ray."""
+    """Status of a ray."""
 
     OK = int(surface_kernels.OK)
-    #: Outside a clear aperture. The ray is marked and goes on; its positions stay valid.
+    #: Outside a clear aperture. The ray is marked and traced on; its positions stay valid.
     VIGNETTED = int(surface_kernels.VIGNETTED)
     #: Did not meet a surface; positions are NaN from there on.
     MISSED = int(surface_kernels.MISSED)
@@ -175,7 +175,7 @@ def launch_rays(
 
 
 def launch_bundles(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
-    """Launch the light of several field points through points of the entrance pupil, whatever the object's distance.
+    """Launch the light of several field points, at any distance, through points of the entrance pupil.
 
     Parameters
     ----------
@@ -212,28 +212,12 @@ def object_points(telescope: Telescope, directions: np.ndarray) -> np.ndarray:
 
 
 def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
-    """Launch a plane wave from each of several directions through points of the entrance pupil.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    directions : ndarray, shape [n_direction, 3]
-        Unit vectors in which the light travels, as :func:`field_direction` gives them.
-    wavelength : float
-        Vacuum wavelength [m].
-    pupil : ndarray, shape [n_pupil, 2] or [n_direction, n_pupil, 2]
-        Entrance-pupil coordinates [m]: the same for all directions, or its own for each.
-
-    Returns
-    -------
-    Rays
-        ``n_direction * n_pupil`` rays, direction by direction; those of one direction are in phase.
+    """Launch plane waves of several field points; arguments as for :func:`launch_bundles`.
 
     Raises
     ------
     DomainError
-        If the telescope's object is at a finite distance, which :func:`launch_bundles` knows.
+        If the telescope's object is at a finite distance.
     """
     if np.isfinite(telescope.object_distance):
         raise DomainError(

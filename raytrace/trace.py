@@ -123,7 +123,7 @@ def trace(
     rays : Rays
         Rays of one wavelength, from :func:`~pachon.raytrace.rays.launch_rays` for example.
     surfaces : {"last", "all"}
-        What to return: the last surface, or a list with one result per surface.
+        Result at the last surface, or a list with one result per surface.
     focal_plane : FocalPlane, optional
         CCD surfaces, heights measured from the last surface along its z axis. The rays then end on the CCDs, and a
         ray that lands between two of them has status GAP (or keeps its worse one) and ``ccd`` -1.

@@ -42,7 +42,7 @@ class FocalPlane:
     terms : tuple of str
         Terms of the height budget that are on.
     budget : HeightBudget, optional
-        What the heights were drawn from.
+        Height budget of the draw.
     seed : int, optional
         Seed that they were drawn with.
     """
@@ -203,7 +203,7 @@ class FocalPlane:
         UnknownNameError
             If there is no such CCD or raft.
         DomainError
-            If a figure is not one finite number.
+            If an argument is not one finite number.
         """
         camera = self.camera
         members = np.array([camera.ccd_index(n) for n in ((name,) if "_" in name else camera.ccds_of_raft(name))])

@@ -122,8 +122,8 @@ def backward_loop(special: bool) -> wp.Function:
             x = x - lanes(surfaces.numbers[s, VERTEX])
             y = y - lanes(surfaces.numbers[s, VERTEX + 1])
             z = z - lanes(surfaces.numbers[s, VERTEX + 2])
-            turned = surfaces.kinds[s, ROTATED]
-            if turned == 1:
+            rotated = surfaces.kinds[s, ROTATED]
+            if rotated == 1:
                 x, y, z = to_local(surfaces, s, x, y, z)
                 u, v, w = to_local(surfaces, s, u, v, w)
                 ax, ay, az = to_local(surfaces, s, ax, ay, az)
@@ -234,7 +234,7 @@ def backward_loop(special: bool) -> wp.Function:
             bx = fx + wp.cw_mul(t, ex)
             by = fy + wp.cw_mul(t, ey)
             bz = fz + wp.cw_mul(t, ez)
-            if turned == 1:
+            if rotated == 1:
                 ax, ay, az = to_telescope(surfaces, s, ax, ay, az)
                 bx, by, bz = to_telescope(surfaces, s, bx, by, bz)
             write_gap(columns, s, o, p, px, py, pz, du, dv, dw, ax, ay, az, bx, by, bz, matrix)

@@ -1,6 +1,6 @@
 """Forward pass to reference spheres and backward pass in one kernel, packet by packet.
 
-A module of its own: with one caller of the surface loop in a module the compiler puts all of it in line.
+A module of its own: with one caller of the surface loop in a module the compiler inlines all of it.
 """
 
 from __future__ import annotations

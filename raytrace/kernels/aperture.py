@@ -1,7 +1,7 @@
 """Which rays of a packet pass an aperture that set algebra makes of discs, rings, rectangles, vanes and polygons.
 
 Each such aperture is a small programme in postfix order: a region puts a bit on the stack of each lane (1 inside), a
-set operation takes bits from it and puts back its own. The last bit says whether light passes.
+set operation takes bits from it and puts back its own. The last bit is 1 where light passes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from .surface import OK, VIGNETTED
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-# What a step of a programme does.
+# Steps of a programme.
 DISC = wp.constant(0)
 RING = wp.constant(1)
 BOX = wp.constant(2)
@@ -29,8 +29,8 @@ OUTSIDE = wp.constant(7)
 class PackedApertures:
     """The general apertures of a telescope; see :mod:`pachon.raytrace.pack.apertures`.
 
-    ``span`` [surface, 2]: first step of the surface's programme, and the one after its last. ``steps`` [step, 3]: what
-    it does, and for an outline the first of its edges and the one after its last. ``numbers`` [step, 6]: centre x, y
+    ``span`` [surface, 2]: first step of the surface's programme, and the one after its last. ``steps`` [step, 3]: kind,
+    and for an outline the first of its edges and the one after its last. ``numbers`` [step, 6]: centre x, y
     [m], cosine and sine of the angle, two sizes: the square of the radius; squares of inner and outer radius; halves of
     width and height; where a strip begins, and half its width [m]. ``edges`` [edge, 4]: one end x, y [m], y of the
     other [m], slope dx/dy.

@@ -1,4 +1,4 @@
-"""Which facet of a mesh a ray meets, and where: as the last step to a focal plane, and for a surface that is a mesh."""
+"""Intersections of rays with triangle meshes: focal planes and surfaces that are meshes."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class PackedMeshes:
 
 @wp.func
 def mesh_distance(meshes: PackedMeshes, s: wp.int32, x: lanes, y: lanes, z: lanes, u: lanes, v: lanes, w: lanes):
-    """Distance to the mesh of surface ``s``, NaN where it is missed, and the slopes along x and y that bend the ray.
+    """Distance to the mesh of surface ``s``, NaN where it is missed, and the slopes along x and y there.
 
-    ``wp.Mesh`` works in single precision, so it is asked only which facet a ray meets; where, is computed in double.
+    ``wp.Mesh`` finds the facet in single precision; the intersection is computed in double precision.
     """
     t = lanes(NO_FACET)
     slope_x = lanes(ZERO)

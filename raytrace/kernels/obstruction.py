@@ -1,4 +1,4 @@
-"""Which rays of a packet meet a solid thing on their way to a surface."""
+"""Obstructions on the way of rays to a surface."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from .surface import OK, VIGNETTED
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: This much of a way [m] after its start and before its end is not looked at: several times what single precision
-#: resolves over 20 m.
+#: Length [m] after the start and before the end of a way that is exempt: several times the resolution of single
+#: precision over 20 m.
 MARGIN = wp.constant(wp.float32(1.0e-5))
 
 
@@ -41,7 +41,7 @@ def past_obstructions(
         if obstructions.blocks[s, m] == 1:
             for i in range(LANES):
                 length = wp.float32(t[i]) - wp.float32(2.0) * MARGIN
-                # A lane that is vignetted already, or a NaN, needs no question.
+                # Lanes that are vignetted already, and NaN, are skipped.
                 if status[i] == OK and length > wp.float32(0.0):
                     heading = wp.vec3(wp.float32(u[i]), wp.float32(v[i]), wp.float32(w[i]))
                     start = wp.vec3(wp.float32(x[i]), wp.float32(y[i]), wp.float32(z[i])) + MARGIN * heading

@@ -1,7 +1,7 @@
-"""The kernel that traces the same pupil points for many stars and keeps only what a PSF needs.
+"""The kernel that traces the same pupil points for many stars and keeps displacement and path at the image.
 
-A module of its own: with one caller of the surface loop in a module the compiler puts all of it in line, which is
-worth a tenth of the time.
+A module of its own: with one caller of the surface loop in a module the compiler inlines all of it, which saves a
+tenth of the time.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
         path_out: wp.array2d(dtype=lanes),
         status_out: wp.array2d(dtype=lane_flags),
     ):
-        """Trace packet ``item % n_packets`` of the pupil for bundle ``item // n_packets`` and keep what a PSF needs.
+        """Trace packet ``item % n_packets`` of the pupil for bundle ``item // n_packets``.
 
         A bundle is one star at one wavelength. ``reference`` holds, per bundle, a point of the CCD surface and its
-        normal (-dh/dx, -dh/dy, 1) before normalisation [6]. Kept: where the rays meet the tangent plane of the CCD
-        there, relative to the point, and their optical path to the sphere of that radius about the point, beyond it.
+        normal (-dh/dx, -dh/dy, 1) before normalisation [6]. Written: the intersections with the tangent plane of the
+        CCD there, relative to the point, and the optical paths to the sphere of that radius about the point, beyond it.
         """
         item = first + wp.tid()
         b = item / n_packets

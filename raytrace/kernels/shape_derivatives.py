@@ -33,6 +33,12 @@ hermite_curvatures = wp.func(bicubic.hermite_curvature)
 
 
 @wp.func
+def horner(re: lanes, im: lanes, x: lanes, y: lanes, add_re: lanes, add_im: lanes):
+    """Real and imaginary part of a step (re + i im)(x + iy) + (add_re + i add_im)."""
+    return wp.cw_mul(re, x) - wp.cw_mul(im, y) + add_re, wp.cw_mul(re, y) + wp.cw_mul(im, x) + add_im
+
+
+@wp.func
 def polar_derivatives(
     numbers: wp.array(dtype=wp.float64), offset: wp.int32, degree: wp.int32, order: wp.int32, x: lanes, y: lanes
 ):
@@ -72,25 +78,13 @@ def polar_derivatives(
             qr = wp.cw_mul(qr, s) + lanes(numbers[at])
             qi = wp.cw_mul(qi, s) + lanes(numbers[at + 1])
             at += 2
-        # Each pair takes the one that the lines below it change.
-        hr = wp.cw_mul(zzr, x) - wp.cw_mul(zzi, y) + TWO * zr
-        zzi = wp.cw_mul(zzr, y) + wp.cw_mul(zzi, x) + TWO * zi
-        zzr = hr
-        hr = wp.cw_mul(zsr, x) - wp.cw_mul(zsi, y) + sr
-        zsi = wp.cw_mul(zsr, y) + wp.cw_mul(zsi, x) + si
-        zsr = hr
-        hr = wp.cw_mul(zr, x) - wp.cw_mul(zi, y) + fr
-        zi = wp.cw_mul(zr, y) + wp.cw_mul(zi, x) + fi
-        zr = hr
-        hr = wp.cw_mul(fr, x) - wp.cw_mul(fi, y) + qr
-        fi = wp.cw_mul(fr, y) + wp.cw_mul(fi, x) + qi
-        fr = hr
-        hr = wp.cw_mul(sr, x) - wp.cw_mul(si, y) + dr
-        si = wp.cw_mul(sr, y) + wp.cw_mul(si, x) + di
-        sr = hr
-        hr = wp.cw_mul(ssr, x) - wp.cw_mul(ssi, y) + er
-        ssi = wp.cw_mul(ssr, y) + wp.cw_mul(ssi, x) + ei
-        ssr = hr
+        # Each line takes values that the lines below it change.
+        zzr, zzi = horner(zzr, zzi, x, y, TWO * zr, TWO * zi)
+        zsr, zsi = horner(zsr, zsi, x, y, sr, si)
+        zr, zi = horner(zr, zi, x, y, fr, fi)
+        fr, fi = horner(fr, fi, x, y, qr, qi)
+        sr, si = horner(sr, si, x, y, dr, di)
+        ssr, ssi = horner(ssr, ssi, x, y, er, ei)
     along = FOUR * wp.cw_mul(x, zsr) + TWO * sr + FOUR * wp.cw_mul(wp.cw_mul(x, x), ssr)
     across = TWO * sr + FOUR * wp.cw_mul(wp.cw_mul(y, y), ssr) - FOUR * wp.cw_mul(y, zsi)
     mixed = TWO * (wp.cw_mul(y, zsr) - wp.cw_mul(x, zsi)) + FOUR * wp.cw_mul(wp.cw_mul(x, y), ssr)

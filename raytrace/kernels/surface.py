@@ -1,7 +1,7 @@
-"""What one surface does to a packet of rays: meet it, find its normal, reflect or refract, see its aperture.
+"""Intersection of rays with conics and even aspheres, reflection and refraction.
 
-All in the local frame of the surface (vertex at the origin, sag along z). Even asphere, conic, sphere and plane are
-one family::
+All in the frame of the surface (vertex at the origin, sag along z). Even asphere, conic, sphere and plane are one
+family::
 
     sag(r) = c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + a_4 r^4 + a_6 r^6 + ...
 
@@ -112,7 +112,7 @@ def aspheric_distance(
         rate = wp.cw_mul(q, w - wp.cw_mul(slope, outward)) - c * outward
         step = wp.cw_div(g, rate)
         for i in range(LANES):
-            # A lane that has converged stays as it is, whatever its neighbours still need.
+            # A lane that has converged stays as it is.
             t[i] = wp.where(running[i] > ZERO, t[i] - step[i], t[i])
             # Written so that a NaN (a ray that misses) stops too.
             running[i] = wp.where(wp.abs(step[i]) > NEWTON_STEP, running[i], ZERO)

@@ -1,8 +1,7 @@
-"""The kernels that carry packets of rays through a whole telescope.
+"""The kernel that traces packets of rays through a telescope.
 
-Each is made twice from one source (`launch.kernel_pair`): what only few telescopes need slows the loop over the
-surfaces by a seventh even where no surface has it, because it takes registers and keeps the compiler from putting
-functions in line.
+It has two variants (`kernel_pair`): code for rare kinds of surfaces slows the loop by a seventh even where no surface
+is of that kind, because it takes registers and keeps the compiler from inlining functions.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ APERTURE = wp.constant(14)
 FIRST_CURVATURE = wp.constant(18)
 NUMBERS = 19
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
-# (0 no, 1 by a disc or ring, 2 by another aperture), whether something may stand in the way to it, whether its shape
-# has parts beside the conic and its even powers (1) or is a mesh (2).
+# (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
+# parts besides the conic and its even powers (1) or is a mesh (2).
 INTERACTION = wp.constant(0)
 TERMS = wp.constant(1)
 ROTATED = wp.constant(2)
@@ -111,7 +110,7 @@ def to_telescope(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: l
 
 
 @wp.func
-def on_the_way(
+def past_obstacles(
     surfaces: PackedSurfaces,
     s: wp.int32,
     x: lanes,
@@ -123,7 +122,7 @@ def on_the_way(
     t: lanes,
     status: lanes,
 ):
-    """Statuses after what may stand in the way over a distance t from a point, given from the vertex of a surface."""
+    """Statuses after the obstructions over a distance t from a point, given from the vertex of surface ``s``."""
     vertex_x = lanes(surfaces.numbers[s, VERTEX])
     vertex_y = lanes(surfaces.numbers[s, VERTEX + 1])
     vertex_z = lanes(surfaces.numbers[s, VERTEX + 2])
@@ -140,9 +139,9 @@ def statuses(status: lanes):
 
 
 def surface_loop(special: bool) -> wp.Function:
-    """Return the loop over the surfaces of a telescope, the same source with or without what only few telescopes need.
+    """Return the loop over the surfaces of a telescope, for plain telescopes or for any.
 
-    Without: figures beside conics with even powers, phase screens, apertures beside discs and rings, obstructions.
+    Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, no obstructions.
     """
 
     @wp.func
@@ -160,10 +159,10 @@ def surface_loop(special: bool) -> wp.Function:
         packet: wp.int32,
         out: RayPackets,
     ):
-        """Carry a packet through every surface, and write it after the last ones, as many as the outputs have room for.
+        """Trace a packet through every surface, and write it after the last ones, as many as ``out`` has surfaces.
 
-        Positions and directions are in the telescope frame. The body of the loop stands here in line: as a function of
-        its own it would hand a dozen vectors to and fro through memory, and the trace would take a third longer.
+        Positions and directions are in the telescope frame. The body of the loop is inline: a function of its own would
+        pass a dozen vectors through memory, and the trace would take a third longer.
         """
         status = lanes(OK)
         n_surfaces = surfaces.kinds.shape[0]
@@ -174,8 +173,8 @@ def surface_loop(special: bool) -> wp.Function:
             x = x - lanes(surfaces.numbers[s, VERTEX])
             y = y - lanes(surfaces.numbers[s, VERTEX + 1])
             z = z - lanes(surfaces.numbers[s, VERTEX + 2])
-            turned = surfaces.kinds[s, ROTATED]
-            if turned == 1:
+            rotated = surfaces.kinds[s, ROTATED]
+            if rotated == 1:
                 x, y, z = to_local(surfaces, s, x, y, z)
                 u, v, w = to_local(surfaces, s, u, v, w)
 
@@ -203,18 +202,18 @@ def surface_loop(special: bool) -> wp.Function:
                     for i in range(LANES):
                         status[i] = wp.where(running[i] > ZERO, NOT_CONVERGED, status[i])
             for i in range(LANES):
-                # A NaN fails every comparison; wp.isfinite would be a call per lane and stop the compiler's vectors.
+                # A NaN fails every comparison; wp.isfinite would be a call per lane and prevent vectorization.
                 status[i] = wp.where(wp.abs(t[i]) < FAR, status[i], wp.where(status[i] <= VIGNETTED, MISSED, status[i]))
 
             if wp.static(special):
                 if surfaces.kinds[s, OBSTRUCTED] == 1:
-                    # Called from two places: a function with one caller is put in line, which slows the whole loop.
-                    if turned == 1:
+                    # Two calls on purpose: a function with one caller is inlined, which slows the whole loop.
+                    if rotated == 1:
                         sx, sy, sz = to_telescope(surfaces, s, x, y, z)
                         su, sv, sw = to_telescope(surfaces, s, u, v, w)
-                        status = on_the_way(surfaces, s, sx, sy, sz, su, sv, sw, t, status)
+                        status = past_obstacles(surfaces, s, sx, sy, sz, su, sv, sw, t, status)
                     else:
-                        status = on_the_way(surfaces, s, x, y, z, u, v, w, t, status)
+                        status = past_obstacles(surfaces, s, x, y, z, u, v, w, t, status)
 
             x = x + wp.cw_mul(t, u)
             y = y + wp.cw_mul(t, v)
@@ -239,20 +238,20 @@ def surface_loop(special: bool) -> wp.Function:
             if interaction == MIRROR or interaction == REFRACT:
                 # The gradient of the implicit form G is normal to the surface, and its length does not matter.
                 b = z
-                bend = lanes(c)
+                radial = lanes(c)
                 if terms > 0:
                     value, slope = polynomial(surfaces.coefficients, s, terms, wp.cw_mul(x, x) + wp.cw_mul(y, y))
                     b = z - value
-                    bend = bend + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
-                nx = -wp.cw_mul(bend, x)
-                ny = -wp.cw_mul(bend, y)
+                    radial = radial + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
+                nx = -wp.cw_mul(radial, x)
+                ny = -wp.cw_mul(radial, y)
                 if wp.static(special):
                     if deformed > 0:
                         b = b - part
                         if terms > 0:
-                            bend = lanes(c) + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
-                        nx = -wp.cw_mul(bend, x) - wp.cw_mul(part_x, lanes(ONE) - ((ONE + k) * c) * b)
-                        ny = -wp.cw_mul(bend, y) - wp.cw_mul(part_y, lanes(ONE) - ((ONE + k) * c) * b)
+                            radial = lanes(c) + wp.cw_mul(slope, lanes(ONE) - ((ONE + k) * c) * b)
+                        nx = -wp.cw_mul(radial, x) - wp.cw_mul(part_x, lanes(ONE) - ((ONE + k) * c) * b)
+                        ny = -wp.cw_mul(radial, y) - wp.cw_mul(part_y, lanes(ONE) - ((ONE + k) * c) * b)
                 nz = lanes(ONE) - ((ONE + k) * c) * b
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
@@ -269,7 +268,7 @@ def surface_loop(special: bool) -> wp.Function:
                         total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
                         status[i] = wp.where(wp.abs(w[i]) < FAR, status[i], total)
 
-            if turned == 1:
+            if rotated == 1:
                 x, y, z = to_telescope(surfaces, s, x, y, z)
                 u, v, w = to_telescope(surfaces, s, u, v, w)
             x = x + lanes(surfaces.numbers[s, VERTEX])

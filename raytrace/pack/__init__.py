@@ -1,1 +1,1 @@
-"""A telescope as the arrays that the trace kernels read."""
+"""A telescope as arrays for the trace kernels."""

@@ -1,4 +1,4 @@
-"""The meshes among a telescope's surfaces as the trace kernels read them."""
+"""The meshes among a telescope's surfaces, for the trace kernels."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def pack_meshes(surfaces: tuple[Surface, ...], device: str = "cpu") -> Any:
         facets.append(np.concatenate([shape.corners.reshape(n, 9), shape.corner_slopes.reshape(n, 6)], axis=1))
     packed = PackedMeshes()
     packed.ids = warp_array(ids, wp.uint64, device=device)
-    # The kernels know meshes by number only: whoever holds the numbers has to keep the meshes.
+    # Kernels refer to meshes by number only: the array of numbers keeps the meshes alive.
     packed.ids.kept = kept
     packed.first_facet = warp_array(first, wp.int32, device=device)
     packed.span = warp_array(span, device=device)

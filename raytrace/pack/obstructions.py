@@ -1,4 +1,4 @@
-"""The obstructions of a telescope as meshes that the trace kernels can ask."""
+"""The obstructions of a telescope as meshes for the trace kernels."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def pack_obstructions(telescope: Telescope, device: str = "cpu") -> Any:
         )
     packed = PackedObstructions()
     ids = warp_array([mesh.id for mesh in meshes], wp.uint64, device=device)
-    # The kernels know meshes by number only: whoever holds the numbers has to keep the meshes.
+    # Kernels refer to meshes by number only: the array of numbers keeps the meshes alive.
     ids.kept = meshes
     packed.meshes = ids
     packed.blocks = warp_array(blocked_ways(telescope), wp.int32, device=device)

@@ -1,4 +1,4 @@
-"""The shapes of a telescope's surfaces as the trace kernels read them: a conic with even powers, and parts."""
+"""The shapes of a telescope's surfaces for the trace kernels: a conic with even powers, and parts."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, Pac
 
 @dataclass(frozen=True)
 class SplitShape:
-    """A shape as its conic with even powers of the radius, and what is added to it.
+    """A shape as a conic with even powers of the radius, and added parts.
 
     Attributes
     ----------
     base : Rotational
         Conic with even powers; a plane where the shape has none of its own.
     parts : tuple of Shape
-        What is added; of an odd asphere only its powers, its conic stands apart.
+        Shapes added to it; of an odd asphere only its powers.
     first_curvature : float
         Curvature [1/m] of the surface that the search for a ray's landing starts from: that of the base, or of the
         sphere that a shape without a base resembles.

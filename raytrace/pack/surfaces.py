@@ -1,4 +1,4 @@
-"""A telescope as the arrays that the trace kernels read, made once per telescope."""
+"""A telescope as arrays for the trace kernels, made once per telescope."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
     general: list[Aperture | None] = []
     for row, s in enumerate(surfaces):
         base, terms = shapes[row].base, shapes[row].base.coefficients
-        turned = not np.array_equal(s.matrix, np.eye(3))
+        rotated = not np.array_equal(s.matrix, np.eye(3))
         coefficients[row, : len(terms)] = terms
         ring = clear_ring(s.aperture)
         general.append(s.aperture if ring is None else None)
@@ -59,7 +59,7 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
         kinds[row] = [
             int(s.interaction),
             len(terms),
-            turned,
+            rotated,
             stopped,
             bool(blocked[row].any()),
             2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
