@@ -58,7 +58,7 @@ class FocalPlaneConfig(Section):
     budget: Literal["simulated", "specification", "flat"] = Field(
         "simulated", description="column of Table 1 that the heights are drawn from, or flat"
     )
-    global_: Switch = Field(True, alias="global", description="deformation of the whole focal plane")
+    global_: Switch = Field(True, alias="global", description="figure of the whole focal plane")
     raft: Switch = Field(True, description="height of each raft")
     ccd: Switch = Field(True, description="height of each CCD")
     tilt: Switch = Field(True, description="tilt of each CCD")
@@ -96,7 +96,7 @@ class FocalPlaneConfig(Section):
 
 
 class ActiveOpticsConfig(Section):
-    """Residual aberration of the active optics in each visit (0.2 um in Jee & Tyson 2011)."""
+    """What the active optics leaves uncorrected: an aberration of each visit (0.2 um in Jee & Tyson 2011)."""
 
     residual_um: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=2)] = Field(
         0.0, description="rms of the wavefront left over, over pupil and field [um]"
