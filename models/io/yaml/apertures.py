@@ -6,7 +6,7 @@ regions that block light stand under ``obscuration``. A region is one of:
 ================================================================= ====================================================
 ``{circle: 0.4, centre: [0, 0]}``                                 disc of a radius
 ``{annulus: [0.6, 4.1], centre: [0, 0]}``                         ring of two radii
-``{rectangle: [0.05, 9.6], centre: [0, 0], angle: 45}``           width along x and height along y, then turned
+``{rectangle: [0.05, 9.6], centre: [0, 0], angle: 45}``           width along x and height along y, then rotated
 ``{polygon: [[0, 0], [1, 0], [0, 1]]}``                           corners in either sense
 ``{vane: 0.05, from: [0.4, 0], angle: 45, both_ways: true}``      strip of a width from a point outwards
 ``{union: [...]}``, ``{intersection: [...]}``, ``{complement: r}`` of other regions

@@ -164,7 +164,7 @@ def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
             current = Block(source, f"surface {len(surfaces)}")
             surfaces.append(current)
         elif surfaces and (record.keyword in TRAILER or (indented and record.line not in indented)):
-            # What stands at the margin after the surfaces no longer belongs to one.
+            # Lines at the margin after the surfaces belong to none of them.
             current = trailer = Block(source) if trailer is header else trailer
             current.lines.append(replace(record, place=""))
         else:

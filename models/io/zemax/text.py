@@ -91,7 +91,7 @@ class Record:
         position : int
             Which of the words.
         default : float, optional
-            What to return where there are not as many words; without one that is an error.
+            Value where there are fewer words; without one that is an error.
         infinite : bool
             Whether "INFINITY" is a number here.
         """
