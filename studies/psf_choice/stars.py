@@ -59,8 +59,8 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
     """Return the noise-free stars of all CCDs."""
 
     def measured(exposure: CcdExposure) -> SimulatedCcd:
-        truth = measure_shapes(exposure.holdout.image, exposure.holdout.pixel_scale, experiment.weight_fwhm)
-        return SimulatedCcd(exposure, truth, _look_at(experiment, exposure, exposure.observed.image))
+        holdout = measure_shapes(exposure.holdout.image, exposure.holdout.pixel_scale, experiment.weight_fwhm)
+        return SimulatedCcd(exposure, holdout, _look_at(experiment, exposure, exposure.observed.image))
 
     with experiment.screens(threads, reporter):
         simulated = simulate_ccds(experiment, measured, title="stars", threads=threads, reporter=reporter)
