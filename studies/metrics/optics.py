@@ -84,29 +84,15 @@ def ee80(scene: Scene) -> dict[str, float]:
     return {f"ee80 field {_pair(p)}": float(v) for v, p in zip(radii, scene.plan.fields_deg, strict=True)}
 
 
-def _scale_tolerance(scene: Scene, slope: float) -> float:
-    """Return the change [m] that rounding causes in a focal length measured over a slope [rad]."""
-    return scene.length_tolerance / slope
-
-
 @OPTICS.group(
     "distortion",
-    Metric(
-        "distortion focal length",
-        "m",
-        "path",
-        lambda scene, _: one_digit(_scale_tolerance(scene, scene.telescope.field_radius)),
-    ),
-    Metric(
-        "distortion axis focal length", "m", "path", lambda scene, _: one_digit(_scale_tolerance(scene, _AXIS_SLOPE))
-    ),
+    Metric("distortion focal", "m", "path", lambda s, _: one_digit(s.length_tolerance / s.telescope.field_radius)),
+    Metric("distortion axis focal length", "m", "path", lambda s, _: one_digit(s.length_tolerance / _AXIS_SLOPE)),
     Metric(
         "distortion largest percent of axis scale",
         "percent",
         "path",
-        lambda scene, _: one_digit(
-            100.0 * _scale_tolerance(scene, _AXIS_SLOPE) / scene.distortion["axis_focal_length_m"]
-        ),
+        lambda s, _: one_digit(100.0 * (s.length_tolerance / _AXIS_SLOPE) / s.distortion["axis_focal_length_m"]),
     ),
     Metric("distortion rms shift", "um", "path"),
 )
