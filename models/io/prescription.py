@@ -81,9 +81,10 @@ def load_telescope(
         Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, or of a ``.zmx`` (Zemax) or ``.seq``
         (CODE V) file.
     lenient : bool
-        Of a Zemax or CODE V file: warn about what is not understood instead of raising.
+        Of a Zemax or CODE V file: warn about lines that are not understood and go on without them.
     glass_catalogues : iterable of GlassCatalogue or path
-        AGF catalogues that a Zemax or CODE V file's glasses are looked up in, before the bundled one.
+        AGF catalogues to look up the glasses of a Zemax or CODE V file in, first of all; then comes one beside the
+        file that has its name and ends in .agf, then the bundled one.
 
     Returns
     -------

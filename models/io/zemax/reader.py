@@ -44,24 +44,10 @@ def read_lens(
     lenient: bool = False,
     glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
 ) -> Telescope:
-    """Read a lens file of Zemax or CODE V.
+    """Read a lens file of Zemax or CODE V, as :func:`~pachon.models.io.prescription.load_telescope` does.
 
-    Parameters
-    ----------
-    path : Path
-        The file, in UTF-16, UTF-8 or ISO 8859-1.
-    parts : callable
-        Reader of the parts of the file, in the terms of a Zemax file.
-    lenient : bool
-        Warn about parts that are not understood and go on without them, instead of raising.
-    glass_catalogues : iterable of GlassCatalogue or path
-        Catalogues to look glasses up in, first of all; then comes one beside the file that has its name and ends in
-        .agf, then the bundled one.
-
-    Returns
-    -------
-    Telescope
-        The lens; lengths in metres, indices as in the file: relative to air, whose index is 1.
+    `parts` reads the parts of the file in the terms of a Zemax file. Lengths of the telescope are in metres, indices as
+    in the file: relative to air, whose index is 1.
 
     Raises
     ------
