@@ -307,7 +307,9 @@ def _dotted(location: Iterable[int | str], content: Any) -> str:
     for part in location:
         if isinstance(part, str) and part.startswith("<"):
             continue
-        inside = (isinstance(content, dict) and part in content) or isinstance(content, list)
+        inside = (isinstance(content, dict) and part in content) or (
+            isinstance(content, list) and isinstance(part, int) and part < len(content)
+        )
         content = content[part] if inside else None
         if isinstance(part, int):
             path += f"[{content.get(label, part) if isinstance(content, dict) else part}]"

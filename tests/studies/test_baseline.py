@@ -206,13 +206,14 @@ def test_a_changed_sign_of_heights_is_caught(project, monkeypatch):
 
 
 def test_a_changed_sign_where_light_meets_the_heights_is_caught(project, monkeypatch):
-    """The heights as such stay as they are; what light sees of them does not."""
-    seen = camera_metrics.trace_pupils
+    """The heights as such stay as they are; those that light meets do not."""
+    trace_pupils = camera_metrics.trace_pupils
 
-    def wrong(telescope, fields, wavelength, pupil, plane=None, **keywords):
-        if plane is not None:
-            plane = replace(plane, surfaces=replace(plane.surfaces, polynomial=-plane.surfaces.polynomial))
-        return seen(telescope, fields, wavelength, pupil, plane, **keywords)
+    def wrong(*arguments, focal_plane=None, **keywords):
+        if focal_plane is not None:
+            surfaces = focal_plane.surfaces
+            focal_plane = replace(focal_plane, surfaces=replace(surfaces, polynomial=-surfaces.polynomial))
+        return trace_pupils(*arguments, focal_plane=focal_plane, **keywords)
 
     monkeypatch.setattr(camera_metrics, "trace_pupils", wrong)
     assert kinds_out(check_baseline(project / "camera.json")) == {"defocus"}
