@@ -100,7 +100,7 @@ def test_the_maps_hold_the_light(lsst_r):
 
 
 def test_the_ghosts_of_the_lsst(lsst_r):
-    found = ghosts(lsst_r, detector_reflectivity=0.3)
+    found = ghosts(lsst_r, detector_reflectivity=0.3, n_pupil=10000)
     assert len(ghost_pairs(lsst_r)) == 36
     summary = found.summary()
     brightest = next(g for g in found.ghosts if g.first.startswith("Filter") and g.second.startswith("Filter"))
