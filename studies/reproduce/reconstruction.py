@@ -160,7 +160,7 @@ def scatter(bench: Bench) -> Reproduced:
     before = _rms(products, "observed", ("e1", "e2"))
     after = _rms(products, "observed", ("residual_e1", "residual_e2"))
     # Noise adds to the variance of the PSFs themselves, which the noise-free ones show.
-    noise = float(np.sqrt(max(before**2 - _rms(products, "truth", ("e1", "e2")) ** 2, 0.0)))
+    noise = float(np.sqrt(max(before**2 - _rms(products, "holdout", ("e1", "e2")) ** 2, 0.0)))
     stars = [p.observed for p in products]
     left = [np.concatenate([getattr(s, k) for s in stars]) for k in ("residual_e1", "residual_e2")]
     mean = [float(np.nanmean(v)) for v in left]
