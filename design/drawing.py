@@ -42,10 +42,10 @@ def _colors(name: str, first: float, span: float, count: int) -> list[Any]:
 
 
 def panel_grid(count: int, width: float, height: float, most: int = 5) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels of a size [inches], at most so many in a row, and the axes that are to be used."""
+    """Return a figure with panels of a size [inches], at most `most` in a row, and the axes in use."""
     columns = min(count, most)
     if count > most:
-        # As even rows as can be.
+        # Rows of about equal length.
         columns = math.ceil(count / math.ceil(count / most))
     rows = math.ceil(count / columns)
     figure = new_figure(max(columns * width, 4.5), rows * height + 0.6)
@@ -56,13 +56,13 @@ def panel_grid(count: int, width: float, height: float, most: int = 5) -> tuple[
 
 
 def round_length(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above a positive value."""
+    """Return the largest of 1, 2, 5 times a power of ten up to a positive value."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(m * power for m in (5.0, 2.0, 1.0) if m * power <= value * (1 + 1e-9))
 
 
 def draw_scale_bar(axes: Axes, length: float, label: str) -> None:
-    """Draw a bar of a length in data units at the lower left, and what it stands for; limits are set by then."""
+    """Draw a bar of a length in data units with its label at the lower left, after the limits are set."""
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
     x, y = left + 0.05 * (right - left), low + 0.05 * (high - low)
@@ -71,7 +71,7 @@ def draw_scale_bar(axes: Axes, length: float, label: str) -> None:
 
 
 def second_scale(axes: Axes, factor: float, label: str) -> None:
-    """Draw the horizontal axis once more above, in a unit of which so many make one of the axis below."""
+    """Draw a second horizontal axis above, in units of which `factor` make one of the axis below."""
 
     def convert(x: Any) -> Any:
         return x * factor
@@ -97,14 +97,14 @@ def bare_frame(axes: Axes, half: float) -> None:
 
 
 def spread_in_field(fields: np.ndarray) -> bool:
-    """Return whether field points are many enough, and not all on a line, to draw a map over the field."""
+    """Return whether field points suffice for a map: many, and not on a line."""
     centered = fields - fields.mean(axis=0)
     strengths = np.linalg.svd(centered, compute_uv=False)
     return len(fields) > FEW and bool(strengths[-1] > 1e-3 * strengths[0])
 
 
 def draw_field_map(axes: Axes, fields: np.ndarray, values: np.ndarray, **style: Any) -> Any:
-    """Draw values at field points [rad] as a map in degrees, smooth between the points, and return its colours' key."""
+    """Draw values at field points [rad] as a smooth map in degrees, and return the image for a colour bar."""
     from matplotlib.tri import Triangulation
 
     x, y = np.rad2deg(fields).T

@@ -1,1 +1,1 @@
-"""Diffraction images and what is measured on them."""
+"""Diffraction images, encircled energy and modulation transfer."""

@@ -90,20 +90,20 @@ def layout_scene(
 
 
 def surface_mesh(surface: Surface, reach: float) -> trimesh.Trimesh:
-    """Return a surface, cut to its aperture, as a mesh in the telescope frame [m]; of a baffle, what blocks light.
+    """Return a surface, cut to its aperture, as a mesh in the telescope frame [m]; of a baffle, the blocking part.
 
     Parameters
     ----------
     surface : Surface
         The surface.
     reach : float
-        Distance from its z axis to go to [m].
+        Radius of the mesh [m].
     """
     rings, spokes = _RINGS, _SPOKES
     center_x, center_y, inner, outer = _ring(surface, reach)
     plain = isinstance(surface.aperture, (Circle, Annulus)) and surface.interaction != Interaction.PASS
     if not plain and surface.aperture is not None:
-        # Cells are either drawn or not, so that edges need fine ones.
+        # Cells are drawn or not, so edges need fine ones.
         rings, spokes = 4 * rings, 4 * spokes
     radius = np.linspace(inner, outer, rings + 1)
     angle = 2.0 * np.pi * np.arange(spokes) / spokes
@@ -129,7 +129,7 @@ def surface_mesh(surface: Surface, reach: float) -> trimesh.Trimesh:
 
 
 def tubes(paths: np.ndarray, radius: float) -> trimesh.Trimesh:
-    """Return thin tubes along lines of straight pieces.
+    """Return thin tubes along polylines.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def tubes(paths: np.ndarray, radius: float) -> trimesh.Trimesh:
     solid = np.isfinite(length) & (length > 1e-9)
     start, end, length = start[solid], end[solid], length[solid]
     along = (end - start) / length[:, None]
-    # Whichever axis a piece is not along serves to find two directions across it.
+    # Two directions across each piece, from the axis that is least along it.
     other = np.eye(3)[np.argmin(np.abs(along), axis=-1)]
     first = np.cross(along, other)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -189,7 +189,7 @@ def _wall(first: np.ndarray, second: np.ndarray) -> trimesh.Trimesh:
 
 
 def _unused(scene: trimesh.Scene, name: str) -> str:
-    """Return a name that no mesh of the scene has yet."""
+    """Return a name that is not in the scene yet."""
     taken, number = set(scene.geometry), 2
     found = name
     while found in taken:

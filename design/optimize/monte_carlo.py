@@ -248,7 +248,7 @@ def monte_carlo(
 
 
 def _merit(judge: Merit, telescope: Telescope) -> float:
-    """Return the merit of a telescope [m]; NaN where its light gets lost."""
+    """Return the merit of a telescope [m]; NaN where its light is lost."""
     try:
         return float(np.linalg.norm(judge.residuals(telescope)))
     except PachonError:
