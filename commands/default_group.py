@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 class DefaultGroup(TyperGroup):
     """A group whose first command may be left out: ``pachon sweep FILE`` is ``pachon sweep run FILE``.
 
-    The help of the group shows the options of that command too.
+    The help of the group shows the options of that command too, and options may stand before the name of a command.
     """
 
     @property
@@ -22,7 +22,11 @@ class DefaultGroup(TyperGroup):
         return next(iter(self.commands))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the name of the default command before arguments that do not begin with that of another one."""
+        """Put the name of the command first: the one behind the options, or the default where there is none."""
+        if args and args[0].startswith("-") and args[0] != "--help":
+            _, rest, _ = self._with_default("option").make_parser(ctx).parse_args(args=list(args))
+            if rest and rest[0] in self.commands:
+                args = [rest[0], *args[: len(args) - len(rest)], *rest[1:]]
         first = args[0] if args else ""
         if first not in (*self.commands, "--help") and not self._is_mistyped(first):
             args = [self.default, *args]
@@ -35,7 +39,10 @@ class DefaultGroup(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help of the group, with the options of the default command."""
-        # The group itself does not parse these.
-        shown = copy(self)
-        shown.params = list(self.commands[self.default].params)
-        super(DefaultGroup, shown).format_help(ctx, formatter)
+        super(DefaultGroup, self._with_default("option", "argument")).format_help(ctx, formatter)
+
+    def _with_default(self, *kinds: str) -> DefaultGroup:
+        """Return a copy of the group with parameters of the default command, which the group itself does not parse."""
+        group = copy(self)
+        group.params = [p for p in self.commands[self.default].params if p.param_type_name in kinds]
+        return group

@@ -75,6 +75,11 @@ class PachonError(Exception):
         keys = ".".join(filter(None, (key, self.key))) if inner else key
         return type(self)(problem, subject=subject, file=file, place=place, key=keys or None)
 
+    def renamed(self, key: str) -> Self:
+        """Return the same error with another name of its key, such as that of a command's option."""
+        problem = self.problem.replace(self.key, key) if self.key else self.problem
+        return type(self)(problem, subject=self.subject, file=self.file, place=self.place, key=key)
+
 
 class PrescriptionError(PachonError):
     """Malformed prescription or site file."""
@@ -102,7 +107,7 @@ class ProductError(PachonError):
 
 @contextmanager
 def error_context(**context: Any) -> Iterator[None]:
-    """Raise errors of the block again within a wider context; keywords as of :meth:`PachonError.within`."""
+    """Raise errors of the block again within a wider context; keywords as in :meth:`PachonError.within`."""
     try:
         yield
     except PachonError as error:
@@ -110,17 +115,7 @@ def error_context(**context: Any) -> Iterator[None]:
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameError:
-    """Return the error for an unknown name, with the nearest known names.
-
-    Parameters
-    ----------
-    kind : str
-        Kind of object: ``"model"``, ``"CCD"``, ``"surface"``.
-    name : str
-        The name given.
-    allowed : iterable of str
-        The names that exist.
-    """
+    """Return the error for an unknown name of a kind, such as ``"CCD"``, with the nearest of the allowed names."""
     names = list(allowed)
     lowered = {n.lower(): n for n in names}
     near = [lowered[m] for m in get_close_matches(str(name).lower(), list(lowered), n=4, cutoff=0.5)]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import typer
 
+from ...core.errors import PachonError
 from .. import options
 from ..inputs import load_model
 from ..interrupt import interruptible
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from ...models.telescope import Telescope
 
 app = typer.Typer()
+
+#: Arguments of functions whose option has another name.
+_ARGUMENTS = {"pupil_points": "n_pupil", "rays": "n_pupil"}
 
 
 class Study(Protocol):
@@ -151,7 +155,11 @@ def design_command(
         def command(picture: Path | None, as_json: bool, **values: Any) -> None:
             kind = options.picture_kind(picture)
             shared = Given(**{f.name: values[f.name] for f in fields(Given) if f.name in values})
-            found = compute(shared, **{key: values[key] for key in own})
+            try:
+                found = compute(shared, **{key: values[key] for key in own})
+            except PachonError as error:
+                option = next((key for key in own if error.key == _ARGUMENTS.get(key, key)), None)
+                raise error if option is None else error.renamed(f"--{option.replace('_', '-')}") from None
             outcome = found if isinstance(found, Outcome) else Outcome(found)
             path = picture or Path(f"{outcome.stem or f'{name}_{shared.telescope.name}'}.png")
             _deliver(outcome, outcome.table or rows, path, kind, as_json)

@@ -94,15 +94,17 @@ def fft_psf(
         if across > _MOST:
             raise DomainError(
                 f"pixel = {plan.pixel * 1e6:.4g} um, pixels = {pixels}: the image would need {across} points "
-                f"across the pupil; expected at most {_MOST} (a smaller image, or n_pupil)"
+                f"across the pupil; expected at most {_MOST} (a smaller image, or n_pupil)",
+                key="n_pupil",
             )
     elif int(across) != across or across < 8:
-        raise DomainError(f"n_pupil = {across!r}: expected a whole number of at least 8")
+        raise DomainError(f"n_pupil = {across!r}: expected a whole number of at least 8", key="n_pupil")
     period = across * plan.wave_over_range
     if period < side or period < plan.spread:
         what = f"an image of {side * 1e6:.4g} um and spots of {plan.spread * 1e6:.4g} um"
         raise DomainError(
-            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} um; expected more points for {what}"
+            f"n_pupil = {across}: the pattern repeats after {period * 1e6:.4g} um; expected more points for {what}",
+            key="n_pupil",
         )
 
     def waves(field: np.ndarray, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:

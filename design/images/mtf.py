@@ -162,7 +162,7 @@ def mtf(
         If no light passes, or the lattice is too coarse for the spots.
     """
     if int(n_pupil) != n_pupil or n_pupil < 16:
-        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 16")
+        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 16", key="n_pupil")
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
@@ -172,7 +172,8 @@ def mtf(
     if 2.0 * reach * step > 1.0:
         raise DomainError(
             f"n_pupil = {n_pupil}: too few for spots of {2e6 * reach:.4g} um; "
-            f"expected at least {int(np.ceil(2.0 * reach * step * n_pupil))}"
+            f"expected at least {int(np.ceil(2.0 * reach * step * n_pupil))}",
+            key="n_pupil",
         )
     frequency = np.arange(int(n_pupil) + 1) * step
     angles = tangential_angle(telescope, principal)

@@ -168,7 +168,12 @@ def test_coatings(capsys, in_folder):
         (["ghosts", "lsst_v3.3_r", "--field-deg", "9"], ("expected within",)),
         (["draw", "lsst_v3.3_r", "--glb", "model.stl"], ("ends in .glb",)),
         (["psf", "lsst_v3.3_r", "--huygens", "--pupil-points", "64"], ("expected one of them",)),
-        (["psf", "lsst_v3.3_r", "--pixel-um", "200"], ("points across the pupil",)),
+        (
+            ["psf", "lsst_v3.3_r", "--pixel-um", "200"],
+            ("points across the pupil", "(a smaller image, or --pupil-points)"),
+        ),
+        (["psf", "lsst_v3.3_r", "--field-deg", "0", "--pupil-points", "16"], ("--pupil-points = 16: the pattern",)),
+        (["mtf", "lsst_v3.3_r", "--field-deg", "1.7", "--pupil-points", "16"], ("--pupil-points = 16: too few",)),
         (["ee", "lsst_v3.3_r", "-o", "ee.xyz"], ("ee.xyz",)),
         (["mtf", "no_such_telescope"], ("no_such_telescope",)),
     ],

@@ -72,6 +72,14 @@ def test_bad_arguments_are_one_line(capsys, in_folder, arguments, words):
     assert list(in_folder.iterdir()) == []
 
 
+@pytest.mark.parametrize("options", [["-o", "x.csv", "--json"], ["--json", "--out=x.csv"]])
+def test_options_may_stand_before_the_command(capsys, store, options):
+    assert main(["sweep", *options, "export", "small.sweep"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"table": "x.csv", "points": 299}
+    assert main(["sweep", "-o", "status", "none.yaml"]) == 2
+    assert "none.yaml: no such file" in capsys.readouterr().err
+
+
 def test_a_file_with_the_name_of_almost_a_command_is_a_sweep(capsys, in_folder):
     (in_folder / "reports").write_text("parameter: {}\n")
     assert main(["sweep", "reports"]) == 2

@@ -1,5 +1,6 @@
 """The examples of the documentation run, page by page, and its pictures are there."""
 
+import inspect
 import re
 import shutil
 from pathlib import Path
@@ -8,6 +9,7 @@ import matplotlib
 import pytest
 
 from pachon.models.io.prescription import DATA
+from pachon.pipeline.psf_model.model import PsfModel
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
@@ -55,6 +57,16 @@ def test_files_named_in_pages_exist(name):
     folders = "tests|models|raytrace|wavefront|design|pipeline|studies|commands|core|benchmarks|docs"
     for path in re.findall(rf"`(?:python |pytest (?:-m slow )?)?((?:{folders})/[\w./]+)", PAGES[name]):
         assert (DOCS.parent / path).exists(), path
+
+
+def test_the_page_of_psf_models_names_what_the_model_has():
+    page = PAGES["psf_models.md"]
+    named = re.findall(r"`(?:model\.)?(\w+)(?:\([^`]*\))?`", page.partition("## Beside Piff")[0])
+    options = inspect.signature(PsfModel.fit).parameters
+    known = {*dir(PsfModel), *options, "PsfModel"}
+    assert set(named) <= known, set(named) - known
+    for option in re.findall(r"^\| `(\w+)", page, flags=re.M):
+        assert option in options
 
 
 def test_every_page_is_in_the_index():

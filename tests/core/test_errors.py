@@ -42,6 +42,11 @@ def test_a_block_raises_in_its_context():
         raise ConfigError("k = 1")
 
 
+def test_a_key_can_have_the_name_of_an_option():
+    error = ConfigError("n_pupil = 4: expected more than 8", key="n_pupil").renamed("--rays")
+    assert (str(error), error.key) == ("--rays = 4: expected more than 8", "--rays")
+
+
 def test_fields_survive_a_process():
     error = pickle.loads(pickle.dumps(ConfigError("k = 1", file="a.yaml", key="k")))
     assert (str(error), error.file, error.key) == ("a.yaml: k = 1", "a.yaml", "k")
