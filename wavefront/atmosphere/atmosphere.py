@@ -125,7 +125,7 @@ class Atmosphere(LayerScreens):
             Directions that the wind blows to, from +x towards +y [rad]; the site's by default, and random where it has
             none.
         ground_lift : float
-            Height given to a layer at exactly 0 [m]: at 0 neighbouring stars see one and the same ground layer.
+            Height given to a layer at exactly 0 [m]: at 0 all stars share one and the same patch of the ground layer.
         zenith_angle : float or Quantity
             Angle of the line of sight from the zenith [rad]: it takes the layers farther by its secant and makes the
             Fried parameter smaller by its cosine to the 3/5.
@@ -141,10 +141,9 @@ class Atmosphere(LayerScreens):
         """
         if not isinstance(site, Site):
             site = load_site(site)
-        if not (isinstance(seed, int | np.integer) and seed >= 0):
-            raise DomainError(f"seed = {seed!r}: expected a whole number from 0")
-        if not (isinstance(epoch, int | np.integer) and epoch >= 0):
-            raise DomainError(f"epoch = {epoch!r}: expected a whole number from 0")
+        for name, value in (("seed", seed), ("epoch", epoch)):
+            if not (isinstance(value, int | np.integer) and value >= 0):
+                raise DomainError(f"{name} = {value!r}: expected a whole number from 0")
         zenith = require_zenith_angle(zenith_angle)
         fried = _length(site.r0 if r0 is None else r0, "r0") * math.cos(zenith) ** 0.6
         outer = _length(site.outer_scale if outer_scale is None else outer_scale, "outer_scale")
@@ -168,7 +167,7 @@ class Atmosphere(LayerScreens):
         size = screen_samples(screen_size, "screen_size")
         # Up to half the Nyquist limit: rays read slopes at the nearest sample, then at most an eighth of a wave away.
         split = min(DEFAULT_CUTOFF / fried, 0.5 * math.pi * size / length)
-        atmosphere = cls(
+        return cls(
             altitudes=height,
             weights=fraction,
             velocities=velocities,
@@ -186,13 +185,11 @@ class Atmosphere(LayerScreens):
             epoch=int(epoch),
             fixed_modulus=bool(fixed_modulus),
         )
-        atmosphere._check_cutoff()
-        return atmosphere
 
     def at_times(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
         """Return the same turbulence at other times, with shared screens.
 
-        Screens made by either are kept for both, and :meth:`release` of either frees them for both.
+        Screens made by either are stored for both, and :meth:`release` of either frees them for both.
 
         Parameters
         ----------
@@ -218,7 +215,7 @@ class Atmosphere(LayerScreens):
             raise DomainError(f"times: expected the middles of {len(middles)} equal steps of {step:g} s, rising")
         check_drift(self.altitudes, np.hypot(*self.velocities.T), exposure, self.screen_length)
         middles.setflags(write=False)
-        return self._through_the_same_screens(exposure=exposure, times=middles)
+        return self._with_shared_screens(exposure=exposure, times=middles)
 
     def at_altitudes(self, altitudes: ArrayLike) -> Atmosphere:
         """Return the same layers at other altitudes, with shared screens.
@@ -237,9 +234,9 @@ class Atmosphere(LayerScreens):
         if heights.shape != self.altitudes.shape or not np.all(np.isfinite(heights) & (heights >= 0.0)):
             raise DomainError(f"altitudes = {altitudes!r}: expected {self.layer_count} distances of 0 m or more")
         heights.setflags(write=False)
-        return self._through_the_same_screens(altitudes=heights)
+        return self._with_shared_screens(altitudes=heights)
 
-    def _through_the_same_screens(self, **changes: Any) -> Atmosphere:
+    def _with_shared_screens(self, **changes: Any) -> Atmosphere:
         """Return a changed atmosphere with shared screens: nothing that determines them may change."""
         other = replace(self, **changes)
         object.__setattr__(other, "_cache", self._cache)

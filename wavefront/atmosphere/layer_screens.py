@@ -1,4 +1,4 @@
-"""The phase screens of the layers of an atmosphere, made once and kept."""
+"""The phase screens of the layers of an atmosphere, each made once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...core.errors import DomainError, unknown_name
 from ...core.memory import require_bytes
 from ...core.random_streams import stream
 from .layers import Layers
-from .screens import phase_screen, slope_screen, working_bytes
+from .screens import draw_modes, phase_screen, slope_screen, working_bytes
 from .spline import evaluate
 from .turbulence import slope_variance
 
@@ -54,8 +54,7 @@ class LayerScreens(Layers):
         """Side of a high screen [m]."""
         return self.fine_size * self.fine_pixel
 
-    def _check_cutoff(self) -> None:
-        """Refuse a cut-off that one of the two grids cannot hold."""
+    def __post_init__(self) -> None:
         grids = {
             "low": (self.screen_length, math.pi / self.screen_pixel),
             "high": (self.fine_length, math.pi / self.fine_pixel),
@@ -69,7 +68,7 @@ class LayerScreens(Layers):
                 )
 
     def _band(self, scale: str) -> tuple[int, float, tuple[float, float]]:
-        """Return samples, side [m] and wavenumbers [rad/m] of one kind of screens."""
+        """Return samples, side [m] and range of wavenumbers [rad/m] of the low or the high screens."""
         if scale == "high":
             return self.fine_size, self.fine_length, (self.cutoff, math.inf)
         return self.screen_size, self.screen_length, (0.0, self.cutoff)
@@ -94,14 +93,14 @@ class LayerScreens(Layers):
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
         out : ndarray, optional
-            Array for the screen: float32, shape [screen_size, screen_size].
+            Array for the screen.
 
         Returns
         -------
-        ndarray
-            Path [m], float32, shape [screen_size, screen_size], ``[y, x]``.
+        ndarray of float32, shape [screen_size, screen_size]
+            Path [m], ``[y, x]``.
         """
-        return phase_screen(**self._drawing(layer, "low"), stencil=stencil, threads=threads, out=out)
+        return phase_screen(self._modes(layer, "low", stencil), self.screen_size, threads=threads, out=out)
 
     def high_screen(
         self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
@@ -110,7 +109,7 @@ class LayerScreens(Layers):
 
         Arguments are those of :meth:`low_screen`; the screen has shape [fine_size, fine_size].
         """
-        return phase_screen(**self._drawing(layer, "high"), stencil=stencil, threads=threads, out=out)
+        return phase_screen(self._modes(layer, "high", stencil), self.fine_size, threads=threads, out=out)
 
     def slope_unit(self, layer: int) -> float:
         """Return the slope of one count of :meth:`slope_screen` [rad]: eight standard deviations fill 15 bits."""
@@ -118,44 +117,33 @@ class LayerScreens(Layers):
         return max(8.0 * math.sqrt(variance) / 32767.0, 1e-30)
 
     def slope_screen(self, layer: int, *, threads: int | None = None, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the slopes of the low screen of a layer over :data:`SLOPE_LAG`, packed.
+        """Return the slopes of the low screen of a layer over :data:`SLOPE_LAG`, in counts of :meth:`slope_unit`.
 
-        Parameters
-        ----------
-        layer : int
-            Index of the layer.
-        threads : int, optional
-            Number of threads; all processors by default. No byte depends on it.
-        out : ndarray, optional
-            Array for the slopes: int32, shape [screen_size, screen_size].
-
-        Returns
-        -------
-        ndarray
-            As :func:`~pachon.wavefront.atmosphere.screens.slope_screen` packs them, in counts of :meth:`slope_unit`.
+        The result is an int32 array of shape [screen_size, screen_size], packed as
+        :func:`~pachon.wavefront.atmosphere.screens.slope_screen` does; the arguments are those of :meth:`low_screen`.
         """
-        return slope_screen(
-            **self._drawing(layer, "low"), unit=self.slope_unit(layer), lag=SLOPE_LAG, threads=threads, out=out
-        )
+        modes, unit = self._modes(layer, "low", "samples"), self.slope_unit(layer)
+        return slope_screen(modes, self.screen_size, self.screen_length, unit, lag=SLOPE_LAG, threads=threads, out=out)
 
-    def _drawing(self, layer: int, scale: str) -> dict[str, Any]:
-        """Return the arguments that determine one screen."""
+    def _modes(self, layer: int, scale: str, stencil: str) -> np.ndarray:
+        """Draw the modes of one screen."""
         if not 0 <= layer < self.layer_count:
             raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
         size, length, band = self._band(scale)
-        return {
-            "generator": stream(self.seed, "atmosphere", self.epoch, layer, scale),
-            "size": size,
-            "length": length,
-            "r0": self.r0,
-            "outer_scale": self.outer_scale,
-            "band": band,
-            "weight": float(self.weights[layer]),
-            "fixed_modulus": self.fixed_modulus,
-        }
+        return draw_modes(
+            stream(self.seed, "atmosphere", self.epoch, layer, scale),
+            size=size,
+            length=length,
+            r0=self.r0,
+            outer_scale=self.outer_scale,
+            band=band,
+            weight=float(self.weights[layer]),
+            stencil=stencil,
+            fixed_modulus=self.fixed_modulus,
+        )
 
     def screens(self, kind: str, threads: int | None = None) -> np.ndarray:
-        """Return the screens of all layers, made at the first call and kept.
+        """Return the screens of all layers, not writable; made at the first call.
 
         Parameters
         ----------
@@ -166,8 +154,7 @@ class LayerScreens(Layers):
 
         Returns
         -------
-        ndarray
-            Shape [n_layer, size, size], not writable.
+        ndarray, shape [n_layer, size, size]
 
         Raises
         ------
@@ -197,28 +184,14 @@ class LayerScreens(Layers):
             return self._cache[kind]
 
     def release(self) -> None:
-        """Free the kept screens; the next call makes the same ones again."""
+        """Free the screens; the next call makes the same ones again."""
         with _cache_lock:
             self._cache.clear()
 
     def path(self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low") -> np.ndarray:
-        """Return the path through one screen at screen coordinates, by plain NumPy.
+        """Return the path [m] through one screen at screen coordinates x, y [m], by plain NumPy; float64.
 
-        The screen is made anew at every call: a reference for the engines, slow.
-
-        Parameters
-        ----------
-        x, y : array_like
-            Screen coordinates [m].
-        layer : int
-            Index of the layer.
-        scale : str
-            ``"low"`` or ``"high"``.
-
-        Returns
-        -------
-        ndarray
-            Path [m], float64, shape of ``x``.
+        The screen, ``"low"`` or ``"high"``, is made anew at every call: a reference for the engines, slow.
         """
         scales = {"low": (self.low_screen, self.screen_pixel), "high": (self.high_screen, self.fine_pixel)}
         if scale not in scales:

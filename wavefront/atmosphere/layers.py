@@ -35,12 +35,12 @@ class Layers:
         direction : ndarray, shape [..., 3]
             Directions in which the light travels, of any length.
         time : array_like
-            Times since the start of the exposure [s]; its shape and that of the directions are broadcast.
+            Times since the start of the exposure [s], broadcast against the directions.
 
         Returns
         -------
-        ndarray
-            Screen coordinates [m], shape [..., n_layer, 2], not yet taken modulo the side.
+        ndarray, shape [..., n_layer, 2]
+            Screen coordinates [m], not yet taken modulo the side.
         """
         slopes = direction[..., None, :2] / -direction[..., None, 2:]
         elapsed = np.asarray(time, dtype=np.float64)[..., None, None]
@@ -108,17 +108,7 @@ def checked_layers(
 
 
 def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.ndarray:
-    """Return the distances of layers along a line of sight [m].
-
-    Parameters
-    ----------
-    heights : ndarray
-        Heights above the telescope [m].
-    ground_lift : float
-        Height given to a layer at exactly 0 [m].
-    zenith : float
-        Angle of the line of sight from the zenith [rad].
-    """
+    """Return distances [m] of layers at heights [m], lifted from exactly 0, along a line of sight [rad]."""
     return np.where(heights == 0.0, ground_lift, heights) / math.cos(zenith)
 
 

@@ -28,25 +28,7 @@ def require_zenith_angle(value: Any) -> float:
 
 
 def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
-    """Return the refractive index of air less one (Filippenko 1982, eqs. 1 to 3).
-
-    Parameters
-    ----------
-    wavelength : array_like or Quantity
-        Wavelength in vacuum [m].
-    weather : Weather
-        Pressure [mm Hg], temperature [degrees Celsius] and water vapour [mm Hg].
-
-    Returns
-    -------
-    ndarray
-        ``n - 1``, shape of ``wavelength``.
-
-    Raises
-    ------
-    DomainError
-        If a wavelength lies outside 0.2 to 2 um.
-    """
+    """Return the refractive index of air less one (Filippenko 1982, eqs. 1 to 3), for 0.2 to 2 um in vacuum."""
     lam = metres(wavelength, "wavelength")
     low, high = WAVELENGTH_RANGE
     outside = lam[~((lam >= low) & (lam <= high))]
@@ -66,36 +48,24 @@ def dispersion_shift(
     position_angle: float,
     weather: Weather,
 ) -> np.ndarray:
-    """Return the shift in field angle of each wavelength against a reference wavelength.
+    """Return the shift in field angle of each wavelength against a reference wavelength [rad], shape [n_wave, 2].
 
-    Refraction lifts a star towards the zenith by ``(n - 1) tan z``, so one wavelength against another by the
-    difference of the indices (Filippenko 1982, eq. 4, there in arcseconds): shorter wavelengths lie nearer to the
-    zenith *on the sky*. A field angle is the slope of the light's own travel, and the source on the sky lies the
-    opposite way, so shorter wavelengths shift in field angle *away from* the zenith's direction.
+    Refraction lifts a star towards the zenith by ``(n - 1) tan z``, so one wavelength against another by the difference
+    of the indices (Filippenko 1982, eq. 4, there in arcseconds): shorter wavelengths lie nearer to the zenith *on the
+    sky*. A field angle is the slope of the light's own travel, and the source on the sky lies the opposite way, so
+    shorter wavelengths shift in field angle *away from* the zenith's direction.
 
     Parameters
     ----------
-    wavelength : array_like or Quantity
-        Wavelengths [m], shape [n_wave].
-    reference_wavelength : float or Quantity
-        Wavelength of no shift [m].
+    wavelength, reference_wavelength : array_like or Quantity
+        Wavelengths in vacuum [m], 0.2 to 2 um.
     zenith_angle : float or Quantity
-        Angle of the line of sight from the zenith [rad].
+        Angle of the line of sight from the zenith [rad], 0 to 80 degrees.
     position_angle : float or Quantity
-        Direction, on the sky as seen from the telescope, towards the zenith: angle in the x-y plane of the
+        Direction, on the sky as viewed from the telescope, towards the zenith: angle in the x-y plane of the
         telescope frame from +x towards +y [rad].
     weather : Weather
         Weather at the telescope, such as ``site.weather``.
-
-    Returns
-    -------
-    ndarray
-        Shift of the field angle ``(tx, ty)`` [rad], shape [n_wave, 2].
-
-    Raises
-    ------
-    DomainError
-        If a wavelength or the zenith angle (0 to 80 degrees) is outside its range.
     """
     zenith, position = require_zenith_angle(zenith_angle), float(radians(position_angle, "position_angle"))
     if not math.isfinite(position):

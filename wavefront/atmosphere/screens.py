@@ -29,42 +29,8 @@ _COLUMN_BLOCK = 64
 _ROW_BLOCK = 128
 
 
-def band_modes(size: int, length: float, band: tuple[float, float]) -> tuple[int, np.ndarray]:
-    """Return the modes of a screen that lie in a band.
-
-    Parameters
-    ----------
-    size : int
-        Samples on a side.
-    length : float
-        Side [m].
-    band : tuple of float
-        Wavenumbers ``(low, high)`` [rad/m]: modes with ``low < |k| <= high`` are in it. Modes at and beyond the
-        Nyquist limit of an axis never are, nor is the mean.
-
-    Returns
-    -------
-    reach : int
-        Largest index of a mode along an axis.
-    inside : ndarray of bool
-        Shape [reach + 1, 2 reach + 1]: the modes of index ``(i, j)``, i from 0, j from -reach; in the column
-        ``i = 0`` only those with j > 0, of which those with j < 0 are the complex conjugates.
-    """
-    per_index = 2.0 * math.pi / length
-    reach = _reach(size, length, band)
-    i = np.arange(reach + 1, dtype=np.float64)[:, np.newaxis]
-    j = np.arange(-reach, reach + 1, dtype=np.float64)
-    square = i * i + j * j
-    inside = (square > (band[0] / per_index) ** 2) & (square <= (band[1] / per_index) ** 2)
-    inside[0, : reach + 1] = False
-    return reach, inside
-
-
 def working_bytes(size: int, length: float, band: tuple[float, float]) -> int:
-    """Return the approximate working memory for one screen, beside the screen itself [bytes].
-
-    Arguments are those of :func:`band_modes`.
-    """
+    """Return the approximate working memory for one screen, beside the screen itself [bytes]."""
     reach = _reach(size, length, band)
     modes = (reach + 1) * (2 * reach + 1)
     # First the modes in complex64 with their amplitudes, twice, and which are in the band; then the modes and their
@@ -73,11 +39,12 @@ def working_bytes(size: int, length: float, band: tuple[float, float]) -> int:
 
 
 def _reach(size: int, length: float, band: tuple[float, float]) -> int:
+    """Return the largest index along an axis of the modes of a band."""
     nyquist = (size - 1) // 2
     return min(nyquist, math.floor(band[1] / (2.0 * math.pi / length))) if math.isfinite(band[1]) else nyquist
 
 
-def _draw_modes(
+def _random_modes(
     generator: np.random.Generator, amplitude: np.ndarray, inside: np.ndarray, fixed_modulus: bool
 ) -> np.ndarray:
     """Return random complex modes [m] with the given rms amplitudes, Hermitian in the column i = 0."""
@@ -96,7 +63,7 @@ def _draw_modes(
     return modes
 
 
-def phase_screen(
+def draw_modes(
     generator: np.random.Generator,
     *,
     size: int,
@@ -107,90 +74,91 @@ def phase_screen(
     weight: float = 1.0,
     stencil: str = "samples",
     fixed_modulus: bool = False,
-    threads: int | None = None,
-    out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw one periodic screen of optical path.
+    """Draw the modes [m] of a screen, complex64, shape [reach + 1, 2 reach + 1], index ``[i, reach + j]``.
 
-    The random numbers depend on the generator and on the modes of the band only, so screens drawn from the same
-    stream with other stencils or other numbers of samples hold the same modes, whatever the threads.
+    The random numbers depend on the generator and on the modes of the band only, so screens drawn from the same stream
+    with other stencils or other numbers of samples hold the same modes.
 
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-        Stream of this screen.
-    size : int
-        Samples on a side.
-    length : float
-        Side [m].
-    r0 : float
-        Fried parameter of the whole atmosphere at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    band : tuple of float
-        Wavenumbers ``(low, high)`` [rad/m]; modes with ``low < |k| <= high`` are drawn.
-    weight : float
-        Fraction of the turbulence that this screen holds; its amplitude goes with the square root.
-    stencil : str
-        Interpolation that the samples are made for, one of :data:`~.spline.STENCILS`.
-    fixed_modulus : bool
-        Give every mode its rms modulus and a random phase only, after Jee & Tyson 2011, eq. 2, in place of a Gaussian
-        complex amplitude. Such a field is not Gaussian.
-    threads : int, optional
-        Number of threads; all processors by default.
-    out : ndarray, optional
-        Array for the screen: float32, shape [size, size].
-
-    Returns
-    -------
-    ndarray
-        Path [m], float32, shape [size, size], ``[y, x]``; of mean zero.
-
-    Raises
-    ------
-    DomainError
-        If a size, a length or the band is outside its range.
+    Modes with ``band[0] < |k| <= band[1]`` [rad/m] are drawn for a square of side ``length`` [m], from the Fried
+    parameter of the whole atmosphere at 500 nm [m] and the outer scale [m]. ``weight`` is the fraction of the
+    turbulence that this screen holds, ``stencil`` one of :data:`~.spline.STENCILS`. With ``fixed_modulus`` every mode
+    has its rms modulus and a random phase only (Jee & Tyson 2011, eq. 2) in place of a Gaussian complex amplitude; such
+    a field is not Gaussian. Modes at and beyond the Nyquist limit of an axis are zero, and so is the mean.
     """
-    modes = _modes(generator, size, length, r0, outer_scale, band, weight, stencil, fixed_modulus)
-    return _transform(modes, size, threads, out)
+    length = require_positive(length, "length", "metres")
+    if size < 4:
+        raise DomainError(f"size = {size!r}: expected at least 4 samples on a side")
+    reach = _reach(size, length, band)
+    j = np.arange(-reach, reach + 1, dtype=np.float64)
+    amplitude = np.empty((reach + 1, 2 * reach + 1), dtype=np.float32)
+    inside = np.empty(amplitude.shape, dtype=bool)
+    per_index, pixel_phase = 2.0 * math.pi / length, 2.0 * math.pi / size
+    for first in range(0, reach + 1, _COLUMN_BLOCK):
+        rows = slice(first, min(first + _COLUMN_BLOCK, reach + 1))
+        i = np.arange(rows.start, rows.stop, dtype=np.float64)[:, np.newaxis]
+        square = i * i + j * j
+        inside[rows] = (square > (band[0] / per_index) ** 2) & (square <= (band[1] / per_index) ** 2)
+        spectrum = path_spectrum(np.hypot(i, j) / length, r0, outer_scale) * weight
+        amplitude[rows] = np.sqrt(spectrum) * stencil_gain(i * pixel_phase, j * pixel_phase, stencil) / length
+    # Of the column i = 0, the modes with j < 0 are the complex conjugates of those with j > 0.
+    inside[0, : reach + 1] = False
+    return _random_modes(generator, amplitude, inside, fixed_modulus)
+
+
+def _in_fft_order(modes: np.ndarray, size: int) -> np.ndarray:
+    """Return rows of modes of index -reach to reach as a transform of so many samples takes them, zeros between."""
+    reach = modes.shape[1] // 2
+    padded = np.zeros((len(modes), size), dtype=np.complex64)
+    padded[:, : reach + 1] = modes[:, reach:]
+    padded[:, size - reach :] = modes[:, :reach]
+    return padded
+
+
+def phase_screen(
+    modes: np.ndarray, size: int, *, threads: int | None = None, out: np.ndarray | None = None
+) -> np.ndarray:
+    """Return the optical path [m] of modes, float32, shape [size, size], ``[y, x]``; of mean zero.
+
+    Only columns and rows that hold modes are transformed. The path is written to ``out`` where that is given.
+    """
+    count = len(modes)
+    columns = np.empty((count, size), dtype=np.complex64)
+    field = np.empty((size, size), dtype=np.float32) if out is None else out
+
+    def along_y(first: int) -> None:
+        part = modes[first : first + _COLUMN_BLOCK]
+        padded = _in_fft_order(part, size)
+        columns[first : first + _COLUMN_BLOCK] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
+
+    def along_x(first: int) -> None:
+        rows = slice(first, min(first + _ROW_BLOCK, size))
+        padded = np.zeros((rows.stop - first, size // 2 + 1), dtype=np.complex64)
+        padded[:, :count] = columns[:, rows].T
+        field[rows] = scipy.fft.irfft(padded, size, axis=1, norm="forward", overwrite_x=True)
+
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        list(pool.map(along_y, range(0, count, _COLUMN_BLOCK)))
+        list(pool.map(along_x, range(0, size, _ROW_BLOCK)))
+    return field
 
 
 def slope_screen(
-    generator: np.random.Generator,
-    *,
+    modes: np.ndarray,
     size: int,
     length: float,
-    r0: float,
-    outer_scale: float,
-    band: tuple[float, float],
     unit: float,
+    *,
     lag: float = 0.0,
-    weight: float = 1.0,
-    fixed_modulus: bool = False,
     threads: int | None = None,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw the slopes of the screen that :func:`phase_screen` draws from the same stream: both gradients, packed.
+    """Return the slopes of modes over a square of side ``length`` [m]: both gradients, packed. Overwrites the modes.
 
-    Parameters
-    ----------
-    generator, size, length, r0, outer_scale, band, weight, fixed_modulus, threads
-        As for :func:`phase_screen`.
-    unit : float
-        Slope of one count [rad]; slopes beyond 32767 counts are held there.
-    lag : float
-        Baseline of the slopes [m]: each mode of wavenumber k is multiplied by
-        ``sin(k lag / 2) / (k lag / 2)``, which makes a gradient the mean slope over so long a baseline.
-    out : ndarray, optional
-        Array for the slopes: int32, shape [size, size].
-
-    Returns
-    -------
-    ndarray
-        Slopes at the samples, int32, shape [size, size], ``[y, x]``: the lower 16 bits hold the slope along x, the
-        upper 16 that along y, as signed counts.
+    The result, int32, shape [size, size], ``[y, x]``, holds the slope along x in its lower 16 bits and that along y in
+    its upper 16, as signed counts of ``unit`` [rad], at most 32767. Each mode of wavenumber k is multiplied by the sinc
+    ``sin(k lag / 2) / (k lag / 2)``, which makes a gradient the mean slope over a baseline ``lag`` [m].
     """
-    modes = _modes(generator, size, length, r0, outer_scale, band, weight, "samples", fixed_modulus)
     reach = len(modes) - 1
     step = 2.0 * math.pi / length
     i = np.arange(reach + 1, dtype=np.float32)[:, np.newaxis] * np.float32(step)
@@ -225,63 +193,3 @@ def slope_screen(
         list(pool.map(along_y, range(0, reach + 1, _COLUMN_BLOCK)))
         list(pool.map(along_x, range(0, size, _ROW_BLOCK)))
     return packed
-
-
-def _modes(
-    generator: np.random.Generator,
-    size: int,
-    length: float,
-    r0: float,
-    outer_scale: float,
-    band: tuple[float, float],
-    weight: float,
-    stencil: str,
-    fixed_modulus: bool,
-) -> np.ndarray:
-    """Draw the modes [m] of a screen, complex64, shape [reach + 1, 2 reach + 1], index ``[i, reach + j]``."""
-    length = require_positive(length, "length", "metres")
-    if size < 4:
-        raise DomainError(f"size = {size!r}: expected at least 4 samples on a side")
-    reach, inside = band_modes(size, length, band)
-    i = np.arange(reach + 1, dtype=np.float64)[:, np.newaxis]
-    j = np.arange(-reach, reach + 1, dtype=np.float64)
-    amplitude = np.empty(inside.shape, dtype=np.float32)
-    pixel_phase = 2.0 * math.pi / size
-    for first in range(0, reach + 1, _COLUMN_BLOCK):
-        part = i[first : first + _COLUMN_BLOCK]
-        spectrum = path_spectrum(np.hypot(part, j) / length, r0, outer_scale) * weight
-        gain = stencil_gain(part * pixel_phase, j * pixel_phase, stencil)
-        amplitude[first : first + _COLUMN_BLOCK] = np.sqrt(spectrum) * gain / length
-    return _draw_modes(generator, amplitude, inside, fixed_modulus)
-
-
-def _in_fft_order(modes: np.ndarray, size: int) -> np.ndarray:
-    """Return rows of modes of index -reach to reach as a transform of so many samples takes them, zeros between."""
-    reach = modes.shape[1] // 2
-    padded = np.zeros((len(modes), size), dtype=np.complex64)
-    padded[:, : reach + 1] = modes[:, reach:]
-    padded[:, size - reach :] = modes[:, :reach]
-    return padded
-
-
-def _transform(modes: np.ndarray, size: int, threads: int | None, out: np.ndarray | None) -> np.ndarray:
-    """Return the real field of the modes ``[i, reach + j]``, transforming only columns and rows that hold any."""
-    count = len(modes)
-    columns = np.empty((count, size), dtype=np.complex64)
-    field = np.empty((size, size), dtype=np.float32) if out is None else out
-
-    def along_y(first: int) -> None:
-        part = modes[first : first + _COLUMN_BLOCK]
-        padded = _in_fft_order(part, size)
-        columns[first : first + _COLUMN_BLOCK] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
-
-    def along_x(first: int) -> None:
-        rows = slice(first, min(first + _ROW_BLOCK, size))
-        padded = np.zeros((rows.stop - first, size // 2 + 1), dtype=np.complex64)
-        padded[:, :count] = columns[:, rows].T
-        field[rows] = scipy.fft.irfft(padded, size, axis=1, norm="forward", overwrite_x=True)
-
-    with ThreadPoolExecutor(thread_count(threads)) as pool:
-        list(pool.map(along_y, range(0, count, _COLUMN_BLOCK)))
-        list(pool.map(along_x, range(0, size, _ROW_BLOCK)))
-    return field

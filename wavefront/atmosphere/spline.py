@@ -14,24 +14,9 @@ STENCILS = ("samples", "spline")
 
 
 def stencil_gain(kx: np.ndarray, ky: np.ndarray, stencil: str) -> np.ndarray:
-    """Return the gain of modes that offsets the smoothing by a stencil.
+    """Return the factor of each mode's amplitude that offsets the smoothing by one of :data:`STENCILS`.
 
-    Parameters
-    ----------
-    kx, ky : ndarray
-        Wavenumbers [rad per pixel], broadcast against each other.
-    stencil : str
-        One of :data:`STENCILS`.
-
-    Returns
-    -------
-    ndarray
-        Factor of each mode's amplitude.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such stencil.
+    Wavenumbers ``kx`` and ``ky`` [rad per pixel] are broadcast against each other.
     """
     if stencil not in STENCILS:
         raise unknown_name("stencil", stencil, STENCILS)
@@ -42,17 +27,9 @@ def stencil_gain(kx: np.ndarray, ky: np.ndarray, stencil: str) -> np.ndarray:
 
 
 def spline_weights(fraction: np.ndarray) -> np.ndarray:
-    """Return the weights of the four samples around a point.
+    """Return the weights of the four samples around a point, shape [..., 4], in the precision of ``fraction``.
 
-    Parameters
-    ----------
-    fraction : ndarray
-        Distance of the point from the second of the four samples [pixels], 0 to 1.
-
-    Returns
-    -------
-    ndarray, shape [..., 4]
-        In the precision of ``fraction``.
+    ``fraction`` is the distance of the point from the second of the four samples [pixels], 0 to 1.
     """
     u, v = fraction, 1.0 - fraction
     weights = np.stack([v**3, 4.0 + u * u * (3.0 * u - 6.0), 4.0 + v * v * (3.0 * v - 6.0), u**3], axis=-1)
@@ -60,22 +37,7 @@ def spline_weights(fraction: np.ndarray) -> np.ndarray:
 
 
 def evaluate(spline: np.ndarray, pixel: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the path at any place of a periodic screen.
-
-    Parameters
-    ----------
-    spline : ndarray
-        Screen as spline coefficients, shape [size, size].
-    pixel : float
-        Distance of the samples [m].
-    x, y : ndarray
-        Places [m], of one shape.
-
-    Returns
-    -------
-    ndarray
-        Path [m], float64, shape of ``x``.
-    """
+    """Return the path [m], float64, at places x, y [m] of a periodic screen of spline coefficients [size, size]."""
     place = np.stack([np.asarray(x), np.asarray(y)]) / pixel
     first = np.floor(place).astype(np.int64)
     weight_x, weight_y = spline_weights(place - first)

@@ -50,26 +50,9 @@ def fried_parameter(r0: float, wavelength: ArrayLike) -> np.ndarray:
 
 
 def path_spectrum(frequency: ArrayLike, r0: float, outer_scale: float) -> np.ndarray:
-    """Return the power spectrum of the optical path.
+    """Return the power spectrum of the optical path [m^2 per (cycles/m)^2] at frequencies [cycles/m].
 
-    Parameters
-    ----------
-    frequency : array_like
-        Spatial frequency [cycles/m].
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-
-    Returns
-    -------
-    ndarray
-        Two-sided, two-dimensional spectrum [m^2 per (cycles/m)^2]; its integral over the plane is the variance.
-
-    Raises
-    ------
-    DomainError
-        If the Fried parameter or the outer scale is not positive.
+    It is two-sided and two-dimensional: its integral over the plane is the variance. ``r0`` [m] is that at 500 nm.
     """
     r0, outer_scale = require_positive(r0, "r0", "metres"), require_positive(outer_scale, "outer_scale", "metres")
     nu = np.asarray(frequency, dtype=np.float64)
@@ -85,29 +68,10 @@ def path_variance(r0: float, outer_scale: float) -> float:
 
 
 def structure_function(separation: ArrayLike, r0: float, outer_scale: float) -> np.ndarray:
-    r"""Return the structure function of the optical path.
+    r"""Return the structure function of the optical path [m^2]: its mean squared difference at separations [m].
 
-    :math:`D(r) = 2 \sigma^2 [1 - \frac{2^{1/6}}{\Gamma(5/6)} x^{5/6} K_{5/6}(x)]` with :math:`x = 2 \pi r / L_0`
-    (Conan 2000; Tokovinin 2002, eq. 16).
-
-    Parameters
-    ----------
-    separation : array_like
-        Distance of the two points [m].
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-
-    Returns
-    -------
-    ndarray
-        Mean squared difference of path [m^2]; times ``(2 pi / wavelength)^2`` it is that of the phase.
-
-    Raises
-    ------
-    DomainError
-        If the Fried parameter or the outer scale is not positive.
+    :math:`D(r) = 2 \sigma^2 [1 - \frac{2^{1/6}}{\Gamma(5/6)} x^{5/6} K_{5/6}(x)]` with :math:`x = 2 \pi r / L_0` (Conan
+    2000; Tokovinin 2002, eq. 16). Times ``(2 pi / wavelength)^2`` it is that of the phase.
     """
     variance = path_variance(r0, outer_scale)
     x = 2.0 * math.pi * np.abs(np.asarray(separation, dtype=np.float64)) / outer_scale
@@ -137,25 +101,10 @@ def _gauss_panels(end: float, panels: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def slope_variance(r0: float, outer_scale: float, cutoff: float, lag: float = 0.0) -> float:
-    """Return the variance of one component of the slope of the modes at and below a cut-off wavenumber.
+    """Return the variance [rad^2] of one component of the slope of the modes with ``|k| <= cutoff`` [rad/m].
 
-    It is half of the integral of ``(k sinc(k lag / 2))^2 W`` over the disc of frequencies, ``k = 2 pi nu``.
-
-    Parameters
-    ----------
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    cutoff : float
-        Cut-off wavenumber [rad/m].
-    lag : float
-        Distance over which the slope is taken [m]; 0 for the gradient.
-
-    Returns
-    -------
-    float
-        Variance [rad^2].
+    Half of the integral of ``(k sinc(k lag / 2))^2 W`` over the disc of frequencies, ``k = 2 pi nu``; ``lag`` [m] is
+    the distance over which the slope is taken, 0 for the gradient.
     """
     # nu = sinh(t) / L0 spreads the knee of the spectrum at 1/L0 evenly over the nodes.
     t, weight = _gauss_panels(math.asinh(cutoff / (2.0 * math.pi) * outer_scale), 8)
@@ -183,24 +132,8 @@ def _lens_area(distance: np.ndarray, radius_a: float, radius_b: float) -> np.nda
 def diffraction_otf(separation: ArrayLike, diameter: float, obscuration: float = 0.0) -> np.ndarray:
     """Return the optical transfer function of an annular pupil, as its autocorrelation (O'Neill 1956).
 
-    Parameters
-    ----------
-    separation : array_like
-        Baseline in the pupil [m]: wavelength times angular frequency.
-    diameter : float
-        Outer diameter [m].
-    obscuration : float
-        Inner over outer diameter.
-
-    Returns
-    -------
-    ndarray
-        Transfer function, 1 at zero and 0 from the diameter on.
-
-    Raises
-    ------
-    DomainError
-        If the diameter is not positive or the obscuration not in [0, 1).
+    It is 1 at zero and 0 from the diameter [m] on. A separation [m] is a baseline in the pupil, the wavelength times an
+    angular frequency; ``obscuration`` is the inner over the outer diameter.
     """
     outer = 0.5 * require_positive(diameter, "diameter", "metres")
     if not 0.0 <= obscuration < 1.0:
@@ -212,15 +145,7 @@ def diffraction_otf(separation: ArrayLike, diameter: float, obscuration: float =
 
 
 def coherence(structure: np.ndarray, wavelength: float | np.ndarray) -> np.ndarray:
-    """Return the mean transfer function ``exp(-k^2 D / 2)`` of a structure function of the path (Roddier 1981, sec. 4).
-
-    Parameters
-    ----------
-    structure : ndarray
-        Structure function D [m^2].
-    wavelength : float or ndarray
-        Wavelengths [m], broadcast against ``structure``.
-    """
+    """Return the mean transfer function ``exp(-k^2 D / 2)`` of a structure function D [m^2] (Roddier 1981, sec. 4)."""
     return np.exp(-0.5 * (2.0 * math.pi / wavelength) ** 2 * structure)
 
 
@@ -235,30 +160,7 @@ def long_exposure_otf(
 ) -> np.ndarray:
     """Return the optical transfer function of an infinitely long exposure.
 
-    Parameters
-    ----------
-    separation : array_like
-        Baseline in the pupil [m]: wavelength times angular frequency.
-    wavelength : float
-        Wavelength [m].
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    diameter : float, optional
-        Pupil diameter [m]; without it, of the atmosphere alone.
-    obscuration : float
-        Inner over outer diameter of the pupil.
-
-    Returns
-    -------
-    ndarray
-        ``exp(-D/2)``, times the transfer function of the pupil where a diameter is given.
-
-    Raises
-    ------
-    DomainError
-        If the wavelength, the Fried parameter, the outer scale or the pupil is outside its range.
+    It is that of the atmosphere, times :func:`diffraction_otf` of the pupil where a diameter [m] is given.
     """
     wavelength = require_positive(wavelength, "wavelength", "metres")
     otf = coherence(structure_function(separation, r0, outer_scale), wavelength)
@@ -270,33 +172,10 @@ def long_exposure_otf(
 def long_exposure_fwhm(
     wavelength: float, r0: float, outer_scale: float, *, diameter: float | None = None, obscuration: float = 0.0
 ) -> float:
-    """Return the full width at half maximum of an infinitely long exposure.
+    """Return the full width at half maximum of an infinitely long exposure [rad].
 
-    The point spread function is the Hankel transform of :func:`long_exposure_otf`, by quadrature.
-
-    Parameters
-    ----------
-    wavelength : float
-        Wavelength [m].
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    diameter : float, optional
-        Pupil diameter [m]; without it, of the atmosphere alone.
-    obscuration : float
-        Inner over outer diameter of the pupil.
-
-    Returns
-    -------
-    float
-        Full width at half maximum [rad].
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range, or if the turbulence is so weak that without a pupil the image has a
-        core of no width.
+    The point spread function is the Hankel transform of :func:`long_exposure_otf`, by quadrature. Without a pupil,
+    turbulence so weak that the image has a core of no width is a :class:`DomainError`.
     """
     wavenumber = 2.0 * math.pi / require_positive(wavelength, "wavelength", "metres")
     floor = math.exp(-(wavenumber**2) * path_variance(r0, outer_scale))

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.core.random_streams import stream
-from pachon.wavefront.atmosphere.screens import phase_screen, slope_screen
+from pachon.wavefront.atmosphere.screens import draw_modes, phase_screen, slope_screen
 from pachon.wavefront.atmosphere.spline import STENCILS, evaluate, stencil_gain
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm, path_spectrum, path_variance, structure_function
 
@@ -27,10 +27,10 @@ FINE_SIZE, FINE_PIXEL = 3072, 0.014
 RADIANS_PER_METRE = 2.0 * math.pi / 500e-9
 
 
-def screen(band, /, seed=1, **options):
+def screen(band, /, seed=1, threads=2, out=None, **options):
     grid = {"size": SIZE, "length": LENGTH} if band == LOW else {"size": FINE_SIZE, "length": FINE_SIZE * FINE_PIXEL}
-    defaults = {"r0": R0, "outer_scale": L0, "band": band, "threads": 2}
-    return phase_screen(stream(seed, "test"), **(defaults | grid | options))
+    options = {"r0": R0, "outer_scale": L0, "band": band} | grid | options
+    return phase_screen(draw_modes(stream(seed, "test"), **options), options["size"], threads=threads, out=out)
 
 
 @lru_cache(maxsize=2)
@@ -133,15 +133,7 @@ def test_power_is_split_without_loss_or_overlap():
     variance = path_variance(R0, L0)
     for cutoff in (0.6 * CUTOFF, CUTOFF, 1.4 * CUTOFF):
         low = screen(LOW, band=(0.0, cutoff), fixed_modulus=True)
-        high = phase_screen(
-            stream(1, "test"),
-            size=FINE_SIZE,
-            length=FINE_SIZE * FINE_PIXEL,
-            r0=R0,
-            outer_scale=L0,
-            band=(cutoff, math.inf),
-            fixed_modulus=True,
-        )
+        high = screen(HIGH, band=(cutoff, math.inf), fixed_modulus=True)
         total = np.mean(low.astype(float) ** 2) + np.mean(high.astype(float) ** 2)
         # The screen of 328 m lacks its mean: 0.265 (L0/L)^2 = 0.15 % of the variance.
         assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4)
@@ -187,21 +179,21 @@ def test_slopes_are_the_gradient_of_the_screen_of_the_same_stream(size, lag):
     seen = np.sinc(np.hypot(k, k[:, None]) * lag / (2.0 * math.pi))
     exact = [np.fft.ifft2(1j * wavenumber * seen * spectrum).real for wavenumber in (k, k[:, None])]
     unit = 8.0 * np.std(exact) / 32767.0
-    options = {"size": size, "length": length, "r0": R0, "outer_scale": L0, "band": LOW, "unit": unit, "lag": lag}
-    packed = slope_screen(stream(1, "test"), threads=1, **options)
+    modes = draw_modes(stream(1, "test"), size=size, length=length, r0=R0, outer_scale=L0, band=LOW)
+    packed = slope_screen(modes.copy(), size, length, unit, lag=lag, threads=1)
     for counts, slope in zip(unpacked(packed), exact, strict=True):
         # Rounding to whole counts, and single precision of a slope of 4000 counts.
         np.testing.assert_allclose(counts, slope / unit, atol=0.55)
     for threads in (2, 3):
         out = np.empty((size, size), dtype=np.int32)
-        again = slope_screen(stream(1, "test"), threads=threads, out=out, **options)
+        again = slope_screen(modes.copy(), size, length, unit, lag=lag, threads=threads, out=out)
         assert again is out
         assert out.tobytes() == packed.tobytes()
 
 
 def test_slopes_beyond_the_counts_are_held():
-    options = {"size": 256, "length": 40.96, "r0": R0, "outer_scale": L0, "band": LOW}
-    x, y = unpacked(slope_screen(stream(1, "test"), unit=1e-11, **options))
+    modes = draw_modes(stream(1, "test"), size=256, length=40.96, r0=R0, outer_scale=L0, band=LOW)
+    x, y = unpacked(slope_screen(modes, 256, 40.96, unit=1e-11))
     assert x.max() == y.max() == 32767
     assert x.min() == y.min() == -32767
 
@@ -272,7 +264,7 @@ def test_mean_is_zero_and_output_is_written_in_place():
 
 @pytest.mark.parametrize("size", [4, 5, 63, 100])
 def test_any_number_of_samples(size):
-    field = phase_screen(stream(1, "odd"), size=size, length=1.0, r0=R0, outer_scale=L0)
+    field = phase_screen(draw_modes(stream(1, "odd"), size=size, length=1.0, r0=R0, outer_scale=L0), size)
     assert field.shape == (size, size)
     assert np.all(np.isfinite(field))
     assert field.std() > 0.0
