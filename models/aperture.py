@@ -22,17 +22,7 @@ class Region(ABC):
 
     @abstractmethod
     def contains(self, x: Any, y: Any) -> np.ndarray:
-        """Return whether points lie in the region.
-
-        Parameters
-        ----------
-        x, y : float or array
-            Position in the surface's own frame [m].
-
-        Returns
-        -------
-        ndarray of bool
-        """
+        """Return whether points x, y [m] of the surface's own frame lie in the region."""
 
 
 def _require(condition: Any, problem: str) -> None:
@@ -219,26 +209,24 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
 
 
 @dataclass(frozen=True)
-class Union(Region):
-    """Points of at least one of several regions."""
+class _Combination(Region):
+    """Base of unions and intersections."""
 
     parts: tuple[Aperture, ...]
 
     def __post_init__(self) -> None:
-        _check_parts("union", self.parts)
+        _check_parts(type(self).__name__.lower(), self.parts)
+
+
+class Union(_Combination):
+    """Points of at least one of several regions."""
 
     def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
 
 
-@dataclass(frozen=True)
-class Intersection(Region):
+class Intersection(_Combination):
     """Points of all of several regions."""
-
-    parts: tuple[Aperture, ...]
-
-    def __post_init__(self) -> None:
-        _check_parts("intersection", self.parts)
 
     def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
         return np.logical_and.reduce([part.contains(x, y) for part in self.parts])

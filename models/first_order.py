@@ -94,8 +94,9 @@ class SeidelSums:
 
 @dataclass(frozen=True)
 class _Trace:
-    """Two paraxial rays through the surfaces: heights before refraction, slopes and indices on either side."""
+    """The marginal and a chief ray (last axis) at each surface: heights [m], slopes and indices on either side."""
 
+    wavelength: float
     surfaces: tuple[Surface, ...]
     curvature: np.ndarray
     n: np.ndarray
@@ -120,10 +121,8 @@ def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
     DomainError
         If a surface is decentred or tilted, the wavelength is not covered, or there is no focus.
     """
-    w = _wavelength(telescope, wavelength)
     radius = 0.5 * telescope.pupil_diameter
-    # Ray 0 enters parallel to the axis at the rim, ray 1 through the centre of the pupil with unit slope.
-    trace = _trace(telescope, w, (radius, 0.0), (0.0, 1.0))
+    trace = _trace(telescope, wavelength, 1.0)
     last_z = trace.surfaces[-1].vertex[2]
     n, (h, hb), (u, ub) = float(trace.n_after[-1]), map(float, trace.h[-1]), map(float, trace.u_after[-1])
     power = -n * u / (abs(float(trace.n[0])) * radius)
@@ -133,7 +132,7 @@ def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
     to_focus = -h / u
     to_pupil = -hb / ub if ub != 0 else math.inf
     return FirstOrder(
-        wavelength=w,
+        wavelength=trace.wavelength,
         focal_length=focal_length,
         f_number=focal_length / telescope.pupil_diameter,
         back_focus=math.copysign(to_focus, to_focus * n),
@@ -148,25 +147,8 @@ def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
 
 
 def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np.ndarray:
-    """Return the paraxial radius of the light of a field angle on each surface.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        Prescription.
-    field : float
-        Field angle [rad].
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m].
-
-    Returns
-    -------
-    ndarray, shape (n_surface,)
-        Radius [m] on each mirror and lens surface.
-    """
-    rays = (0.5 * telescope.pupil_diameter, 0.0), (0.0, np.tan(field))
-    trace = _trace(telescope, _wavelength(telescope, wavelength), *rays)
-    return np.abs(trace.h).sum(axis=1)
+    """Return the paraxial radius [m] of the light of a field angle [rad] on each mirror and lens surface."""
+    return np.abs(_trace(telescope, wavelength, np.tan(field)).h).sum(axis=1)
 
 
 def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | None = None) -> SeidelSums:
@@ -187,8 +169,7 @@ def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | Non
         If a surface is decentred or tilted, or the wavelength is not covered.
     """
     angle = telescope.field_radius if field is None else field
-    rays = (0.5 * telescope.pupil_diameter, 0.0), (0.0, np.tan(angle))
-    trace = _trace(telescope, _wavelength(telescope, wavelength), *rays)
+    trace = _trace(telescope, wavelength, np.tan(angle))
     c, n, n2 = trace.curvature, trace.n, trace.n_after
     h, hb = trace.h.T
     u, ub = trace.u.T
@@ -207,25 +188,21 @@ def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | Non
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
 
 
-def _wavelength(telescope: Telescope, wavelength: Any) -> float:
-    return float(telescope.check_wavelength(telescope.default_wavelength if wavelength is None else wavelength))
-
-
-def _trace(telescope: Telescope, wavelength: float, first: tuple[float, float], second: tuple[float, float]) -> _Trace:
-    """Trace two rays, each given by height [m] and slope in the plane of the entrance pupil."""
+def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
+    """Trace the ray at the rim of the pupil, parallel to the axis, and one through its centre with a slope."""
+    w = float(telescope.check_wavelength(telescope.default_wavelength if wavelength is None else wavelength))
     surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
     for surface in surfaces:
         axis = surface.matrix[:, 2]
         if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:
             raise DomainError(f"surface {surface.name} of {telescope.name}: expected one on the axis, not perturbed")
     curvature = np.array([-s.shape.curvature for s in surfaces])
-    (h1, u1), (h2, u2) = first, second
-    h, u = np.array([h1, h2]), np.array([u1, u2])
-    z, index = telescope.stop_z, float(telescope.medium_before.index(wavelength))
+    h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([0.0, slope])
+    z, index = telescope.stop_z, float(telescope.medium_before.index(w))
     before, after, heights, slopes, slopes_after = [], [], [], [], []
     for surface, c in zip(surfaces, curvature, strict=True):
         mirror = surface.interaction == Interaction.MIRROR
-        glass = float(surface.medium_after.index(wavelength))
+        glass = float(surface.medium_after.index(w))
         index_after = -index if mirror else np.copysign(glass, index)
         h = h + u * (z - surface.vertex[2])
         before.append(index)
@@ -236,4 +213,4 @@ def _trace(telescope: Telescope, wavelength: float, first: tuple[float, float], 
         after.append(index_after)
         index, z = index_after, surface.vertex[2]
     columns = (before, after, heights, slopes, slopes_after)
-    return _Trace(surfaces, curvature, *(np.array(v, dtype=np.float64) for v in columns))
+    return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in columns))

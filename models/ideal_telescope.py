@@ -13,20 +13,14 @@ from .telescope import VACUUM, Telescope
 def without_aberration(telescope: Telescope, focal_ratio: float = 1000.0) -> Telescope:
     """Return a telescope with the same pupil and no aberration to speak of: one long paraboloid.
 
-    At f/N its coma, 3 theta / (16 N^2), and its astigmatism, theta^2 / (2 N), blur a star at an angle theta from the
-    axis: at f/1000 by 1e-4 and 9e-4 arcsec 10 arcmin from it, at f/100 000 by 1e-7 and 1e-3 arcsec at 1.75 degrees.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        Gives the pupil.
-    focal_ratio : float
-        N: focal length over diameter of the pupil.
+    At f/N (`focal_ratio`) its coma, 3 theta / (16 N^2), and its astigmatism, theta^2 / (2 N), blur a star at an angle
+    theta from the axis: at f/1000 by 1e-4 and 9e-4 arcsec 10 arcmin from it, at f/100 000 by 1e-7 and 1e-3 arcsec at
+    1.75 degrees.
     """
     length = focal_ratio * telescope.pupil_diameter
     origin, focus = (0.0, 0.0, 0.0), (0.0, 0.0, length)
     outer = 0.5 * telescope.pupil_diameter
-    # The mirror has the rims of the pupil too, so that rays traced by themselves see it as the engines do.
+    # The mirror has the rims of the pupil too, so that single rays are vignetted as in the engines.
     ring = Annulus(telescope.pupil_obscuration * outer, outer)
     return replace(
         telescope,

@@ -18,17 +18,8 @@ MESH_SUFFIXES = (".stl", ".glb", ".gltf", ".obj", ".ply", ".off")
 def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh:
     """Return the content of an STL, GLB, OBJ, PLY or OFF file, in the unit of the file.
 
-    Parameters
-    ----------
-    path : str or path
-        The file.
-    merged : bool
-        Whether all meshes of the file become one, with equal vertices merged. Otherwise nothing is changed.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be read as a mesh, or has no triangles.
+    If ``merged``, all meshes of the file become one, with equal vertices merged; otherwise nothing is changed. A
+    PrescriptionError names a file that cannot be read as a mesh, or has no triangles.
     """
     # Imported here: loading trimesh takes as long as everything else that a telescope needs.
     import trimesh

@@ -35,7 +35,7 @@ class Obstruction(ContentEquality):
         Corners (x, y, z) of each triangle [m], telescope frame.
     before : tuple of str, optional
         Names of mirrors, lens surfaces or detectors: only the light on its way to these is blocked, baffle planes in
-        between included. By default, all ways from the sky to the last surface that do not lie inside a lens.
+        between included. By default, all light from the sky to the last surface except inside lenses.
 
     Raises
     ------

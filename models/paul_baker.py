@@ -1,36 +1,14 @@
-r"""The classical Paul-Baker telescope, from its first-order layout and the third-order conditions.
+"""The classical Paul-Baker telescope, from its first-order layout and the third-order conditions.
 
 A concave paraboloid M1 and a convex M2 that shares its focus make the light parallel again, in a beam narrower by
 ``m = R2 / R1``. A concave sphere M3, with its centre of curvature at the vertex of M2, brings it to a focus half-way
-between M3 and M2. All radii below are positive lengths; `h` is the height of the marginal ray on M1, `m h` on M2, M3.
+between M3 and M2. With positive radii and focal length ``f`` four Seidel sums vanish (see docs/paul_baker.md)::
 
-Third order:
+    f1 = f (1 - m),   R1 = 2 f1,   R2 = m R1,   R3 = R1 R2 / (R1 - R2) = 2 f1 m / (1 - m)
+    k1 = -1,          k2 = -1 + (R2/R3)^3,      k3 = 0
+    M1 to M2: f1 (1 - m),   M2 to M3: R3,   so M3 stands at z3 = f1 (1 - m) - R3
 
-1. Two confocal paraboloids have no spherical aberration, coma or astigmatism (Mersenne's telescope), wherever the stop.
-2. Seen from M2, a sphere centred there is the same in every direction: with the stop at M2 it has spherical
-   aberration but neither coma nor astigmatism. For parallel light of height ``m h`` its sum is S1 = 2 (m h)^4 / R3^3.
-3. A change of M2's conic by ``dk`` acts, with the stop at M2, on the spherical aberration alone:
-   S1 = -2 dk (m h)^4 / R2^3. So ``dk = (R2/R3)^3`` and
-
-       k1 = -1,    k2 = -1 + (R2/R3)^3,    k3 = 0
-
-   leave S1 = S2 = S3 = 0; and since all three vanish, they vanish wherever the stop really is (here at M1).
-4. Without astigmatism the image lies on the Petzval surface, which is flat when
-
-       1/R1 - 1/R2 + 1/R3 = 0,    so R3 = R1 R2 / (R1 - R2) = 2 f1 m / (1 - m).
-
-   Paul's own R3 = R2, with a spherical M2, leaves a field curved by 2/R1; Baker's longer R3 flattens it.
-
-Freedoms: eight (three radii, three conics, two spacings). Focal length, parallel light after M2 and four Seidel sums
-take six, "M1 a paraboloid" and "M3 a sphere" two more; yet one is left, because coma and astigmatism of M3 vanish
-together once its centre is at M2: two conditions at the price of one. Nothing is over-determined: the strictly
-classical layout meets all four sums exactly, and M2's conic is what closes it. What is left is ``m``. With the focal
-length ``f = f1 R3 / R2 = f1 / (1 - m)``:
-
-    f1 = f (1 - m),   R1 = 2 f1,   R2 = m R1,   M1 to M2: f1 (1 - m),   M2 to M3: R3
-
-and M3 stands at ``z3 = f1 (1 - m) - 2 f1 m / (1 - m)``. By default ``m = 2 - sqrt(3)``, which makes z3 = 0: primary and
-tertiary share their vertex, as the LSST's nearly do. ``m = 0.382`` would put the focus there (Willstrop 1985).
+By default ``m = 2 - sqrt(3)``, which makes z3 = 0: primary and tertiary share their vertex, as the LSST's nearly do.
 
 Sources: Paul, Revue d'Optique 14, 169 (1935); Baker, IEEE Trans. Aerosp. Electron. Syst. 5, 261 (1969); Willstrop,
 MNRAS 216, 411 (1985); Wilson, Reflecting Telescope Optics I (2nd ed.), section 3.6.
@@ -60,7 +38,7 @@ def paul_baker(
 ) -> Telescope:
     """Design a flat-field Paul-Baker telescope with no third-order aberration but distortion.
 
-    The derivation is in the docstring of this module. Third order is all that is corrected: the fifth-order spherical
+    The derivation is in docs/paul_baker.md. Third order is all that is corrected: the fifth-order spherical
     aberration that is left goes as ``focal_ratio**-5``.
 
     Parameters

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -16,11 +16,10 @@ import numpy as np
 
 from ..core.errors import DomainError, PrescriptionError, unknown_name
 from ..core.units import metres, radians
-from .media.medium import ConstantIndex, Medium
+from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
 from .obstruction import Obstruction
 from .shapes.shape import Shape, Sum
 from .surface import Interaction, Matrix, Surface, Vector, move_frame
-from .wavelengths import check_wavelength_range, wavelengths_within
 
 VACUUM = ConstantIndex(1.0)
 #: Interactions without a change of medium.
@@ -28,10 +27,7 @@ _STAYING = {Interaction.MIRROR: "mirror", Interaction.PASS: "baffle", Interactio
 
 
 def rotation_matrix(tilt: Any) -> np.ndarray:
-    """Return Rx @ Ry @ Rz, shape (3, 3), of three angles (rx, ry, rz) [rad].
-
-    This is the order of a Zemax coordinate break: about x, then about the new y, then about the new z.
-    """
+    """Return Rx @ Ry @ Rz, shape (3, 3), of angles [rad] about x, the new y and the new z, as in Zemax."""
     rx, ry, rz = radians(tilt, "tilt")
     cx, cy, cz = np.cos((rx, ry, rz))
     sx, sy, sz = np.sin((rx, ry, rz))
@@ -167,14 +163,12 @@ class Telescope:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mapping proxy cannot be pickled: hand over plain dictionaries.
-        plain = {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in self._fields().items()}
-        return _rebuild, (plain,)
-
-    def _fields(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        plain = {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in values.items()}
+        return partial(Telescope, **plain), ()
 
     def _surface_frame(self, name: str) -> tuple[Vector, Matrix]:
-        surface = next(s for s in self.surfaces if s.name == name)
+        surface = self.surface(name)
         return surface.vertex, surface.rotation
 
     @cached_property
@@ -264,11 +258,9 @@ class Telescope:
             If `shift`, `tilt` or `about` is not three finite numbers.
         """
         if name in self.groups:
-            members = set(self.groups[name])
-            pivot, axes = self.group_frames[name]
+            members, (pivot, axes) = set(self.groups[name]), self.group_frames[name]
         elif name in self.surface_names:
-            members = {name}
-            pivot, axes = self._surface_frame(name)
+            members, (pivot, axes) = {name}, self._surface_frame(name)
         else:
             raise unknown_name("surface or group", name, (*self.surface_names, *self.groups))
         dr, angles = metres(shift, "shift"), radians(tilt, "tilt")
@@ -292,7 +284,7 @@ class Telescope:
         return replace(self, surfaces=surfaces, group_frames=frames)
 
     def with_obstructions(self, *obstructions: Obstruction) -> Telescope:
-        """Return the telescope with more meshes in the light's way.
+        """Return the telescope with more meshes that block light.
 
         Raises
         ------
@@ -330,7 +322,3 @@ class Telescope:
                 f"expected within {np.rad2deg(self.field_limit):.6g} deg of the axis for {self.name}"
             )
         return x, y
-
-
-def _rebuild(fields: dict[str, Any]) -> Telescope:
-    return Telescope(**fields)

@@ -75,9 +75,8 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
     DomainError
         If the obscuration or the index is out of range.
     """
-    x, y, s, low = _annulus(x, y, obscuration)
+    x, y, s, nodes = _annulus(x, y, obscuration)
     theta = np.arctan2(y, x)
-    nodes = (2 * s - 1 - low) / (1 - low)
     orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
     radial: dict[int, np.ndarray] = {}
     for m, top in _radial_degrees(orders).items():
@@ -92,44 +91,24 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
 
 
 def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
-    """Evaluate the gradients of annular Zernike polynomials 1 ... jmax.
+    """Return the derivatives along x and y, per outer radius, shape [jmax, 2, ...]; as :func:`annular_zernikes`.
 
     A term is a polynomial in ``x^2 + y^2`` times the real or imaginary part of ``(x + iy)^m``, and is differentiated as
     such: the result is exact, at the centre too.
-
-    Parameters
-    ----------
-    jmax : int
-        Highest Noll index.
-    x, y : ndarray
-        Pupil coordinates in units of the outer radius, one shape.
-    obscuration : float
-        Inner over outer radius, 0 <= obscuration < 1.
-
-    Returns
-    -------
-    ndarray, shape [jmax, 2, ...]
-        Derivatives along x and y, per outer radius.
-
-    Raises
-    ------
-    DomainError
-        If the obscuration or the index is out of range.
     """
-    x, y, s, low = _annulus(x, y, obscuration)
-    nodes = (2 * s - 1 - low) / (1 - low)
+    x, y, _, nodes = _annulus(x, y, obscuration)
     orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
     columns: dict[int, np.ndarray] = {}
     for m, top in _radial_degrees(orders).items():
         columns[m] = _radial_coefficients(m, top + 1, float(obscuration))
-    z = x + 1j * y
+    z, scale_s = x + 1j * y, 4.0 / (1 - obscuration**2)
     out = np.empty((jmax, 2, *x.shape))
     for row, (n, signed) in enumerate(orders):
         m = abs(signed)
         series = columns[m][:, (n - m) // 2]
         value = np.polynomial.legendre.legval(nodes, series)
         # d/dx = 2x d/ds and d/dy = 2y d/ds of the radial part
-        slope = np.polynomial.legendre.legval(nodes, np.polynomial.legendre.legder(series)) * (4.0 / (1 - low))
+        slope = np.polynomial.legendre.legval(nodes, np.polynomial.legendre.legder(series)) * scale_s
         # (x + iy)^m and its derivative along x; the one along y is i times that.
         power, change = z**m, m * z ** max(m - 1, 0)
         along_x, along_y = value * change + slope * x * power, 1j * value * change + slope * y * power
@@ -140,21 +119,9 @@ def annular_zernike_gradients(jmax: int, x: np.ndarray, y: np.ndarray, obscurati
 
 
 def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
-    """Return the radial polynomials of azimuthal order m as powers of rho^2, without the factor rho^m.
+    """Return the first ``count`` radial polynomials of azimuthal order m >= 0 as powers of rho^2, shape [count, count].
 
-    Parameters
-    ----------
-    m : int
-        Azimuthal order, not negative.
-    count : int
-        How many, from degree m upwards in steps of two.
-    obscuration : float
-        Inner over outer radius, 0 <= obscuration < 1.
-
-    Returns
-    -------
-    ndarray, shape [count, count]
-        Coefficient of ``rho^(2 k)`` (row) of each polynomial (column).
+    Element [k, i] is the coefficient of ``rho^(m + 2 k)`` of the polynomial of degree ``m + 2 i``.
     """
     if not 0 <= obscuration < 1:
         raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
@@ -169,12 +136,13 @@ def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
     return powers @ _radial_coefficients(m, count, float(obscuration))
 
 
-def _annulus(x: np.ndarray, y: np.ndarray, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return the coordinates as arrays of one shape, the square of the radius, and that of the inner rim."""
+def _annulus(x: np.ndarray, y: np.ndarray, obscuration: float) -> tuple[np.ndarray, ...]:
+    """Return x and y as arrays of one shape, s = x^2 + y^2, and s scaled to -1 ... 1 between the rims."""
     if not 0 <= obscuration < 1:
         raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
     x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
-    return x, y, x * x + y * y, obscuration**2
+    s, low = x * x + y * y, obscuration**2
+    return x, y, s, (2 * s - 1 - low) / (1 - low)
 
 
 def _radial_degrees(orders: list[tuple[int, int]]) -> dict[int, int]:

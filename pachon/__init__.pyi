@@ -63,9 +63,9 @@ from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
 from .models.io.site_file import load_site as load_site
 from .models.media.air import Air as Air
-from .models.media.changed_index import ChangedIndex as ChangedIndex
 from .models.media.dispersion import Dispersion as Dispersion
 from .models.media.dispersion import model_glass as model_glass
+from .models.media.medium import ChangedIndex as ChangedIndex
 from .models.media.medium import ConstantIndex as ConstantIndex
 from .models.media.medium import Medium as Medium
 from .models.media.medium import RelativeToAir as RelativeToAir

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError, unknown_name
-from ...models.media.changed_index import with_index_change
+from ...models.media.medium import with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
 from ...models.telescope import Telescope, rotation_matrix

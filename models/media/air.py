@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import PrescriptionError
-from ..wavelengths import wavelengths_within
-from .medium import Medium
+from .medium import Medium, wavelengths_within
 
 #: Ciddor's equations hold from the ultraviolet to 1.7 um, Filippenko's to 2 um.
 WAVELENGTH_RANGES = {"ciddor": (0.23e-6, 1.7e-6), "filippenko": (0.2e-6, 2.0e-6)}
@@ -159,14 +158,8 @@ def filippenko_refractivity(
 ) -> np.ndarray:
     """Return the refractive index of air less one (Filippenko 1982, eqs. 1 to 3).
 
-    Parameters
-    ----------
-    wavenumber_squared : ndarray
-        Square of the wave number in vacuum [1/um^2].
-    pressure_mmhg, water_vapour_mmhg : float
-        Total pressure and partial pressure of water vapour [mm Hg].
-    temperature_c : float
-        Temperature [deg C].
+    Arguments: square of the wave number in vacuum [1/um^2], pressure and partial pressure of water vapour [mm Hg],
+    temperature [deg C].
     """
     # Eq. 1: dry air at 15 C and 760 mm Hg; eq. 2: other temperatures and pressures; eq. 3: water vapour.
     standard = 64.328 + 29498.1 / (146.0 - wavenumber_squared) + 255.4 / (41.0 - wavenumber_squared)

@@ -29,8 +29,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import PrescriptionError
-from ..wavelengths import check_wavelength_range, wavelengths_within
-from .medium import ConstantIndex, Medium, real_index
+from .medium import ConstantIndex, Medium, check_wavelength_range, real_index, wavelengths_within
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Refractive media: the base class, constant and Sellmeier indices, indices relative to air.
+"""Refractive media: the base class, constant and Sellmeier indices, indices relative to air or with an offset.
 
-Further dispersion formulas stand in `dispersion`, tables in `tabulated`, air in `air`, changed indices in
-`changed_index`, glasses by name in `models.io.glass_catalogue`.
+Further dispersion formulas stand in `dispersion`, tables in `tabulated`, air in `air`, glasses by name in
+`models.io.glass_catalogue`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,25 @@ import numpy as np
 
 from ...core.errors import DomainError, PrescriptionError
 from ...core.units import metres
-from ..wavelengths import check_wavelength_range, nanometres, wavelengths_within
+
+
+def check_wavelength_range(wavelength_range: tuple[float, float]) -> None:
+    """Raise PrescriptionError unless a range of wavelengths [m] is two finite numbers, rising from above zero."""
+    if len(wavelength_range) != 2 or not np.all(np.isfinite(wavelength_range)):
+        raise PrescriptionError(f"wavelength_range = {wavelength_range!r}: expected 2 finite numbers")
+    if not 0 < wavelength_range[0] < wavelength_range[1]:
+        raise PrescriptionError(f"wavelength_range = {wavelength_range!r}: expected 0 < shortest < longest")
+
+
+def wavelengths_within(wavelength: Any, wavelength_range: tuple[float, float], model: str) -> np.ndarray:
+    """Return wavelengths [m] as a float64 array, or raise DomainError where one is out of the range of a model."""
+    w = metres(wavelength, "wavelength")
+    low, high = wavelength_range
+    # One part in 1e12 is what conversions between units may add to a limit.
+    outside = ~((w >= low * (1 - 1e-12)) & (w <= high * (1 + 1e-12)))
+    if np.any(outside):
+        raise DomainError(f"{_nanometres(w, outside)}: expected {low * 1e9:.6g} to {high * 1e9:.6g} nm for {model}")
+    return w
 
 
 class Medium(ABC):
@@ -49,11 +67,16 @@ class Medium(ABC):
         """
 
 
+def _nanometres(wavelength: np.ndarray, which: np.ndarray) -> str:
+    """Return the text for the first of the chosen wavelengths [m], in nm."""
+    return f"wavelength = {np.atleast_1d(wavelength)[np.atleast_1d(which)][0] * 1e9:.6g} nm"
+
+
 def real_index(index: np.ndarray, wavelength: np.ndarray, *, squared: bool = False) -> np.ndarray:
     """Return the index that a dispersion formula gives, or raise DomainError where it is not positive and finite."""
     bad = ~(np.isfinite(index) & (index > 0))
     if np.any(bad):
-        raise DomainError(f"{nanometres(wavelength, bad)}: the dispersion formula gives no real index there")
+        raise DomainError(f"{_nanometres(wavelength, bad)}: the dispersion formula gives no real index there")
     return np.sqrt(index) if squared else index
 
 
@@ -142,3 +165,35 @@ class RelativeToAir(Medium):
         w = metres(wavelength, "wavelength")
         n_air = self.air.index(w)
         return n_air * self.relative.index(w / n_air)
+
+
+@dataclass(frozen=True)
+class ChangedIndex(Medium):
+    """Medium with the index of another plus a constant at every wavelength.
+
+    Parameters
+    ----------
+    medium : Medium
+        The other medium.
+    change : float
+        Addition to its index.
+    name : str
+        Name for messages and files; not part of equality.
+    """
+
+    medium: Medium
+    change: float
+    name: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.change):
+            raise PrescriptionError(f"change = {self.change!r}: expected a finite change of the refractive index")
+
+    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+        return self.medium.index(wavelength) + self.change
+
+
+def with_index_change(medium: Medium, change: float) -> Medium:
+    """Return a medium with its index changed by a constant; successive changes add up."""
+    base, before = (medium.medium, medium.change) if isinstance(medium, ChangedIndex) else (medium, 0.0)
+    return ChangedIndex(base, before + change, medium.name) if before + change else base

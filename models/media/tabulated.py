@@ -10,8 +10,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from ...core.errors import PrescriptionError
-from ..wavelengths import wavelengths_within
-from .medium import Medium
+from .medium import Medium, wavelengths_within
 
 INTERPOLATIONS = ("monotone", "linear")
 

@@ -24,9 +24,8 @@ from typing import Annotated, Any
 from ....core.errors import PachonError, PrescriptionError
 from ....core.schema import Parameters, Tagged, mapping, unknown_key
 from ...media.air import Air
-from ...media.changed_index import ChangedIndex, with_index_change
 from ...media.dispersion import Dispersion
-from ...media.medium import ConstantIndex, Medium, RelativeToAir, Sellmeier
+from ...media.medium import ChangedIndex, ConstantIndex, Medium, RelativeToAir, Sellmeier, with_index_change
 from ...media.tabulated import TabulatedIndex
 from ..glass_catalogue import GlassCatalogue
 from .values import Band, Number, Numbers, OptionalFile, Text, Wavelengths

@@ -6,9 +6,8 @@ from pachon.core.errors import PrescriptionError
 from pachon.models.io.glass_catalogue import GlassCatalogue
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.media.air import Air
-from pachon.models.media.changed_index import ChangedIndex
 from pachon.models.media.dispersion import Dispersion
-from pachon.models.media.medium import ConstantIndex, RelativeToAir, Sellmeier
+from pachon.models.media.medium import ChangedIndex, ConstantIndex, RelativeToAir, Sellmeier
 from pachon.models.media.tabulated import TabulatedIndex
 
 SCHOTT = "{formula: schott, coefficients: [2.27, -0.0101, 0.0106, 2.1e-4, -7.6e-6, 4.9e-7], range: [0.4, 1.0]}"
