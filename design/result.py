@@ -11,13 +11,7 @@ from ..wavefront.request import Request
 
 @dataclass(frozen=True)
 class FieldResult:
-    """Base of results over field points.
-
-    Attributes
-    ----------
-    request : Request
-        Telescope, field points, wavelengths and pupil points of the computation.
-    """
+    """Base of results over field points: telescope, field points, wavelengths and pupil points of the computation."""
 
     request: Request
 

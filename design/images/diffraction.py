@@ -159,18 +159,10 @@ _Sum = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def lattice_sum(lattice: WaveletLattice, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the irradiance on a grid of points by a Fourier sum, fraction of the light per area [1/m^2].
+    """Return the irradiance by a Fourier sum, fraction of the light per area [1/m^2], shape [ny, nx].
 
-    Parameters
-    ----------
-    lattice : WaveletLattice
-        Wavelets on a lattice along the axes of the detector.
-    x, y : ndarray, shape [nx], [ny]
-        Coordinates of the columns and rows from the reference point [m].
-
-    Returns
-    -------
-    ndarray, shape [ny, nx]
+    Coordinates x and y of columns and rows count from the reference point [m]; the lattice lies along the axes of the
+    detector.
     """
     turn = 2j * np.pi / lattice.wavelets.wavelength
     field = lattice.wavelets.field

@@ -156,20 +156,7 @@ def encircled_energy(
 
 
 def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> EncircledEnergy:
-    """Return the encircled energy about the middles of diffraction images.
-
-    Parameters
-    ----------
-    psf : DiffractionPsf
-        The images.
-    radii : ndarray, shape [n_radius], optional
-        Radii [m]; out to the edge of the images by default.
-
-    Raises
-    ------
-    DomainError
-        If a radius lies beyond the images.
-    """
+    """Return the encircled energy about the middles of diffraction images, by default out to their edge [m]."""
     edge = float(psf.axis[-1])
     radius = np.linspace(0.0, edge, _RADII) if radii is None else radii
     if radius[-1] > edge * (1 + 1e-9):

@@ -53,27 +53,13 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class Wavelets:
-    """Plane waves of the image of one field point at one wavelength.
+    """Plane waves of the image of one field point at one wavelength, arrays of one shape."""
 
-    Attributes
-    ----------
-    cosine : ndarray, shape [..., 2]
-        Direction cosines along the detector, relative to the chief ray, times the refractive index.
-    opd : ndarray, shape [...]
-        Path of the chief ray minus path of the ray [m], at the reference point.
-    amplitude : ndarray, shape [...]
-        Amplitudes `a`; zero where no light passes.
-    lit_fraction : float
-        Fraction of the entrance pupil that is lit.
-    wavelength : float
-        Vacuum wavelength [m].
-    """
-
-    cosine: np.ndarray
-    opd: np.ndarray
-    amplitude: np.ndarray
-    lit_fraction: float
-    wavelength: float
+    cosine: np.ndarray  #: [..., 2] along the detector, relative to the chief ray, times the refractive index
+    opd: np.ndarray  #: [...] path of the chief ray minus path of the ray at the reference point, m
+    amplitude: np.ndarray  #: [...] a; zero where no light passes
+    lit_fraction: float  #: of the entrance pupil
+    wavelength: float  #: m, in vacuum
 
     @property
     def field(self) -> np.ndarray:
@@ -88,20 +74,10 @@ class Wavelets:
 
 @dataclass(frozen=True)
 class WaveletLattice:
-    """Wavelets whose cosines lie on a square lattice.
-
-    Attributes
-    ----------
-    wavelets : Wavelets
-        The wavelets, shape [n, n]: the second axis of the lattice first.
-    steps : ndarray, shape [n]
-        Cosines along either axis of the lattice.
-    spacing : float
-        Spacing of the lattice.
-    """
+    """Wavelets, shape [n, n], whose cosines lie on a square lattice: the second axis of the lattice first."""
 
     wavelets: Wavelets
-    steps: np.ndarray
+    steps: np.ndarray  #: [n] cosines along either axis
     spacing: float
 
 
@@ -114,24 +90,9 @@ def traced_wavelets(
     projection: str = "zemax",
     threads: int | None = None,
 ) -> Wavelets:
-    """Return the wavelets of rays through given points of the entrance pupil.
+    """Return the wavelets of rays through given points of the entrance pupil, for the one field of a request.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    field : ndarray, shape [2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
-    center : ndarray, shape [2]
-        Reference point, x and y of the detector [m].
-    sampling : PupilSampling
-        Points of the pupil and their weights.
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
+    The reference point `center` is x and y of the detector [m].
     """
     step = _STEP * 0.5 * telescope.pupil_diameter
     points = sampling.points
@@ -166,31 +127,11 @@ def lattice_wavelets(
 ) -> WaveletLattice:
     """Return the wavelets of rays that are aimed at a square lattice of direction cosines on the detector.
 
-    Cells that a rim crosses are traced with more rays, for their lit fraction; their amplitude is in proportion to it.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    field : ndarray, shape [2]
-        Field angles [rad].
-    wavelength : float
-        Vacuum wavelength [m].
-    center : ndarray, shape [2]
-        Reference point, x and y of the detector [m].
-    spacing : float
-        Spacing of the lattice: the pattern repeats itself after wavelength / spacing.
-    angle : float
-        Angle from the x axis of the detector to the first axis of the lattice [rad].
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default.
-
-    Raises
-    ------
-    DomainError
-        If no light passes, or no ray has some of the directions: the map of the pupil to the image is not one to one.
+    The request has one field. The reference point `center` is x and y of the detector [m]; the pattern repeats itself
+    after wavelength / `spacing`; `angle` [rad] is that from the x axis of the detector to the first axis of the
+    lattice. Cells that a rim crosses are traced with more rays, for their lit fraction; their amplitude is in
+    proportion to it. A DomainError says that no light passes, or no ray has some of the directions: the map of the
+    pupil to the image is not one to one.
     """
     radius = 0.5 * telescope.pupil_diameter
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -241,13 +182,7 @@ def lattice_wavelets(
 
 
 def range_of_cosines(principal: PrincipalRays) -> float:
-    """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio.
-
-    Raises
-    ------
-    DomainError
-        If light arrives parallel: there is no image.
-    """
+    """Return the largest range of direction cosines across the pupil, 1 over the smallest focal ratio."""
     found = float((1.0 / principal.f_number).max())
     if not _PARALLEL < found < np.inf:
         raise DomainError(

@@ -45,7 +45,7 @@ def layout_scene(
 ) -> trimesh.Scene:
     """Return a telescope as a scene of named meshes [m]; y points to the sky, as viewers of glTF have it up.
 
-    Parameters are the attributes of :class:`~.layout.Layout`; `size` is its largest extent [m].
+    Arguments are the attributes of :class:`~.layout.Layout`; `size` is its largest extent [m].
     """
     scene = trimesh.Scene()
     glass = {name for lens in lenses for name in (lens.front, lens.back)}
@@ -90,15 +90,7 @@ def layout_scene(
 
 
 def surface_mesh(surface: Surface, reach: float) -> trimesh.Trimesh:
-    """Return a surface, cut to its aperture, as a mesh in the telescope frame [m]; of a baffle, the blocking part.
-
-    Parameters
-    ----------
-    surface : Surface
-        The surface.
-    reach : float
-        Radius of the mesh [m].
-    """
+    """Return a surface, cut to its aperture, as a mesh in the telescope frame [m]; of a baffle, the blocking part."""
     rings, spokes = _RINGS, _SPOKES
     center_x, center_y, inner, outer = _ring(surface, reach)
     plain = isinstance(surface.aperture, (Circle, Annulus)) and surface.interaction != Interaction.PASS
@@ -129,15 +121,7 @@ def surface_mesh(surface: Surface, reach: float) -> trimesh.Trimesh:
 
 
 def tubes(paths: np.ndarray, radius: float) -> trimesh.Trimesh:
-    """Return thin tubes along polylines.
-
-    Parameters
-    ----------
-    paths : ndarray, shape [n, n_point, 3]
-        Points of each line [m].
-    radius : float
-        Radius of the tubes [m].
-    """
+    """Return thin tubes of a radius [m] along polylines [m], shape [n, n_point, 3]."""
     start, end = paths[:, :-1].reshape(-1, 3), paths[:, 1:].reshape(-1, 3)
     length = np.linalg.norm(end - start, axis=-1)
     solid = np.isfinite(length) & (length > 1e-9)

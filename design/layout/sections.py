@@ -27,22 +27,12 @@ _RIM = 1.12
 
 @dataclass(frozen=True)
 class Lens:
-    """A piece of glass between two neighbouring surfaces.
+    """A piece of glass between two neighbouring surfaces, in the order of the light."""
 
-    Attributes
-    ----------
-    name : str
-        Common part of the names of both surfaces, or both names.
-    front, back : str
-        The surfaces in the order of the light.
-    index : float
-        Refractive index of the glass.
-    """
-
-    name: str
+    name: str  #: common part of the names of both surfaces, or both names
     front: str
     back: str
-    index: float
+    index: float  #: refractive index of the glass
 
 
 def ray_paths(
@@ -54,21 +44,10 @@ def ray_paths(
     projection: str = "zemax",
     threads: int | None = None,
 ) -> np.ndarray:
-    """Return the paths of the rays that arrive, from a height in front of the telescope to the detector.
+    """Return the paths of the rays that arrive [m], telescope frame, shape [n_ray, n_surface + 1, 3].
 
-    Parameters
-    ----------
-    telescope, field, wavelength, pupil, projection
-        As in :func:`~pachon.raytrace.rays.launch_rays`.
-    top : float
-        Height at which the paths start [m].
-    threads : int, optional
-        Number of threads; all processors by default.
-
-    Returns
-    -------
-    ndarray, shape [n_ray, n_surface + 1, 3]
-        Start and intersections with the surfaces [m], telescope frame.
+    They start at the height `top` [m] in front of the telescope, and pass the intersections with all surfaces. The
+    other arguments are those of :func:`~pachon.raytrace.rays.launch_rays`.
     """
     rays = launch_rays(telescope, (field[0], field[1]), wavelength, pupil, projection)
     met = trace(telescope, rays, "all", threads=threads)
@@ -78,19 +57,9 @@ def ray_paths(
 
 
 def surface_section(surface: Surface, reach: float) -> np.ndarray:
-    """Return points along the section x = 0 of a surface, cut to its aperture.
+    """Return points along the section x = 0 of a surface out to a radius [m], telescope frame, shape [n, 3].
 
-    Parameters
-    ----------
-    surface : Surface
-        The surface; of a baffle, the blocking part counts.
-    reach : float
-        Radius of the section [m].
-
-    Returns
-    -------
-    ndarray, shape [n, 3]
-        Points [m], telescope frame, from -y to +y; NaN breaks the line.
+    They run from -y to +y. NaN breaks the line where the aperture cuts it; of a baffle, the blocking part counts.
     """
     blocks = surface.interaction == Interaction.PASS
 

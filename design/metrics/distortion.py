@@ -170,13 +170,7 @@ def distortion(
 
 
 def field_lattice(telescope: Telescope, across: int) -> np.ndarray:
-    """Return the points of a square lattice that lie in the field of view [rad], shape [n, 2], the axis among them.
-
-    Raises
-    ------
-    DomainError
-        If `across` is not an odd whole number of at least 3.
-    """
+    """Return the points of a square lattice, an odd number across, in the field of view [rad], shape [n, 2]."""
     if int(across) != across or across < 3 or across % 2 == 0:
         raise DomainError(f"across = {across!r}: expected an odd whole number of at least 3")
     u = np.linspace(-1.0, 1.0, int(across)) * telescope.field_radius

@@ -42,12 +42,10 @@ class SurfaceFootprint:
     outlines : ndarray, shape [n_field, 2, n_rim, 2]
         Outer and inner rim of the entrance pupil on the surface [m], blocked or not. The inner rim is NaN where there
         is no obscuration.
-    outline_arriving : ndarray of bool, shape [n_field, 2, n_rim]
-        Rays of the rims that no earlier surface has blocked.
+    outline_arriving, arriving : ndarray of bool, shape [n_field, 2, n_rim], [n_field, n_pupil]
+        Rays of the rims and of the pupil that no earlier surface has blocked.
     position : ndarray, shape [n_field, n_pupil, 2]
         Intersections of the rays with the surface [m].
-    arriving : ndarray of bool, shape [n_field, n_pupil]
-        Rays that no earlier surface has blocked.
     passing : ndarray of bool, shape [n_field, n_pupil]
         Arriving rays that pass the aperture of this surface.
     weights : ndarray, shape [n_pupil]

@@ -22,25 +22,13 @@ from ...raytrace.trace import trace
 
 @dataclass(frozen=True)
 class GhostPath:
-    """One path with two reflections.
-
-    Attributes
-    ----------
-    first, second : str
-        Reflecting surfaces in the order of the light: the second stands before the first in the telescope.
-    telescope : Telescope
-        The surfaces in the order of the light; "#2" and "#3" are added to the names of those that it meets again.
-    source : tuple of int
-        Index of each of them in the real telescope.
-    reflecting : tuple of bool
-        Whether each of them reflects the light without being a mirror.
-    """
+    """One path with two reflections: at `first`, then at `second`, which stands before it in the telescope."""
 
     first: str
     second: str
-    telescope: Telescope
-    source: tuple[int, ...]
-    reflecting: tuple[bool, ...]
+    telescope: Telescope  #: surfaces in the order of the light; those that it meets again are named "#2", "#3"
+    source: tuple[int, ...]  #: index of each of them in the real telescope
+    reflecting: tuple[bool, ...]  #: whether each reflects the light without being a mirror
 
 
 def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
@@ -55,20 +43,7 @@ def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
 
 
 def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
-    """Return the path of light that is reflected at two surfaces.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    first, second : int
-        Indices of the surfaces, ``second < first``; the first may be the detector.
-
-    Raises
-    ------
-    DomainError
-        If a surface does not exist, their order is wrong, or one of them is a mirror or transmits all.
-    """
+    """Return the path of light that is reflected at two surfaces, by their indices; the first may be the detector."""
     surfaces = telescope.surfaces
     if not 0 <= second < first < len(surfaces):
         raise DomainError(
@@ -115,19 +90,9 @@ def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
 
 
 def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.ndarray:
-    """Return the reflectivity of a bare interface for unpolarised light (Fresnel's equations).
+    """Return the reflectivity of a bare interface for unpolarised light (Fresnel's equations); 1 at total reflection.
 
-    Parameters
-    ----------
-    cosine : ndarray
-        Cosines of the angles of incidence.
-    before, after : float
-        Refractive indices on the side of the light and on the other.
-
-    Returns
-    -------
-    ndarray
-        Mean of both polarisations; 1 at total reflection.
+    The refractive indices are those on the side of the light and on the other.
     """
     cosine = np.abs(np.asarray(cosine, dtype=np.float64))
     square = 1.0 - (before / after) ** 2 * (1.0 - cosine**2)

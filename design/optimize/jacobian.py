@@ -21,31 +21,19 @@ from ..parameters.shape_terms import term_polynomial
 class ParameterColumns:
     """Columns of the adjoint matrix for a set of parameters, and their weights.
 
-    Attributes
-    ----------
-    telescope : Telescope
-        The telescope with all changes applied, at which derivatives are taken.
-    parameters : tuple of Parameter
-        The parameters.
-    table : ndarray of int, shape [n_surface + 1, 13]
-        Numbers of the columns, for :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`.
-    polynomials : tuple of (surface, scale, degree, columns)
-        Surfaces with polynomial shape terms, for the same.
-    other_terms : tuple of (surface, name)
-        Other shape terms; each has a column of its own behind all others.
-    intermediate : int
-        Number of intermediate columns, which come first; those of a sphere follow, then all with weights.
-    weights : ndarray, shape [n_column, n_parameter]
-        Derivatives of the columns with respect to the parameters.
+    Derivatives are taken at `telescope`, with all changes applied. `table` (numbers of the columns) and `polynomials`
+    (surface, scale, degree and columns of polynomial shape terms) are arguments of
+    :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`; each of `other_terms` (surface, name) has a column of
+    its own behind all others. `intermediate` columns come first, then those of a sphere, then all with `weights`.
     """
 
     telescope: Telescope
     parameters: tuple[Parameter, ...]
-    table: np.ndarray
+    table: np.ndarray  #: [n_surface + 1, 13] int
     polynomials: tuple[tuple[int, float, int, np.ndarray], ...]
     other_terms: tuple[tuple[int, str], ...]
     intermediate: int
-    weights: np.ndarray
+    weights: np.ndarray  #: [n_column, n_parameter] derivatives of the columns with respect to the parameters
 
     @classmethod
     def at(
@@ -113,7 +101,7 @@ class ParameterColumns:
     def of_path(self, matrix: AdjointMatrix) -> np.ndarray:
         """Return the columns of optical paths to reference spheres, shape [n_column, n_field, n_pupil].
 
-        The first four are the path and its derivatives with respect to the landing point; the others have weights.
+        The first four, without weights, are the path and its derivatives with respect to the landing point.
         """
         return self._with_other_terms(matrix, self.intermediate)[0]
 

@@ -29,15 +29,7 @@ _RINGS = 6
 
 @dataclass(frozen=True)
 class Beams:
-    """Rays of a merit with their weights.
-
-    Attributes
-    ----------
-    request : Request
-        Field points, wavelengths and pupil points.
-    field_weights : ndarray, shape [n_field]
-        Weights of a mean square over fields; they sum to 1.
-    """
+    """Rays of a merit, and weights of a mean square over fields, shape [n_field]; they sum to 1."""
 
     request: Request
     field_weights: np.ndarray
@@ -64,13 +56,7 @@ class Beams:
         return parallel_rays(telescope, self.request.directions, wavelength, self.request.pupil.points)
 
     def weights(self, telescope: Telescope) -> np.ndarray:
-        """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit.
-
-        Raises
-        ------
-        DomainError
-            If no ray of a field point is lit.
-        """
+        """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit."""
         fields, pupil, found = self.request.fields, self.request.pupil, []
         for wavelength in self.request.wavelengths:
             status = trace(telescope, self.rays(telescope, wavelength), threads=self.request.threads).status
@@ -102,19 +88,10 @@ class Merit(Protocol):
 class SpotMerit:
     """Landing points relative to the centroid of each field point, all wavelengths together.
 
-    The sum of squares is the mean square radius of the spots.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        Telescope at the start, whose lit rays count.
-    beams : Beams
-        The rays.
-    reference : {"centroid", "chief"}
-        Origin of the landing points; "chief" is the chief ray of the first wavelength.
-    heights : array_like, shape [n_field], optional
-        Height of the image surface, such as a CCD, above the detector at each field point [m]. Rays continue straight
-        to it; derivatives leave out the change of their slopes, 1e-6 of them for 10 um.
+    The sum of squares is the mean square radius of the spots. The rays are those that are lit in `telescope`. With
+    `reference` "chief", landing points refer to the chief ray of the first wavelength. `heights` [m], shape [n_field],
+    are those of the image surface, such as a CCD, above the detector: rays continue straight to it, and derivatives
+    leave out the change of their slopes, 1e-6 of them for 10 um.
     """
 
     def __init__(self, telescope: Telescope, beams: Beams, reference: str = "centroid", heights: Any = None) -> None:
@@ -190,18 +167,9 @@ class SpotMerit:
 
 
 class WavefrontMerit:
-    """Wavefront without piston and tilt, minus a goal.
+    """Wavefront without piston and tilt, minus a goal [m], shape [n_field, n_wave, n_pupil], whose NaN do not count.
 
-    The sum of squares is the mean square of the wavefront.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        Telescope at the start, whose lit rays count.
-    beams : Beams
-        The rays.
-    goal : array_like, shape [n_field, n_wave, n_pupil], optional
-        Target wavefronts [m]; NaN points do not count.
+    The sum of squares is the mean square of the wavefront. The rays are those that are lit in `telescope`.
     """
 
     def __init__(self, telescope: Telescope, beams: Beams, goal: Any = None) -> None:

@@ -241,12 +241,7 @@ def optimize(
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
     """Return the wavefronts of a telescope [m], shape [n_field, n_wave, n_pupil], NaN where not lit.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    rays : Beams
-        Rays, as :meth:`Beams.of` returns them for the arguments of :func:`optimize`.
+    Rays are those of :meth:`Beams.of` for the arguments of :func:`optimize`.
     """
     columns = ParameterColumns.at(telescope, ())
 

@@ -18,20 +18,6 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
 
     ``.fits``: images MATRIX [field, zernike, parameter] and ZERNIKES [field, zernike], tables FIELDS and PARAMETERS.
     ``.ecsv``: a row for each field point and Zernike term, a column for each parameter.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    result : Sensitivity
-        The matrix.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix is another.
-    ProductError
-        If the file cannot be written.
     """
     x, y = np.rad2deg(result.fields.T)
     names, units = result.parameters.names, ["" if unit == "1" else unit for unit in result.parameters.units]

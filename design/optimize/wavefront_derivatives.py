@@ -33,26 +33,16 @@ class WavefrontBlock:
     ray. That point moves with the parameters, so a derivative of the wavefront is
     ``by_center @ moved - columns @ weights + piston``, summed over three components of the point and over columns.
 
-    Attributes
-    ----------
-    fields : slice
-        Slice of the field points.
-    table : ndarray, shape [4 + n_column, n_field, n_pupil]
-        Paths minus those of the chief rays [m], their derivatives with respect to the landing point (3), and the
-        columns with weights; 0 where a ray is lost, and with `lit_only` where it is vignetted.
-    status : ndarray of int32, shape [n_field, n_pupil]
-        A :class:`~pachon.raytrace.rays.RayStatus` each.
-    moved : ndarray, shape [n_field, 3, n_parameter]
-        Derivatives of the centres.
-    piston : ndarray, shape [n_field, n_parameter]
-        Derivatives of the paths of the chief rays.
+    In `table` stand paths minus those of the chief rays [m], their derivatives with respect to the landing point (3),
+    and the columns with weights; 0 where a ray is lost, and with `lit_only` where it is vignetted. `moved` holds the
+    derivatives of the centres, `piston` those of the paths of the chief rays.
     """
 
     fields: slice
-    table: np.ndarray
-    status: np.ndarray
-    moved: np.ndarray
-    piston: np.ndarray
+    table: np.ndarray  #: [4 + n_column, n_field, n_pupil]
+    status: np.ndarray  #: [n_field, n_pupil] RayStatus
+    moved: np.ndarray  #: [n_field, 3, n_parameter]
+    piston: np.ndarray  #: [n_field, n_parameter]
 
     @property
     def value(self) -> np.ndarray:
@@ -72,19 +62,8 @@ class WavefrontBlock:
     def project(self, terms: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sums over the rays of terms times wavefront and derivatives, these without piston.
 
-        Parameters
-        ----------
-        terms : ndarray, shape [n_term, n_pupil]
-            Coefficients of the rays.
-        weights : ndarray, shape [n_column, n_parameter]
-            Weights of the columns.
-
-        Returns
-        -------
-        value : ndarray, shape [n_field, n_term]
-            Sums of the wavefront [m].
-        change : ndarray, shape [n_field, n_term, n_parameter]
-            Sums of its derivatives.
+        From terms [n_term, n_pupil] and weights of the columns [n_column, n_parameter] these are sums of the wavefront
+        [m], shape [n_field, n_term], and of its derivatives, shape [n_field, n_term, n_parameter].
         """
         # Sums over the rays first, as there are fewer columns than rays; all columns and field points in one product.
         count, n_field, n_pupil = self.table.shape
@@ -93,24 +72,7 @@ class WavefrontBlock:
 
 
 class FieldWavefronts:
-    """Wavefronts of many field points at one wavelength, computed part by part.
-
-    Parameters
-    ----------
-    columns : ParameterColumns
-        The telescope and its parameters.
-    request : Request
-        Field points and pupil points.
-    wavelength : float
-        Vacuum wavelength [m].
-    lit_only : bool
-        Whether vignetted rays are zero.
-
-    Raises
-    ------
-    DomainError
-        If a chief ray does not reach the image.
-    """
+    """Wavefronts of many field points at one wavelength, part by part; with `lit_only`, vignetted rays are zero."""
 
     def __init__(
         self, columns: ParameterColumns, request: Request, wavelength: float, *, lit_only: bool = False

@@ -26,13 +26,7 @@ _SI = (u.m, u.rad, u.K, u.dimensionless_unscaled)
 
 
 def unit_size(text: str) -> float:
-    """Return the size of a unit in m, rad, K or as a pure number.
-
-    Raises
-    ------
-    ConfigError
-        If it is not a unit of length, angle or temperature.
-    """
+    """Return the size of a unit of length, angle or temperature in m, rad, K or as a pure number ("1")."""
     try:
         unit = u.Unit("" if text == "1" else text)
         return next(float(unit.to(base)) for base in _SI if unit.physical_type == base.physical_type)

@@ -159,15 +159,7 @@ class ParameterVector:
 
 
 def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> tuple[Parameter, ...]:
-    """Return the parameters of a list of addresses; ``M1.Z4-22`` stands for Z4, Z5 ... Z22, ``M2.*`` for six motions.
-
-    Raises
-    ------
-    ConfigError
-        If the list is empty or has a parameter twice, or a text is not an address.
-    UnknownNameError
-        If there is no such surface, group or term.
-    """
+    """Return the parameters at addresses; ``M1.Z4-22`` stands for Z4, Z5 ... Z22, ``M2.*`` for six motions."""
     found: list[Parameter] = []
     for text in texts:
         if isinstance(text, Parameter):
@@ -234,21 +226,10 @@ def shapes_with_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> 
 
 
 def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter, float]) -> Telescope:
-    """Return the telescope with changes applied.
+    """Return the telescope with changes applied, each in the unit of its parameter; the argument stays as it is.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope; it stays as it is.
-    values : mapping of str or Parameter to float
-        Change of each parameter, in its unit.
-
-    Raises
-    ------
-    DomainError
-        If a value is not finite, or the result is not a valid telescope.
-    UnknownNameError, ConfigError
-        As :meth:`Parameter.parse`.
+    Errors are those of :meth:`Parameter.parse`, and a DomainError if a value is not finite or the result is not a valid
+    telescope.
     """
     parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
     changes = _finite(parameters, values.values())
@@ -322,22 +303,11 @@ def _members(telescope: Telescope, body: str) -> tuple[str, ...]:
 
 
 def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.ndarray) -> np.ndarray:
-    """Return the twist (velocity and rotation) of each surface per unit of each parameter.
+    """Return the twist of each surface per unit of each parameter, shape [n_parameter, n_surface, 6].
 
-    Parameters
-    ----------
-    telescope : Telescope
-        Telescope before the changes.
-    parameters : tuple of Parameter
-        All parameters that change.
-    values : ndarray, shape [n_parameter]
-        Their changes.
-
-    Returns
-    -------
-    ndarray, shape [n_parameter, n_surface, 6]
-        Velocity of the point of the surface's frame at the telescope's origin, and angular velocity: a point ``x`` of
-        surface ``s`` moves by ``v + w x x`` per unit of the parameter. Zero for shapes and indices.
+    A twist is the velocity of the point of the surface's frame at the telescope's origin, and the angular velocity: a
+    point ``x`` of the surface moves by ``v + w x x``. It is zero for shapes and indices. The telescope is that before
+    the changes `values` of all parameters.
     """
     result = np.zeros((len(parameters), len(telescope.surfaces), 6))
     names = telescope.surface_names

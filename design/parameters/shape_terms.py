@@ -17,24 +17,10 @@ from ...models.surface import Surface
 
 
 def shape_with_term(surface: Surface, name: str) -> Shape:
-    """Return the shape of a surface with a term, which is zero if it is new.
+    """Return the shape of a surface with a term such as "radius", "conic", "a6" or "Z5", which is zero if it is new.
 
-    A Zernike term extends the Zernike sag of the surface; without one, it is added over the rims of the aperture. Even
-    powers are added to a conic of revolution.
-
-    Parameters
-    ----------
-    surface : Surface
-        The surface.
-    name : str
-        Name of the term: "radius", "conic", "a6", "Z5"...
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such term.
-    DomainError
-        If a Zernike term is added to a surface without rims, or a number is out of range.
+    A Zernike term extends the Zernike sag of the surface; without one, it is added over the rims of the aperture, which
+    must be round. Even powers are added to a conic of revolution.
     """
     shape = surface.shape
     if name in shape.parameters:

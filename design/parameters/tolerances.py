@@ -78,30 +78,9 @@ class Tolerance:
 
 
 def draw(tolerances: Iterable[Tolerance], seed: int, n: int = 1) -> np.ndarray:
-    """Draw deviations within tolerances.
+    """Return deviations within tolerances, shape [n, n_tolerance], each in the unit of its degree of freedom.
 
     Each tolerance has a random stream of its own, by its name, so the draws of the others do not depend on it.
-
-    Parameters
-    ----------
-    tolerances : iterable of Tolerance
-        The tolerances.
-    seed : int
-        Seed, not negative.
-    n : int
-        Number of telescopes to draw.
-
-    Returns
-    -------
-    ndarray, shape [n, n_tolerance]
-        Deviations, each in the unit of its degree of freedom.
-
-    Raises
-    ------
-    ConfigError
-        If there is no tolerance, or two have one name.
-    DomainError
-        If the number or the seed is not a whole number in range.
     """
     chosen = tuple(tolerances)
     names = [t.name for t in chosen]
