@@ -38,20 +38,15 @@ _XI = ("truth", "observed", "residual", "away")
 
 @dataclass(frozen=True)
 class Attribution:
-    """Metrics with all causes, and without each.
+    """Metrics with all causes (``full``), and without each.
 
-    Attributes
-    ----------
-    metrics : dict of str to dict
-        For ``full`` and each cause that is switched off: rms of e and of its residuals, median FWHM, and the mean xi+
-        of noise-free PSFs, observed stars and residuals, over short and long separations. ``change_`` and a key is the
-        effect of the cause, the full case less this one; ``error_`` and a key of xi+ its jackknife error over the CCDs.
-    correlations : dict of str to dict of str to Correlation
-        Correlations of each case, by kind.
+    Metrics are rms of e and of its residuals, median FWHM, and the mean xi+ of noise-free PSFs, observed stars and
+    residuals, over short and long separations. ``change_`` and a key is the effect of the cause, the full case less
+    this one; ``error_`` and a key of xi+ its jackknife error over the CCDs.
     """
 
-    metrics: dict[str, dict[str, float]]
-    correlations: dict[str, dict[str, Correlation]]
+    metrics: dict[str, dict[str, float]]  #: by case
+    correlations: dict[str, dict[str, Correlation]]  #: by case and kind
 
 
 def attribute(
@@ -61,28 +56,10 @@ def attribute(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> Attribution:
-    """Simulate and model the same stars with all causes and without each, and compare.
+    """Simulate and model the same stars with all causes and without each, by default of all that are on.
 
     The engine ``long_exposure`` averages over all turbulence. It is fast, and ellipticities are effects of optics and
     heights alone; the atmosphere cannot be switched off.
-
-    Parameters
-    ----------
-    config : Configuration
-        Resolved configuration.
-    causes : sequence of str, optional
-        Names of :data:`~pachon.studies.attribution.causes.CAUSES`; by default all that are on.
-    threads : int, optional
-        Number of threads; all processors by default. Results do not depend on it.
-    reporter : Reporter, optional
-        Progress display; silent by default.
-
-    Raises
-    ------
-    UnknownNameError, ConfigError
-        See :func:`~pachon.studies.attribution.causes.checked_causes`.
-    PachonError
-        If a case cannot be computed.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     chosen = checked_causes(config, causes)

@@ -83,12 +83,7 @@ CAUSES: dict[str, Cause] = {
 def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -> tuple[str, ...]:
     """Return causes each once; by default all that can be switched off in a resolved configuration.
 
-    Raises
-    ------
-    UnknownNameError
-        If there is no such cause.
-    ConfigError
-        If one is off in the configuration already, or cannot be switched off with its engine.
+    A ConfigError names one that is off in the configuration already, or cannot be switched off with its engine.
     """
     if causes is None:
         return tuple(name for name, cause in CAUSES.items() if cause.problem(config) is None)

@@ -17,15 +17,7 @@ from .causes import FULL
 def attribution_plot(
     metrics: Mapping[str, Mapping[str, float]], correlations: Mapping[str, Mapping[str, Correlation]]
 ) -> bytes:
-    """Draw rms ellipticities and residuals as bars, and xi+ as curves, for each case.
-
-    Parameters
-    ----------
-    metrics : mapping of str to mapping
-        Metrics of each case, as in :class:`~pachon.studies.attribution.attribution.Attribution`; ``full`` first.
-    correlations : mapping of str to mapping of str to Correlation
-        Correlations of each case.
-    """
+    """Draw rms ellipticities and residuals as bars, and xi+ as curves, for each case."""
     cases = list(metrics)
     colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {FULL: "black"}
     with styled():

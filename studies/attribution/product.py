@@ -18,22 +18,7 @@ from .plots import attribution_plot
 
 
 def write_attribution(result: Attribution, folder: Path, config: Configuration) -> tuple[str, ...]:
-    """Write metrics, correlations, plot and configuration, and return the names of the files.
-
-    Parameters
-    ----------
-    result : Attribution
-        The attribution.
-    folder : Path
-        Existing folder.
-    config : Configuration
-        Resolved configuration of the full case.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
-    """
+    """Write metrics, correlations, plot and configuration; return the names of the files."""
     stamp = stamp_of(Experiment.from_config(config))
     meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed}
     cases = list(result.metrics)

@@ -169,15 +169,10 @@ def check_baseline(
 def updated_baseline(
     path: Path, *, threads: int | None = None, progress: Callable[[int], None] | None = None
 ) -> tuple[Baseline, BaselineCheck]:
-    """Replace the metrics of a baseline that are out of tolerance.
+    """Replace the metrics of a baseline that are out of tolerance; return it and the check.
 
     Plan, tolerances and reasons stay, as do metrics within their tolerances. Replaced metrics lose their independent
     source.
-
-    Raises
-    ------
-    PachonError
-        If a file cannot be read, or a metric can no longer be computed.
     """
     baseline = read_baseline(path)
     check = check_baseline(path, threads=threads, progress=progress)

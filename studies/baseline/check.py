@@ -14,29 +14,15 @@ _COLUMNS = ("metric", "now", "baseline", "tolerance", "unit", "deviation / toler
 
 @dataclass(frozen=True)
 class Deviation:
-    """One metric against its baseline.
-
-    Attributes
-    ----------
-    name, unit : str
-        Name and unit of the metric.
-    stored, tolerance : float
-        Value and tolerance of the baseline.
-    found : float or None
-        Present value; None where it cannot be computed.
-    checked_against : str or None
-        Independent source of the stored value.
-    problem : str or None
-        Reason why it cannot be computed.
-    """
+    """One metric against its baseline."""
 
     name: str
     unit: str
-    stored: float
+    stored: float  #: value of the baseline
     tolerance: float
-    found: float | None
-    checked_against: str | None
-    problem: str | None = None
+    found: float | None  #: present value; None where it cannot be computed
+    checked_against: str | None  #: independent source of the stored value
+    problem: str | None = None  #: reason why it cannot be computed
 
     @property
     def ratio(self) -> float:

@@ -23,24 +23,12 @@ _PER_METRE = {"m": 1.0, "mm": 1e3, "um": 1e6, "nm": 1e9}
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric, of one or several places.
+    """One metric, of one or several places; a tolerance is the change that another machine may cause."""
 
-    Attributes
-    ----------
-    name : str
-        Start of the names of its values.
-    unit : str
-        Unit of its values; empty for pure numbers.
-    reason : str
-        Reason of the tolerance, a key of :data:`REASONS`; empty for metrics without a tolerance.
-    tolerance : float or callable, optional
-        Change that another machine may cause, in the unit: a number, or a function of the scene and the value. By
-        default, for lengths, :attr:`~pachon.studies.metrics.scene.Scene.length_tolerance`.
-    """
-
-    name: str
-    unit: str = ""
-    reason: str = ""
+    name: str  #: start of the names of its values
+    unit: str = ""  #: empty for pure numbers
+    reason: str = ""  #: of the tolerance, a key of :data:`REASONS`; empty for metrics without a tolerance
+    #: In the unit, or a function of scene and value; for lengths by default ``Scene.length_tolerance``.
     tolerance: float | Callable[[Scene, float], float] | None = None
 
     def tolerance_of(self, scene: Scene, value: float) -> float:
@@ -52,15 +40,7 @@ class Metric:
 
 @dataclass(frozen=True)
 class MetricGroup:
-    """Metrics that are computed together.
-
-    Attributes
-    ----------
-    compute : callable
-        Function from a scene to values by name.
-    metrics : tuple of Metric
-        Its metrics.
-    """
+    """Metrics that are computed together, from a scene to values by name."""
 
     compute: Callable[[Scene], dict[str, float]]
     metrics: tuple[Metric, ...]

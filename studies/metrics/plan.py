@@ -43,18 +43,9 @@ def make_plan(
     ccds: Sequence[str] | None = None,
     pupil: Sequence[tuple[float, float]] | None = None,
 ) -> Plan:
-    """Return a plan, with defaults for what is not given.
+    """Return a plan, with defaults for what is not given: see :func:`~pachon.studies.baseline.baseline.make_baseline`.
 
-    Parameters are those of :func:`~pachon.studies.baseline.baseline.make_baseline`.
-
-    Raises
-    ------
-    DomainError
-        If a field or a wavelength lies outside the domain of the telescope.
-    UnknownNameError
-        If there is no such CCD.
-    ConfigError
-        If CCDs are given without a configuration.
+    A ConfigError says that CCDs need a configuration, for the focal plane that they lie in.
     """
     angles = field_points(telescope, np.array(_FIELDS) * telescope.field_radius if fields is None else fields)
     if wavelengths is None:

@@ -26,23 +26,11 @@ _CORRELATION_BINS = 15
 
 @dataclass(frozen=True)
 class Scene:
-    """Telescope, places and stars of which metrics are taken.
-
-    Attributes
-    ----------
-    telescope : Telescope
-        The telescope.
-    experiment : Experiment, optional
-        Focal plane, atmosphere and reconstruction; only metrics of the optics do without.
-    given_plan : Plan, optional
-        Fields, wavelengths, pupil points and CCDs of the metrics of optics and camera; see :attr:`plan`.
-    threads : int, optional
-        Number of threads; results do not depend on it.
-    """
+    """Telescope, places and stars of which metrics are taken; only metrics of the optics do without an experiment."""
 
     telescope: Telescope
-    experiment: Experiment | None = None
-    given_plan: Plan | None = None
+    experiment: Experiment | None = None  #: focal plane, atmosphere and reconstruction
+    given_plan: Plan | None = None  #: places of the metrics of optics and camera; see :attr:`plan`
     threads: int | None = None
 
     @cached_property

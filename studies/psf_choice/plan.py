@@ -22,30 +22,14 @@ NOISE_FREE = math.inf
 
 @dataclass(frozen=True)
 class Case:
-    """Parameters of a PSF model of a CCD.
+    """Parameters of a PSF model of a CCD."""
 
-    Attributes
-    ----------
-    stars : int
-        Stars of a CCD.
-    snr : float
-        Signal-to-noise ratio of the faintest star; :data:`NOISE_FREE` for stars without noise.
-    basis : str
-        One of :data:`~pachon.pipeline.psf_model.basis.BASES`.
-    interpolation : str
-        One of :data:`INTERPOLATIONS`.
-    order : int
-        Order of the polynomials; 0 with a Gaussian process.
-    components : int
-        Components of the basis; 0 for pixels, which are all used.
-    """
-
-    stars: int
-    snr: float = 30.0
-    basis: str = "pca"
-    interpolation: str = "equal"
-    order: int = 3
-    components: int = 20
+    stars: int  #: stars of a CCD
+    snr: float = 30.0  #: S/N of the faintest star; :data:`NOISE_FREE` for stars without noise
+    basis: str = "pca"  #: one of :data:`~pachon.pipeline.psf_model.basis.BASES`
+    interpolation: str = "equal"  #: one of :data:`INTERPOLATIONS`
+    order: int = 3  #: of the polynomials; 0 with a Gaussian process
+    components: int = 20  #: of the basis; 0 for pixels, which are all used
 
     @property
     def terms(self) -> int:
@@ -73,24 +57,14 @@ class Case:
 
 @dataclass(frozen=True)
 class Plan:
-    """Values of the parameters of a study.
-
-    Attributes
-    ----------
-    base : Case
-        Case of the parameters that do not vary.
-    stars, orders, components, snrs : tuple
-        Values, ascending, with that of the base.
-    draws : int
-        Number of draws of the noise.
-    """
+    """Values of the parameters of a study, ascending, with those of the base, whose other parameters do not vary."""
 
     base: Case
     stars: tuple[int, ...]
     orders: tuple[int, ...]
     components: tuple[int, ...]
     snrs: tuple[float, ...]
-    draws: int = 4
+    draws: int = 4  #: of the noise
 
     def cases(self) -> tuple[Case, ...]:
         """Return the cases of the study, each once.
@@ -129,13 +103,7 @@ def make_plan(
     snrs: Iterable[float] = (30.0, 100.0, 300.0),
     draws: int = 4,
 ) -> Plan:
-    """Return a plan around the observed stars, S/N and reconstruction of a configuration.
-
-    Raises
-    ------
-    ConfigError
-        If a number is out of range.
-    """
+    """Return a plan around the observed stars, S/N and reconstruction of a configuration."""
     fit = config.reconstruction
     base = Case(
         config.stars.observed,

@@ -20,22 +20,7 @@ from .study import Study, study_experiment
 
 
 def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str, ...]:
-    """Write table, metrics, plots and configuration, and return the names of the files.
-
-    Parameters
-    ----------
-    result : Study
-        The study.
-    folder : Path
-        Existing folder.
-    config : Configuration
-        Configuration of the study.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
-    """
+    """Write table, metrics, plots and configuration; return the names of the files."""
     stamp = stamp_of(study_experiment(config, result.plan))
     meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed, "draws": result.plan.draws}
     write_ecsv(folder / "study.ecsv", study_columns(result), {"what": "PSF models against the truth", **meta})

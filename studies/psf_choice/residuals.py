@@ -28,28 +28,14 @@ _BINS: dict[str, Any] = {"min_sep": _LOW**2 / _HIGH * ARCMIN, "max_sep": _HIGH *
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of one case and one draw of the noise, at the stars and at the holdout positions.
+    """Residuals of one case and one draw of the noise, for each of :data:`KINDS`."""
 
-    Attributes
-    ----------
-    square : ndarray, shape [n_ccd, 2, 2]
-        Mean squares of one component of e, and of the relative size, for each of :data:`KINDS`.
-    mean : ndarray, shape [n_ccd, 2, 2]
-        Means of e1 and e2.
-    law : ndarray, shape [n_ccd, 2]
-        Mean squares of e by :func:`noise_law`.
-    xi, xi_left : ndarray, shape [2, 2] and [2, n_ccd, 2]
-        xi+ of short and long separations, of all CCDs and without each.
-    lost : int
-        Holdout positions at which the model has no shape.
-    """
-
-    square: np.ndarray
-    mean: np.ndarray
-    law: np.ndarray
-    xi: np.ndarray
-    xi_left: np.ndarray
-    lost: int
+    square: np.ndarray  #: [n_ccd, kind, 2] mean squares of one component of e, and of the relative size
+    mean: np.ndarray  #: [n_ccd, kind, 2] means of e1 and e2
+    law: np.ndarray  #: [n_ccd, kind] mean squares of e by :func:`noise_law`
+    xi: np.ndarray  #: [kind, 2] xi+ of short and long separations, of all CCDs
+    xi_left: np.ndarray  #: [kind, n_ccd, 2] the same without each CCD
+    lost: int  #: holdout positions at which the model has no shape
 
 
 def measure_residuals(
@@ -147,18 +133,7 @@ def noise_law(
     of the latter is exactly 1 - p/n of the noise for p terms and n stars. Model - noise-free PSF has p/n at the stars,
     and about that elsewhere, more in gaps between the stars.
 
-    Parameters
-    ----------
-    stars, places : array
-        Positions, [n, 2] and [m, 2].
-    variance : array
-        Variance of the noise of each star, [n].
-    weights : array or None
-        Weights of the stars, [n].
-    order : int
-        Order of the polynomial.
-    extent : tuple of float
-        Domain of the polynomial.
+    Shapes: `stars` [n, 2], `places` elsewhere [m, 2], `variance` of the noise and `weights` [n].
     """
     root = np.ones(len(stars)) if weights is None else np.sqrt(weights)
     terms = design_matrix(stars, extent, order)

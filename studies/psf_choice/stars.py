@@ -29,21 +29,11 @@ from .plan import NOISE_FREE, Case
 
 @dataclass(frozen=True)
 class SimulatedCcd:
-    """Stars of a CCD.
-
-    Attributes
-    ----------
-    exposure : CcdExposure
-        Noise-free stars.
-    holdout : Shapes
-        Shapes of the PSFs at the holdout positions.
-    noise_free : Observation
-        Stars to be observed, without noise.
-    """
+    """Stars of a CCD without noise."""
 
     exposure: CcdExposure
-    holdout: Shapes
-    noise_free: Observation
+    holdout: Shapes  #: of the PSFs at the holdout positions
+    noise_free: Observation  #: of the stars to be observed
 
 
 @dataclass(frozen=True)
@@ -74,18 +64,9 @@ def _look_at(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) 
 
 
 def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int) -> ObservedCcd:
-    """Return the stars of a CCD with noise.
+    """Return the stars of a CCD with one draw of the noise.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Settings.
-    ccd : SimulatedCcd
-        The stars.
-    snr_min : float
-        Signal-to-noise ratio of the faintest star where the lit fraction is least; infinite for no noise.
-    draw : int
-        Number of the draw of the noise.
+    `snr_min` is the signal-to-noise ratio of the faintest star where the lit fraction is least; infinite for no noise.
     """
     exposed, places, name = ccd.exposure.observed, ccd.exposure.places, ccd.exposure.name
     n_stars = len(exposed.image)
@@ -109,13 +90,7 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
 
 
 def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
-    """Fit the PSF model of a case to the first stars of a CCD.
-
-    Raises
-    ------
-    PachonError
-        If it cannot be fitted.
-    """
+    """Fit the PSF model of a case to the first stars of a CCD."""
     used = used_stars(case, observed)
     return PsfModel.fit(
         observed.observation.images[used],

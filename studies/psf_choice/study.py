@@ -29,28 +29,21 @@ STUDY_CCDS = tuple(f"R{raft}_S11" for raft in ("02", "11", "13", "20", "22", "24
 
 @dataclass(frozen=True)
 class Study:
-    """Result of the study of PSF models.
+    """Result of the study of PSF models, for the cases of a plan.
 
-    Attributes
-    ----------
-    plan : Plan
-        Cases.
-    metrics : dict of Case to dict
-        For each fitted case: ``rms_e_`` and ``rms_size_`` (one component of e; relative size), ``mean_e_``
-        (rms over the CCDs of the mean of one component), ``noise_law_`` (rms of e by noise alone) and
-        ``xi_plus_..._short``, ``_long`` (below and beyond 10') of each of
-        :data:`~pachon.studies.psf_choice.residuals.KINDS`, with an ``error_`` over the CCDs where it is defined; and
-        ``lost``, holdout positions at which the model has no shape, over all draws.
-    problems : dict of Case to str
-        Reasons why the other cases could not be fitted.
-    holdout_square : dict of Case to ndarray, shape [n_ccd]
-        Mean square residual at the holdout positions of each CCD: of e1, e2 and the relative size together, which are
-        commensurate for a PSF of axes a and b: ln a = ln size + |e|, ln b = ln size - |e| to first order.
+    Metrics of each fitted case are ``rms_e_`` and ``rms_size_`` (one component of e; relative size), ``mean_e_`` (rms
+    over the CCDs of the mean of one component), ``noise_law_`` (rms of e by noise alone) and ``xi_plus_..._short``,
+    ``_long`` (below and beyond 10') of each of :data:`~pachon.studies.psf_choice.residuals.KINDS`, with an ``error_``
+    over the CCDs where it is defined; and ``lost``, holdout positions at which the model has no shape, over all draws.
+
+    `holdout_square` is the mean square residual at the holdout positions of each CCD, [n_ccd]: of e1, e2 and the
+    relative size together, which are commensurate for a PSF of axes a and b: ln a = ln size + |e|, ln b = ln size - |e|
+    to first order.
     """
 
     plan: Plan
     metrics: dict[Case, dict[str, float]]
-    problems: dict[Case, str]
+    problems: dict[Case, str]  #: reasons why the other cases could not be fitted
     holdout_square: dict[Case, np.ndarray]
 
     def recommended(self) -> Case | None:
@@ -83,10 +76,7 @@ class Study:
 def study_experiment(config: Configuration, plan: Plan) -> Experiment:
     """Return the experiment of a plan, with as many observed stars as the largest case needs.
 
-    Raises
-    ------
-    ConfigError
-        If values contradict each other, or stars have defects: the study adds its own noise.
+    Stars with defects are a ConfigError: the study adds its own noise.
     """
     for key in ("neighbours", "cosmic_rays", "saturated"):
         if (value := getattr(config.stars, key)) > 0.0:
@@ -95,24 +85,7 @@ def study_experiment(config: Configuration, plan: Plan) -> Experiment:
 
 
 def study(config: Configuration, plan: Plan, *, threads: int | None = None, reporter: Reporter | None = None) -> Study:
-    """Simulate stars, and fit the PSF model of every case of a plan.
-
-    Parameters
-    ----------
-    config : Configuration
-        Configuration of the stars and of the standard model.
-    plan : Plan
-        Cases.
-    threads : int, optional
-        Number of threads; all processors by default. Results do not depend on it.
-    reporter : Reporter, optional
-        Progress display; silent by default.
-
-    Raises
-    ------
-    PachonError
-        If the stars cannot be simulated, or no case can be fitted.
-    """
+    """Simulate the stars of a configuration, and fit the PSF model of every case of a plan."""
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = study_experiment(config, plan)
     check_memory(experiment, threads)

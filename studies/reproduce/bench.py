@@ -112,18 +112,7 @@ class PipelineRun:
 class Bench:
     """Settings of the figures, and objects that they share, each made at its first use.
 
-    Attributes
-    ----------
-    scale : Scale
-        Sizes.
-    folder : Path
-        Folder of the figures; the run of the pipeline is in its sub-folder ``run``.
-    seed : int
-        Seed of all random numbers.
-    threads : int or None
-        Number of threads; results do not depend on it.
-    reporter : Reporter
-        Progress display; silent by default.
+    The run of the pipeline is in the sub-folder ``run`` of that of the figures. Results do not depend on `threads`.
     """
 
     scale: Scale

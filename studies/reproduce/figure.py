@@ -34,30 +34,14 @@ class FitsData:
 
 @dataclass(frozen=True)
 class Reproduced:
-    """One reproduced figure.
+    """One reproduced figure."""
 
-    Attributes
-    ----------
-    pictures : dict of str to bytes
-        PNG pictures, by the suffix of the figure's name in the file name.
-    data : dict of str to EcsvData or FitsData
-        Numbers of the pictures, by the same suffixes.
-    here : str
-        Result.
-    agrees : bool or None
-        Whether the result agrees with the paper; None where the two cannot be compared.
-    why : str
-        Reason of the verdict.
-    measured : dict
-        Metrics behind `here`; keys end in their unit.
-    """
-
-    pictures: dict[str, bytes]
-    data: dict[str, EcsvData | FitsData]
-    here: str
-    agrees: bool | None
-    why: str
-    measured: dict[str, Any]
+    pictures: dict[str, bytes]  #: PNG, by the suffix of the figure's name in the file name
+    data: dict[str, EcsvData | FitsData]  #: numbers of the pictures, by the same suffixes
+    here: str  #: the result in words
+    agrees: bool | None  #: with the paper; None where the two cannot be compared
+    why: str  #: reason of the verdict
+    measured: dict[str, Any]  #: metrics behind `here`; keys end in their unit
 
     @property
     def verdict(self) -> str:
@@ -84,28 +68,15 @@ class Reproduced:
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of the paper.
+    """One figure of the paper."""
 
-    Attributes
-    ----------
-    name, title : str
-        Name, such as ``fig3``, and subject.
-    paper : str
-        Statement of the paper.
-    make : callable
-        Function that reproduces it.
-    minutes : tuple of float
-        Approximate time on two cores at the scales ``small`` and ``paper``, without the run of the pipeline.
-    of_run : bool
-        Whether it needs the run of the pipeline.
-    """
-
-    name: str
+    name: str  #: such as ``fig3``
     title: str
-    paper: str
+    paper: str  #: statement of the paper
     make: Callable[[Bench], Reproduced]
+    #: Approximate time on two cores at the scales ``small`` and ``paper``, without the run of the pipeline.
     minutes: tuple[float, float]
-    of_run: bool = False
+    of_run: bool = False  #: needs the run of the pipeline
 
 
 def figure(

@@ -34,15 +34,7 @@ _ALL = "all"
 
 
 def chosen_figures(names: Iterable[str]) -> tuple[str, ...]:
-    """Return figures by name, each once, in the order of the paper; ``all`` stands for every one.
-
-    Raises
-    ------
-    UnknownNameError
-        If the paper has no such figure; the message has the nearest names.
-    ConfigError
-        If the figure cannot be reproduced.
-    """
+    """Return figures by name, each once, in the order of the paper; ``all`` stands for every one."""
     wanted = set()
     for name in names:
         if name in _NOT_OFFERED:
@@ -69,25 +61,9 @@ def expected_minutes(names: Iterable[str], scale: Scale) -> float:
 def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
     """Reproduce figures of the paper: pictures, data and, for all of them, ``summary.json``.
 
-    Files have the same bytes for the same scale and seed, on any number of threads.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Figures, as for :func:`chosen_figures`.
-    bench : Bench
-        Scale, folder, seed, threads.
-
-    Returns
-    -------
-    dict
-        Content of ``summary.json``: scale, seed, and for each figure title, statement of the paper, result, verdict
-        with its reason, metrics and files.
-
-    Raises
-    ------
-    PachonError
-        If there is no such figure, or a file cannot be written.
+    Files have the same bytes for the same scale and seed, on any number of threads. Returned is the content of
+    ``summary.json``: scale, seed, and for each figure title, statement of the paper, result, verdict with its reason,
+    metrics and files.
     """
     chosen = chosen_figures(names)
     make_folder(bench.folder)
@@ -124,15 +100,7 @@ def reproduce_at(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> dict[str, Any]:
-    """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such scale.
-    PachonError
-        As :func:`reproduce`.
-    """
+    """Reproduce figures at a scale given by name, after a line with the expected time: see :func:`reproduce`."""
     chosen = chosen_figures(names)
     if scale not in SCALES:
         raise unknown_name("scale", scale, SCALES)

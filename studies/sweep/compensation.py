@@ -26,28 +26,10 @@ _TOLERANCE = 1e-9
 def compensated(
     experiment: Experiment, names: Sequence[str], threads: int | None = None
 ) -> tuple[Experiment, dict[str, float]]:
-    """Optimize compensators for the smallest mean square spot radius.
+    """Return the experiment with compensators at their best, and their values in the units of their names.
 
-    Spots are those on the surfaces of the CCDs of the configuration, at the middle wavelength.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    names : sequence of str
-        Changes of the prescription with their units, such as Camera.dz_um and Camera.rx_urad.
-    threads : int, optional
-        Number of threads; results do not depend on it.
-
-    Returns
-    -------
-    tuple of Experiment and dict
-        The experiment with the compensators at their best, and their values in the units of their names.
-
-    Raises
-    ------
-    PachonError
-        If there is no such parameter, or one has no effect.
+    `names` are changes of the prescription, such as Camera.dz_um. The mean square spot radius is minimized on the
+    surfaces of the CCDs of the configuration, at the middle wavelength. A compensator without effect is a PachonError.
     """
     if not names:
         return experiment, {}

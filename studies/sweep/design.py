@@ -28,11 +28,6 @@ def design_points(sweep: SweepFile) -> list[Point]:
     covers the unit cube, mapped through the distribution of each parameter: uniform over a range or a list, or by
     quantiles of a normal distribution. Latin hypercube and Sobol points are SciPy's (``scipy.stats.qmc``), scrambled by
     the seed.
-
-    Raises
-    ------
-    ConfigError
-        If a table of points cannot be read or does not fit the parameters.
     """
     design = sweep.design
     if design.kind == "table":

@@ -37,18 +37,10 @@ _MOTIONS = ("dz_um", "rx_urad", "ry_urad")
 
 @dataclass(frozen=True)
 class PointMeasurement:
-    """Compute the metrics of points; a picklable function for every kind of worker.
-
-    Parameters
-    ----------
-    sweep : SweepFile
-        The sweep.
-    folder : str
-        Folder that relative paths of its configuration start from.
-    """
+    """Compute the metrics of points; a picklable function for every kind of worker."""
 
     sweep: SweepFile
-    folder: str
+    folder: str  #: from which relative paths of the configuration start
 
     def __call__(self, point: SweepPoint, threads: int) -> PointResult:
         """Compute one point; where that fails, the result holds one line with the reason."""
@@ -71,13 +63,7 @@ class PointMeasurement:
 
 
 def point_configuration(sweep: SweepFile, parameters: dict[str, Any], seed: int, folder: Path) -> Configuration:
-    """Return the configuration of one point; defaults stay open.
-
-    Raises
-    ------
-    PachonError
-        If a parameter is unknown, or its value not possible: one line.
-    """
+    """Return the configuration of one point; defaults stay open."""
     if not isinstance(sweep.base, dict):
         raise ConfigError(f"base = {sweep.base!r}: expected the content of the file; see load_sweep")
     content = deepcopy(sweep.base)
@@ -113,13 +99,7 @@ def point_experiment(sweep: SweepFile, point: SweepPoint, folder: Path) -> Exper
 
 
 def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> None:
-    """Check names and values, on the first point and the extremes of each parameter.
-
-    Raises
-    ------
-    PachonError
-        If a parameter, metric or compensator is unknown, or a value not possible: one line.
-    """
+    """Check names and values, on the first point and the extremes of each parameter."""
     if not sweep.metrics:
         raise ConfigError(f"metrics = []: expected some of {', '.join(STARS)}")
     for name in sweep.metrics:

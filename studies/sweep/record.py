@@ -17,24 +17,10 @@ class SweepPoint:
 
 @dataclass(frozen=True)
 class PointResult:
-    """Result of one point.
-
-    Attributes
-    ----------
-    number : int
-        Number of the point.
-    metrics : dict of str to float, or None
-        Metrics by name; None where the point could not be computed.
-    problem : str or None
-        Reason why it could not be computed, in one line.
-    seconds : float
-        Time of the computation.
-    worker : str
-        Machine and process of the computation.
-    """
+    """Result of one point."""
 
     number: int
-    metrics: dict[str, float] | None
-    problem: str | None
-    seconds: float
-    worker: str
+    metrics: dict[str, float] | None  #: None where the point could not be computed
+    problem: str | None  #: reason why it could not be computed, in one line
+    seconds: float  #: time of the computation
+    worker: str  #: machine and process of the computation

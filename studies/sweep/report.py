@@ -24,13 +24,7 @@ _ENOUGH = 24
 
 
 def write_report(store: SweepStore, folder: Path) -> Path:
-    """Write ``report.html``, ``summary.json`` and the plots of a sweep, and return the path of the report.
-
-    Raises
-    ------
-    ProductError
-        If nothing has been computed yet, or the folder cannot be written.
-    """
+    """Write ``report.html``, ``summary.json`` and the plots of a sweep, and return the path of the report."""
     table, sweep = read_table(store), store.sweep
     if not len(table) or not table.metrics:
         raise ProductError(f"{store.path}: no point has been computed yet")

@@ -40,18 +40,7 @@ class DamagedStoreError(ProductError):
 
 
 class SweepStore:
-    """Open file of a sweep.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it must exist. See :func:`create_store`.
-
-    Raises
-    ------
-    ProductError
-        If it is no store of a sweep, of another format, or damaged.
-    """
+    """Open file of a sweep, which must exist; a ProductError where it is no store, of another format, or damaged."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
@@ -105,13 +94,7 @@ class SweepStore:
             return self._connection.execute("DELETE FROM results WHERE problem IS NOT NULL").rowcount
 
     def write(self, result: PointResult) -> None:
-        """Write one result, whole; an earlier result of the point stays.
-
-        Raises
-        ------
-        ProductError
-            If it cannot be written; earlier results stay.
-        """
+        """Write one result, whole; an earlier result of the point stays."""
         row = (
             result.number,
             None if result.metrics is None else exact_json(result.metrics),
@@ -132,13 +115,7 @@ class SweepStore:
 
 
 def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
-    """Create the file of a sweep with all its points and no results, whole or not at all.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
-    """
+    """Create the file of a sweep with all its points and no results, whole or not at all."""
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -194,13 +171,7 @@ def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:
 
 
 def check_same_sweep(store: SweepStore, sweep: SweepFile) -> None:
-    """Refuse another sweep than that of the store.
-
-    Raises
-    ------
-    ConfigError
-        If they differ: one line with the differences.
-    """
+    """Refuse another sweep than that of the store, in one line with the differences."""
     if store.about.get("digest") == sweep.digest:
         return
     changed = differences(json.loads(store.about["sweep"]), sweep.model_dump(mode="json"))

@@ -30,21 +30,13 @@ _BYTES_ON_DISK, _BYTES_IN_MEMORY = 1500, 2500
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """Numbers of points of a sweep after a computation.
+    """Numbers of points of a sweep after a computation."""
 
-    Attributes
-    ----------
-    path : Path
-        The store.
-    points, kept, computed, failed : int
-        Points of the sweep, points computed before, points computed now, and points that could not be computed.
-    """
-
-    path: Path
+    path: Path  #: store
     points: int
-    kept: int
-    computed: int
-    failed: int
+    kept: int  #: computed before
+    computed: int  #: computed now
+    failed: int  #: could not be computed
 
 
 def run_sweep(
@@ -131,13 +123,7 @@ def numbered_points(sweep: SweepFile, folder: Path) -> list[SweepPoint]:
 
 
 def check_room(sweep: SweepFile, path: Path) -> None:
-    """Refuse a sweep with more points than memory or disk can hold.
-
-    Raises
-    ------
-    ConfigError
-        One line with the required and the available space.
-    """
+    """Refuse a sweep with more points than memory or disk can hold, with required and available space."""
     count = point_count(sweep) * sweep.design.replicas
     place = next(parent for parent in (path.resolve().parent, *path.resolve().parents) if parent.exists())
     try:

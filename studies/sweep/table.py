@@ -88,15 +88,7 @@ def read_table(store: SweepStore) -> SweepTable:
 
 
 def export_table(store: SweepStore, path: Path) -> int:
-    """Write the points of a store as ECSV, CSV, FITS or Parquet, and return their number.
-
-    Raises
-    ------
-    ConfigError
-        If the ending of the file names no format, or ``pyarrow`` is not installed for Parquet.
-    ProductError
-        If the file cannot be written, or nothing has been computed.
-    """
+    """Write the points of a store as ECSV, CSV, FITS or Parquet (with ``pyarrow``), and return their number."""
     table = read_table(store)
     if not len(table):
         raise ProductError(f"{store.path}: no point has been computed yet")
@@ -107,15 +99,7 @@ def export_table(store: SweepStore, path: Path) -> int:
 
 
 def salvage(path: Path, out: Path) -> int:
-    """Write the readable points of a damaged store as a table, and return their number.
-
-    Raises
-    ------
-    ConfigError
-        If the ending of the file names no format.
-    ProductError
-        If nothing can be read.
-    """
+    """Write the readable points of a damaged store as a table, and return their number."""
     rows = [
         ({"number": number}, json.loads(parameters), json.loads(metrics or "{}"))
         for number, parameters, metrics in readable_rows(path)

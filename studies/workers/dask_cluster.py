@@ -28,16 +28,9 @@ _Task = TypeVar("_Task", bound=_Numbered)
 
 
 def dask_workers(measure: Measure[_Task, Result], client: Any) -> Workers[_Task, Result]:
-    """Return the workers of a Dask cluster.
+    """Return the workers of a Dask cluster, reached through a ``distributed.Client``.
 
     The tasks of a lost worker are computed by another. Without any worker, the results wait until one comes.
-
-    Parameters
-    ----------
-    measure : callable
-        Function of one task and a number of threads.
-    client : distributed.Client
-        Connection to the scheduler.
     """
     info = client.scheduler_info()
     count = len(info["workers"])
@@ -77,19 +70,10 @@ def dask_workers(measure: Measure[_Task, Result], client: Any) -> Workers[_Task,
 
 @contextmanager
 def dask_client(address: str, security: Any = None) -> Iterator[Any]:
-    """Connect to a Dask scheduler whose workers have the same pachon.
+    """Connect to a Dask scheduler, such as ``tls://host:8786``, whose workers have the same pachon.
 
-    Parameters
-    ----------
-    address : str
-        Such as ``tcp://host:8786`` or ``tls://host:8786``.
-    security : distributed.Security, optional
-        TLS settings; by default those of Dask's own configuration.
-
-    Raises
-    ------
-    ConfigError
-        If ``distributed`` is not installed, the scheduler does not answer, or a worker has another version of pachon.
+    `security` is a ``distributed.Security``, by default that of Dask's own configuration. No answer, another version of
+    pachon, or no package ``distributed`` are a ConfigError.
     """
     _require_distributed("--scheduler")
     if not re.fullmatch(r"(tcp|tls|ws|wss|ucx)://\S+:\d+", address):
@@ -113,13 +97,7 @@ def dask_client(address: str, security: Any = None) -> Iterator[Any]:
 
 @contextmanager
 def local_cluster(workers: int | None, say: Callable[[str], None]) -> Iterator[Any]:
-    """Start a Dask cluster of processes on this machine, print the address of its dashboard, and connect to it.
-
-    Raises
-    ------
-    ConfigError
-        If ``distributed`` is not installed.
-    """
+    """Start a Dask cluster of processes on this machine, print the address of its dashboard, and connect to it."""
     _require_distributed("--workers")
     from distributed import Client, LocalCluster
 
@@ -133,13 +111,7 @@ def local_cluster(workers: int | None, say: Callable[[str], None]) -> Iterator[A
 
 
 def check_versions(client: Any) -> None:
-    """Refuse workers with another version of pachon, whose results may differ.
-
-    Raises
-    ------
-    ConfigError
-        If there is one, or a worker has no pachon.
-    """
+    """Refuse workers with another version of pachon, whose results may differ, or without it."""
     for worker, theirs in client.run(_version, on_error="return").items():
         if not isinstance(theirs, str):
             raise ConfigError(f"worker {worker}: pachon cannot be imported there ({_first_line(theirs)})")

@@ -33,16 +33,11 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 class Workers(Generic[Task, Result]):
     """Workers for tasks of one kind.
 
-    Attributes
-    ----------
-    description : str
-        Their number and kind.
-    results : callable
-        Function that yields the result of every task, as soon as it is there. It raises a ProductError if a worker or
-        the connection to it is lost.
+    `results` yields the result of every task as soon as it is there, in any order, and raises a ProductError if a
+    worker or the connection to it is lost.
     """
 
-    description: str
+    description: str  #: number and kind
     results: Callable[[Iterable[Task]], Iterator[Result]]
 
 
@@ -53,16 +48,9 @@ def serial_worker(measure: Measure[Task, Result], threads: int | None = None) ->
 
 
 def process_workers(measure: Measure[Task, Result], count: int, threads: int | None = None) -> Workers[Task, Result]:
-    """Return processes of this machine that share its processors evenly.
+    """Return processes of this machine that share its processors, or a number of threads, evenly.
 
-    Parameters
-    ----------
-    measure : callable
-        Function of one task and a number of threads; a function of a module, or a picklable object.
-    count : int
-        Number of processes.
-    threads : int, optional
-        Threads of all processes together; all processors by default.
+    `measure` is a function of a module, or a picklable object: it computes one task on a number of threads.
     """
     each = max(1, thread_count(threads) // count)
 
