@@ -11,6 +11,7 @@ from typer import Argument, Option
 from ..core.errors import ConfigError
 from .interrupt import interruptible
 from .options import FieldsDeg, Json, Model, Quiet, Threads, WavelengthsNm, field_list, name_list
+from .tables import print_json
 
 app = typer.Typer()
 baseline_app = typer.Typer()
@@ -55,30 +56,28 @@ def baseline_save(
 
     - `pachon baseline save telescope.yaml -o telescope.baseline.json --config run.yaml --ccds R22_S11,R02_S01`
     """
-    from ..core.files import json_text
     from ..studies.baseline.baseline import make_baseline
     from ..studies.baseline.file import write_baseline
     from ..studies.metrics.camera import CAMERA
     from ..studies.metrics.optics import OPTICS
 
-    with interruptible(quiet or as_json) as reporter:
-        count = len(OPTICS) + (0 if config is None else len(CAMERA))
-        with reporter.stage("baseline", count) as stage:
-            baseline, left_out = make_baseline(
-                model,
-                out.parent,
-                config,
-                fields=field_list(field_deg),
-                wavelengths=[nm / 1e9 for nm in wavelength_nm] if wavelength_nm else None,
-                ccds=None if ccds is None else name_list(ccds, "--ccds"),
-                threads=threads,
-                progress=stage.advance,
-            )
+    count = len(OPTICS) + (0 if config is None else len(CAMERA))
+    with interruptible(quiet or as_json) as reporter, reporter.stage("baseline", count) as stage:
+        baseline, left_out = make_baseline(
+            model,
+            out.parent,
+            config,
+            fields=field_list(field_deg),
+            wavelengths=[nm / 1e9 for nm in wavelength_nm] if wavelength_nm else None,
+            ccds=None if ccds is None else name_list(ccds, "--ccds"),
+            threads=threads,
+            progress=stage.advance,
+        )
     write_baseline(out, baseline)
     for kind, why in left_out.items():
         typer.echo(f"pachon: warning: no metrics of kind {kind}: {why}", err=True)
     if as_json:
-        print(json_text({"baseline": str(out), "figures": len(baseline.figures), "left_out": left_out}))
+        print_json({"baseline": str(out), "figures": len(baseline.figures), "left_out": left_out})
     elif not quiet:
         print(f"{out}: {len(baseline.figures)} metrics of {baseline.model}")
 
@@ -96,7 +95,6 @@ def baseline_update(
 
     - `pachon baseline update telescope.baseline.json`
     """
-    from ..core.files import json_text
     from ..studies.baseline.baseline import updated_baseline
     from ..studies.baseline.file import write_baseline
 
@@ -104,7 +102,7 @@ def baseline_update(
         baseline, check = updated_baseline(path, threads=threads, progress=stage.advance)
     write_baseline(path, baseline)
     if as_json:
-        print(json_text({"baseline": str(path), "updated": [d.name for d in check.out]}))
+        print_json({"baseline": str(path), "updated": [d.name for d in check.out]})
     elif not quiet:
         print(f"{path}: {len(check.out)} of {len(check.deviations)} metrics updated")
 
@@ -132,7 +130,6 @@ def check_command(
     - `pachon check telescope.baseline.json`: after a change of the prescription, in CI
     - `pachon check telescope.baseline.json --model as_built.yaml --json`
     """
-    from ..core.files import json_text
     from ..studies.baseline.baseline import bundled_baselines, check_baseline
     from ..studies.metrics.camera import CAMERA
     from ..studies.metrics.optics import OPTICS
@@ -146,7 +143,7 @@ def check_command(
                 checks.append(check_baseline(path, model, config, threads=threads, progress=stage.advance))
     passed = all(check.passed for check in checks)
     if as_json:
-        print(json_text({"passed": passed, "baselines": [check.summary() for check in checks]}))
+        print_json({"passed": passed, "baselines": [check.summary() for check in checks]})
     elif not quiet:
         for check in checks:
             print(check.text(everything))

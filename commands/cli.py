@@ -33,18 +33,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
-
 _INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Arguments; those of the process by default.
-    """
+    """Run the command line with arguments, by default those of the process, and return its exit status."""
     try:
         status = app(args=None if arguments is None else list(arguments), prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()

@@ -11,7 +11,7 @@ from typer import Argument, Option
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, name_list, one_name_list
-from .tables import Rows, wide_console
+from .tables import Rows, print_json, wide_console
 
 app = typer.Typer()
 
@@ -34,13 +34,12 @@ def diagnose_command(
     - `pachon diagnose pachon_run --out residuals`
     - `pachon diagnose pachon_run --json`: all metrics on standard output
     """
-    from ..core.files import json_text
     from ..pipeline.measure.diagnostics import diagnose
     from ..pipeline.report.tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
 
     result = diagnose(folder, out, strict=strict)
     if as_json:
-        print(json_text(result.as_dict()))
+        print_json(result.as_dict())
         return
     Rows(DIAGNOSTICS_COLUMNS, diagnostics_rows(result.overall), DIAGNOSTICS_CAPTION).show()
     if result.missing:
@@ -79,7 +78,7 @@ def attribute_command(
     - `pachon attribute --raft R22 --average`: seconds
     - `pachon attribute pachon_run/config.yaml --causes ccd,potato_chip,atmosphere --truth-stars 200`
     """
-    from ..core.files import json_text, make_folder
+    from ..core.files import make_folder
     from ..pipeline.report.tables import ATTRIBUTION_CAPTION, ATTRIBUTION_COLUMNS, attribution_rows
     from ..studies.attribution.attribution import attribute
     from ..studies.attribution.causes import checked_causes
@@ -96,7 +95,7 @@ def attribute_command(
         result = attribute(resolved, chosen, threads=threads, reporter=reporter)
     write_attribution(result, out, resolved)
     if as_json:
-        print(json_text(result.metrics))
+        print_json(result.metrics)
         return
     if not quiet:
         Rows(ATTRIBUTION_COLUMNS, attribution_rows(result.metrics), ATTRIBUTION_CAPTION).show()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from ..core.errors import PachonError
+from ..core.errors import PachonError, PrescriptionWarning
 
 if TYPE_CHECKING:
     from ..models.telescope import Telescope
@@ -33,7 +33,6 @@ def configured_experiment(config: Path | None, **options: object) -> Experiment:
 
 def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Path] = ()) -> Telescope:
     """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each."""
-    from ..core.errors import PrescriptionWarning
     from ..models.io.prescription import load_telescope
 
     with warnings.catch_warnings(record=True) as caught:

@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
-from .tables import wide_console
+from .tables import print_json, wide_console
 
 app = typer.Typer()
 
@@ -39,13 +39,12 @@ def reproduce_command(
     - `pachon reproduce fig3 table1 --out figures`
     - `pachon reproduce all --scale paper --out paper_figures`
     """
-    from ..core.files import json_text
     from ..studies.reproduce.reproduce import reproduce_at
 
     with interruptible(quiet, f"finished parts are in {out}, and are used by the next call") as reporter:
         summary = reproduce_at(figures or ("all",), scale, out, seed=seed, threads=threads, reporter=reporter)
     if as_json:
-        print(json_text(summary))
+        print_json(summary)
     elif not quiet:
         _show_reproduced(summary, out)
 

@@ -12,7 +12,7 @@ from typer import Option
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
-from .tables import Rows, plain_table, wide_console
+from .tables import Rows, plain_table, print_json, wide_console
 
 app = typer.Typer()
 
@@ -48,7 +48,6 @@ def run_command(
     - `pachon run pachon_run/config.yaml --out again`: the same bytes
     - `pachon run --all --out full --resume`: go on where a run was stopped
     """
-    from ..core.files import json_text
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
 
@@ -62,7 +61,7 @@ def run_command(
         for name, reason in result.not_modelled.items():
             print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)
     if as_json:
-        print(json_text(result.summary))
+        print_json(result.summary)
     elif not quiet:
         _show_run(result, sum(reporter.seconds.values()))
 

@@ -12,7 +12,7 @@ from ..core.errors import ConfigError
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Config, Json, Quiet, Threads, TruthStars, name_list, one_name_list
-from .tables import Rows, wide_console
+from .tables import Rows, print_json, wide_console
 
 if TYPE_CHECKING:
     from ..studies.psf_choice.study import Study
@@ -61,7 +61,7 @@ def study_command(
     - `pachon study`: forty stars of S/N 30 and more on nine CCDs across the field
     - `pachon study my_config.yaml --ccds R22_S11,R24_S11 -o small_study --stars 20,40 --orders 1,2,3 --draws 2`
     """
-    from ..core.files import json_text, make_folder
+    from ..core.files import make_folder
     from ..studies.psf_choice.plan import make_plan
     from ..studies.psf_choice.product import study_summary, write_study
     from ..studies.psf_choice.study import STUDY_CCDS, study, study_experiment
@@ -82,7 +82,7 @@ def study_command(
         result = study(resolved, plan, threads=threads, reporter=reporter)
     write_study(result, out, resolved)
     if as_json:
-        print(json_text(study_summary(result)))
+        print_json(study_summary(result))
         return
     if not quiet:
         _show(result)
@@ -100,7 +100,10 @@ def _show(result: Study) -> None:
             rows.append((f"{case.stars} stars, {case}", *(f"{found[key]:.1e}" for key in _COLUMNS)))
     Rows(("model", *_COLUMNS.values()), rows, _CAPTION).show()
     if result.problems:
-        console.print(f"{len(result.problems)} models could not be fitted, such as {_example(result)}", style="dim")
+        case, why = next(iter(result.problems.items()))
+        console.print(
+            f"{len(result.problems)} models could not be fitted, such as {case.stars} stars, {case}: {why}", style="dim"
+        )
     if chosen is None:
         console.print(f"no model of {plan.base.stars} stars could be fitted")
         return
@@ -110,11 +113,6 @@ def _show(result: Study) -> None:
         f"holdout positions {result.metrics[chosen]['rms_e_away']:.2e} ± {error:.0e}",
         highlight=False,
     )
-
-
-def _example(result: Study) -> str:
-    case, why = next(iter(result.problems.items()))
-    return f"{case.stars} stars, {case}: {why}"
 
 
 def _numbers(text: str, option: str, kind: type[_Number]) -> tuple[_Number, ...]:

@@ -14,7 +14,7 @@ from ..core.errors import ConfigError
 from .default_group import DefaultGroup
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
-from .tables import Rows
+from .tables import Rows, print_json
 
 if TYPE_CHECKING:
     from ..core.progress import Reporter
@@ -210,9 +210,7 @@ def _report_folder(store: Path) -> Path:
 
 
 def _show(values: dict[str, Any], as_json: bool, quiet: bool = False) -> None:
-    from ..core.files import json_text
-
     if as_json:
-        print(json_text(values))
+        print_json(values)
     elif not quiet:
         Rows(["", ""], [[k.replace("_", " "), "" if v is None else f"{v}"] for k, v in values.items()], left=2).show()

@@ -1,4 +1,4 @@
-"""Tables on the terminal: numbers as text, columns by key of a summary, and a console that cuts nothing short."""
+"""Tables and JSON on standard output: numbers as text, columns by key of a summary, a console of enough width."""
 
 from __future__ import annotations
 
@@ -11,24 +11,12 @@ from rich.table import Table
 
 
 class Column(NamedTuple):
-    """A column of numbers or names.
+    """A column of numbers or names."""
 
-    Attributes
-    ----------
-    heading : str
-        Heading, with the unit in brackets.
-    values : str or callable
-        Key of the result's summary, or a function from the result to one value per row.
-    form : str
-        Format of the numbers; of pairs that of each.
-    scale : float
-        Factor from the value to the unit of the heading.
-    """
-
-    heading: str
-    values: str | Callable[[Any], Any]
-    form: str = ""
-    scale: float = 1.0
+    heading: str  #: with the unit in brackets
+    values: str | Callable[[Any], Any]  #: key of the result's summary, or function from the result to a value per row
+    form: str = ""  #: format of the numbers; of pairs that of each
+    scale: float = 1.0  #: factor from the value to the unit of the heading
 
     def texts(self, result: Any, summary: dict[str, Any]) -> list[str]:
         """Return the cells of the column."""
@@ -42,24 +30,12 @@ FIELD = Column("field [deg]", "field_deg", ".4g")
 
 @dataclass(frozen=True)
 class Rows:
-    """A table as text.
-
-    Attributes
-    ----------
-    headings : sequence of str
-        Headings of the columns.
-    rows : sequence of sequences of str
-        Cells, row by row.
-    caption : str
-        Meaning of the columns, printed below.
-    left : int
-        Number of columns that are aligned on the left, as names are; the others hold numbers.
-    """
+    """A table as text."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
-    caption: str = ""
-    left: int = 1
+    caption: str = ""  #: meaning of the columns, printed below
+    left: int = 1  #: number of columns that are aligned on the left, as names are; the others hold numbers
 
     def show(self) -> None:
         """Print the table."""
@@ -72,6 +48,13 @@ class Rows:
         console.print(table)
         if self.caption:
             console.print(self.caption, style="dim", width=100)
+
+
+def print_json(content: Any) -> None:
+    """Print metrics as JSON."""
+    from ..core.files import json_text
+
+    print(json_text(content))
 
 
 def number_texts(values: Iterable[Any], form: str) -> list[str]:
@@ -88,7 +71,7 @@ def _number(value: float, form: str) -> str:
 
 
 def wide_console() -> Console:
-    """Return a console that cuts no table short: a narrow terminal wraps its lines itself."""
+    """Return a console of at least 132 columns: a narrower terminal wraps the lines of a table itself."""
     return Console(width=max(Console().width, 132))
 
 

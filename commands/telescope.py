@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from .inputs import load_model
 from .options import Json, Lenient, Model
-from .tables import Rows, plain_table, wide_console
+from .tables import Rows, plain_table, print_json, wide_console
 
 app = typer.Typer()
 
@@ -32,14 +32,13 @@ def info_command(
     - `pachon info lsst_v3.3_r`
     - `pachon info my_telescope.yaml --json`
     """
-    from ..core.files import json_text
     from ..pipeline.report.info import SURFACE_COLUMNS, describe, figure_rows, list_models, surface_rows
 
     console = wide_console()
     if model is None:
         models = list_models()
         if as_json:
-            print(json_text({"models": models}))
+            print_json({"models": models})
             return
         table = plain_table()
         table.add_column("model", no_wrap=True)
@@ -50,7 +49,7 @@ def info_command(
         return
     description = describe(load_model(model, lenient))
     if as_json:
-        print(json_text(description))
+        print_json(description)
         return
     console.print(f"{description['name']}: {description['description']}", highlight=False)
     console.print(f"source: {description['source']}\n", highlight=False)

@@ -1,1 +1,1 @@
-"""What every layer needs: errors, units, random streams, YAML, files, memory, threads, Warp, progress, plotting."""
+"""Foundations of every layer: errors, units, random streams, YAML, files, memory, threads, Warp, progress, plots."""

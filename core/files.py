@@ -20,19 +20,7 @@ from .errors import PachonError, ProductError
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
     """Write a file under a temporary name, flush it to the disk and rename it.
 
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    data : bytes
-        Its content.
-    error : type
-        Class of the error.
-
-    Raises
-    ------
-    PachonError
-        If it cannot be written: one line with the path and the system's reason. Nothing is left behind then.
+    Where that fails, nothing is left behind, and `error` is raised with the path and the system's reason.
     """
     partial = path.with_name(f".{path.name}.partial")
     try:
@@ -51,13 +39,7 @@ def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those it lies in, where they are not there yet.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be made.
-    """
+    """Make a folder, and those it lies in, where they are not there yet."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -65,11 +65,8 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
             return
         block = 1 if device == "cpu" else 256
         if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
-            print(
-                f"compiling {kernel.module.name.rpartition('.')[2]} for this machine (once)",
-                file=sys.stderr,
-                flush=True,
-            )
+            name = kernel.module.name.rpartition(".")[2]
+            print(f"compiling {name} for this machine (once)", file=sys.stderr, flush=True)
         wp.load_module(kernel.module, device=device, block_dim=block)
         _loaded.add(key)
 
@@ -77,36 +74,23 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
 def launch(
     kernel: wp.Kernel, count: int, inputs: list[Any], *, threads: int | None = None, device: str = "cpu"
 ) -> None:
-    """Run a kernel over ``count`` items, cut into one contiguous slice per thread.
+    """Run a kernel over ``count`` items, on the CPU cut into one contiguous slice per thread.
 
     The kernel's first argument is the index of the first item of its slice (``first: wp.int32``); item ``i`` is
     ``first + wp.tid()``. An item writes only to its own outputs, so the result does not depend on the slices.
-
-    Parameters
-    ----------
-    kernel : wp.Kernel
-        Kernel whose first argument is ``first``.
-    count : int
-        Number of items.
-    inputs : list
-        Remaining arguments, outputs included.
-    threads : int, optional
-        Number of threads; all processors by default.
-    device : str
-        Warp device; only ``"cpu"`` is cut into slices.
+    `inputs` are the other arguments, outputs included; `threads` are all processors by default.
     """
     if count == 0:
         return
     load_kernels(kernel, device)
     slices = min(thread_count(threads), count) if device == "cpu" else 1
-    bounds = [count * i // slices for i in range(slices + 1)]
 
-    def run(first: int, last: int) -> None:
-        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], device=device)
+    def run(i: int) -> None:
+        first, end = (count * k // slices for k in (i, i + 1))
+        wp.launch(kernel, dim=end - first, inputs=[first, *inputs], device=device)
 
     if slices == 1:
-        run(0, count)
+        run(0)
         return
     with ThreadPoolExecutor(slices) as pool:
-        for job in [pool.submit(run, bounds[i], bounds[i + 1]) for i in range(slices)]:
-            job.result()
+        list(pool.map(run, range(slices)))

@@ -16,30 +16,14 @@ def available_bytes(root: Path = Path("/")) -> int | None:
     """Return the bytes that this process may still take without swapping.
 
     On Linux it is the least of the machine's available memory and of the room left in each control group of the process
-    (containers and batch systems set their limits there). Cached files, which the kernel drops when it must, count as
-    free.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of ``proc`` and ``sys``.
-
-    Returns
-    -------
-    int or None
-        None on systems without these files.
+    (containers and batch systems set their limits there), by the files in ``proc`` and ``sys`` under `root`. Cached
+    files, which the kernel drops when it must, count as free. None on systems without these files.
     """
     return min((*_machine(root), *_groups(root)), default=None)
 
 
 def require_bytes(needed: int, what: str) -> None:
-    """Raise an error if a job needs more memory than is free.
-
-    Raises
-    ------
-    DomainError
-        If less is known to be free; the line starts with ``what``.
-    """
+    """Raise DomainError, with a text that starts with ``what``, if a job needs more memory than is known to be free."""
     free = available_bytes()
     if free is not None and needed > free:
         raise DomainError(f"{what}: needs about {readable(needed)} of memory, {readable(free)} are free")

@@ -36,7 +36,7 @@ _NAMELESS: dict[str, dict[str, Any]] = {
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Date": None, "Creator": None},
 }
-# Matplotlib announces the building of its font cache, which no astronomer asked about.
+# Matplotlib announces the building of its font cache.
 logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 
@@ -58,20 +58,7 @@ def new_figure(width: float, height: float, layout: Literal["constrained", "comp
 
 
 def picture_bytes(figure: Figure, kind: str) -> bytes:
-    """Return a figure as the bytes of a file, without the date and the version of what drew it.
-
-    Parameters
-    ----------
-    figure : Figure
-        The figure.
-    kind : {"png", "pdf", "svg"}
-        Format of the file.
-
-    Raises
-    ------
-    ConfigError
-        If the format is another.
-    """
+    """Return a figure as the bytes of a png, pdf or svg file, without the date and the version of what drew it."""
     if kind not in _NAMELESS:
         raise ConfigError(f"picture format {kind!r}: expected one of {', '.join(_NAMELESS)}")
     buffer = io.BytesIO()

@@ -20,21 +20,15 @@ from .version import VERSION
 
 #: Comment of CHECKSUM and DATASUM. astropy's default is the time of day, with which no two runs have the same bytes.
 _WHEN = "FITS checksum"
+#: FITS formats of columns by kind of NumPy type.
+_FORMATS = {"f": "D", "i": "J", "b": "L"}
+#: Columns of a table in order, by name: values, unit in FITS notation (empty for pure numbers), description.
+Columns = dict[str, tuple[np.ndarray, str, str]]
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """Origin of a product.
-
-    Attributes
-    ----------
-    config_hash : str
-        SHA-256 of the resolved configuration.
-    seed : int
-        Seed of the run.
-    version : str
-        Version of pachon.
-    """
+    """Origin of a product: SHA-256 of the resolved configuration, seed of the run, version of pachon."""
 
     config_hash: str
     seed: int
@@ -48,33 +42,15 @@ class Stamp:
             ("SEED", self.seed, "seed of all random numbers"),
         ]
 
-    def meta(self) -> dict[str, Any]:
-        """Return the entries of a table's header or a JSON file."""
-        return {"pachon": self.version, "config_hash": self.config_hash, "seed": self.seed}
-
     def matches(self, header: fits.Header) -> bool:
         """Return whether a header has this stamp."""
         return all(header.get(key) == value for key, value, _ in self.cards())
 
 
 def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tuple[str, Any, str]]) -> None:
-    """Write a FITS product with checksums and the stamp in the primary header.
+    """Write named extensions as a FITS product with checksums.
 
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    hdus : list of ImageHDU and BinTableHDU
-        Extensions, each with a name.
-    stamp : Stamp or None
-        Where the product comes from; None where it comes from no run.
-    cards : list of (keyword, value, comment)
-        More for the primary header.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
+    The primary header has the stamp, which is None for a product of no run, and `cards`: (keyword, value, comment).
     """
     primary = fits.PrimaryHDU()
     parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
@@ -91,10 +67,7 @@ def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tup
 def read_fits(path: Path) -> fits.HDUList:
     """Read a FITS product into memory and check the checksum of every part.
 
-    Raises
-    ------
-    ProductError
-        If there is no such file, or it is no product of this program as it was written.
+    Raises ProductError if there is no such file, or it is no product of this program as it was written.
     """
     try:
         data = path.read_bytes()
@@ -110,9 +83,8 @@ def read_fits(path: Path) -> fits.HDUList:
                     raise ProductError(f"damaged ({hdu.name} does not match its checksum)", file=path)
                 hdu.data  # noqa: B018 - reads it now, within the checks
             if len(hdus) != hdus[0].header["NPARTS"]:
-                raise ProductError(
-                    f"cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}", file=path
-                )
+                text = f"cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}"
+                raise ProductError(text, file=path)
         except (AstropyWarning, OSError, ValueError, KeyError, TypeError, IndexError) as error:
             raise ProductError(f"damaged or no FITS product ({' '.join(str(error).split())})", file=path) from None
     return hdus
@@ -128,16 +100,8 @@ def _checksum_holds(part: bytes) -> bool:
     return total == 0xFFFFFFFF
 
 
-def table_hdu(name: str, columns: dict[str, tuple[np.ndarray, str, str]]) -> fits.BinTableHDU:
-    """Return a FITS table.
-
-    Parameters
-    ----------
-    name : str
-        Name of the extension.
-    columns : dict of str to (values, unit, description)
-        Columns in order; the unit in FITS notation, empty for pure numbers.
-    """
+def table_hdu(name: str, columns: Columns) -> fits.BinTableHDU:
+    """Return a FITS table."""
     table = fits.BinTableHDU.from_columns(
         [
             fits.Column(name=key, array=values, format=_FORMATS[values.dtype.kind], unit=unit or None)
@@ -149,9 +113,6 @@ def table_hdu(name: str, columns: dict[str, tuple[np.ndarray, str, str]]) -> fit
         table.header.comments[f"TTYPE{index}"] = description
         table.header.set(f"TTYPE{index}", key, description)
     return table
-
-
-_FORMATS = {"f": "D", "i": "J", "b": "L"}
 
 
 def image_hdu(name: str, image: np.ndarray, comment: str) -> fits.ImageHDU:
@@ -167,15 +128,15 @@ def column(table: fits.BinTableHDU, name: str) -> np.ndarray:
     return values.astype(values.dtype.newbyteorder("="))
 
 
-def write_ecsv(path: Path, columns: dict[str, tuple[np.ndarray, str, str]], meta: dict[str, Any]) -> None:
-    """Write an ECSV table, which people and astropy both read; the columns as in :func:`table_hdu`."""
+def write_ecsv(path: Path, columns: Columns, meta: dict[str, Any]) -> None:
+    """Write an ECSV table, which people and astropy both read."""
     text = io.StringIO()
     described_table(columns, meta).write(text, format="ascii.ecsv")
     write_bytes(path, text.getvalue().encode())
 
 
-def described_table(columns: dict[str, tuple[np.ndarray, str, str]], meta: dict[str, Any]) -> Table:
-    """Return an astropy table with units and descriptions; the columns as in :func:`table_hdu`."""
+def described_table(columns: Columns, meta: dict[str, Any]) -> Table:
+    """Return an astropy table with units and descriptions."""
     table = Table(meta=meta)
     for key, (values, unit, description) in columns.items():
         table[key] = values

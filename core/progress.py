@@ -15,7 +15,6 @@ from rich.progress import (
     ProgressColumn,
     SpinnerColumn,
     Task,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -24,48 +23,33 @@ from rich.text import Text
 
 
 class Stage:
-    """One stage of a run in progress.
+    """One stage of a run in progress, with a bar on a terminal or, if `say`, with lines.
 
-    Parameters
-    ----------
-    bars : Progress, optional
-        Bars on a terminal.
-    task : TaskID, optional
-        The bar of this stage.
-    say : bool
-        Whether to write lines in place of bars.
-    check : callable
-        Called whenever something is done; may raise.
+    `bar` moves the bar on by a number of items. `check` is called whenever something is done, and may raise.
     """
 
-    def __init__(self, bars: Progress | None, task: TaskID | None, say: bool, check: Callable[[], None]) -> None:
-        self._bars = bars
-        self._check = check
-        self._task = task
-        self._say = say
+    def __init__(self, bar: Callable[[int], None] | None, say: bool, check: Callable[[], None]) -> None:
+        self._bar, self._say, self._check = bar, say, check
         self._start = time.perf_counter()
 
     def advance(self, count: int = 1) -> None:
         """Advance by a number of items."""
         self._check()
-        if self._bars is not None and self._task is not None:
-            self._bars.advance(self._task, count)
+        if self._bar is not None:
+            self._bar(count)
 
     def line(self, text: str) -> None:
-        """Write one line, unless there are bars."""
+        """Write one line, unless there is a bar."""
         if self._say:
             print(text, file=sys.stderr, flush=True)
 
     def step(self, name: str, done: int, total: int) -> None:
-        """Write that one more part is done, and the time left, unless there are bars."""
+        """Write that one more part is done, and the time left, unless there is a bar."""
         seconds = time.perf_counter() - self._start
         left = seconds / done * (total - done)
-        rest = (
-            f", {_rate(done / seconds)}, about "
-            + (f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min")
-            + " left"
-        )
-        self.line(f"{name} ({done} of {total}{rest if done < total else ''})")
+        time_left = f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min"
+        rest = f", {_rate(done / seconds)}, about {time_left} left" if done < total else ""
+        self.line(f"{name} ({done} of {total}{rest})")
 
 
 class _Rate(ProgressColumn):
@@ -80,14 +64,9 @@ def _rate(per_second: float) -> str:
 
 
 class Reporter:
-    """Progress display of a run, and the time that each stage takes.
+    """Progress display of a run, and the time [s] that each stage takes.
 
-    Parameters
-    ----------
-    quiet : bool
-        Whether to print nothing.
-    check : callable, optional
-        Called at every step that is reported, to stop the run by raising an exception.
+    `check` is called at every step that is reported, to stop the run by raising an exception.
     """
 
     def __init__(self, quiet: bool = False, check: Callable[[], None] | None = None) -> None:
@@ -102,20 +81,12 @@ class Reporter:
 
     @contextmanager
     def stage(self, title: str, total: int | None = None) -> Iterator[Stage]:
-        """Show one stage while it runs.
-
-        Parameters
-        ----------
-        title : str
-            Name of the stage.
-        total : int, optional
-            Number of items; without it the bar has no length.
-        """
+        """Show one stage while it runs; without the total number of items its bar has no length."""
         self._check()
         start = time.perf_counter()
         console = Console(stderr=True)
         if self.quiet or not console.is_terminal:
-            stage = Stage(None, None, not self.quiet, self._check)
+            stage = Stage(None, not self.quiet, self._check)
             yield stage
             self.seconds[title] = time.perf_counter() - start
             stage.line(f"{title}: {self.seconds[title]:.1f} s")
@@ -132,6 +103,6 @@ class Reporter:
         shown = columns if total is not None else (*columns[:2], columns[-1])
         with Progress(*shown, console=console) as bars:
             task = bars.add_task(title, total=total)
-            yield Stage(bars, task, False, self._check)
+            yield Stage(lambda count: bars.advance(task, count), False, self._check)
             bars.update(task, total=total or 1, completed=total or 1)
         self.seconds[title] = time.perf_counter() - start

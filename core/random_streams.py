@@ -11,14 +11,8 @@ def stream(seed: int, *key: str | int) -> np.random.Generator:
     """Return the generator of one named stream.
 
     The stream depends on the seed and the key only, never on which other streams were drawn, so leaving out a term,
-    a layer or a CCD leaves all others as they were.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the run, not negative.
-    *key : str or int
-        Name of the stream, such as ``("atmosphere", "layer", 3)``.
+    a layer or a CCD leaves all others as they were. A key is a name such as ``("atmosphere", "layer", 3)``; the seed is
+    not negative.
     """
     # CRC-32 and not hash(): Python's own hash of a string changes from process to process.
     words = tuple(zlib.crc32(part.encode()) if isinstance(part, str) else int(part) for part in key)

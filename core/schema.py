@@ -25,7 +25,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError, core_schema
 
 from .errors import ConfigError, PachonError
-from .yaml_reader import as_number
+from .yaml_reader import as_number, cut_short
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -74,31 +74,12 @@ class Section(BaseModel):
 
 
 def validated(
-    model: type[Model],
-    content: Any,
-    source: str,
-    error: type[PachonError] = ConfigError,
-    context: Any = None,
+    model: type[Model], content: Any, source: str, error: type[PachonError] = ConfigError, context: Any = None
 ) -> Model:
-    """Return the model of plain mappings, lists and values.
+    """Return the model of the plain mappings, lists and values of a file, of which `source` is the name in messages.
 
-    Parameters
-    ----------
-    model : type
-        Class of the file.
-    content : dict
-        Content of the file.
-    source : str
-        Name of the file, for messages.
-    error : type
-        Class of the error.
-    context : object, optional
-        Context of the validators, such as the units of the file.
-
-    Raises
-    ------
-    PachonError
-        If a key is unknown or missing, or a value is not as expected: the first problem, in one line.
+    Raises `error` with the first problem, in one line, if a key is unknown or missing or a value is not as expected.
+    `context` is that of the validators, such as the units of the file.
     """
     try:
         return model.model_validate(content, context=context)
@@ -132,16 +113,10 @@ def either(content: Mapping[str, Any], key: str, others: Iterable[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Tagged:
-    """Discriminated union of sections, as an annotation.
+    """Discriminated union of sections by kind, as an annotation.
 
-    Parameters
-    ----------
-    classes : mapping of str to type
-        Section of each kind.
-    kind : callable
-        Function from a mapping to its kind, one of the keys of `classes`; it raises :func:`expected`.
-    built : bool
-        Whether the value is the object that a section builds, or the section itself.
+    `kind` is a function from a mapping to its kind, one of the keys of `classes`; it raises :func:`expected`. The value
+    is the object that a section builds or, where `built` is False, the section itself.
     """
 
     classes: Mapping[str, type[Section]]
@@ -242,8 +217,7 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
 
 def shown(value: Any) -> str:
     """Return a value as JSON, cut short."""
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return cut_short(json.dumps(value, ensure_ascii=False, default=str))
 
 
 _EXPECTED = {
@@ -291,10 +265,7 @@ def _first_problem(problems: ValidationError, content: Any, source: str, error: 
 
 def _as_in(error: type[PachonError], value: Any) -> str:
     """Return a value cut short: as JSON in configurations, else as Python has it."""
-    if error is ConfigError:
-        return shown(value)
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return shown(value) if error is ConfigError else cut_short(repr(value))
 
 
 #: Keys that tell the entries of a list apart in messages, by the key of the list.

@@ -23,10 +23,9 @@ def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
     elif isinstance(value, (tuple, list)) and any(isinstance(v, u.Quantity) for v in value):
         return np.stack([_si(v, unit, name) for v in value])
     try:
-        array = np.asarray(value, dtype=np.float64)
+        return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DomainError(f"{name} = {value!r}: expected a number in {unit} or a quantity") from error
-    return array
 
 
 def radians(value: Any, name: str) -> np.ndarray:

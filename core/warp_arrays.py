@@ -11,14 +11,7 @@ import warp as wp
 def warp_array(values: Any, dtype: Any = wp.float64, device: str = "cpu") -> wp.array:
     """Wrap values for a kernel, without a copy where their type, order and device allow it.
 
-    Parameters
-    ----------
-    values : array_like
-        Numbers; complex numbers become pairs. For a vector or matrix type the last axes are its components.
-    dtype : Warp type
-        Type of the elements.
-    device : str
-        Warp device.
+    Complex numbers become pairs. For a vector or matrix type the last axes are its components.
     """
     values = np.asarray(values)
     if np.iscomplexobj(values):

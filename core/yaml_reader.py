@@ -35,19 +35,9 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping_without_repeats)
 
 
 def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> dict[str, Any]:
-    """Return the top level of a YAML file.
+    """Return the top level of a YAML file in UTF-8.
 
-    Parameters
-    ----------
-    path : Path
-        File to read, UTF-8.
-    error : type
-        Class of the error.
-
-    Raises
-    ------
-    PachonError
-        If the file cannot be read, is not YAML, or is not a mapping.
+    Raises `error` if the file cannot be read, is not YAML, or is not a mapping.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -66,7 +56,7 @@ def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> di
     except (yaml.YAMLError, ValueError) as problem:
         raise error(f"not valid YAML: {' '.join(str(problem).split())}", file=path) from None
     if not isinstance(content, dict):
-        raise error(f"expected a mapping of keys to values, not {_shown(content)}", file=path)
+        raise error(f"expected a mapping of keys to values, not {cut_short(repr(content))}", file=path)
     return content
 
 
@@ -89,6 +79,6 @@ def as_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _shown(value: Any) -> str:
-    text = repr(value)
+def cut_short(text: str) -> str:
+    """Return a text of at most 60 characters."""
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,4 +1,4 @@
-"""Builder of design commands: the options that all of them have, the way in, and the way out.
+"""Builder of design commands, with the options, tables and pictures that all of them have.
 
 A command is one function that takes the shared options as a :class:`Given`, has the command's own options as further
 parameters, and returns a result with ``summary()`` and ``plot()``. Its name and docstring are those of the command;
@@ -21,7 +21,7 @@ from ...core.errors import PachonError
 from .. import options
 from ..inputs import load_model
 from ..interrupt import interruptible
-from ..tables import Column, Rows
+from ..tables import Column, Rows, print_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,24 +47,12 @@ class Study(Protocol):
 
 @dataclass(frozen=True)
 class Outcome:
-    """A result with more to show than its command's table.
-
-    Attributes
-    ----------
-    result : Study
-        Metrics and picture.
-    table : callable, optional
-        Function from the result to a table, in place of the command's columns.
-    stem : str, optional
-        Name of the picture without its end; by default those of command and telescope.
-    notes : sequence of str
-        Lines below the table.
-    """
+    """A result with more to show than its command's table."""
 
     result: Study
-    table: Callable[[Any], Rows] | None = None
-    stem: str | None = None
-    notes: Sequence[str] = ()
+    table: Callable[[Any], Rows] | None = None  #: function from the result to a table, in place of the columns
+    stem: str | None = None  #: name of the picture without its end; by default those of command and telescope
+    notes: Sequence[str] = ()  #: lines below the table
 
 
 @dataclass(frozen=True)
@@ -126,20 +114,11 @@ def design_command(
     band: bool = False,
     picture: Any = options.Picture,
 ) -> Callable[[Callable[..., Study | Outcome]], Callable[..., Study | Outcome]]:
-    """Make a command of a function, and add it to :data:`app`.
+    """Make a command of a function, with the columns of its table, and add it to :data:`app`.
 
-    Parameters
-    ----------
-    *columns : Column
-        Columns of the table.
-    caption : str or callable
-        Text below the table; fields in braces are those of the summary. Or a function of the summary.
-    left : int
-        Number of columns of names.
-    band : bool
-        Take several wavelengths or the pass band, not one wavelength.
-    picture : annotated type
-        The option that names the picture.
+    The caption is a text, with fields of the summary in braces, or a function of the summary; `left` is the number of
+    columns of names. With `band` the command takes several wavelengths or the pass band, not one wavelength. `picture`
+    is the annotated type of the option that names the picture.
     """
 
     def rows(result: Study) -> Rows:
@@ -198,12 +177,12 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
 
 def _deliver(outcome: Outcome, table: Callable[[Any], Rows], path: Path, kind: str, as_json: bool) -> None:
     """Save the picture, and print the metrics as JSON or as a table."""
-    from ...core.files import json_text, write_bytes
+    from ...core.files import write_bytes
     from ...core.plotting import picture_bytes
 
     write_bytes(path, picture_bytes(outcome.result.plot(), kind))
     if as_json:
-        print(json_text({**outcome.result.summary(), "picture": str(path)}))
+        print_json({**outcome.result.summary(), "picture": str(path)})
         return
     table(outcome.result).show()
     for note in outcome.notes:

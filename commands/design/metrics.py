@@ -132,13 +132,17 @@ def _map_rows(result: Any) -> Rows:
     return _terms(result.summary(), ["mean", "rms", "least", "largest"], values)
 
 
-def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
+def noll_labels(count: int) -> list[str]:
+    """Return the indices of the first Noll terms, with their names where they have one."""
     from ...models.zernike_polynomials import NOLL_NAMES
 
-    names = [f"{j} {NOLL_NAMES.get(j, '')}".strip() for j in range(1, len(columns[0]) + 1)]
+    return [f"{j} {NOLL_NAMES.get(j, '')}".strip() for j in range(1, count + 1)]
+
+
+def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
     cells = [number_texts(values, ".2f") for values in columns]
     caption = "{telescope}, {wavelength_nm:g} nm; {pupil} pupil, obscuration {obscuration:g}; nm".format_map(summary)
-    return Rows(["term", *headings], [*zip(names, *cells, strict=True)], caption)
+    return Rows(["term", *headings], [*zip(noll_labels(len(cells[0])), *cells, strict=True)], caption)
 
 
 def _double_rows(result: Any) -> Rows:

@@ -11,6 +11,7 @@ from typer import Option
 from ..options import degrees_pair
 from ..tables import Column
 from .command import Given, Outcome, design_command
+from .metrics import noll_labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,14 +67,8 @@ class FittedOpd:
         return self.opd.plot(self.fit, self.telescope.name)
 
 
-def _names(result: FittedOpd) -> list[str]:
-    from ...models.zernike_polynomials import NOLL_NAMES
-
-    return [f"{j} {NOLL_NAMES.get(j, '')}".strip() for j in range(1, len(result.fit.coefficients) + 1)]
-
-
 @design_command(
-    Column("Noll term", _names),
+    Column("Noll term", lambda result: noll_labels(len(result.fit.coefficients))),
     Column("[nm]", "zernike_nm", ".3f"),
     Column("[waves]", lambda result: result.fit.coefficients / result.opd.wavelength, ".5f"),
     caption=lambda s: (
