@@ -9,14 +9,15 @@ from ..core.errors import DomainError
 from ..core.units import field_label, metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..raytrace.rays import RayStatus, field_angles, field_direction, launch_bundles, parallel_rays
+from ..raytrace.rays import RayStatus, field_angles, field_direction, parallel_rays
 from ..raytrace.trace import TraceResult, trace
+from .request import Request
 
 #: Step of the central differences for the Jacobian [rad]: 20 arcsec, so that both rounding (1e-15 m / 1e-4) and the
 #: third-order distortion over it stay below 1e-8 of the focal length.
 JACOBIAN_STEP = 1.0e-4
-#: Distance [m] from a wanted point of the detector at which a chief ray counts as found.
-_FOUND = 1e-12
+#: Largest distance of a chief ray from its target on the detector [m].
+_TOLERANCE = 1e-12
 #: Steps of the iteration with the scale on the axis, and of Newton's method after it.
 _SCALE_STEPS, _NEWTON_STEPS = 12, 20
 
@@ -28,58 +29,31 @@ def chief_rays(
     focal_plane: FocalPlane | None = None,
     threads: int | None = None,
 ) -> TraceResult:
-    """Trace parallel light through the centre of the entrance pupil; vignetting does not stop chief rays.
+    """Trace parallel light along unit vectors [n, 3] through the centre of the entrance pupil, vignetting ignored.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    directions : ndarray, shape [n, 3]
-        Unit vectors in which the light travels, telescope frame.
-    wavelength : float
-        Vacuum wavelength [m].
-    focal_plane : FocalPlane, optional
-        CCD surfaces; the nominal detector surface without it.
-    threads : int, optional
-        Number of threads; all processors by default.
+    It ends on the CCDs of a focal plane, or on the nominal detector without one.
     """
     rays = parallel_rays(telescope, directions, wavelength, np.zeros((1, 2)))
     return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
 
 
 def reference_rays(
-    telescope: Telescope,
-    fields: np.ndarray,
-    directions: np.ndarray,
-    wavelength: float,
-    focal_plane: FocalPlane | None = None,
-    threads: int | None = None,
-    *,
-    advice: str = "",
+    request: Request, wavelength: float, focal_plane: FocalPlane | None = None, *, advice: str = ""
 ) -> TraceResult:
-    """Trace the chief rays whose landing points are reference points; the object may be at a finite distance.
-
-    Parameters
-    ----------
-    telescope, directions, wavelength, focal_plane, threads
-        As in :func:`chief_rays`.
-    fields : ndarray, shape [n, 2]
-        Field angles [rad], for error messages.
-    advice : str
-        Addition to the message about a lost chief ray.
+    """Trace the chief rays of one wavelength [m] as :func:`chief_rays` does, from an object at any distance.
 
     Raises
     ------
     DomainError
-        If a chief ray does not reach the image, or lands between the CCDs.
+        If a chief ray does not reach the image (``advice`` ends the message), or lands between the CCDs.
     """
-    rays = launch_bundles(telescope, directions, wavelength, np.zeros((1, 2)))
-    end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
+    rays = request.launch(wavelength, np.zeros((1, 2)))
+    end = trace(request.telescope, rays, focal_plane=focal_plane, threads=request.threads)
     lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
     if lost.any():
-        raise DomainError(f"{field_label(fields[lost][0])}: the chief ray does not reach the image{advice}")
+        raise DomainError(f"{field_label(request.fields[lost][0])}: the chief ray does not reach the image{advice}")
     if end.ccd is not None and (end.ccd < 0).any():
-        name = field_label(fields[end.ccd < 0][0])
+        name = field_label(request.fields[end.ccd < 0][0])
         raise DomainError(f"{name}: the chief ray lands between the CCDs; expected a point on a CCD")
     return end
 
@@ -87,10 +61,7 @@ def reference_rays(
 def image_jacobians(
     telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None = None
 ) -> np.ndarray:
-    """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences.
-
-    Parameters are those of :func:`chief_rays`.
-    """
+    """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences."""
     jacobian = np.empty((len(directions), 2, 2))
     for axis in range(2):
         ends = []
@@ -114,16 +85,12 @@ def fields_at(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, projection, threads
+        As in :meth:`pachon.Request.of`.
     positions : array_like or Quantity, shape [n, 2]
         Detector x and y [m], on the nominal flat surface.
     wavelength : float or Quantity, optional
         Vacuum wavelength [m]; the telescope's default if not given.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the angles returned.
-    threads : int, optional
-        Number of threads; all processors by default.
 
     Returns
     -------
@@ -135,7 +102,7 @@ def fields_at(
     ConfigError
         If the projection is unknown.
     DomainError
-        If a point lies outside the field that the telescope covers, or its chief ray is not found.
+        If a point lies outside the field that the telescope covers, or the search for its chief ray fails.
     """
     target = np.atleast_2d(metres(positions, "positions"))
     light = telescope.default_wavelength if wavelength is None else float(metres(wavelength, "wavelength"))
@@ -149,7 +116,7 @@ def fields_at(
 def _by_axis_scale(
     telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None
 ) -> np.ndarray | None:
-    """Return slopes found with the scales of x and y on the axis; None where that fails, as for a rotated detector."""
+    """Return slopes by iteration with the scales of x and y on the axis; None if it fails (rotated detector)."""
     corners = np.array([0.0, JACOBIAN_STEP])
     origin, corner = _landing(telescope, field_direction(corners, corners, "gnomonic"), wavelength, threads)
     scale = (corner - origin) / JACOBIAN_STEP
@@ -163,13 +130,13 @@ def _by_axis_scale(
         slopes = slopes + miss / scale
         if not np.isfinite(miss).all():
             return None
-        if np.abs(miss).max(initial=0.0) < _FOUND:
+        if np.abs(miss).max(initial=0.0) < _TOLERANCE:
             return slopes
     return None
 
 
 def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
-    """Return slopes found from the axis by Newton's method, each with the Jacobian of its own chief ray."""
+    """Return slopes by Newton's method from the axis, with the Jacobian of each chief ray."""
     cosines = np.zeros_like(target)
     for _ in range(_NEWTON_STEPS):
         light = _downwards(cosines)
@@ -177,7 +144,7 @@ def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, thre
         jacobian = image_jacobians(telescope, light, wavelength, threads)
         if not (np.isfinite(miss).all() and np.isfinite(jacobian).all()):
             raise DomainError("positions: a point of the detector lies outside the field of the telescope")
-        if np.abs(miss).max(initial=0.0) < _FOUND:
+        if np.abs(miss).max(initial=0.0) < _TOLERANCE:
             return cosines / -light[:, 2:]
         if not np.linalg.det(jacobian).all():
             break
@@ -190,7 +157,7 @@ def _by_newton(telescope: Telescope, target: np.ndarray, wavelength: float, thre
 
 
 def _landing(telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None) -> np.ndarray:
-    """Return where chief rays land on the detector [m], its own x and y, shape [n, 2]."""
+    """Return detector x and y [m] of the landing points of chief rays, shape [n, 2]."""
     end = chief_rays(telescope, directions, wavelength, threads=threads)
     return telescope.surfaces[-1].to_local(end.position)[:, :2]
 

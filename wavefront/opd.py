@@ -16,13 +16,11 @@ from ..raytrace.rays import RayStatus
 from ..raytrace.trace import trace
 from .chief_rays import reference_rays
 from .opd_map import OpdMap, OpdMaps
-from .opd_packets import OpdTracer
+from .opd_packets import traced_opds
 from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
 from .request import Request
 
-#: Rays in one batch: enough that starting a batch does not count, and 0.2 s between two reports of progress.
-RAYS_AT_ONCE = 1 << 22
 _ADVICE = "; wavefront_opd can do without it, with reference='mean'"
 
 
@@ -88,14 +86,14 @@ def wavefront_opd(
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
     lit = (end.status == RayStatus.OK) | (end.status == RayStatus.GAP)
     if reference == "chief":
-        centers, chief_path = _spheres(request, radius, focal_plane)
-        center = centers[0]
+        sphere = _spheres(request, radius, focal_plane)[0]
+        center = sphere[:3]
     else:
         if not lit.any():
             raise DomainError(f"field = {field!r}: no ray reaches the image")
         center = end.position[lit].mean(axis=0)
     path = path_to_sphere(end.path_length, index, end.position, end.direction, center, radius)
-    zero = chief_path[0] if reference == "chief" else path[lit].mean()
+    zero = sphere[3] if reference == "chief" else path[lit].mean()
     return OpdMap(
         value=np.where(lit, zero - path, np.nan).reshape(x.shape),
         x=x,
@@ -125,9 +123,9 @@ def wavefront_opds(
 ) -> OpdMaps:
     """Return the optical path difference over the entrance pupil of many field points.
 
-    The maps are those of :func:`wavefront_opd` with the chief ray as reference, but for rounding in the last bits. No
-    ray is kept, and light that the first aperture stops is traced no further; beside the maps themselves a batch takes
-    a few megabytes.
+    The maps are those of :func:`wavefront_opd` with the chief ray as reference, but for rounding in the last bits. Rays
+    are not stored, and light that the first aperture stops is traced no further. Beside the maps a batch takes a few
+    megabytes.
 
     Parameters
     ----------
@@ -153,17 +151,8 @@ def wavefront_opds(
     x, y = _pupil_points(telescope, pupil, grid)
     radius = _sphere_radius(telescope, sphere_radius)
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
-    centers, chief_path = _spheres(request, radius, focal_plane)
-    spheres = np.concatenate([centers, chief_path[:, None]], axis=1)
-    n_fields = len(request.fields)
-    value = np.full((n_fields, x.size), np.nan)
-    tracer = OpdTracer.of(telescope, request.wavelength, x.ravel(), y.ravel(), radius)
-    step = max(1, RAYS_AT_ONCE // max(1, x.size))
-    for first in range(0, n_fields, step):
-        part = slice(first, min(first + step, n_fields))
-        tracer.trace(request.directions[part], spheres[part], value[part], threads)
-        if progress is not None:
-            progress(part.stop - part.start)
+    spheres = _spheres(request, radius, focal_plane)
+    value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress)
     return OpdMaps(
         value=value.reshape(-1, *x.shape),
         x=x,
@@ -171,28 +160,24 @@ def wavefront_opds(
         wavelength=request.wavelength,
         radius=radius,
         fields=request.fields,
-        centers=centers,
+        centers=spheres[:, :3],
     )
-
-
-def pupil_grid(diameter: float, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the centres of n x n cells that tile the square about the entrance pupil, [y, x] order [m]."""
-    if int(n) != n or n < 2:
-        raise DomainError(f"grid = {n!r}: expected a whole number of at least 2 points across the pupil")
-    u = ((np.arange(int(n)) + 0.5) / int(n) - 0.5) * diameter
-    x, y = np.meshgrid(u, u)
-    return x, y
 
 
 def _pupil_points(
     telescope: Telescope, pupil: tuple[ArrayLike, ArrayLike] | None, grid: int | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return entrance-pupil coordinates [m] as given, or those of a square grid."""
+    """Return entrance-pupil coordinates [m] as given, or centres of n x n cells of a square, [y, x] order."""
     if pupil is not None and grid is not None:
         raise ConfigError("pupil and grid are both given: expected one of them")
     if pupil is None:
-        return pupil_grid(telescope.pupil_diameter, 64 if grid is None else grid)
-    x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
+        n = 64 if grid is None else grid
+        if int(n) != n or n < 2:
+            raise DomainError(f"grid = {n!r}: expected a whole number of at least 2 points across the pupil")
+        u = ((np.arange(int(n)) + 0.5) / int(n) - 0.5) * telescope.pupil_diameter
+        x, y = np.meshgrid(u, u)
+    else:
+        x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
     return x, y
 
 
@@ -205,11 +190,8 @@ def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> flo
     return radius
 
 
-def _spheres(request: Request, radius: float, focal_plane: FocalPlane | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return centres [n_field, 3] of the reference spheres and optical paths [n_field] of their chief rays [m]."""
-    telescope, w = request.telescope, request.wavelength
-    chief = reference_rays(
-        telescope, request.fields, request.directions, w, focal_plane, request.threads, advice=_ADVICE
-    )
-    center, index = np.array(chief.position), refractive_indices(telescope, w)[-2]
-    return center, path_to_sphere(chief.path_length, index, chief.position, chief.direction, center, radius)
+def _spheres(request: Request, radius: float, focal_plane: FocalPlane | None) -> np.ndarray:
+    """Return centres of the reference spheres and optical paths of the chief rays to them [m], shape [n_field, 4]."""
+    chief = reference_rays(request, request.wavelength, focal_plane, advice=_ADVICE)
+    center, index = chief.position, refractive_indices(request.telescope, request.wavelength)[-2]
+    return np.column_stack([center, path_to_sphere(chief.path_length, index, center, chief.direction, center, radius)])

@@ -1,7 +1,7 @@
-"""Pupil optics: landing points and optical paths of many stars through given points of the entrance pupil.
+"""Landing points and optical paths of many stars through given points of the entrance pupil.
 
-This is the optical part of every PSF. The fast and the long-exposure engine use the landing points, the wave engine the
-paths. The kernel keeps these few numbers alone, so memory does not hold the rays.
+This is the optical part of every PSF: the fast and the long-exposure engine use the landing points, the wave engine the
+paths. The kernel returns these few numbers, so that memory does not hold the rays.
 """
 
 from __future__ import annotations
@@ -13,52 +13,38 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..core.launch import launch
-from ..core.units import metres, radians
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
 from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
-from ..raytrace.rays import RayStatus, field_direction
+from ..raytrace.rays import RayStatus
 from .aberration import ResidualWavefront
 from .chief_rays import chief_rays, image_jacobians, reference_rays
+from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
+from .request import Request
 
 
 @dataclass(frozen=True)
 class PupilOptics:
     """Landing points and optical paths through given points of the entrance pupil.
 
-    Attributes
-    ----------
-    pupil : ndarray, shape [n_pupil, 2]
-        Entrance-pupil coordinates [m].
-    displacement : ndarray of float32, shape [n_star, n_wave, n_pupil, 2]
-        Landing point on the CCD minus the star's reference point [m], x and y of the detector.
-    path : ndarray, shape [n_star, n_wave, n_pupil]
-        Optical path to the reference sphere minus the chief ray's [m]; the negative of the OPD.
-    lit : ndarray of bool, shape [n_star, n_wave, n_pupil]
-        Where light passes.
-    jacobian : ndarray, shape [n_star, 2, 2]
-        Change of position on the detector per change of the direction cosines of the incoming light [m/rad].
-    reference_points : ndarray, shape [n_star, 3]
-        Centres of the reference spheres: where the chief ray of the middle wavelength meets the CCD, telescope frame
-        [m]. All wavelengths share it, so lateral colour stays in path and displacement.
-    fields : ndarray, shape [n_star, 2]
-        Field angles [rad].
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
+    The reference points are the centres of the reference spheres, where the chief rays of the middle wavelength meet
+    the CCDs. All wavelengths share them, so lateral colour stays in path and displacement.
     """
 
-    pupil: np.ndarray
+    pupil: np.ndarray  #: [n_pupil, 2] m, entrance-pupil coordinates
+    #: [n_star, n_wave, n_pupil, 2] m, float32: landing point on the CCD minus reference point, x and y of the detector
     displacement: np.ndarray
+    #: [n_star, n_wave, n_pupil] m: path to the reference sphere minus that of the chief ray, the negative of the OPD
     path: np.ndarray
-    lit: np.ndarray
-    jacobian: np.ndarray
-    reference_points: np.ndarray
-    fields: np.ndarray
-    wavelengths: np.ndarray
+    lit: np.ndarray  #: [n_star, n_wave, n_pupil] bool
+    jacobian: np.ndarray  #: [n_star, 2, 2] m/rad: detector position by direction cosines of the incoming light
+    reference_points: np.ndarray  #: [n_star, 3] m, telescope frame
+    fields: np.ndarray  #: [n_star, 2] rad
+    wavelengths: np.ndarray  #: [n_wave] m, in vacuum
 
 
 def trace_pupils(
@@ -74,17 +60,10 @@ def trace_pupils(
 ) -> PupilOptics:
     """Trace the same pupil points for many stars at several wavelengths to the CCD of each star.
 
-    Parameters
-    ----------
-    telescope, fields, wavelengths, projection, threads
-        As in :meth:`pachon.Request.of`; the reference points belong to the middle wavelength.
-    pupil : ndarray, shape [n_pupil, 2]
-        Entrance-pupil coordinates [m].
-    focal_plane : FocalPlane, optional
-        CCD heights; each star's CCD is taken as its tangent plane at the reference point (over the blur of a star,
-        some 50 um, a potato chip of two cycles deviates from it by less than 0.2 nm).
-    aberration : ResidualWavefront, optional
-        Added to the traced wavefront; reference points and zero of the path stay those of the telescope without it.
+    Other arguments than the pupil points [n_pupil, 2] [m] are those of :meth:`pachon.Request.of`. Each CCD is taken as
+    its tangent plane at the reference point: over the blur of a star, some 50 um, a potato chip of two cycles deviates
+    from it by less than 0.2 nm. An aberration is added to the traced wavefront; reference points and zero of the path
+    stay those of the telescope without it.
 
     Raises
     ------
@@ -92,16 +71,13 @@ def trace_pupils(
         If a field or wavelength lies outside what the telescope covers, the object is at a finite distance, or a chief
         ray does not reach the image or lands between two CCDs.
     """
-    stars = np.atleast_2d(radians(fields, "fields"))
-    waves = np.atleast_1d(metres(wavelengths, "wavelengths"))
+    request = Request.of(telescope, fields, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    direction, waves = request.directions, request.wavelengths
     pupil = np.asarray(pupil, dtype=np.float64)
-    n_star, n_wave, n_pupil = len(stars), len(waves), len(pupil)
-    telescope.check_field(stars[:, 0], stars[:, 1])
-    direction = field_direction(stars[:, 0], stars[:, 1], projection)
+    n_star, n_wave, n_pupil = len(direction), len(waves), len(pupil)
     indices = np.array([refractive_indices(telescope, w) for w in waves])
-    middle = float(waves[n_wave // 2])
 
-    chief = reference_rays(telescope, stars, direction, middle, focal_plane, threads)
+    chief = reference_rays(request, request.middle, focal_plane)
     reference_points = np.array(chief.position)
     normal = np.zeros((n_star, 3))
     normal[:, 2] = 1.0
@@ -114,9 +90,8 @@ def trace_pupils(
 
     radius = telescope.reference_sphere_radius
     chief_path = np.empty((n_star, n_wave))
-    for w in range(n_wave):
-        end = chief_rays(telescope, direction, float(waves[w]), None, threads)
-        index = indices[w, -2]
+    for w, index in enumerate(indices[:, -2]):
+        end = chief_rays(telescope, direction, float(waves[w]), threads=threads)
         chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference_points, radius)
 
     count, bundles = packet_count(n_pupil), n_star * n_wave
@@ -151,13 +126,11 @@ def trace_pupils(
         # The detector's own x and y; the third component, along its normal, is the tilt of a CCD times micrometres.
         offset = offset @ rotation[:2, :2]
     path = trimmed(out_path) - chief_path[:, :, None]
-    jacobian = image_jacobians(telescope, direction, middle, threads)
+    jacobian = image_jacobians(telescope, direction, request.middle, threads)
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
-        slopes = direction[:, :2] / -direction[:, 2:]
-        x, y = pupil.T
-        path -= aberration.opd(x, y, slopes)[:, None]
-        along_x, along_y = np.moveaxis(aberration.gradient(x, y, slopes), -1, 0)
+        path -= aberration.opd(*pupil.T, request.slopes)[:, None]
+        along_x, along_y = np.moveaxis(aberration.gradient(*pupil.T, request.slopes), -1, 0)
         for axis in range(2):
             shift = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
             offset[..., axis] -= shift[:, None]
@@ -168,6 +141,6 @@ def trace_pupils(
         lit=trimmed(out_status) == RayStatus.OK,
         jacobian=jacobian,
         reference_points=reference_points,
-        fields=stars,
+        fields=request.fields,
         wavelengths=waves,
     )

@@ -18,7 +18,7 @@ from pachon.raytrace.adjoint.backward_pass import OutputGradient, backward_pass,
 from pachon.raytrace.adjoint.forward_pass import forward_pass
 from pachon.raytrace.adjoint.sphere_adjoint import SphereAdjoint
 from pachon.raytrace.rays import RayStatus, field_direction
-from pachon.wavefront.reference_sphere import distance_to_sphere, sphere_distance_derivatives
+from pachon.wavefront.reference_sphere import path_to_sphere, sphere_distance_derivatives
 
 RADIUS = 5.0
 FIELD, WAVELENGTH = (0.01, 0.02), 620e-9
@@ -70,7 +70,7 @@ def outputs(rays, center):
         """Landing x and y in the detector's frame, and path to the sphere."""
         end = pachon.trace(telescope, rays)
         landing = telescope.surfaces[-1].to_local(end.position)[:, :2].T
-        return np.stack([*landing, end.path_length + distance_to_sphere(end.position, end.direction, center, RADIUS)])
+        return np.stack([*landing, path_to_sphere(end.path_length, 1.0, end.position, end.direction, center, RADIUS)])
 
     return of
 
@@ -155,9 +155,7 @@ def test_indices(forward, responses, rays, slope, k, monkeypatch, center, crooke
         monkeypatch.setattr(module, "refractive_indices", plain)
         landing = crooked.surfaces[-1].to_local(end.position)[:, :2].T
         last = changed(crooked, WAVELENGTH)[-2]
-        return np.stack(
-            [*landing, end.path_length + last * distance_to_sphere(end.position, end.direction, center, RADIUS)]
-        )
+        return np.stack([*landing, path_to_sphere(end.path_length, last, end.position, end.direction, center, RADIUS)])
 
     found = both(responses, k, "index")[:, 1] + both(responses, k + 1, "index")[:, 0]
     numeric = slope(outputs, 1e-4)
