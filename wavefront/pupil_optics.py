@@ -129,8 +129,9 @@ def trace_pupils(
     jacobian = image_jacobians(telescope, direction, request.middle, threads)
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
-        path -= aberration.opd(*pupil.T, request.slopes)[:, None]
-        along_x, along_y = np.moveaxis(aberration.gradient(*pupil.T, request.slopes), -1, 0)
+        x, y = pupil.T
+        path -= aberration.opd(x, y, request.slopes)[:, None]
+        along_x, along_y = np.moveaxis(aberration.gradient(x, y, request.slopes), -1, 0)
         for axis in range(2):
             shift = jacobian[:, axis, 0, None] * along_x + jacobian[:, axis, 1, None] * along_y
             offset[..., axis] -= shift[:, None]
