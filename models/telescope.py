@@ -163,8 +163,8 @@ class Telescope:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mapping proxy cannot be pickled: hand over plain dictionaries.
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        plain = {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in values.items()}
+        plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        plain |= {"groups": dict(self.groups), "group_frames": dict(self.group_frames)}
         return partial(Telescope, **plain), ()
 
     def _surface_frame(self, name: str) -> tuple[Vector, Matrix]:

@@ -16,21 +16,11 @@ STEPS = 3
 
 @dataclass(frozen=True)
 class Landing:
-    """Where rays meet the CCD surfaces.
+    """Intersections of rays with the CCD surfaces."""
 
-    Attributes
-    ----------
-    position : ndarray, shape [n, 3]
-        Points on the CCD surfaces (on the nominal surface in a gap), telescope frame [m].
-    path : ndarray, shape [n]
-        Optical path from the nominal surface [m]; negative where the CCD stands in front of it.
-    ccd : ndarray of int32, shape [n]
-        Index of the CCD, -1 in a gap.
-    """
-
-    position: np.ndarray
-    path: np.ndarray
-    ccd: np.ndarray
+    position: np.ndarray  #: on the CCD surfaces (on the nominal surface in a gap), telescope frame [m], [n, 3]
+    path: np.ndarray  #: optical path from the nominal surface [m], [n]; negative where the CCD stands in front of it
+    ccd: np.ndarray  #: index of the CCD, -1 in a gap, int32 [n]
 
 
 def land_on_ccds(
@@ -44,22 +34,8 @@ def land_on_ccds(
     """Carry rays from the nominal detector surface to the CCD surfaces.
 
     Heights are measured along the z axis of the detector's own frame, which is the telescope's +z unless the
-    detector was tilted; positions on the CCDs are that frame's x and y.
-
-    Parameters
-    ----------
-    detector : Surface
-        The nominal detector.
-    focal_plane : FocalPlane
-        Heights of the CCDs above it.
-    position, direction : ndarray, shape [n, 3]
-        Rays at the nominal detector, telescope frame [m].
-    index : float
-        Refractive index before the detector.
-
-    Returns
-    -------
-    Landing
+    detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and ``direction``, [n, 3], are
+    in the telescope frame; ``index`` is the refractive index before the detector.
     """
     p = detector.to_local(position)
     d = direction @ detector.matrix
@@ -67,14 +43,14 @@ def land_on_ccds(
     center = focal_plane.camera.centers[ccd]
     t = np.zeros(len(p))
     for _ in range(STEPS):
-        # The CCD of the first intersection is kept, so a ray near an edge cannot alternate between two CCDs.
+        # The CCD stays that of the first intersection, so a ray near an edge cannot alternate between two CCDs.
         dx = p[:, 0] + t * d[:, 0] - center[:, 0]
         dy = p[:, 1] + t * d[:, 1] - center[:, 1]
         slope = focal_plane.surfaces.gradient(ccd, dx, dy)
         rate = d[:, 2] - slope[:, 0] * d[:, 0] - slope[:, 1] * d[:, 1]
         t = t + (focal_plane.surfaces.height(ccd, dx, dy) - (p[:, 2] + t * d[:, 2])) / rate
     x, y = p[:, 0] + t * d[:, 0], p[:, 1] + t * d[:, 1]
-    # A ray that slips over the edge on its last micrometres has left the CCD. (In a gap, index -1, t meant nothing.)
+    # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
     ccd = np.where(focal_plane.ccd_at(x, y) == ccd, ccd, -1).astype(np.int32)
     t = np.where(ccd >= 0, t, 0.0)
     return Landing(position + t[:, None] * direction, index * t, ccd)

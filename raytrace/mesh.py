@@ -20,21 +20,11 @@ REACH = 1.0e-3
 
 @dataclass(frozen=True)
 class MeshLanding:
-    """Where rays meet a mesh.
+    """Intersections of rays with a mesh."""
 
-    Attributes
-    ----------
-    position : ndarray, shape [n, 3]
-        Points on the facets, telescope frame [m]; NaN where no facet is met.
-    path : ndarray, shape [n]
-        Distance from the given points along the rays [m].
-    facet : ndarray of int32, shape [n]
-        Index of the facet, -1 where none is met.
-    """
-
-    position: np.ndarray
-    path: np.ndarray
-    facet: np.ndarray
+    position: np.ndarray  #: on the facets, telescope frame [m], [n, 3]; NaN where no facet is met
+    path: np.ndarray  #: distance from the given points along the rays [m], [n]
+    facet: np.ndarray  #: index of the facet, -1 where none is met, int32 [n]
 
 
 def land_on_mesh(
@@ -73,12 +63,8 @@ def land_on_mesh(
     found = wp.Mesh(points=warp_array(mesh.vertices, wp.vec3), indices=warp_array(mesh.faces.ravel(), wp.int32))
     facet = wp.empty(len(p), dtype=wp.int32, device="cpu")
     reach = float(2 * REACH / np.abs(d[:, 2]).min(initial=1.0))
-    launch(
-        first_facet,
-        len(p),
-        [found.id, *(warp_array(a, wp.vec3) for a in (start, d)), reach, facet],
-        threads=threads,
-    )
+    inputs = [found.id, warp_array(start, wp.vec3), warp_array(d, wp.vec3), reach, facet]
+    launch(first_facet, len(p), inputs, threads=threads)
 
     index = facet.numpy()
     corners = np.asarray(mesh.triangles, dtype=np.float64)[index]

@@ -34,25 +34,12 @@ PROJECTIONS = ("zemax", "gnomonic", "postel")
 
 
 def field_direction(tx: Any, ty: Any, projection: str = "zemax") -> np.ndarray:
-    """Return the unit direction in which light from a field point travels.
+    """Return the unit vector along which light from a field point travels, telescope frame, shape [..., 3].
 
-    Parameters
-    ----------
-    tx, ty : array_like
-        Field angles [rad], of the light's own travel: the source on the sky lies the opposite way.
-    projection : {"zemax", "gnomonic", "postel"}
-        "zemax": (vx, vy)/|vz| = (tan tx, tan ty). "gnomonic": (vx, vy)/|vz| = (tx, ty). "postel" (zenithal
-        equidistant): sin(rho) (tx, ty)/rho with rho = hypot(tx, ty) the angle from the axis.
-
-    Returns
-    -------
-    ndarray, shape [..., 3]
-        Unit vectors in the telescope frame; z is negative (towards the primary).
-
-    Raises
-    ------
-    ConfigError
-        If the projection is unknown.
+    Field angles (tx, ty) [rad] are those of the light's own travel v, with vz < 0 (towards the primary): the source on
+    the sky lies the opposite way. Projections are "zemax", (vx, vy)/|vz| = (tan tx, tan ty); "gnomonic",
+    (vx, vy)/|vz| = (tx, ty); "postel" (zenithal equidistant), (vx, vy) = sin(rho) (tx, ty)/rho with rho = hypot(tx, ty)
+    the angle from the axis. Another one is a ConfigError.
     """
     tx, ty = np.broadcast_arrays(radians(tx, "field x"), radians(ty, "field y"))
     if projection == "zemax":
@@ -70,24 +57,7 @@ def field_direction(tx: Any, ty: Any, projection: str = "zemax") -> np.ndarray:
 
 
 def field_angles(slopes: np.ndarray, projection: str = "zemax") -> np.ndarray:
-    """Return the field angles [rad] of light with slopes (vx, vy)/abs(vz): the inverse of :func:`field_direction`.
-
-    Parameters
-    ----------
-    slopes : ndarray, shape [n, 2]
-        Slopes of the light's own travel.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the angles returned.
-
-    Returns
-    -------
-    ndarray, shape [n, 2]
-
-    Raises
-    ------
-    ConfigError
-        If the projection is unknown.
-    """
+    """Return the field angles [rad] of light of slopes (vx, vy)/|vz|, both [n, 2]: the inverse of `field_direction`."""
     if projection == "zemax":
         return np.arctan(slopes)
     if projection == "gnomonic":
@@ -177,21 +147,9 @@ def launch_rays(
 def launch_bundles(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
     """Launch the light of several field points, at any distance, through points of the entrance pupil.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    directions : ndarray, shape [n_direction, 3]
-        Unit vectors in which the chief rays travel, as :func:`field_direction` gives them.
-    wavelength : float
-        Vacuum wavelength [m].
-    pupil : ndarray, shape [n_pupil, 2] or [n_direction, n_pupil, 2]
-        Entrance-pupil coordinates [m]: the same for all directions, or its own for each.
-
-    Returns
-    -------
-    Rays
-        ``n_direction * n_pupil`` rays, direction by direction; those of one direction are in phase.
+    ``directions`` [n_direction, 3] are those of the chief rays, as :func:`field_direction` gives them; ``pupil`` [m] is
+    [n_pupil, 2], the same for all of them, or [n_direction, n_pupil, 2]. Returned are ``n_direction * n_pupil`` rays,
+    direction by direction; those of one direction are in phase.
     """
     if not np.isfinite(telescope.object_distance):
         return parallel_rays(telescope, directions, wavelength, pupil)
@@ -212,13 +170,7 @@ def object_points(telescope: Telescope, directions: np.ndarray) -> np.ndarray:
 
 
 def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
-    """Launch plane waves of several field points; arguments as for :func:`launch_bundles`.
-
-    Raises
-    ------
-    DomainError
-        If the telescope's object is at a finite distance.
-    """
+    """Launch plane waves as :func:`launch_bundles`; an object at a finite distance is a DomainError."""
     if np.isfinite(telescope.object_distance):
         raise DomainError(
             f"{telescope.name}: object at {telescope.object_distance:.6g} m: expected an object at infinity; "

@@ -13,7 +13,7 @@ from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .detector import land_on_ccds
-from .kernels.packet import lanes, packet_count, ray_packets, to_packets
+from .kernels.packet import from_packets, lanes, packet_count, ray_packets, to_packets
 from .kernels.trace import trace_rays
 from .pack.surfaces import pack_surfaces, refractive_indices
 from .rays import Rays, RayStatus
@@ -28,7 +28,7 @@ class TraceResult:
     surface : str
         Name of the surface.
     position : ndarray, shape [n, 3]
-        Where the rays meet the surface [m].
+        Intersections of the rays with the surface [m].
     direction : ndarray, shape [n, 3]
         Unit directions after the surface.
     path_length : ndarray, shape [n]
@@ -54,21 +54,11 @@ class TraceResult:
 
 @dataclass(frozen=True)
 class PacketTrace:
-    """Packets of rays before the first surface and after the last ones.
+    """Packets of rays before the first surface and after the last ones."""
 
-    Attributes
-    ----------
-    indices : ndarray, shape [n_surface + 1]
-        Refractive index before the first surface and after each.
-    start : RayPackets
-        Rays before the first surface, as one surface.
-    end : RayPackets
-        Rays after each surface kept.
-    """
-
-    indices: np.ndarray
-    start: Any
-    end: Any
+    indices: np.ndarray  #: refractive index before the first surface and after each, [n_surface + 1]
+    start: Any  #: RayPackets before the first surface, as one surface
+    end: Any  #: RayPackets after each of the last surfaces
 
 
 def trace_packets(telescope: Telescope, rays: Rays, n_kept: int, *, threads: int | None = None) -> PacketTrace:
@@ -147,10 +137,8 @@ def trace(
     every = len(telescope.surfaces) if surfaces == "all" else 1
     end = trace_packets(telescope, rays, every, threads=threads).end
     names = telescope.surface_names if surfaces == "all" else telescope.surface_names[-1:]
-    positions = end.position.numpy().reshape(every, 3, -1)[:, :, :n]
-    directions = end.direction.numpy().reshape(every, 3, -1)[:, :, :n]
-    paths = end.path.numpy().reshape(every, -1)[:, :n]
-    statuses = end.status.numpy().reshape(every, -1)[:, :n]
+    positions, directions = from_packets(end.position, n), from_packets(end.direction, n)
+    paths, statuses = from_packets(end.path, n), from_packets(end.status, n)
     # Transposed views, not copies: the rays stay in structure-of-arrays order.
     results = [
         TraceResult(name, positions[i].T, directions[i].T, paths[i], statuses[i]) for i, name in enumerate(names)
@@ -159,12 +147,7 @@ def trace(
         last = results[-1]
         index = float(refractive_indices(telescope, rays.wavelength)[-2])
         landing = land_on_ccds(telescope.surfaces[-1], focal_plane, last.position, last.direction, index=index)
-        results[-1] = TraceResult(
-            last.surface,
-            landing.position,
-            last.direction,
-            last.path_length + landing.path,
-            np.where((last.status == RayStatus.OK) & (landing.ccd < 0), np.int32(RayStatus.GAP), last.status),
-            landing.ccd,
-        )
+        status = np.where((last.status == RayStatus.OK) & (landing.ccd < 0), np.int32(RayStatus.GAP), last.status)
+        path = last.path_length + landing.path
+        results[-1] = TraceResult(last.surface, landing.position, last.direction, path, status, landing.ccd)
     return results if surfaces == "all" else results[0]

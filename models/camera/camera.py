@@ -18,33 +18,15 @@ from ...core.units import metres
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A mosaic of equal square CCDs.
-
-    Parameters
-    ----------
-    name : str
-        Name of the camera.
-    ccd_names : tuple of str
-        Names of the CCDs.
-    raft_names : tuple of str
-        Names of the rafts that carry them.
-    raft_index : ndarray of int, shape (n,)
-        Raft of each CCD.
-    centers : ndarray, shape (n, 2)
-        Centres of the CCDs (x, y) [m].
-    pixels : int
-        Pixels along a side of a CCD.
-    pixel_size : float
-        Side of a pixel [m].
-    """
+    """A mosaic of equal square CCDs, on rafts."""
 
     name: str
     ccd_names: tuple[str, ...]
     raft_names: tuple[str, ...]
-    raft_index: np.ndarray
-    centers: np.ndarray
-    pixels: int
-    pixel_size: float
+    raft_index: np.ndarray  #: raft of each CCD, [n_ccd]
+    centers: np.ndarray  #: centres of the CCDs (x, y) [m], [n_ccd, 2]
+    pixels: int  #: pixels along a side of a CCD
+    pixel_size: float  #: side of a pixel [m]
 
     def __post_init__(self) -> None:
         for array in (self.raft_index, self.centers):
@@ -77,45 +59,20 @@ class Camera:
         return cKDTree(self.centers)
 
     def ccd_index(self, name: str) -> int:
-        """Return the index of a CCD.
-
-        Raises
-        ------
-        UnknownNameError
-            If the camera has no CCD of that name.
-        """
+        """Return the index of a CCD, or raise UnknownNameError."""
         try:
             return self._index[name]
         except (KeyError, TypeError):
             raise unknown_name(f"CCD of {self.name}", name, self.ccd_names) from None
 
     def ccds_of_raft(self, raft: str) -> tuple[str, ...]:
-        """Return the names of the CCDs on a raft.
-
-        Raises
-        ------
-        UnknownNameError
-            If the camera has no raft of that name.
-        """
+        """Return the names of the CCDs on a raft, or raise UnknownNameError."""
         if raft not in self.raft_names:
             raise unknown_name(f"raft of {self.name}", raft, self.raft_names)
         return tuple(n for n, r in zip(self.ccd_names, self.raft_of, strict=True) if r == raft)
 
     def ccd_at(self, x: Any, y: Any, *, margin: float = 0.0) -> np.ndarray:
-        """Return which CCD a point lies on.
-
-        Parameters
-        ----------
-        x, y : float, array or Quantity
-            Position on the focal plane [m].
-        margin : float
-            Width added around every CCD [m], less than half a gap.
-
-        Returns
-        -------
-        ndarray of int
-            Index of the CCD, rims included; -1 in a gap or outside.
-        """
+        """Return the index of the CCD at points [m], or at most a margin [m] outside its rim; -1 without one."""
         px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
@@ -137,20 +94,18 @@ def lsst_camera() -> Camera:
     # A corner has both its row and its column at the rim; every other place has at least one that is not.
     grid = [(row, column) for row in range(5) for column in range(5) if {row, column} - {0, 4}]
     rafts = [(f"R{row}{column}", row, column) for row, column in grid]
-    names, raft_index, centers = [], [], []
-    for index, (raft, row, column) in enumerate(rafts):
-        for s_row in range(3):
-            for s_column in range(3):
-                names.append(f"{raft}_S{s_row}{s_column}")
-                raft_index.append(index)
-                x = (column - 2) * raft_pitch + (s_column - 1) * ccd_pitch
-                y = (row - 2) * raft_pitch + (s_row - 1) * ccd_pitch
-                centers.append((x, y))
+    names, centers = [], []
+    for raft, row, column in rafts:
+        for s_row, s_column in np.ndindex(3, 3):
+            names.append(f"{raft}_S{s_row}{s_column}")
+            x = (column - 2) * raft_pitch + (s_column - 1) * ccd_pitch
+            y = (row - 2) * raft_pitch + (s_row - 1) * ccd_pitch
+            centers.append((x, y))
     return Camera(
         name="lsst",
         ccd_names=tuple(names),
         raft_names=tuple(r[0] for r in rafts),
-        raft_index=np.array(raft_index),
+        raft_index=np.repeat(np.arange(len(rafts)), 9),
         centers=np.array(centers),
         pixels=4096,
         pixel_size=10e-6,
@@ -160,14 +115,10 @@ def lsst_camera() -> Camera:
 CAMERAS = {"lsst": lsst_camera}
 
 
-def load_camera(name: str) -> Camera:
-    """Return a camera by name.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no camera of that name.
-    """
-    if name not in CAMERAS:
-        raise unknown_name("camera", name, CAMERAS)
-    return CAMERAS[name]()
+def load_camera(camera: str | Camera) -> Camera:
+    """Return a camera by name, or a camera as it is; an unknown name is an UnknownNameError."""
+    if isinstance(camera, Camera):
+        return camera
+    if camera not in CAMERAS:
+        raise unknown_name("camera", camera, CAMERAS)
+    return CAMERAS[camera]()

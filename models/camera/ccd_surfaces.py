@@ -22,24 +22,12 @@ POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2)
 
 @dataclass(frozen=True, eq=False)
 class CcdSurfaces:
-    """Height functions of `n` square CCDs of half side `half_size` [m].
+    """Height functions of `n` square CCDs."""
 
-    Parameters
-    ----------
-    half_size : float
-        Half the side of a CCD [m].
-    polynomial : ndarray, shape (n, 10)
-        Coefficients [m] of 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3.
-    waves : ndarray, shape (n, 2, 4)
-        Amplitude [m], kx [rad/m], ky [rad/m], phase [rad] of two waves.
-    grid : ndarray, shape (n, m, m), optional
-        B-spline coefficients [m], index order CCD, y, x.
-    """
-
-    half_size: float
-    polynomial: np.ndarray
-    waves: np.ndarray
-    grid: np.ndarray | None = None
+    half_size: float  #: half the side of a CCD [m]
+    polynomial: np.ndarray  #: coefficients [m] of 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3, [n, 10]
+    waves: np.ndarray  #: amplitude [m], kx [rad/m], ky [rad/m], phase [rad] of two waves, [n, 2, 4]
+    grid: np.ndarray | None = None  #: B-spline coefficients [m], index order CCD, y, x, [n, m, m]
 
     def __post_init__(self) -> None:
         for array in (self.polynomial, self.waves, self.grid):
@@ -106,23 +94,10 @@ class CcdSurfaces:
 
 
 def spline_weights(u: np.ndarray, m: int, order: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first of the four B-splines that are not zero at `u`, and their values or first derivatives.
+    """Return the index [n] of the first of the four B-splines that are not zero at `u`, and their values [4, n].
 
-    Parameters
-    ----------
-    u : ndarray, shape (n,)
-        Position on the tile, -1 to 1.
-    m : int
-        Number of coefficients along a side; ``m - 3`` cells.
-    order : int
-        0 for values, 1 for derivatives with respect to `u`.
-
-    Returns
-    -------
-    first : ndarray of int, shape (n,)
-        Index of the first of four.
-    weights : ndarray, shape (4, n)
-        Their values.
+    `u` [n] is the position on the tile, -1 to 1, whose side has ``m`` coefficients, ``m - 3`` cells. With ``order`` 1
+    first derivatives with respect to `u` replace the values.
     """
     t = (u + 1.0) * (0.5 * (m - 3))
     first = np.clip(np.floor(t).astype(np.int64), 0, m - 4)

@@ -1,12 +1,12 @@
 """The focal plane: the height of every CCD's surface, drawn from a budget, measured, or flat.
 
 Heights are positive along +z of the telescope frame, which is the direction that light travels when it meets the LSST
-detector. Camera teams often use the opposite sign: turn it round before a table or mesh enters here.
+detector. Camera teams often use the opposite sign: change it before a table or mesh enters here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,17 +34,17 @@ class FocalPlane:
     Parameters
     ----------
     camera : Camera
-        Where the CCDs lie.
+        Names and places of the CCDs.
     surfaces : CcdSurfaces
         Height function of each CCD.
     measured : ndarray of bool, shape (n_ccd,)
-        Which CCDs carry measured heights; all False for a drawn or flat focal plane.
+        CCDs with measured heights; all False for a drawn or flat focal plane.
     terms : tuple of str
         Terms of the height budget that are on.
     budget : HeightBudget, optional
         Height budget of the draw.
     seed : int, optional
-        Seed that they were drawn with.
+        Seed of the draw.
     """
 
     camera: Camera
@@ -83,7 +83,7 @@ class FocalPlane:
         DomainError
             If the seed is not a whole number of zero or more.
         """
-        camera = load_camera(camera) if isinstance(camera, str) else camera
+        camera = load_camera(camera)
         budget = load_budget(budget) if isinstance(budget, str) else budget
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise DomainError(f"seed = {seed!r}: expected a whole number of zero or more")
@@ -98,7 +98,7 @@ class FocalPlane:
     @classmethod
     def flat(cls, camera: str | Camera = "lsst") -> FocalPlane:
         """Return a focal plane whose every CCD lies at height zero."""
-        camera = load_camera(camera) if isinstance(camera, str) else camera
+        camera = load_camera(camera)
         n = len(camera)
         surfaces = CcdSurfaces(camera.half_size, np.zeros((n, 10)), np.zeros((n, 2, 4)))
         return cls(camera, surfaces, np.zeros(n, dtype=bool))
@@ -118,7 +118,7 @@ class FocalPlane:
         Returns
         -------
         FocalPlane
-            With `measured` telling which CCDs had points; the others lie at height zero.
+            `measured` is True for CCDs with points; the others lie at height zero.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class FocalPlane:
             If a column is missing or not finite, no point lies on a CCD, or a CCD has points but fewer than three
             or all on one line.
         """
-        camera = load_camera(camera) if isinstance(camera, str) else camera
+        camera = load_camera(camera)
         x, y, z = (_column(table, name) for name in "xyz")
         if not x.shape == y.shape == z.shape or x.ndim != 1:
             raise DomainError(f"heights: columns of shape {x.shape}, {y.shape}, {z.shape}: expected one length")
@@ -136,7 +136,7 @@ class FocalPlane:
     @classmethod
     def from_mesh(cls, mesh: trimesh.Trimesh, camera: str | Camera = "lsst") -> FocalPlane:
         """Fit the vertices of a surface mesh as `from_heights` does: metres, z positive along +z of the telescope."""
-        camera = load_camera(camera) if isinstance(camera, str) else camera
+        camera = load_camera(camera)
         x, y, z = np.asarray(mesh.vertices, dtype=np.float64).T
         surfaces, measured = fit_heights(camera, x, y, z, margin=_MESH_MARGIN)
         return cls(camera, surfaces, measured)
@@ -231,34 +231,21 @@ class FocalPlane:
         ndarray
             Height [m], positive along +z of the telescope frame; NaN in a gap or outside.
         """
-        ccd, dx, dy, lit = self._local(x, y)
-        height = np.full(lit.shape, np.nan)
-        height[lit] = self.surfaces.height(ccd[lit], dx[lit], dy[lit])
-        return height
+        return self._on_ccds(self.surfaces.height, x, y)
 
     def gradient(self, x: Any, y: Any) -> np.ndarray:
-        """Return the slopes (dh/dx, dh/dy) of the CCD surface.
+        """Return the slopes (dh/dx, dh/dy) of the CCD surface [rad], shape (..., 2); arguments as for `height`."""
+        return self._on_ccds(self.surfaces.gradient, x, y, 2)
 
-        Parameters
-        ----------
-        x, y : float, array or Quantity
-            Position on the focal plane [m].
-
-        Returns
-        -------
-        ndarray, shape (..., 2)
-            Slopes [rad]; NaN in a gap or outside.
-        """
-        ccd, dx, dy, lit = self._local(x, y)
-        slopes = np.full((*lit.shape, 2), np.nan)
-        slopes[lit] = self.surfaces.gradient(ccd[lit], dx[lit], dy[lit])
-        return slopes
-
-    def _local(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _on_ccds(self, function: Callable[..., np.ndarray], x: Any, y: Any, *values: int) -> np.ndarray:
+        """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
         px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
         ccd = self.camera.ccd_at(px, py)
-        centre = self.camera.centers[ccd]
-        return ccd, px - centre[..., 0], py - centre[..., 1], ccd >= 0
+        lit = ccd >= 0
+        dx, dy = px - self.camera.centers[ccd, 0], py - self.camera.centers[ccd, 1]
+        out = np.full((*lit.shape, *values), np.nan)
+        out[lit] = function(ccd[lit], dx[lit], dy[lit])
+        return out
 
     def to_mesh(self, cells_per_ccd: int = 32) -> trimesh.Trimesh:
         """Return the CCD surfaces as triangles, one tile for each CCD.
@@ -276,9 +263,7 @@ class FocalPlane:
             `facet_error`.
         """
         cells = _cells(cells_per_ccd)
-        ccd, dx, dy = self._nodes(cells)
-        x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
-        vertices = np.stack([x, y, self.surfaces.height(ccd, dx, dy)], axis=-1)
+        vertices = np.stack(self._nodes(cells)[1:], axis=-1)
         index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
         tile = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2).reshape(-1, 3)
@@ -286,7 +271,7 @@ class FocalPlane:
         return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
 
     def facet_error(self, cells_per_ccd: int = 32) -> np.ndarray:
-        """Return how far the mesh can depart from the surface.
+        """Return an upper bound of the distance between mesh and surface.
 
         On a right triangle with two sides of one cell, linear interpolation is off by at most the largest second
         derivative in any direction times the square of the cell over 4 (the circumscribed circle's radius squared
@@ -295,7 +280,7 @@ class FocalPlane:
         Parameters
         ----------
         cells_per_ccd : int
-            Cells along the side of a CCD.
+            As for `to_mesh`.
 
         Returns
         -------
@@ -319,17 +304,17 @@ class FocalPlane:
             Columns ccd (name), x, y, z [m].
         """
         # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
-        ccd, dx, dy = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
-        x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
-        names = np.array(self.names)[ccd]
-        columns = [names, x, y, self.surfaces.height(ccd, dx, dy)]
-        return Table(columns, names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
+        ccd, *points = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
+        return Table([np.array(self.names)[ccd], *points], names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
 
-    def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, ...]:
+        """Return CCD index, x, y and height [m] of the nodes of a grid on every CCD."""
         axis = np.linspace(-1.0, 1.0, cells + 1) * (self.camera.half_size * scale)
         n = len(self.camera)
         ccd, dy, dx = np.broadcast_arrays(np.arange(n)[:, None, None], axis[None, :, None], axis[None, None, :])
-        return ccd.ravel(), dx.ravel(), dy.ravel()
+        ccd, dx, dy = ccd.ravel(), dx.ravel(), dy.ravel()
+        x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
+        return ccd, x, y, self.surfaces.height(ccd, dx, dy)
 
 
 def _cells(cells_per_ccd: int) -> int:
@@ -349,7 +334,7 @@ def _column(table: Any, name: str) -> np.ndarray:
         raise DomainError(f"heights: column {name!r} is missing: expected columns x, y, z")
     column = table[name]
     if isinstance(table, Table) and getattr(column, "unit", None) is not None:
-        column = column.quantity if hasattr(column, "quantity") else column
+        column = getattr(column, "quantity", column)
     if np.ma.isMaskedArray(column) and np.ma.is_masked(column):
         raise DomainError(f"heights: column {name!r} has masked rows: expected finite numbers")
     values = metres(column, f"heights column {name!r}")

@@ -11,12 +11,11 @@ to the last bit. Heights are positive along +z of the telescope frame.
 - ``potato_chip``: two crossed cosine waves of equal amplitude on each CCD, of random orientation and phase, each with
   1 to 2 cycles along a CCD's side, scaled to exactly the peak to valley over the CCD, with zero mean.
 
-The paper gives the peak-to-valley figures and the 1 to 2 cycles; the distributions are ours.
+The paper gives the peak-to-valley sizes and the 1 to 2 cycles; the distributions are ours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,36 +25,20 @@ from ...core.random_streams import stream
 from .camera import Camera
 from .ccd_surfaces import CcdSurfaces
 
-# Points a side at which the potato chip's peak and valley are sought: 64 a cycle or more, so found to 0.1 %.
+# Points a side at which the potato chip's peak and valley are searched: 64 a cycle or more, good to 0.1 %.
 _POTATO_POINTS = 129
 
 
 @dataclass(frozen=True)
 class HeightBudget:
-    """Peak-to-valley size of each term of the focal-plane height.
+    """Peak-to-valley size of each term of the focal-plane height."""
 
-    Parameters
-    ----------
-    global_height : float
-        Surface of the whole focal plane [m].
-    raft_height : float
-        Height of rafts [m].
-    ccd_height : float
-        Height of CCDs on their raft [m].
-    ccd_tilt : float
-        Tilt of CCDs about either axis [rad].
-    potato_chip : float
-        Ripple within a CCD [m].
-    potato_chip_cycles : tuple of float, shape (2,)
-        Fewest and most cycles of the ripple along the side of a CCD.
-    """
-
-    global_height: float
-    raft_height: float
-    ccd_height: float
-    ccd_tilt: float
-    potato_chip: float
-    potato_chip_cycles: tuple[float, float] = (1.0, 2.0)
+    global_height: float  #: surface of the whole focal plane [m]
+    raft_height: float  #: height of rafts [m]
+    ccd_height: float  #: height of CCDs on their raft [m]
+    ccd_tilt: float  #: tilt of CCDs about either axis [rad]
+    potato_chip: float  #: ripple within a CCD [m]
+    potato_chip_cycles: tuple[float, float] = (1.0, 2.0)  #: fewest and most cycles of the ripple along a CCD's side
 
     def __post_init__(self) -> None:
         for key in ("global_height", "raft_height", "ccd_height", "ccd_tilt", "potato_chip"):
@@ -73,42 +56,19 @@ BUDGETS = {"specification": SPECIFICATION, "simulated": SIMULATED}
 
 
 def load_budget(name: str) -> HeightBudget:
-    """Return a column of Table 1 by name: "specification" or "simulated".
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no budget of that name.
-    """
+    """Return a column of Table 1, "specification" or "simulated"; another name is an UnknownNameError."""
     if name not in BUDGETS:
         raise unknown_name("height budget", name, BUDGETS)
     return BUDGETS[name]
 
 
 def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[str, ...]) -> CcdSurfaces:
-    """Draw the heights of every CCD.
-
-    Parameters
-    ----------
-    camera : Camera
-        Where the CCDs lie.
-    budget : HeightBudget
-        Size of each term.
-    seed : int
-        Seed of the focal plane.
-    terms : tuple of str
-        Terms to include, of `TERMS`.
-
-    Returns
-    -------
-    CcdSurfaces
-        Height functions.
-    """
+    """Draw the heights of every CCD: the sum of the given terms, of `TERMS`."""
     polynomial = np.zeros((len(camera), 10))
     waves = np.zeros((len(camera), 2, 4))
     for term, draw in _DRAWS.items():
         if term in terms:
-            # Added in the order of the table whatever the order asked for: sums must not depend on it.
+            # Added in the order of the table, whatever that of the terms: sums must not depend on it.
             polynomial += draw(camera, budget, seed)
     if "potato_chip" in terms:
         offset, waves = _potato_chip(camera, budget, seed)
@@ -194,10 +154,5 @@ def _potato_chip(camera: Camera, budget: HeightBudget, seed: int) -> tuple[np.nd
     return offset, waves
 
 
-_DRAWS: dict[str, Callable[[Camera, HeightBudget, int], np.ndarray]] = {
-    "global": _global,
-    "raft": _raft,
-    "ccd": _ccd,
-    "tilt": _tilt,
-}
+_DRAWS = {"global": _global, "raft": _raft, "ccd": _ccd, "tilt": _tilt}
 TERMS = (*_DRAWS, "potato_chip")

@@ -25,31 +25,12 @@ _SMOOTHING = 1e-4
 def fit_heights(
     camera: Camera, x: np.ndarray, y: np.ndarray, z: np.ndarray, *, margin: float = 0.0
 ) -> tuple[CcdSurfaces, np.ndarray]:
-    """Fit each CCD's height function to the points that lie on it.
+    """Fit each CCD's height function to the points [m], shape [n], that lie on it or at most a margin [m] outside.
 
     A polynomial by least squares takes the large shape: a plane from 3 points, a quadratic from 9, a cubic from 20.
-    Where there are at least 48 points, a uniform cubic B-spline takes what is left.
-
-    Parameters
-    ----------
-    camera : Camera
-        Where the CCDs lie.
-    x, y, z : ndarray, shape (n,)
-        Measured points [m]; z positive along +z of the telescope frame.
-    margin : float
-        Points this far outside a CCD still count as on it [m].
-
-    Returns
-    -------
-    surfaces : CcdSurfaces
-        Height functions; flat at zero where there are no points.
-    measured : ndarray of bool, shape (n_ccd,)
-        Which CCDs have points.
-
-    Raises
-    ------
-    DomainError
-        If no point lies on a CCD, or a CCD has points but too few or all on one line.
+    Where there are at least 48 points, a uniform cubic B-spline takes what is left. CCDs without points are flat at
+    zero. Returned with the functions: which CCDs have points, shape [n_ccd] bool. A DomainError is raised if no point
+    lies on a CCD, or a CCD has points but too few or all on one line.
     """
     ccd = camera.ccd_at(x, y, margin=margin)
     order = np.argsort(ccd, kind="stable")

@@ -103,8 +103,7 @@ class OddAsphere(Shape):
         f, slope = conic_derivative(1.0 / self.radius, self.conic, name, x * x + y * y)
         return f, 2 * x * slope, 2 * y * slope
 
-    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         if name.startswith("a"):
             return replace(self, coefficients=with_coefficient(self.coefficients, int(name[1:]) - 1, value))
         return replace(self, **_conic_change(name, value))
@@ -114,7 +113,7 @@ def _conic_change(name: str, value: float) -> dict[str, Any]:
     """Return the field and the value for a parameter: a curvature is stored as a radius."""
     if name.startswith("curvature"):
         return {name.replace("curvature", "radius"): 1.0 / value if value else np.inf}
-    return {name: float(value)}
+    return {name: value}
 
 
 @dataclass(frozen=True)
@@ -139,8 +138,7 @@ class _TwoRadii(Shape):
         fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return fields | {"curvature_x": 1.0 / self.radius_x, "curvature_y": 1.0 / self.radius_y}
 
-    def with_parameter(self, name: str, value: float) -> Shape:
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         return replace(self, **_conic_change(name, value))
 
 
@@ -342,8 +340,7 @@ class XYPolynomial(_Polynomial):
         fy = j * x**i * y ** (j - 1) if j else zero
         return x**i * y**j, fx, fy
 
-    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         return XYPolynomial(tuple((i, j, value if name == f"x{i}y{j}" else a) for i, j, a in self.terms))
 
 
@@ -387,6 +384,5 @@ class ZernikeSag(_Polynomial):
         polynomial = from_zernikes(one, self.outer_radius, self.inner_radius)
         return polynomial.value(x, y), *polynomial.gradient(x, y)
 
-    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         return replace(self, coefficients=with_coefficient(self.coefficients, int(name[1:]) - 1, value))

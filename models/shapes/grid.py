@@ -143,8 +143,7 @@ class GridSag(ContentEquality, Shape):
         f, fx, fy = GridSag(self.x, self.y, one)._evaluate(x, y, (0, 0), (1, 0), (0, 1))
         return f, fx, fy
 
-    def with_parameter(self, name: str, value: float) -> GridSag:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> GridSag:
         values = self.values.copy()
         values[self._place(name)] = value
         return GridSag(self.x, self.y, values)

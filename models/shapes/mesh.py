@@ -214,14 +214,5 @@ class MeshSurface(ContentEquality, Shape):
         """No parameters."""
         return {}
 
-    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
-        raise self._unknown(name)
-
-    def with_parameter(self, name: str, value: float) -> NoReturn:  # noqa: D102
-        raise self._unknown(name)
-
     def _check_parameter(self, name: str) -> NoReturn:
-        raise self._unknown(name)
-
-    def _unknown(self, name: str) -> UnknownNameError:
-        return UnknownNameError(f"unknown parameter {name!r} of a mesh: a mesh has none")
+        raise UnknownNameError(f"unknown parameter {name!r} of a mesh: a mesh has none")

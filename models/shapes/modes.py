@@ -68,6 +68,5 @@ class GridModes(GridSag):
         mode = self.modes[name]
         return mode.sag(x, y), *mode.gradient(x, y)
 
-    def with_parameter(self, name: str, value: float) -> GridModes:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> GridModes:
         return replace(self, amounts={**self.amounts, name: value})

@@ -22,15 +22,9 @@ from ..zernike_polynomials import noll_to_nm, radial_series
 
 @dataclass(frozen=True, eq=False)
 class PolarPolynomial:
-    """A polynomial of x and y [m].
+    """A polynomial of x and y [m]."""
 
-    Parameters
-    ----------
-    terms : ndarray of complex, shape [m_max + 1, k_max + 1]
-        Coefficient of ``s^k (x + i y)^m`` [m^(1 - m - 2 k)].
-    """
-
-    terms: np.ndarray
+    terms: np.ndarray  #: coefficient of ``s^k (x + i y)^m`` [m^(1 - m - 2 k)], complex, [m_max + 1, k_max + 1]
 
     def __add__(self, other: PolarPolynomial) -> PolarPolynomial:
         shape = np.maximum(self.terms.shape, other.terms.shape)

@@ -43,7 +43,7 @@ def check_coefficients(coefficients: tuple[float, ...]) -> None:
 
 def with_coefficient(coefficients: tuple[float, ...], place: int, value: float) -> tuple[float, ...]:
     """Return coefficients with another value at one place."""
-    return (*coefficients[:place], float(value), *coefficients[place + 1 :])
+    return (*coefficients[:place], value, *coefficients[place + 1 :])
 
 
 def coordinates(x: Any, y: Any) -> Pair:
@@ -102,9 +102,16 @@ class Shape(ABC):
     def parameters(self) -> dict[str, float]:
         """Parameters by name, in SI; radius and curvature are two names of one."""
 
-    @abstractmethod
     def with_parameter(self, name: str, value: float) -> Shape:
-        """Return the shape with another value of a parameter."""
+        """Return the shape with another value of a parameter.
+
+        Raises
+        ------
+        UnknownNameError
+            If the shape has no such parameter.
+        """
+        self._check_parameter(name)
+        return self._changed(name, float(value))
 
     def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:
         """Return the derivative of the sag by a parameter.
@@ -136,9 +143,13 @@ class Shape(ABC):
             return factor * f, factor * fx, factor * fy
         return self._derivative(name, x, y)
 
-    @abstractmethod
+    def _changed(self, name: str, value: float) -> Shape:
+        """Return `with_parameter` for an existing parameter."""
+        raise NotImplementedError
+
     def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
         """Return `sag_derivative` for an existing parameter other than a radius."""
+        raise NotImplementedError
 
     def _check_parameter(self, name: str) -> None:
         if name not in self.parameters:
@@ -210,20 +221,19 @@ class Rotational(Shape):
             f, slope = conic_derivative(self.curvature, self.conic, name, s)
         return f, 2 * x * slope, 2 * y * slope
 
-    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         if name.startswith("a"):
             terms = with_coefficient(self.coefficients, int(name[1:]) // 2 - 2, value)
             return EvenAsphere(self.parameters["radius"], self.conic, terms)
-        conic = float(value) if name == "conic" else self.conic
+        conic = value if name == "conic" else self.conic
         if name == "curvature" and value == 0 and not any(self.coefficients):
             return Plane()
         radius = self.parameters["radius"]
         if name in ("radius", "curvature"):
             radius = value if name == "radius" else (1.0 / value if value else np.inf)
         if isinstance(self, EvenAsphere):
-            return EvenAsphere(float(radius), conic, self.coefficients)
-        return Conic(float(radius), conic) if conic != 0 else Sphere(float(radius))
+            return EvenAsphere(radius, conic, self.coefficients)
+        return Conic(radius, conic) if conic != 0 else Sphere(radius)
 
 
 def conic_derivative(c: float, k: float, name: str, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -249,8 +259,7 @@ class Plane(Rotational):
     def parameters(self) -> dict[str, float]:  # noqa: D102
         return {"curvature": 0.0}
 
-    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         return Sphere(1.0 / value) if value else self
 
 
@@ -335,7 +344,7 @@ class Sum(Shape):
 
     @cached_property
     def _places(self) -> dict[str, tuple[int, str]]:
-        """Return, for each name, the part and the name within it."""
+        """Index of the part, and name within it, of each parameter."""
         places: dict[str, tuple[int, str]] = {}
         for i, part in enumerate(self.parts):
             for name in part.parameters:
@@ -352,11 +361,7 @@ class Sum(Shape):
         part, inner = self.place(name)
         return part.sag_derivative(inner, x, y)
 
-    def _derivative(self, name: str, x: np.ndarray, y: np.ndarray) -> Triple:
-        return self.sag_derivative(name, x, y)
-
-    def with_parameter(self, name: str, value: float) -> Shape:  # noqa: D102
-        self._check_parameter(name)
+    def _changed(self, name: str, value: float) -> Shape:
         i, inner = self._places[name]
         changed = self.parts[i].with_parameter(inner, value)
         return replace(self, parts=(*self.parts[:i], changed, *self.parts[i + 1 :]))

@@ -1,8 +1,8 @@
 """Adjoint matrix: derivatives of outputs of rays, with columns per surface parameter.
 
 All parameters of a telescope act through few quantities of each surface: a change of its sag and of the slopes of that
-change, the refractive indices on both sides, and, for motions, force and torque of the ray on either side. A table of
-columns tells which of them are computed, and where each is stored.
+change, the refractive indices on both sides, and, for motions, force and torque of the ray on either side. A table
+lists the column of each that is computed.
 """
 
 from __future__ import annotations
@@ -31,20 +31,11 @@ Polynomials = Sequence[tuple[int, float, int, np.ndarray]]
 
 @dataclass(frozen=True)
 class AdjointMatrix:
-    """Derivatives of each output of each ray, with columns per surface.
+    """Derivatives of each output of each ray, with columns per surface."""
 
-    Attributes
-    ----------
-    columns : ndarray of int, shape [n_surface + 1, 13]
-        Column of ``values`` for each quantity of each surface; -1 where it was not computed.
-    values : ndarray, shape [n_output, n_column, n]
-        The columns.
-    start : ndarray, shape [n_output, 6, n], or None
-        Derivatives with respect to position [1/m] and direction of the ray at its start, telescope frame.
-    """
-
-    columns: np.ndarray
-    values: np.ndarray
+    columns: np.ndarray  #: column of each quantity of each surface, -1 where not computed, [n_surface + 1, 13]
+    values: np.ndarray  #: the columns, [n_output, n_column, n]
+    #: Derivatives by position [1/m] and direction of the ray at its start, telescope frame, [n_output, 6, n].
     start: np.ndarray | None = None
 
     def _quantity(self, surface: int, name: str) -> np.ndarray:
@@ -58,7 +49,7 @@ class AdjointMatrix:
         return self._quantity(surface, "sag")
 
     def gap(self, gap: int) -> np.ndarray:
-        """Force and torque in the gap in front of a surface, [n_output, 6, n]; the last gap is behind the last one."""
+        """Return force and torque in the gap before a surface, [n_output, 6, n]; the last gap is behind the last."""
         return self._quantity(gap, "gap")
 
     def motion(self, surface: int) -> np.ndarray:
@@ -74,22 +65,16 @@ class AdjointMatrix:
         return self._quantity(surface, "index")
 
     def intersection(self, surface: int) -> np.ndarray:
-        """Intersections of the rays with the surface, in its own x and y [m], shape [2, n]."""
+        """Return intersections of the rays with the surface, in its own x and y [m], shape [2, n]."""
         return self._quantity(surface, "intersection")[0]
 
 
 def column_table(telescope: Telescope, wanted: Iterable[tuple[int, str]] | None = None, first: int = 0) -> np.ndarray:
     """Return the table of columns for some quantities, shape [n_surface + 1, 13]; -1 stands for none.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    wanted : iterable of (surface, name), optional
-        Index of a surface and "sag", "index", "intersection", or "gap" for the gap in front of it; the gap behind the
-        last surface belongs to the index after that. All quantities by default.
-    first : int
-        Number of the first column.
+    ``wanted`` are pairs (index of a surface, name), all quantities by default: "sag", "index", "intersection", or "gap"
+    for the gap in front of it; the gap behind the last surface belongs to the index after that. The first column has
+    the number ``first``.
     """
     count = len(telescope.surfaces)
     if wanted is None:

@@ -14,7 +14,7 @@ import warp as wp
 
 from ...core.launch import launch
 from ...core.warp_arrays import warp_array
-from ..kernels.packet import LANES, lanes
+from ..kernels.packet import LANES, from_packets, lanes
 from ..pack.surfaces import pack_surfaces
 from .adjoint_matrix import AdjointMatrix, Polynomials, column_count, column_table, polynomial_tables
 from .backward_kernels import backward_rays
@@ -24,25 +24,14 @@ from .forward_pass import ForwardPass
 
 @dataclass(frozen=True)
 class OutputGradient:
-    """Derivatives of outputs with respect to the rays at the last surface.
+    """Derivatives of outputs with respect to the rays at the last surface, telescope frame."""
 
-    Attributes
-    ----------
-    position, direction : ndarray, shape [n_output, 3, n]
-        With respect to position [1/m] and direction of each ray, telescope frame; the direction taken as a free vector.
-    path : ndarray, shape [n_output]
-        With respect to the optical path: 1 or 0.
-    index : ndarray, shape [n_output, n], optional
-        With respect to the refractive index before the last surface, where an output depends on that directly.
-    own_frame : bool
-        Whether the outputs are x and y in the frame of the last surface, which then moves with it.
-    """
-
-    position: np.ndarray
-    direction: np.ndarray
-    path: np.ndarray
+    position: np.ndarray  #: by the position of each ray [1/m], [n_output, 3, n]
+    direction: np.ndarray  #: by its direction, taken as a free vector, [n_output, 3, n]
+    path: np.ndarray  #: by the optical path: 1 or 0, [n_output]
+    #: By the refractive index before the last surface, where an output depends on that directly, [n_output, n].
     index: np.ndarray | None = None
-    own_frame: bool = False
+    own_frame: bool = False  #: outputs are x and y in the frame of the last surface, which then moves with it
 
 
 def landing_gradient(forward: ForwardPass) -> OutputGradient:
@@ -69,26 +58,10 @@ def backward_pass(
 ) -> AdjointMatrix:
     """Carry the gradient of outputs back through all surfaces.
 
-    Parameters
-    ----------
-    forward : ForwardPass
-        The rays at every surface.
-    gradient : OutputGradient
-        Derivatives of the outputs with respect to the rays at the last surface.
-    columns : ndarray of int, shape [n_surface + 1, 13], optional
-        Columns to compute, from :func:`~pachon.raytrace.adjoint.adjoint_matrix.column_table`; all by default.
-    polynomials : sequence of (surface, scale, degree, columns)
-        Surfaces with derivatives by polynomial sags: the column of each term of
-        :func:`~pachon.raytrace.adjoint.adjoint_matrix.polynomial_terms`, -1 for terms left out, with x and y in units
-        of ``scale`` [m]. Their "sag" and "intersection" must be among the columns.
-    start : bool
-        Whether to return the derivatives with respect to the start of the rays too.
-    threads : int, optional
-        Number of threads; all processors by default.
-
-    Returns
-    -------
-    AdjointMatrix
+    ``columns`` [n_surface + 1, 13] are those to compute, from :func:`column_table`; all by default. Each of
+    ``polynomials`` (surface, scale, degree, columns) adds derivatives by polynomial sags of a surface: the column of
+    each term of :func:`polynomial_terms`, -1 for terms left out, with x and y in units of the scale [m]; its "sag" and
+    "intersection" must be among the columns. With ``start``, derivatives by the start of the rays are returned too.
     """
     packets, packed = forward.packets, pack_surfaces(forward.telescope)
     outputs, count = len(gradient.path), packets.start.position.shape[2]
@@ -114,19 +87,13 @@ def backward_pass(
         ],
         threads=threads,
     )
-    values = _as_rays(matrix, forward.n_rays)
+    values = from_packets(matrix, forward.n_rays)
     if gradient.index is not None and columns[-2, INDEX] >= 0:
         values[:, columns[-2, INDEX]] += gradient.index
     if gradient.own_frame and columns[-1, FORCE] >= 0:
         # The frame of the outputs moves with the last surface, and so does the gap behind it.
         values[:, columns[-1, FORCE:]] = 0.0
-    return AdjointMatrix(columns, values, _as_rays(at_start, forward.n_rays) if start else None)
-
-
-def _as_rays(values: wp.array, n: int) -> np.ndarray:
-    """Return packets [n_output, n_column, n_packet] as rays, shape [n_output, n_column, n]."""
-    outputs, columns, count = values.shape
-    return values.numpy().reshape(outputs, columns, count * LANES)[:, :, :n]
+    return AdjointMatrix(columns, values, from_packets(at_start, forward.n_rays) if start else None)
 
 
 def _zero_filled(values: np.ndarray, count: int) -> wp.array:

@@ -10,30 +10,19 @@ import warp as wp
 from ...core.errors import DomainError
 from ...models.shapes.mesh import MeshSurface
 from ...models.telescope import Telescope
+from ..kernels.packet import from_packets
 from ..rays import Rays, RayStatus
 from ..trace import PacketTrace, trace_packets
 
 
 @dataclass(frozen=True)
 class ForwardPass:
-    """Rays at every surface of a telescope.
-
-    Attributes
-    ----------
-    telescope : Telescope
-        The telescope.
-    wavelength : float
-        Vacuum wavelength [m].
-    n_rays : int
-        Number of rays, ``n``.
-    packets : PacketTrace
-        The rays before the first surface and after each.
-    """
+    """Rays at every surface of a telescope."""
 
     telescope: Telescope
-    wavelength: float
-    n_rays: int
-    packets: PacketTrace
+    wavelength: float  #: vacuum wavelength [m]
+    n_rays: int  #: number of rays, ``n``
+    packets: PacketTrace  #: the rays before the first surface and after each
 
     @property
     def indices(self) -> np.ndarray:
@@ -41,8 +30,7 @@ class ForwardPass:
         return self.packets.indices
 
     def _last(self, values: wp.array) -> np.ndarray:
-        last = values.numpy()[-1]
-        return last.reshape(*last.shape[:-2], -1)[..., : self.n_rays]
+        return from_packets(values, self.n_rays)[-1]
 
     @property
     def position(self) -> np.ndarray:
@@ -84,22 +72,7 @@ def check_differentiable(telescope: Telescope) -> None:
 
 
 def forward_pass(telescope: Telescope, rays: Rays, *, threads: int | None = None) -> ForwardPass:
-    """Trace rays and keep them at every surface.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    rays : Rays
-        Rays of one wavelength.
-    threads : int, optional
-        Number of threads; all processors by default.
-
-    Raises
-    ------
-    DomainError
-        If the telescope does not cover the wavelength, or a surface is a mesh.
-    """
+    """Trace rays and store them at every surface; a wavelength not covered, or a mesh, is a DomainError."""
     check_differentiable(telescope)
     packets = trace_packets(telescope, rays, len(telescope.surfaces), threads=threads)
     return ForwardPass(telescope, rays.wavelength, len(rays), packets)

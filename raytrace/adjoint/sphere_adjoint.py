@@ -25,33 +25,24 @@ class SphereAdjoint:
     Parameters
     ----------
     telescope : Telescope
-        The telescope.
+        Without meshes, else a DomainError is raised.
     directions : ndarray, shape [n_field, 3]
-        Unit vectors in which the light of each field point travels.
+        Unit vectors of the light's travel.
     indices : ndarray, shape [n_surface + 1]
         Refractive index before the first surface and after each.
     pupil : ndarray, shape [n_pupil, 2]
         Entrance-pupil coordinates [m].
-    center : ndarray, shape [3, n_field]
-        Centre of each sphere [m], telescope frame.
-    path : ndarray, shape [n_field]
-        Optical path [m] that is subtracted from those of the rays: the chief ray's.
+    center, path : ndarray, shape [3, n_field] and [n_field]
+        Centre of each sphere [m], telescope frame; optical path of the chief ray [m], which is subtracted.
     radius : float
         Radius of the spheres [m].
-    columns : ndarray of int, shape [n_surface + 1, 13]
-        Columns to compute, from :func:`~pachon.raytrace.adjoint.adjoint_matrix.column_table`; four are left free.
+    columns, polynomials
+        As in :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, with four columns left free.
     sphere_column : int
         The first of these: the path less `path` [m] and its derivatives with respect to the landing point, which are
         opposite to those with respect to the centre.
-    polynomials : sequence of (surface, scale, degree, columns)
-        As in :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`.
     lit_only : bool
         Whether all is zero for rays that are vignetted.
-
-    Raises
-    ------
-    DomainError
-        If a surface is a mesh.
     """
 
     def __init__(
@@ -92,19 +83,8 @@ class SphereAdjoint:
     def matrix(self, fields: slice, *, threads: int | None = None) -> tuple[AdjointMatrix, np.ndarray]:
         """Return the adjoint matrix of the paths of some field points, and the status of their rays.
 
-        Parameters
-        ----------
-        fields : slice
-            Which field points; start and stop are given.
-        threads : int, optional
-            Number of threads; all processors by default.
-
-        Returns
-        -------
-        matrix : AdjointMatrix
-            One output; the axis of rays is two, [n_field, n_pupil].
-        status : ndarray of int32, shape [n_field, n_pupil]
-            A :class:`~pachon.raytrace.rays.RayStatus` each.
+        The slice has a start and a stop. The matrix has one output; its axis of rays is two, [n_field, n_pupil], which
+        is also the shape of the statuses (:class:`~pachon.raytrace.rays.RayStatus`, int32).
         """
         n_fields = fields.stop - fields.start
         count = n_fields * self._n_packets
@@ -112,20 +92,9 @@ class SphereAdjoint:
         parts = min(thread_count(threads), max(count, 1))
         matrix = wp.empty((1, self._n_columns, count), dtype=lanes, device="cpu")
         status = wp.empty(count, dtype=lane_flags, device="cpu")
-        launch(
-            sphere_paths.suited(self._inputs[0]),
-            parts,
-            [
-                *self._inputs,
-                fields.start,
-                parts,
-                ray_packets(1, parts),
-                ray_packets(self._n_surface, parts),
-                matrix,
-                status,
-            ],
-            threads=threads,
-        )
+        rays = ray_packets(1, parts), ray_packets(self._n_surface, parts)
+        inputs = [*self._inputs, fields.start, parts, *rays, matrix, status]
+        launch(sphere_paths.suited(self._inputs[0]), parts, inputs, threads=threads)
 
         def as_rays(values: wp.array) -> np.ndarray:
             return values.numpy().reshape(*values.shape[:-1], n_fields, self._n_packets * LANES)[..., : self._n_pupil]

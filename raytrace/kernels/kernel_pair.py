@@ -13,14 +13,9 @@ from ...core.launch import FORWARD_OPTIONS
 
 @dataclass(frozen=True)
 class KernelPair:
-    """A kernel in two variants of one source: for plain telescopes, and for any.
+    """A kernel in two variants of one source, for plain telescopes and for any, each compiled at its first use.
 
     Code that a plain telescope does not need slows the loop over its surfaces even where it does not run.
-
-    Attributes
-    ----------
-    plain, special : wp.Kernel
-        The two variants, each in a module of its own, compiled at its first use.
     """
 
     plain: wp.Kernel

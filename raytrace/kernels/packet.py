@@ -62,16 +62,9 @@ def packet_count(n: int) -> int:
 
 
 def to_packets(values: np.ndarray) -> np.ndarray:
-    """Return values as whole packets, the last one filled up with copies of the last value.
+    """Return values [..., n] as packets [..., n_packet, LANES], the last filled up with copies of the last value.
 
-    Parameters
-    ----------
-    values : array_like, shape [..., n]
-
-    Returns
-    -------
-    ndarray, shape [..., n_packet, LANES]
-        A view where ``n`` is a multiple of ``LANES`` and the values are contiguous float64, else a copy.
+    The result is a view where ``n`` is a multiple of ``LANES`` and the values are contiguous float64, else a copy.
     """
     values = np.ascontiguousarray(values, dtype=np.float64)
     n = values.shape[-1]
@@ -79,3 +72,9 @@ def to_packets(values: np.ndarray) -> np.ndarray:
     if missing:
         values = np.concatenate([values, np.repeat(values[..., -1:], missing, axis=-1)], axis=-1)
     return values.reshape(*values.shape[:-1], -1, LANES)
+
+
+def from_packets(packets: wp.array, n: int) -> np.ndarray:
+    """Return the first ``n`` values [..., n] of packets [..., n_packet] on the CPU, without a copy."""
+    values = packets.numpy()
+    return values.reshape(*packets.shape[:-1], packets.shape[-1] * LANES)[..., :n]

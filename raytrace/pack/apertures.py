@@ -11,17 +11,7 @@ import warp as wp
 
 from ...core.errors import PrescriptionError
 from ...core.warp_arrays import warp_array
-from ...models.aperture import (
-    Annulus,
-    Aperture,
-    Circle,
-    Complement,
-    Intersection,
-    Polygon,
-    Rectangle,
-    Union,
-    Vane,
-)
+from ...models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from ..kernels import aperture as kernels
 from ..kernels.aperture import PackedApertures
 
@@ -30,7 +20,7 @@ DEEPEST = 31
 
 
 def depth(aperture: Aperture) -> int:
-    """Return how many bits the programme of an aperture keeps on its stack at most."""
+    """Return the largest number of bits that the programme of an aperture has on its stack."""
     if isinstance(aperture, Complement):
         return depth(aperture.part)
     if isinstance(aperture, (Union, Intersection)):
@@ -60,11 +50,10 @@ class _Programme:
         elif isinstance(a, Annulus):
             self._step(kernels.RING, a.x, a.y, 1.0, 0.0, a.inner**2, a.outer**2)
         elif isinstance(a, Rectangle):
-            turn = (math.cos(a.angle), math.sin(a.angle))
-            self._step(kernels.BOX, a.x, a.y, *turn, 0.5 * a.width, 0.5 * a.height)
+            self._step(kernels.BOX, a.x, a.y, math.cos(a.angle), math.sin(a.angle), 0.5 * a.width, 0.5 * a.height)
         elif isinstance(a, Vane):
-            turn = (math.cos(a.angle), math.sin(a.angle))
-            self._step(kernels.STRIP, a.x, a.y, *turn, -math.inf if a.both_ways else 0.0, 0.5 * a.width)
+            start = -math.inf if a.both_ways else 0.0
+            self._step(kernels.STRIP, a.x, a.y, math.cos(a.angle), math.sin(a.angle), start, 0.5 * a.width)
         elif isinstance(a, Polygon):
             first = len(self.edges)
             for (ax, ay), (bx, by) in zip(a.corners, (*a.corners[1:], a.corners[0]), strict=True):
@@ -82,13 +71,7 @@ class _Programme:
 
 
 def pack_apertures(apertures: Sequence[Aperture | None], device: str = "cpu") -> Any:
-    """Return the programmes of apertures, one per surface (None for a surface that needs none).
-
-    Raises
-    ------
-    PrescriptionError
-        If an aperture is nested too deeply.
-    """
+    """Return the programmes of apertures, one per surface (None without); a PrescriptionError if nested too deeply."""
     programme = _Programme()
     span = []
     for aperture in apertures:

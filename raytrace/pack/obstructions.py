@@ -14,11 +14,11 @@ from ..kernels.obstruction import PackedObstructions
 
 
 def blocked_ways(telescope: Telescope) -> np.ndarray:
-    """Return on the way to which surfaces each obstruction blocks light, shape [n_surface, n_obstruction] bool.
+    """Return whether each obstruction blocks light on its way to each surface, shape [n_surface, n_obstruction].
 
-    Light on its way to a mirror, a lens surface or the detector crosses the baffle planes before it: the ways to these
-    go with the way to that. Ways inside a lens, where the medium is not that in front of the telescope, are left out
-    unless an obstruction names where they lead.
+    Light on its way to a mirror, a lens surface or the detector crosses the baffle planes before it, which go with
+    that surface. Space inside a lens, where the medium is not that in front of the telescope, is left out unless an
+    obstruction names the surface behind it.
     """
     surfaces, obstructions = telescope.surfaces, telescope.obstructions
     blocked = np.zeros((len(surfaces), len(obstructions)), dtype=bool)

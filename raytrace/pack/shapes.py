@@ -21,21 +21,12 @@ from ..kernels.shape import BICONIC, GRID, ODD, PART_COLUMNS, POLAR, TOROID, Pac
 
 @dataclass(frozen=True)
 class SplitShape:
-    """A shape as a conic with even powers of the radius, and added parts.
+    """A shape as a conic with even powers of the radius, and added parts."""
 
-    Attributes
-    ----------
-    base : Rotational
-        Conic with even powers; a plane where the shape has none of its own.
-    parts : tuple of Shape
-        Shapes added to it; of an odd asphere only its powers.
-    first_curvature : float
-        Curvature [1/m] of the surface that the search for a ray's landing starts from: that of the base, or of the
-        sphere that a shape without a base resembles.
-    """
-
-    base: Rotational
-    parts: tuple[Shape, ...]
+    base: Rotational  #: conic with even powers; a plane where the shape has none of its own
+    parts: tuple[Shape, ...]  #: shapes added to it; of an odd asphere only its powers
+    #: Curvature [1/m] of the surface that the search for a ray's landing starts from: that of the base, or of the
+    #: sphere that a shape without a base resembles.
     first_curvature: float
 
 
@@ -68,10 +59,7 @@ def _flat(shape: Shape) -> Sequence[Shape]:
 def pack_deformations(shapes: Sequence[SplitShape], device: str = "cpu") -> Any:
     """Return the parts of all surfaces as a :class:`PackedDeformations` struct on a device.
 
-    Raises
-    ------
-    PrescriptionError
-        If a shape cannot be a part of a sum.
+    A shape that cannot be a part of a sum is a PrescriptionError.
     """
     span = np.zeros((len(shapes), 2), dtype=np.int32)
     rows: list[list[int]] = []
