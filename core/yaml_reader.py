@@ -62,19 +62,13 @@ def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> di
 
 def as_number(value: Any) -> float | None:
     """Return a finite float, or None where the value is not one."""
-    if isinstance(value, bool):
-        return None
-    if isinstance(value, str):
-        # YAML 1.1 reads 1e-9 (no point) as text; an optician means a number.
-        try:
-            value = float(value) if value.strip()[:1] in set("+-.0123456789") else None
-        except ValueError:
-            return None
-    if not isinstance(value, (int, float)):
+    # YAML 1.1 reads 1e-9 (no point) as text; an optician means a number.
+    text_of_number = isinstance(value, str) and value.strip()[:1] in set("+-.0123456789")
+    if isinstance(value, bool) or not (text_of_number or isinstance(value, (int, float))):
         return None
     try:
         number = float(value)
-    except OverflowError:
+    except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None
 

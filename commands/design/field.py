@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,11 +64,10 @@ def vignetting(
     from ...design.metrics.vignetting import vignetting as compute
 
     fields: Any = field_disc(given.telescope) if given.fields is None else given.fields
-    where = given.telescope, fields, given.wavelength
-    if rays * (len(fields) + 1) < _MANY_RAYS:
-        return Outcome(compute(*where, n_pupil=rays, **given.how), _vignetting_rows)
-    with given.stage("vignetting", len(fields) + 1) as progress:
-        return Outcome(compute(*where, n_pupil=rays, progress=progress, **given.how), _vignetting_rows)
+    parts = len(fields) + 1
+    with given.stage("vignetting", parts) if rays * parts >= _MANY_RAYS else nullcontext() as progress:
+        how = dict(n_pupil=rays, progress=progress, **given.how)
+        return Outcome(compute(given.telescope, fields, given.wavelength, **how), _vignetting_rows)
 
 
 def _vignetting_rows(result: Any) -> Rows:
@@ -142,10 +142,10 @@ def draw(
     from ...core.files import write_bytes
     from ...design.layout.layout import layout
 
-    if glb is None:
-        return Outcome(layout(*given.where, **given.how))
-    if glb.suffix.lower() != ".glb":
+    if glb is not None and glb.suffix.lower() != ".glb":
         raise ConfigError(f"--glb = {str(glb)!r}: expected a name that ends in .glb")
     result = layout(*given.where, **given.how)
+    if glb is None:
+        return Outcome(result)
     write_bytes(glb, result.glb())
     return Outcome(result, notes=[f"model: {glb.resolve()}"])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column
-from .command import Given, Outcome, Study, design_command
+from .command import Given, Study, design_command
 
 PupilPoints = Annotated[
     int | None, Option(min=16, max=4096, help="Lattice points across the pupil; enough by default.")
@@ -54,12 +54,11 @@ def psf(
 
     if huygens and pupil_points is not None:
         raise ConfigError("--huygens and --pupil-points: expected one of them")
-    how: dict[str, Any] = dict(pixel=None if pixel_um is None else pixel_um * 1e-6, pixels=pixels, **given.how)
+    compute = huygens_psf if huygens else fft_psf
+    pixel = None if pixel_um is None else pixel_um * 1e-6
     with given.stage("diffraction images", given.images) as progress:
-        if huygens:
-            result = huygens_psf(*given.where, progress=progress, **how)
-        else:
-            result = fft_psf(*given.where, n_pupil=pupil_points, progress=progress, **how)
+        how = dict(pixels=pixels, n_pupil=pupil_points, progress=progress, **given.how)
+        result = compute(*given.where, pixel=pixel, **how)
     if fits is not None:
         cards = [
             ("MODEL", result.telescope, "telescope"),
@@ -161,7 +160,7 @@ def ghosts(
     ] = None,
     detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
     rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
-) -> Outcome:
+) -> Study:
     """Trace every ghost that two reflections make: its light, irradiance, size and focus, the brightest first.
 
     **Examples**
@@ -173,11 +172,11 @@ def ghosts(
     from ...design.metrics.ghost_paths import ghost_pairs
     from ...design.metrics.ghosts import ghosts as compute
 
-    how: dict[str, Any] = dict(reflectivity=_reflectivities(reflectivity or []), **given.how)
+    lenses = _reflectivities(reflectivity or [])
     field = None if given.fields is None else given.fields[0]
     with given.stage("ghosts", max(len(ghost_pairs(given.telescope)), 1)) as progress:
-        how |= dict(detector_reflectivity=detector_reflectivity, n_pupil=rays, progress=progress)
-        return Outcome(compute(given.telescope, field, given.wavelength, **how))
+        how = dict(detector_reflectivity=detector_reflectivity, n_pupil=rays, progress=progress, **given.how)
+        return compute(given.telescope, field, given.wavelength, reflectivity=lenses, **how)
 
 
 def _reflectivities(texts: list[str]) -> float | dict[str, float] | None:
