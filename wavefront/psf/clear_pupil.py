@@ -30,24 +30,14 @@ class SpokePupil:
     """Points on rings and spokes, with the rule that integrates over the pupil.
 
     Along each spoke this is Gauss-Lobatto quadrature in the square of the radius, in which area is even; it has points
-    on both rims. Around, it is the trapezoidal rule.
-
-    Attributes
-    ----------
-    radius : ndarray, shape [n_ring]
-        Rising radii of the rings [m].
-    fraction : ndarray, shape [n_ring]
-        Fraction of the pupil's area within each ring.
-    quadrature : ndarray, shape [n_ring]
-        Weights of the rings, of sum 1.
-    unit : ndarray, shape [n_spoke, 2]
-        Directions of the spokes; a multiple of four, symmetric about both axes and the diagonals.
+    on both rims. Around, it is the trapezoidal rule. The number of spokes is a multiple of four, and they are symmetric
+    about both axes and the diagonals.
     """
 
-    radius: np.ndarray
-    fraction: np.ndarray
-    quadrature: np.ndarray
-    unit: np.ndarray
+    radius: np.ndarray  #: rising radii of the rings, [n_ring] m
+    fraction: np.ndarray  #: of the pupil's area within each ring, [n_ring]
+    quadrature: np.ndarray  #: weights of the rings, of sum 1, [n_ring]
+    unit: np.ndarray  #: directions of the spokes, [n_spoke, 2]
 
     @classmethod
     def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
@@ -87,33 +77,12 @@ class SpokePupil:
 def clear_edges(
     telescope: Telescope, direction: np.ndarray, unit: np.ndarray, wavelength: float, threads: int | None = None
 ) -> np.ndarray:
-    """Return the radii of the entrance pupil between which light passes all apertures.
+    """Return the radii of the entrance pupil between which light passes all apertures [m], shape [n_star, n_spoke, 2].
 
-    On each spoke the clear part is taken to be one piece, as it is where apertures are discs and rings about the light:
-    spiders, other apertures and obstructions are refused.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    direction : ndarray, shape [n_star, 3]
-        Directions in which the light travels.
-    unit : ndarray, shape [n_spoke, 2]
-        Directions of the spokes in the pupil.
-    wavelength : float
-        Vacuum wavelength [m].
-    threads : int, optional
-        Number of threads.
-
-    Returns
-    -------
-    ndarray, shape [n_star, n_spoke, 2]
-        Inner and outer radius [m]; equal where a spoke is dark.
-
-    Raises
-    ------
-    DomainError
-        If something other than discs and rings stops the light.
+    Inner and outer radius are equal where a spoke is dark. On each spoke of direction ``unit`` [n_spoke, 2] the clear
+    part is taken to be one piece, as it is where apertures are discs and rings about the light: spiders, other
+    apertures and obstructions are a :class:`DomainError`. ``direction`` [n_star, 3] is that in which the light travels,
+    the wavelength that in vacuum [m].
     """
     _check_rings(telescope)
     n_star, n_spoke = len(direction), len(unit)

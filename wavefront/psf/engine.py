@@ -29,48 +29,15 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, eq=False)
 class PsfInputs:
-    """Inputs of a PSF engine.
+    """Inputs of a PSF engine: checked arguments of :func:`.make_psfs`, and the tracer of the pupils.
 
-    Attributes
-    ----------
-    telescope : Telescope
-        The telescope.
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m].
-    plane : ImagePlane
-        Stamp and detector.
-    dispersion : ndarray, shape [n_wave, 2], optional
-        Shift in field angle of each wavelength [rad]; 0 by default.
-    focal_plane : FocalPlane, optional
-        CCD heights; the nominal flat plane by default.
-    atmosphere : Atmosphere, optional
-        The exposure; none outside the atmosphere.
-    aberration : ResidualWavefront, optional
-        Added to the traced wavefront.
-    projection : str
-        Meaning of the field angles.
-    threads : int, optional
-        Number of threads; all processors by default. No byte depends on it.
-    n_pupil : int, optional
-        Approximate number of pupil points (fast and long_exposure).
-    oversampling : int, optional
-        Cells of the fine grid per pixel (fast).
-    padding : bool, optional
-        Whether all baselines are kept, up to the diameter of the pupil (wave). By default they are where there is no
-        atmosphere or next to no charge diffusion.
-    pupil_spacing : float, optional
-        Distance of the pupil points [m] (wave). By default the image repeats itself outside the stamp only, and the
-        distance is at most :data:`.wave.LARGEST_SPACING`, or :data:`.wave.LARGEST_SPACING_OPTICS` without an
-        atmosphere.
-    trace : callable
-        Tracer of the pupils, with the signature of :func:`.pupil_optics.trace_pupils`. Another one gives optics of
-        known wavefront.
+    ``trace`` has the signature of :func:`.pupil_optics.trace_pupils`; another one gives optics of known wavefront.
     """
 
     telescope: Telescope
-    wavelengths: np.ndarray
+    wavelengths: np.ndarray  #: [n_wave] m
     plane: ImagePlane
-    dispersion: np.ndarray | None = None
+    dispersion: np.ndarray | None = None  #: [n_wave, 2] rad
     focal_plane: FocalPlane | None = None
     atmosphere: Atmosphere | None = None
     aberration: ResidualWavefront | None = None
@@ -85,24 +52,12 @@ class PsfInputs:
 
 @dataclass(frozen=True)
 class RenderedStars:
-    """Images of one batch of stars.
+    """Images of one batch of stars."""
 
-    Attributes
-    ----------
-    image : ndarray, shape [n_star, ny, nx]
-        Fraction of the light that reaches the focal plane in each pixel, float64; 0 for a dark star.
-    lit_fraction : ndarray, shape [n_star, n_wave]
-        Lit fraction of the pupil.
-    reference_point : ndarray, shape [n_star, 3]
-        Point of the CCD at the star's place on the stamp, telescope frame [m].
-    offset : ndarray, shape [n_star, 2]
-        Place (x, y) of the reference point from the centre of the middle pixel [pixels].
-    """
-
-    image: np.ndarray
-    lit_fraction: np.ndarray
-    reference_point: np.ndarray
-    offset: np.ndarray
+    image: np.ndarray  #: fraction of the light that reaches the focal plane, [n_star, ny, nx]; 0 for a dark star
+    lit_fraction: np.ndarray  #: of the pupil, [n_star, n_wave]
+    reference_point: np.ndarray  #: point of the CCD at the star's place on the stamp, telescope frame, [n_star, 3] m
+    offset: np.ndarray  #: place (x, y) of that point from the centre of the middle pixel, [n_star, 2] pixels
 
 
 class Exposed(NamedTuple):
@@ -116,36 +71,14 @@ class Exposed(NamedTuple):
 class PsfEngine(ABC):
     """Base of the PSF engines.
 
-    Parameters
-    ----------
-    inputs : PsfInputs
-        Telescope, detector, atmosphere and options.
-
-    Attributes
-    ----------
-    name : str
-        Name of the engine.
-    options : tuple of str
-        Members of :data:`OPTIONS` that the engine takes.
-    screens : tuple of str
-        Kinds of screens that the engine uses, as :meth:`.Atmosphere.screens` names them.
-    batch : int
-        Number of stars to render at a time.
-    focal_length : float
-        Effective focal length at the centre of the field [m].
-
-    Raises
-    ------
-    ConfigError
-        If an option is given that the engine does not take.
-    DomainError
-        If an option is outside its range.
+    An option that the engine does not take is a :class:`ConfigError`, one outside its range a :class:`DomainError`.
     """
 
     name: ClassVar[str]
-    options: ClassVar[tuple[str, ...]]
-    screens: ClassVar[tuple[str, ...]]
-    batch: int
+    options: ClassVar[tuple[str, ...]]  #: members of :data:`OPTIONS` that the engine takes
+    screens: ClassVar[tuple[str, ...]]  #: kinds of screens that it uses, as :meth:`.Atmosphere.screens` names them
+    batch: int  #: number of stars to render at a time
+    focal_length: float  #: effective one at the centre of the field [m]
 
     def __init__(self, inputs: PsfInputs) -> None:
         for option in OPTIONS:
@@ -172,20 +105,10 @@ class PsfEngine(ABC):
         """Carry the light of stars to the focal plane."""
 
     def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
-        """Render one batch of stars.
+        """Render one batch of stars at field angles [n_star, 2] [rad].
 
-        Parameters
-        ----------
-        fields : ndarray, shape [n_star, 2]
-            Field angles [rad].
-        offsets : ndarray, shape [n_star, 2]
-            Places of the reference points from the centre of the middle pixel [pixels].
-        recenter : callable, optional
-            Centroids of given stamps [pixels]. The stars are drawn once more, with their centroids at the centre.
-
-        Returns
-        -------
-        RenderedStars
+        ``offsets`` [n_star, 2] are the places of the reference points from the centre of the middle pixel [pixels].
+        With ``recenter`` the stars are drawn once more, with their centroids at the centre.
         """
         stars = self._expose(fields, offsets)
         image = stars.draw(None)
@@ -224,19 +147,7 @@ def center_focal_length(
     threads: int | None = None,
     trace: Callable[..., PupilOptics] = trace_pupils,
 ) -> float:
-    """Return the effective focal length at the centre of the field [m].
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    wavelengths : ndarray, shape [n_wave]
-        Vacuum wavelengths [m], of which the middle one counts.
-    threads : int, optional
-        Number of threads.
-    trace : callable
-        Tracer of the pupils, as in :class:`PsfInputs`.
-    """
+    """Return the effective focal length at the centre of the field [m], at the middle wavelength."""
     center = np.zeros((1, 2))
     return float(focal_length(trace(telescope, center, wavelengths, center, threads=threads).jacobian)[0])
 

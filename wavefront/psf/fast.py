@@ -52,23 +52,9 @@ _TABLE_SIZE = 4096
 
 
 def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: float, cutoff: float) -> np.ndarray:
-    """Return the structure function of the filter, beside rays through the low modes.
+    """Return the structure function of the filter, beside rays through the low modes; path squared [m^2], not falling.
 
-    Parameters
-    ----------
-    separation : ndarray
-        Rising baselines in the pupil [m].
-    r0 : float
-        Fried parameter at 500 nm [m].
-    outer_scale : float
-        Outer scale [m].
-    cutoff : float
-        Cut-off wavenumber of the low modes [rad/m].
-
-    Returns
-    -------
-    ndarray
-        Path squared [m^2], not falling, shape of ``separation``.
+    Separations are rising baselines in the pupil [m]; the low modes are those up to the cut-off [rad/m].
     """
     rest = structure_function(separation, r0, outer_scale)
     rest = rest - slope_variance(r0, outer_scale, cutoff, SLOPE_LAG) * separation**2
@@ -157,9 +143,7 @@ class FastPsfEngine(PsfEngine):
         light = optics.lit * self._weights
         deposit = self._deposit(optics, light)
         # One transform a star, so that its bytes do not depend on its neighbours.
-        spectra = np.empty((*deposit.shape[:-1], self._grid_size // 2 + 1), dtype=np.complex64)
-        self._map(lambda star: np.copyto(spectra[star], scipy.fft.rfft2(deposit[star])), range(len(fields)))
-        combined = self._combine(spectra, optics, offsets)
+        combined = self._combine(np.stack(self._map(scipy.fft.rfft2, deposit)), optics, offsets)
         n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
         # A dark star has no light to divide by.
         total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * n_time
@@ -177,16 +161,11 @@ class FastPsfEngine(PsfEngine):
 
     def _stamps(self, combined: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Return the stamps of transforms of the fine grid as fractions of each star's light, [n_star, side, side]."""
-        n, side = self._grid_size, self._plane.stamp_size
-        span = slice(0, side * self._oversampling, self._oversampling)
-        stamps = np.empty((len(combined), side, side))
-        self._map(
-            lambda star: np.copyto(stamps[star], scipy.fft.irfft2(combined[star], s=(n, n))[span, span]),
-            range(len(combined)),
-        )
+        grid = (self._grid_size, self._grid_size)
+        span = slice(0, self._plane.stamp_size * self._oversampling, self._oversampling)
+        stamps = self._map(lambda star: scipy.fft.irfft2(star, s=grid)[span, span].astype(np.float64), combined)
         # The transform gave light per cell; a pixel, averaged over already, holds so many cells.
-        stamps *= (self._oversampling**2 / light)[:, None, None]
-        return stamps
+        return np.stack(stamps) * (self._oversampling**2 / light)[:, None, None]
 
     def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
         """Return the rays of each star, with their light, on the fine grid, [n_star, n_wave, grid_size, grid_size]."""

@@ -17,34 +17,21 @@ from ...core.errors import DomainError
 
 @dataclass(frozen=True)
 class ImagePlane:
-    """The pixels of a stamp and the detector behind them.
+    """The pixels of a stamp and the detector behind them."""
 
-    Attributes
-    ----------
-    stamp_size : int
-        Pixels on a side.
-    pixel_size : float
-        Side of a square pixel [m].
-    diffusion : float
-        Root mean square of the charge diffusion along each axis [m].
-    jitter : float
-        Root mean square along each axis of how far the pointing of the telescope moves images during an exposure [m].
-    """
-
-    stamp_size: int
-    pixel_size: float
-    diffusion: float
-    jitter: float = 0.0
+    stamp_size: int  #: pixels on a side
+    pixel_size: float  #: side of a square pixel [m]
+    diffusion: float  #: rms along each axis of the charge diffusion [m]
+    jitter: float = 0.0  #: rms along each axis of how far the telescope's pointing moves images during an exposure [m]
 
     def __post_init__(self) -> None:
         if int(self.stamp_size) != self.stamp_size or self.stamp_size < 3:
             raise DomainError(f"stamp_size = {self.stamp_size!r}: expected a whole number of at least 3 pixels")
         if not (math.isfinite(self.pixel_size) and self.pixel_size > 0.0):
             raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
-        if not (math.isfinite(self.diffusion) and self.diffusion >= 0.0):
-            raise DomainError(f"diffusion = {self.diffusion!r}: expected a length in metres from 0")
-        if not (math.isfinite(self.jitter) and self.jitter >= 0.0):
-            raise DomainError(f"jitter = {self.jitter!r}: expected a length in metres from 0")
+        for name, rms in (("diffusion", self.diffusion), ("jitter", self.jitter)):
+            if not (math.isfinite(rms) and rms >= 0.0):
+                raise DomainError(f"{name} = {rms!r}: expected a length in metres from 0")
 
     @property
     def side(self) -> float:
@@ -64,15 +51,7 @@ class ImagePlane:
     def transfer(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
         """Return the transfer function of a square pixel, Gaussian charge diffusion and Gaussian pointing jitter.
 
-        Parameters
-        ----------
-        kx, ky : ndarray
-            Wavenumbers on the focal plane [rad/m], broadcast against each other.
-
-        Returns
-        -------
-        ndarray
-            Real factor of each wavenumber, 1 at zero.
+        It is real, and 1 at zero; wavenumbers on the focal plane [rad/m] are broadcast against each other.
         """
         variance = self.diffusion**2 + self.jitter**2
         return square_transfer(kx, ky, self.pixel_size) * np.exp(-0.5 * variance * (kx * kx + ky * ky))

@@ -54,14 +54,8 @@ _TABLE_SIZE = 2048
 class LongExposureEngine(PsfEngine):
     """Mean over all turbulence.
 
-    The atmosphere gives the Fried parameter and the outer scale; its screens are not made.
-
-    Raises
-    ------
-    ConfigError
-        If there is no atmosphere.
-    DomainError
-        If ``n_pupil`` is too small, or the turbulence so weak that long baselines matter.
+    The atmosphere gives the Fried parameter and the outer scale; its screens are not made. No atmosphere is a
+    :class:`ConfigError`; too few points, or turbulence so weak that long baselines matter, a :class:`DomainError`.
     """
 
     name = "long_exposure"
@@ -81,15 +75,13 @@ class LongExposureEngine(PsfEngine):
         self._width = 0.5 * self._diameter * (1.0 - self._obscuration)
         #: Side of the periodic image [m].
         self.period = GRID_MARGIN * self._plane.side
+        # Baseline of one step of frequency at each wavelength [m].
+        self._step = self._wavelengths * self.focal_length / self.period
         self._choose_frequencies()
         self._tabulate_filter()
         self._tabulate_pixels()
         star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points)
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
-
-    def _baselines(self) -> np.ndarray:
-        """Return the baseline of one step of frequency at each wavelength [m], shape [n_wave]."""
-        return self._wavelengths * self.focal_length / self.period
 
     def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
         """Return the mean transfer function of the atmosphere at baselines [m], shape [n_wave, n]."""
@@ -97,8 +89,7 @@ class LongExposureEngine(PsfEngine):
 
     def _choose_frequencies(self) -> None:
         """Choose the largest frequency of the sums."""
-        width = self._width
-        step = self._baselines()
+        width, step = self._width, self._step
         largest = math.ceil(width / step.min())
         count = np.arange(1, largest + 1)
         k = 2.0 * math.pi / self.period * count
@@ -119,7 +110,7 @@ class LongExposureEngine(PsfEngine):
     def _tabulate_filter(self) -> None:
         """Tabulate the filter of the points and strips of the pupil: the atmosphere, and the overlap of strips."""
         # 1.5: to the corner of the grid of frequencies, and some room for a scale that changes over the field
-        baseline = np.linspace(0.0, 1.5 * self._reach * self._baselines().max(), _TABLE_SIZE)
+        baseline = np.linspace(0.0, 1.5 * self._reach * self._step.max(), _TABLE_SIZE)
         # Strips as wide as half the baseline overlap a little: to third order in the baseline, less than 1e-3.
         ring = np.minimum(baseline, self._width)
         overlap = diffraction_otf(ring, self._diameter, self._obscuration) / (
@@ -173,18 +164,14 @@ class LongExposureEngine(PsfEngine):
         n_star, n_wave, n_point = optics.lit.shape
         n_row, n_packet = self._detector.shape[1:3]
         landed = np.isfinite(optics.displacement).all(axis=(1, 3)).astype(np.float64)
-        place = np.empty((n_star, n_wave, 2, n_point), dtype=np.float32)
-        light = np.empty((n_star, n_point), dtype=np.float32)
-        cut = np.empty((n_star, 2 * pupil.n_spoke, 2), dtype=np.float32)
-        lean = np.empty((n_star, n_wave, 2 * pupil.n_spoke, 2), dtype=np.float32)
+        # Place and light of the points, cut and lean of the strips along the rims.
+        shapes = (n_wave, 2, n_point), (n_point,), (2 * pupil.n_spoke, 2), (n_wave, 2 * pupil.n_spoke, 2)
+        points = [wp.empty((n_star, *shape), dtype=wp.float32, device="cpu") for shape in shapes]
         launch(
             place_points,
             n_star * pupil.n_spoke,
             [
-                warp_array(pupil.radius, wp.float64),
-                warp_array(pupil.inverse, wp.float64),
-                warp_array(pupil.fraction, wp.float64),
-                warp_array(pupil.quadrature, wp.float64),
+                *(warp_array(rule) for rule in (pupil.radius, pupil.inverse, pupil.fraction, pupil.quadrature)),
                 warp_array(pupil.unit, wp.vec2d),
                 warp_array(edges, wp.float64),
                 warp_array(optics.displacement, wp.float32),
@@ -193,10 +180,7 @@ class LongExposureEngine(PsfEngine):
                 warp_array(self._dispersion, wp.vec2d),
                 self.period,
                 warp_array(area, wp.float64),
-                warp_array(place, wp.float32),
-                warp_array(light, wp.float32),
-                warp_array(cut, wp.float32),
-                warp_array(lean, wp.float32),
+                *points,
             ],
             threads=self._threads,
         )
@@ -207,10 +191,7 @@ class LongExposureEngine(PsfEngine):
             n_star,
             [
                 pupil.n_spoke,
-                warp_array(place, wp.float32),
-                warp_array(light, wp.float32),
-                warp_array(cut, wp.float32),
-                warp_array(lean, wp.float32),
+                *points,
                 warp_array(self._wavelengths.astype(np.float32), wp.float32),
                 warp_array(self._rows, wp.int32),
                 warp_array(metric_of(optics.jacobian), wp.float32),

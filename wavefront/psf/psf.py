@@ -125,8 +125,16 @@ def make_psfs(
     dispersion : array_like or Quantity, shape [n_wave, 2], optional
         Shift in field angle of each wavelength by the atmosphere [rad], such as
         :func:`~pachon.wavefront.atmosphere.refraction.dispersion_shift` gives.
-    n_pupil, oversampling, padding, pupil_spacing : optional
-        Options of some engines, as in :class:`~pachon.wavefront.psf.engine.PsfInputs`.
+    n_pupil : int, optional
+        Approximate number of pupil points (fast and long_exposure).
+    oversampling : int, optional
+        Cells of the fine grid per pixel (fast).
+    padding : bool, optional
+        Whether all baselines are used, up to the diameter of the pupil (wave). By default they are where there is no
+        atmosphere or next to no charge diffusion.
+    pupil_spacing : float, optional
+        Distance of the pupil points [m] (wave). By default the image repeats itself outside the stamp only, and the
+        distance is at most 0.02 m, or 0.04 m without an atmosphere.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     threads : int, optional
@@ -187,11 +195,8 @@ def make_psfs(
         stars = maker.render(angles[part], places[part], centroids)
         inside[part] = stars.image.sum(axis=(1, 2))
         image[part] = stars.image / np.where(inside[part] > 0.0, inside[part], 1.0)[:, None, None]
-        lit_fraction[part], reference_point[part], offset[part] = (
-            stars.lit_fraction,
-            stars.reference_point,
-            stars.offset,
-        )
+        lit_fraction[part], reference_point[part] = stars.lit_fraction, stars.reference_point
+        offset[part] = stars.offset
         if progress is not None:
             progress(part.stop - first)
     return Psfs(
@@ -223,10 +228,8 @@ def _table(values: Any, name: str, count: int | None) -> np.ndarray:
         table = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DomainError(f"{name} = {values!r}: expected pairs of numbers") from error
-    if count is None and table.size:
-        table = np.atleast_2d(table)
-    if count is None and not table.size:
-        table = table.reshape(0, 2)
+    if count is None:
+        table = np.atleast_2d(table) if table.size else table.reshape(0, 2)
     if table.ndim != 2 or table.shape[1] != 2 or (count is not None and len(table) != count):
         expected = f"[{'n' if count is None else count}, 2]"
         raise DomainError(f"{name} of shape {table.shape}: expected {expected}")

@@ -14,21 +14,12 @@ class PupilLattice:
 
     The gradient of the low screens has no modes beyond the cut-off, so on a lattice finer than half their wavelength
     sums over the pupil of the gradient and its squares are exact but for the rim; random points would be noisier.
-
-    Attributes
-    ----------
-    spacing : float
-        Distance of neighbouring points [m].
-    column, row : ndarray of int, shape [n_pupil]
-        Indices of the points, from the first column and row.
-    origin : float
-        Coordinate of the first column and row [m].
     """
 
-    spacing: float
-    column: np.ndarray
-    row: np.ndarray
-    origin: float
+    spacing: float  #: distance of neighbouring points [m]
+    column: np.ndarray  #: of each point, counted from the first column, [n_pupil] int
+    row: np.ndarray  #: of each point, counted from the first row, [n_pupil] int
+    origin: float  #: coordinate of the first column and row [m]
 
     @classmethod
     def fill(cls, diameter: float, obscuration: float, spacing: float) -> PupilLattice:
@@ -55,17 +46,7 @@ class PupilLattice:
 
         A rim that cuts through a coarse lattice leaves its points a little too far in or out; of all weights under
         which every monomial of the coordinates up to the fourth order has its mean over the annulus, these are nearest
-        to 1.
-
-        Parameters
-        ----------
-        diameter, obscuration : float
-            The annulus that the lattice fills: outer diameter [m], and inner over outer.
-
-        Returns
-        -------
-        ndarray
-            Shape [n_pupil].
+        to 1. The annulus is the one that the lattice fills.
         """
         x, y = self.points.T / (0.5 * diameter)
         # The mean of x^a y^b: over the angle (a-1)!! (b-1)!! / (a+b)!! for even a and b, over the radius r^(a+b).

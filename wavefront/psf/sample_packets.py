@@ -15,16 +15,9 @@ indices = wp.types.vector(LANES, wp.int32)
 
 
 def to_packets(values: np.ndarray, dtype: Any, fill: str = "edge") -> np.ndarray:
-    """Return values as whole packets, shape [..., n_packet, LANES], contiguous.
+    """Return values [..., n], one per pupil point, as whole packets [..., n_packet, LANES], contiguous.
 
-    Parameters
-    ----------
-    values : ndarray, shape [..., n]
-        One number per pupil point.
-    dtype : numpy dtype
-        Type of the packets.
-    fill : {"edge", "constant"}
-        Filling of the last packet: copies of the last value, or zeros.
+    The last packet is filled up with copies of the last value (``"edge"``) or with zeros (``"constant"``).
     """
     missing = -values.shape[-1] % LANES
     padding = [(0, 0)] * (values.ndim - 1) + [(0, missing)]
