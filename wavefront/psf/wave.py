@@ -41,7 +41,7 @@ from ..pupil_optics import PupilOptics
 from .engine import Exposed, PsfEngine, PsfInputs
 from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
-from .wave_kernels import add_squares, pupil_fields
+from .wave_kernels import Screens, Taps, add_squares, pupil_fields
 
 #: Longest baseline [m] that an unpadded grid keeps.
 LONGEST_BASELINE = 1.5
@@ -102,12 +102,12 @@ class WavePsfEngine(PsfEngine):
         spans = np.ceil(self._steps * self._packets * LANES) + 5
         self._runs = tuple(int(-(-span // LANES)) for span in spans)
 
-    def _screen_arguments(self) -> tuple[list[Any], int]:
-        """Return the screens as the kernel takes them, and the number of layers."""
-        arguments: list[Any] = []
-        for screens, side, run in zip(self._splines, self._sides, self._runs, strict=True):
-            arguments += [warp_array(screens, wp.float32), int(side), run]
-        return arguments, 0 if self._atmosphere is None else self._atmosphere.layer_count
+    def _packed_screens(self) -> list[Any]:
+        """Return the low and the high screens as the kernel takes them."""
+        packed = [Screens(), Screens()]
+        for screens, values, size, run in zip(packed, self._splines, self._sides, self._runs, strict=True):
+            screens.values, screens.size, screens.run = warp_array(values, wp.float32), int(size), run
+        return packed
 
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
         optics, spectra = zip(*self._map(self._expose_star, fields), strict=True)
@@ -141,7 +141,7 @@ class WavePsfEngine(PsfEngine):
         used = np.asarray(amplitude.any(axis=(0, 3)), dtype=np.int32)
         fields = np.zeros((n_wave, size, size), dtype=np.complex64)
         squares = [wp.zeros(2 * size * size // LANES, dtype=samples, device="cpu") for _ in range(n_wave)]
-        screens, n_layer = self._screen_arguments()
+        screens, n_layer = self._packed_screens(), 0 if self._atmosphere is None else self._atmosphere.layer_count
         after: list[Any] = [
             warp_array(used, wp.int32),
             warp_array((1.0 / self._wavelengths).astype(np.float32), wp.float32),
@@ -153,7 +153,7 @@ class WavePsfEngine(PsfEngine):
         ]
         steps = self._screen_places(field)
         for places in steps:
-            launch(pupil_fields, line, [*screens, n_layer, *self._taps(places), *after], threads=1)
+            launch(pupil_fields, line, [*screens, n_layer, self._taps(places), *after], threads=1)
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
                 launch(add_squares, len(focused), [warp_array(focused, samples), squares[wave]], threads=1)
@@ -179,7 +179,7 @@ class WavePsfEngine(PsfEngine):
         both = np.stack([corner / atmosphere.screen_pixel, corner / atmosphere.fine_pixel], axis=-2)
         return both.reshape(len(atmosphere.times), -1, 2)
 
-    def _taps(self, places: np.ndarray) -> list[Any]:
+    def _taps(self, places: np.ndarray) -> Any:
         """Return the samples of the screens around the lattice points at one time, and their weights."""
         sides, steps = np.tile(self._sides, len(places) // 2), np.tile(self._steps, len(places) // 2)
         start = places - sides[:, None] * np.floor(places / sides[:, None])
@@ -193,14 +193,12 @@ class WavePsfEngine(PsfEngine):
         column = (first[:, 0] - 1) % sides
         row = (first[:, 1, None] + sample[:, 1]) % sides[:, None]
         packed = (len(places), self._packets, LANES)
-        of_columns = np.ascontiguousarray(np.moveaxis(weights[:, 0].reshape(*packed, 4), -1, 1))
-        return [
-            warp_array(np.ascontiguousarray(column, dtype=np.int32), wp.int32),
-            warp_array(np.ascontiguousarray(row, dtype=np.int32), wp.int32),
-            warp_array(np.ascontiguousarray(weights[:, 1]), wp.vec4f),
-            warp_array(np.ascontiguousarray(sample[:, 0].reshape(packed)), indices),
-            warp_array(of_columns, samples),
-        ]
+        taps = Taps()
+        taps.column, taps.row = warp_array(column, wp.int32), warp_array(row, wp.int32)
+        taps.row_weight = warp_array(weights[:, 1], wp.vec4f)
+        taps.sample = warp_array(sample[:, 0].reshape(packed), indices)
+        taps.column_weight = warp_array(np.moveaxis(weights[:, 0].reshape(*packed, 4), -1, 1), samples)
+        return taps
 
     def _filtered(self, intensity: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
         """Return the OTF times the transfer function of the detector, shape [n_wave, baseline y, baseline x]."""

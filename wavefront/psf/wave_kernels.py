@@ -11,86 +11,95 @@ from .sample_packets import LANES, indices, samples
 wp.set_module_options(FORWARD_OPTIONS)
 
 
+@wp.struct
+class Screens:
+    """Path of all layers at one scale [m], as coefficients of periodic cubic B-splines.
+
+    ``values`` [layer, y * size + x]; a row of the pupil spans ``run`` packets of a row.
+    """
+
+    values: wp.array2d(dtype=wp.float32)
+    size: wp.int32
+    run: wp.int32
+
+
+@wp.struct
+class Taps:
+    """Samples about the lattice points at one time on all screens, counted layer by layer, low before high.
+
+    ``column`` [screen]: first column of the run; ``row`` and ``row_weight`` [screen, item]: second of the four rows
+    about a row of the pupil, and their weights; ``sample`` [screen, packet]: first of the four columns about a point,
+    counted along the run; ``column_weight`` [screen, 4, packet].
+    """
+
+    column: wp.array(dtype=wp.int32)
+    row: wp.array2d(dtype=wp.int32)
+    row_weight: wp.array2d(dtype=wp.vec4f)
+    sample: wp.array2d(dtype=indices)
+    column_weight: wp.array3d(dtype=samples)
+
+
 @wp.func
-def blend(
-    screens: wp.array2d(dtype=wp.float32),
-    layer: wp.int32,
-    weight: wp.vec4f,
-    before: wp.int32,
-    first: wp.int32,
-    second: wp.int32,
-    after: wp.int32,
-    column: wp.int32,
-):
+def blend(screens: Screens, layer: wp.int32, weight: wp.vec4f, rows: wp.vec4i, column: wp.int32):
     """Weighted sum of one column of four rows, each given by its first sample."""
     return (
-        weight[0] * screens[layer, before + column]
-        + weight[1] * screens[layer, first + column]
-        + weight[2] * screens[layer, second + column]
-        + weight[3] * screens[layer, after + column]
+        weight[0] * screens.values[layer, rows[0] + column]
+        + weight[1] * screens.values[layer, rows[1] + column]
+        + weight[2] * screens.values[layer, rows[2] + column]
+        + weight[3] * screens.values[layer, rows[3] + column]
     )
 
 
 @wp.func
 def blend_rows(
-    screens: wp.array2d(dtype=wp.float32),
+    screens: Screens,
     layer: wp.int32,
-    size: wp.int32,
     row: wp.int32,
     weight: wp.vec4f,
     column: wp.int32,
-    packets: wp.int32,
     item: wp.int32,
     blended: wp.array2d(dtype=wp.float32),
 ):
-    """Interpolate a periodic screen of cubic B-spline coefficients in y, along a run of columns.
+    """Interpolate a screen in y along a run of columns.
 
     ``row`` is the second of the four rows that ``weight`` belongs to, ``column`` the first of the run.
     """
-    before = ((row + size - 1) % size) * size
-    first = row * size
-    second = ((row + 1) % size) * size
-    after = ((row + 2) % size) * size
-    for packet in range(packets):
+    size = screens.size
+    rows = wp.vec4i(((row + size - 1) % size) * size, row * size, ((row + 1) % size) * size, ((row + 2) % size) * size)
+    for packet in range(screens.run):
         values = samples()
         start = column + packet * LANES
         # Two loops in place of one with a choice inside: the compiler vectorizes the first.
         if start + LANES <= size:
             for i in range(LANES):
-                values[i] = blend(screens, layer, weight, before, first, second, after, start + i)
+                values[i] = blend(screens, layer, weight, rows, start + i)
         else:
             for i in range(LANES):
-                values[i] = blend(screens, layer, weight, before, first, second, after, (start + i) % size)
+                values[i] = blend(screens, layer, weight, rows, (start + i) % size)
         for i in range(LANES):
             blended[item, packet * LANES + i] = values[i]
 
 
 @wp.func
 def lay_row(
-    screens: wp.array2d(dtype=wp.float32),
+    screens: Screens,
     layer: wp.int32,
-    size: wp.int32,
     scale: wp.int32,
     item: wp.int32,
-    column: wp.array(dtype=wp.int32),
-    row: wp.array2d(dtype=wp.int32),
-    row_weight: wp.array2d(dtype=wp.vec4f),
-    sample: wp.array2d(dtype=indices),
-    column_weight: wp.array3d(dtype=samples),
-    run: wp.int32,
+    taps: Taps,
     lit: wp.array2d(dtype=wp.int32),
     blended: wp.array2d(dtype=wp.float32),
     path: wp.array2d(dtype=samples),
 ):
     """Add one screen to the path along one row of the pupil; ``scale`` counts the screens of both scales."""
-    blend_rows(screens, layer, size, row[scale, item], row_weight[scale, item], column[scale], run, item, blended)
+    blend_rows(screens, layer, taps.row[scale, item], taps.row_weight[scale, item], taps.column[scale], item, blended)
     for packet in range(path.shape[1]):
         if lit[item, packet] == 1:
-            at = sample[scale, packet]
-            before = column_weight[scale, 0, packet]
-            first = column_weight[scale, 1, packet]
-            second = column_weight[scale, 2, packet]
-            after = column_weight[scale, 3, packet]
+            at = taps.sample[scale, packet]
+            before = taps.column_weight[scale, 0, packet]
+            first = taps.column_weight[scale, 1, packet]
+            second = taps.column_weight[scale, 2, packet]
+            after = taps.column_weight[scale, 3, packet]
             here = samples()
             for i in range(LANES):
                 k = at[i]
@@ -106,18 +115,10 @@ def lay_row(
 @wp.kernel
 def pupil_fields(
     first: wp.int32,
-    low: wp.array2d(dtype=wp.float32),
-    low_size: wp.int32,
-    low_run: wp.int32,
-    high: wp.array2d(dtype=wp.float32),
-    high_size: wp.int32,
-    high_run: wp.int32,
+    low: Screens,
+    high: Screens,
     n_layer: wp.int32,
-    column: wp.array(dtype=wp.int32),
-    row: wp.array2d(dtype=wp.int32),
-    row_weight: wp.array2d(dtype=wp.vec4f),
-    sample: wp.array2d(dtype=indices),
-    column_weight: wp.array3d(dtype=samples),
+    taps: Taps,
     lit: wp.array2d(dtype=wp.int32),
     turns_per_meter: wp.array(dtype=wp.float32),
     optics: wp.array3d(dtype=samples),
@@ -131,52 +132,16 @@ def pupil_fields(
     The pupil is a square lattice along the axes of the screens, so interpolation is done row by row: first between the
     rows of a screen, then along the row so gained.
 
-    Arguments: low, high [layer, y * size + x]: spline coefficients of path [m], of which a row of the pupil spans
-    ``run`` packets; screens are counted layer by layer, low before high: column [screen]: first column of the run; row
-    [screen, item] and row_weight [screen, item]: second of the four rows about a row of the pupil, and their weights;
-    sample [screen, packet]: first of the four columns about a point, counted along the run; column_weight
-    [screen, 4, packet]; lit [item, packet]: 1 where a packet holds light; turns_per_meter [wave]; optics
-    [wave, item, packet]: phase [turns]; amplitude [wave, item, packet]; blended [item, column], path [item, packet]:
-    room for a row of a screen and for the path [m]; field [wave, y, x], of which the pupil fills the first corner.
+    Arguments: lit [item, packet]: 1 where a packet holds light; turns_per_meter [wave]; optics [wave, item, packet]:
+    phase [turns]; amplitude [wave, item, packet]; blended [item, column], path [item, packet]: room for a row of a
+    screen and for the path [m]; field [wave, y, x], of which the pupil fills the first corner.
     """
     item = first + wp.tid()
     for packet in range(path.shape[1]):
         path[item, packet] = samples()
     for layer in range(n_layer):
-        scale = 2 * layer
-        lay_row(
-            low,
-            layer,
-            low_size,
-            scale,
-            item,
-            column,
-            row,
-            row_weight,
-            sample,
-            column_weight,
-            low_run,
-            lit,
-            blended,
-            path,
-        )
-        scale = scale + 1
-        lay_row(
-            high,
-            layer,
-            high_size,
-            scale,
-            item,
-            column,
-            row,
-            row_weight,
-            sample,
-            column_weight,
-            high_run,
-            lit,
-            blended,
-            path,
-        )
+        lay_row(low, layer, 2 * layer, item, taps, lit, blended, path)
+        lay_row(high, layer, 2 * layer + 1, item, taps, lit, blended, path)
     for packet in range(path.shape[1]):
         if lit[item, packet] == 1:
             for wave in range(turns_per_meter.shape[0]):
