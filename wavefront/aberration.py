@@ -14,9 +14,8 @@ decentre brings coma that is constant over the field, a tilted camera defocus th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,10 +47,8 @@ class ResidualWavefront:
     coefficients : ndarray, shape [n_term]
         OPD of the Noll terms j = 4, 5, ... on the axis [m]: positive where the wavefront leads, as
         :func:`~pachon.wavefront.zernike.fit_zernikes` gives them.
-    pupil_diameter : float
-        Outer diameter of the entrance pupil [m].
-    pupil_obscuration : float
-        Inner over outer diameter.
+    pupil_diameter, pupil_obscuration : float
+        Outer diameter of the entrance pupil [m], and its inner over its outer diameter.
     field_gradient : ndarray, shape [n_term, 2], optional
         Change of the coefficients along the field slopes x and y [m/rad]; none by default.
     """
@@ -85,7 +82,7 @@ class ResidualWavefront:
     def draw(
         cls,
         telescope: Telescope,
-        rms: Any = PAPER_RMS,
+        rms: ArrayLike = PAPER_RMS,
         seed: int = 0,
         epoch: int = 0,
         *,
@@ -101,7 +98,7 @@ class ResidualWavefront:
         Parameters
         ----------
         telescope : Telescope
-            The telescope, whose pupil and field radius are taken.
+            Telescope with the pupil and the field radius.
         rms : float or Quantity
             Root mean square of the OPD over pupil, field of view and exposures [m], 0 to 2 um; 0.2 um in the paper.
         seed : int
@@ -146,12 +143,11 @@ class ResidualWavefront:
 
     def at(self, slopes: ArrayLike) -> np.ndarray:
         """Return the coefficients [m] at field slopes [..., 2] of the light's travel, shape [..., n_term]."""
-        place = np.asarray(slopes, dtype=np.float64)
-        gradient = self.field_gradient
-        return self.coefficients + place[..., :1] * gradient[:, 0] + place[..., 1:] * gradient[:, 1]
+        tx, ty = np.split(np.asarray(slopes, dtype=np.float64), 2, axis=-1)
+        return self.coefficients + tx * self.field_gradient[:, 0] + ty * self.field_gradient[:, 1]
 
     def opd(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
-        """Return the OPD over the pupil, of mean zero over the annulus.
+        """Return the OPD [m] over the pupil, of mean zero over the annulus, positive where the wavefront leads.
 
         Parameters
         ----------
@@ -163,20 +159,15 @@ class ResidualWavefront:
         Returns
         -------
         ndarray, shape [..., n_pupil]
-            OPD [m], positive where the wavefront leads.
         """
         return _combined(self.at(slopes), self._basis(annular_zernikes, x, y))
 
     def gradient(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
-        """Return the derivatives of the OPD along the pupil's x and y [rad], shape [..., n_pupil, 2].
-
-        Arguments are those of :meth:`opd`.
-        """
-        radius = 0.5 * self.pupil_diameter
-        basis = self._basis(annular_zernike_gradients, x, y) / radius
+        """Return the derivatives of :meth:`opd` along x and y of the pupil [rad], shape [..., n_pupil, 2]."""
+        basis = self._basis(annular_zernike_gradients, x, y) / (0.5 * self.pupil_diameter)
         return _combined(self.at(slopes), np.moveaxis(basis, 1, -1))
 
-    def _basis(self, terms: Any, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+    def _basis(self, terms: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the terms or their derivatives from j = 4 on."""
         radius = 0.5 * self.pupil_diameter
         return terms(3 + len(self.coefficients), np.divide(x, radius), np.divide(y, radius), self.pupil_obscuration)[3:]

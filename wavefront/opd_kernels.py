@@ -1,6 +1,6 @@
-"""Kernel that traces the pupil of many field points and keeps the optical path differences alone.
+"""Kernel that traces the pupil of many field points and stores nothing but optical path differences.
 
-A module of its own: with one caller of the surface loop in a module the compiler inlines all of it.
+Its module has no other kernel: the compiler inlines the surface loop where it has one caller in a module.
 """
 
 from __future__ import annotations
@@ -43,11 +43,10 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
     ):
         """Trace one packet of the pupil for one field point: item ``i`` of the work is field ``i // n_packets``.
 
-        ``place`` is the column of ``value`` that belongs to each lane (-1: none). ``start`` [field, 3] is empty for
-        light that comes from infinity along ``direction`` [field, 3], else the point that it comes from. ``sphere``
-        [field, 4]: centre of the reference sphere, and optical path of its chief ray to it. ``value`` is that path less
-        the ray's; it is not written where the ray is not lit, and may be empty. ``lit`` [item] counts the lanes of the
-        packet that are.
+        ``place``: column of ``value`` for each lane (-1: none). ``direction`` [field, 3], or ``start`` [field, 3] where
+        it is not empty: directions of light from infinity, points of the object otherwise. ``sphere`` [field, 4]:
+        centre of the reference sphere, and path of the chief ray to it. ``value`` [field, pupil] is that path less the
+        ray's where the ray is lit; it may be empty. ``lit`` [item]: number of lit lanes of the packet.
         """
         item = work[first + wp.tid()]
         n_packets = pupil.shape[1]
@@ -73,18 +72,7 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
             dv = wp.cw_mul(scale, dv)
             dw = wp.cw_mul(scale, dw)
         x, y, z, u, v, w, path, status = through_telescope(
-            surfaces,
-            indices,
-            0,
-            x,
-            y,
-            z,
-            du,
-            dv,
-            dw,
-            lanes(ZERO),
-            p,
-            no_rays,
+            surfaces, indices, 0, x, y, z, du, dv, dw, lanes(ZERO), p, no_rays
         )
         count = wp.int32(0)
         for i in range(LANES):

@@ -1,4 +1,4 @@
-"""Optical path differences over the entrance pupil, their Zernike terms, and the plot of both."""
+"""Maps of the optical path difference over the entrance pupil, their Zernike terms, and the plot of both."""
 
 from __future__ import annotations
 
@@ -43,21 +43,17 @@ class OpdMap(_PupilMaps):
         leads. NaN where no light passes. Shape of the pupil coordinates.
     x, y : ndarray
         Entrance-pupil coordinates [m], same shape.
-    wavelength : float
-        Vacuum wavelength [m].
-    radius : float
-        Radius of the reference sphere [m].
+    wavelength, radius : float
+        Vacuum wavelength, and radius of the reference sphere [m].
     lit : ndarray of bool
-        Where light passes, same shape.
+        Mask of the points where light passes, same shape.
     field : tuple of float
         Field angles [rad].
     center : ndarray, shape [3]
         Centre of the reference sphere, telescope frame [m].
-    exit_direction : ndarray, shape [..., 3]
-        Directions of the rays at the image, telescope frame; the first two components are the exit-pupil coordinates
-        of diffraction integrals.
-    landing : ndarray, shape [..., 3]
-        Where the rays meet the image surface, telescope frame [m].
+    exit_direction, landing : ndarray, shape [..., 3]
+        Unit directions of the rays at the image surface and their landing points on it [m], telescope frame. The first
+        two components of the directions are the exit-pupil coordinates of diffraction integrals.
     """
 
     lit: np.ndarray
@@ -86,23 +82,10 @@ class OpdMap(_PupilMaps):
         return self.value - plane @ terms
 
     def plot(self, zernikes: ZernikeFit | None = None, name: str = "") -> Figure:
-        """Draw the map in nanometres and waves, with and without piston and tilt.
+        """Draw the map in nanometres and waves, with and without piston and tilt, and Zernike terms as bars.
 
-        Parameters
-        ----------
-        zernikes : ZernikeFit, optional
-            Zernike terms, drawn as bars below the maps.
-        name : str
-            Name of the telescope, for the title.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        DomainError
-            If the map is not on a square grid, or no light passes.
+        The title contains the ``name`` of the telescope. A map that is not on a square grid or has no lit point raises
+        :class:`~pachon.DomainError`.
         """
         from ..core.plotting import new_figure, styled
 
@@ -117,10 +100,9 @@ class OpdMap(_PupilMaps):
             _draw_map(panels["rest"], self, self.without_tilt, "piston and tilt removed")
             if zernikes is not None:
                 _draw_bars(panels["bars"], zernikes)
-            what = f"{name}: optical" if name else "Optical"
-            figure.suptitle(
-                f"{what} path difference at field ({tx:g}, {ty:g}) deg, {self.wavelength * 1e9:g} nm", fontsize=11
-            )
+            subject = f"{name}: optical" if name else "Optical"
+            title = f"{subject} path difference at field ({tx:g}, {ty:g}) deg, {self.wavelength * 1e9:g} nm"
+            figure.suptitle(title, fontsize=11)
             return figure
 
 
@@ -131,14 +113,9 @@ class OpdMaps(_PupilMaps):
     Attributes
     ----------
     value : ndarray, shape [n_field, ...]
-        Path of the chief ray minus path of the ray [m], to the reference sphere; positive where the wavefront leads.
-        NaN where no light passes. The axes after the first are those of the pupil coordinates.
-    x, y : ndarray, shape [...]
-        Entrance-pupil coordinates [m].
-    wavelength : float
-        Vacuum wavelength [m].
-    radius : float
-        Radius of the reference spheres [m].
+        As in :class:`OpdMap`, against the chief rays; the axes after the first are those of the pupil coordinates.
+    x, y, wavelength, radius
+        As in :class:`OpdMap`, the same for all field points.
     fields : ndarray, shape [n_field, 2]
         Field angles [rad].
     centers : ndarray, shape [n_field, 3]
@@ -153,7 +130,7 @@ class OpdMaps(_PupilMaps):
 
     @cached_property
     def lit(self) -> np.ndarray:
-        """Where light passes, shape [n_field, ...] bool."""
+        """Mask of the points where light passes, shape [n_field, ...]."""
         return np.isfinite(self.value)
 
     @property
@@ -170,10 +147,8 @@ class ZernikeFit:
     ----------
     coefficients : ndarray, shape [jmax]
         Noll order from j = 1 [m]; orthonormal terms, so each is its own rms over the unvignetted annulus.
-    obscuration : float
-        Inner over outer radius of the annulus.
-    residual_rms : float
-        Root mean square of the residuals [m].
+    obscuration, residual_rms : float
+        Inner over outer radius of the annulus, and root mean square of the residuals [m].
     """
 
     coefficients: np.ndarray
@@ -192,10 +167,7 @@ def _draw_map(axes: Axes, opd: OpdMap, value: np.ndarray, title: str) -> None:
     edge = max(float(np.nanmax(np.abs(nm))), 1e-6)
     half = float(np.abs(opd.x).max()) + 0.5 * abs(float(opd.x[0, 1] - opd.x[0, 0]))
     image = axes.imshow(nm, extent=(-half, half, -half, half), cmap="RdBu_r", vmin=-edge, vmax=edge)
-    axes.set_facecolor("0.93")
-    axes.set_aspect("equal")
-    axes.set_xlabel("entrance pupil x [m]")
-    axes.set_ylabel("entrance pupil y [m]")
+    axes.set(facecolor="0.93", aspect="equal", xlabel="entrance pupil x [m]", ylabel="entrance pupil y [m]")
     rms, span = float(np.nanstd(nm)), float(np.nanmax(nm) - np.nanmin(nm))
     axes.set_title(
         f"{title}\nrms {rms:.4g} nm = {rms / wavelength:.4f} waves; peak to valley {span:.4g} nm", loc="left"
@@ -216,17 +188,15 @@ def _draw_bars(axes: Axes, zernikes: ZernikeFit) -> None:
     axes.bar(j, zernikes.coefficients[1:] * 1e9, color=BLUE, width=0.75)
     axes.axhline(0.0, color="0.3", linewidth=0.7)
     if len(j) <= 45:
-        axes.set_xticks(
-            j, [f"{n} {NOLL_NAMES.get(int(n), '')}".strip() for n in j], rotation=60, ha="right", rotation_mode="anchor"
-        )
+        names = [f"{n} {NOLL_NAMES.get(int(n), '')}".strip() for n in j]
+        axes.set_xticks(j, names, rotation=60, ha="right", rotation_mode="anchor")
     axes.set_xlim(1.3, j[-1] + 0.7)
-    # Tilt is often far larger than all else; a scale that is linear about zero shows both.
     largest = float(np.abs(zernikes.coefficients[1:]).max()) * 1e9
+    # Tilt is often far larger than all other terms; a scale that is linear about zero shows them too.
     axes.set_yscale("symlog", linthresh=max(largest / 100.0, 1e-3))
     axes.grid(True, axis="y", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.set_ylabel("coefficient = rms over the annulus [nm]")
-    axes.set_xlabel("Noll index")
+    axes.set(xlabel="Noll index", ylabel="coefficient = rms over the annulus [nm]")
     axes.set_title(
         f"annular Zernikes, obscuration {zernikes.obscuration:g}; residual {zernikes.residual_rms * 1e9:.3g} nm rms",
         loc="left",

@@ -1,8 +1,7 @@
 """Points of an annulus with weights: quadrature over the entrance pupil or over a field of view.
 
-A mean over the pupil is a weighted sum over points. Gauss quadrature is exact for polynomials and is the default; the
-others are rings of equal width, a spiral without symmetry, and a square lattice. Where an edge vignettes the pupil, all
-of them converge with the number of points.
+A mean over the pupil is a weighted sum over points. Gauss quadrature is exact for polynomials and is the default. Where
+an edge vignettes the pupil, all samplings converge with the number of points.
 """
 
 from __future__ import annotations
@@ -14,9 +13,8 @@ import numpy as np
 from ..core.errors import ConfigError, DomainError
 from ..models.telescope import Telescope
 
-KINDS = ("gauss", "rings", "spiral", "square")
 #: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
-_DEFAULT_COUNT = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
+_DEFAULT_N_PUPIL = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
 
 
 @dataclass(frozen=True)
@@ -57,16 +55,8 @@ def gauss_annulus(radius: float, obscuration: float, rings: int, spokes: int) ->
     """Return Gauss quadrature on an annulus: Gauss-Legendre in the square of the radius, equal angles.
 
     The mean of ``x^a y^b`` comes out exactly for ``a + b < min(4 rings, spokes)``: 5 rings and 17 spokes integrate the
-    square of a wavefront of degree 8 (Forbes 1988, J. Opt. Soc. Am. A 5, 1943).
-
-    Parameters
-    ----------
-    radius : float
-        Outer radius, in the unit of the points.
-    obscuration : float
-        Inner over outer radius.
-    rings, spokes : int
-        Points along the radius and around.
+    square of a wavefront of degree 8 (Forbes 1988, J. Opt. Soc. Am. A 5, 1943). The outer radius has the unit of the
+    points; the obscuration is inner over outer radius.
     """
     _check_counts(obscuration, rings=rings, spokes=spokes)
     nodes, weights = np.polynomial.legendre.leggauss(rings)
@@ -81,13 +71,6 @@ def ring_annulus(radius: float, obscuration: float, rings: int) -> PupilSampling
 
     Points lie at the root mean square radius of their ring, so quadratic functions are averaged exactly. For others
     the error falls as the inverse square of the number of rings.
-
-    Parameters
-    ----------
-    radius, obscuration
-        As in :func:`gauss_annulus`.
-    rings : int
-        Number of rings.
     """
     _check_counts(obscuration, rings=rings)
     edges = np.linspace(obscuration, 1.0, rings + 1)
@@ -107,13 +90,6 @@ def spiral_annulus(radius: float, obscuration: float, count: int) -> PupilSampli
 
     The pattern has no symmetry, so an edge across the pupil cuts off about the right number of points wherever it
     lies (Vogel 1979, Mathematical Biosciences 44, 179).
-
-    Parameters
-    ----------
-    radius, obscuration
-        As in :func:`gauss_annulus`.
-    count : int
-        Number of points.
     """
     _check_counts(obscuration, count=count)
     k = np.arange(count)
@@ -123,15 +99,7 @@ def spiral_annulus(radius: float, obscuration: float, count: int) -> PupilSampli
 
 
 def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampling:
-    """Return the centres, of equal weight, of those cells of a square lattice whose centres lie in an annulus.
-
-    Parameters
-    ----------
-    radius, obscuration
-        As in :func:`gauss_annulus`.
-    across : int
-        Cells across the diameter.
-    """
+    """Return points of equal weight: centres of the cells of a square lattice, where they lie in an annulus."""
     _check_counts(obscuration, across=across)
     u = (2.0 * np.arange(across) + 1.0) / across - 1.0
     x, y = np.meshgrid(u, u)
@@ -149,12 +117,11 @@ def pupil_sampling(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, n_pupil
+        As in :meth:`pachon.Request.of`.
     sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
-        Kind of sampling; a :class:`PupilSampling` is returned unchanged.
-    n_pupil : int, optional
-        Points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
+        Gauss quadrature, exact for polynomials; rings of equal width, as hexapolar in Zemax; a golden-angle spiral; a
+        square lattice. A :class:`PupilSampling` is returned unchanged.
 
     Raises
     ------
@@ -165,10 +132,10 @@ def pupil_sampling(
     """
     if isinstance(sampling, PupilSampling):
         return sampling
-    if sampling not in KINDS:
-        raise ConfigError(f"sampling = {sampling!r}: expected one of {', '.join(KINDS)}")
+    if sampling not in _DEFAULT_N_PUPIL:
+        raise ConfigError(f"sampling = {sampling!r}: expected one of {', '.join(_DEFAULT_N_PUPIL)}")
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    n = _DEFAULT_COUNT[sampling] if n_pupil is None else n_pupil
+    n = _DEFAULT_N_PUPIL[sampling] if n_pupil is None else n_pupil
     if sampling == "gauss":
         return gauss_annulus(radius, obscuration, n, 4 * n)
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)

@@ -18,7 +18,7 @@ from ..raytrace.trace import trace
 from .bundles import Bundles
 from .pupil_sampling import PupilSampling, pupil_sampling
 
-#: Rays in one part of a request: 15 doubles each, so some 60 MB.
+#: Rays in one part of a request: 15 float64 numbers each, so some 60 MB.
 RAYS_AT_ONCE = 1 << 19
 #: Radii of the default field points over the radius of the field; for the LSST 0, 0.5, 1, 1.5 and 1.75 degrees.
 _RADII = np.array([0.0, 2.0, 4.0, 6.0, 7.0]) / 7.0
@@ -32,8 +32,8 @@ class Request:
 
     Attributes
     ----------
-    telescope : Telescope
-        The telescope.
+    telescope, projection, threads
+        As in :meth:`of`.
     fields : ndarray, shape [n_field, 2]
         Field angles [rad].
     wavelengths : ndarray, shape [n_wave]
@@ -42,10 +42,6 @@ class Request:
         Relative amounts of light of the wavelengths; they sum to 1.
     pupil : PupilSampling
         Points of the entrance pupil.
-    projection : {"zemax", "gnomonic", "postel"}
-        Meaning of the field angles.
-    threads : int or None
-        Number of threads; None for all processors.
     """
 
     telescope: Telescope
@@ -123,13 +119,7 @@ class Request:
 
     @property
     def wavelength(self) -> float:
-        """The only wavelength [m].
-
-        Raises
-        ------
-        DomainError
-            If there are several.
-        """
+        """The only wavelength [m]; several of them are a :class:`~pachon.DomainError`."""
         if len(self.wavelengths) != 1:
             raise DomainError(f"wavelength: {len(self.wavelengths)} wavelengths are given; expected one")
         return float(self.wavelengths[0])
@@ -140,12 +130,12 @@ class Request:
         return self.pupil.points / (0.5 * self.telescope.pupil_diameter)
 
     def launch(self, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
-        """Return the rays of one wavelength [m], field by field; through other pupil points [m] if these are given."""
+        """Return the rays of one wavelength [m], field by field, through other pupil points [m] where given."""
         points = self.pupil.points if pupil is None else pupil
         return launch_bundles(self.telescope, self.directions, wavelength, points)
 
     def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
-        """Trace the rays of one wavelength [m] to the detector; through other pupil points [m] if these are given."""
+        """Trace the rays of :meth:`launch` to the detector."""
         points = self.pupil.points if pupil is None else pupil
         # The chief ray is traced as one more point of the pupil.
         rays = self.launch(wavelength, np.concatenate([points, np.zeros((1, 2))]))
@@ -179,10 +169,8 @@ def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.nd
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields : array_like or Quantity, shape [n, 2] or [2], optional
-        Field angles [rad]; five points from the axis to the edge of the field along +y by default.
+    telescope, fields
+        As in :meth:`Request.of`.
 
     Raises
     ------
@@ -208,13 +196,7 @@ def wavelength_points(telescope: Telescope, wavelengths: ArrayLike | None = None
 
 
 def relative_weights(weights: ArrayLike | None, count: int, name: str = "wavelength_weights") -> np.ndarray:
-    """Return so many weights of sum 1, equal where none are given.
-
-    Raises
-    ------
-    DomainError
-        If there are more or fewer, or one is negative, or all are zero.
-    """
+    """Return so many weights of sum 1, equal where none are given; negative or all zero they are a DomainError."""
     values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
     if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
         raise DomainError(f"{name} = {weights!r}: expected {count} numbers, none negative, not all zero")

@@ -19,10 +19,8 @@ def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int
     ----------
     opd : OpdMap
         The map.
-    pupil_radius : float
-        Outer radius [m].
-    obscuration : float
-        Inner over outer radius.
+    pupil_radius, obscuration : float
+        Outer radius of the pupil [m], and its inner over its outer radius.
     jmax : int
         Highest Noll index.
 
