@@ -99,8 +99,7 @@ def _workers(
     if sum(option is not None for option in (processes, scheduler, on_dask)) > 1:
         raise ConfigError("--processes, --scheduler and --workers: expected one of them")
     from ..core.threads import thread_count
-    from ..studies.workers.dask_cluster import dask_client, dask_workers, local_cluster
-    from ..studies.workers.workers import process_workers, serial_worker
+    from ..studies.sweep.workers import dask_client, dask_workers, local_cluster, process_workers, serial_worker
 
     if scheduler is not None or on_dask is not None:
         with local_cluster(on_dask, reporter.line) if scheduler is None else dask_client(scheduler) as client:

@@ -2,39 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 
-from ...core.files import write_bytes, write_json
-from ...core.products import write_ecsv
-from ...pipeline.config import Configuration, to_yaml
+from ...core.plotting import new_figure, png_bytes, styled
+from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
-from ...pipeline.measure.correlation import SEPARATION_RANGES
+from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation
 from ...pipeline.measure.diagnostics import correlation_columns
-from ...pipeline.run_folder import CONFIG_NAME, stamp_of
+from ...pipeline.report.focal_plane_axes import AWAY, RESIDUAL, TRUTH
+from ...pipeline.run_folder import stamp_of
+from ..product import write_products
 from .attribution import Attribution
-from .plots import attribution_plot
+from .causes import FULL
 
 
 def write_attribution(result: Attribution, folder: Path, config: Configuration) -> tuple[str, ...]:
     """Write metrics, correlations, plot and configuration; return the names of the files."""
-    stamp = stamp_of(Experiment.from_config(config))
-    meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed}
-    cases = list(result.metrics)
     keys = list(dict.fromkeys(key for each in result.metrics.values() for key in each))
-    columns = {"off": (np.array(cases), "", "cause that is switched off, or full")}
+    columns = {"off": (np.array(list(result.metrics)), "", "cause that is switched off, or full")}
     for key in keys:
-        values = np.array([result.metrics[case].get(key, np.nan) for case in cases])
+        values = np.array([case.get(key, np.nan) for case in result.metrics.values()])
         columns[key] = (values, "arcsec" if key.endswith("arcsec") else "", _meaning(key))
-    everything = {f"{case} {kind}": c for case, each in result.correlations.items() for kind, c in each.items()}
-    write_ecsv(folder / "attribution.ecsv", columns, {"what": "the same stars without one cause", **meta})
-    write_ecsv(folder / "correlations.ecsv", correlation_columns(everything), {"what": "xi of each case", **meta})
-    write_bytes(folder / "attribution.png", attribution_plot(result.metrics, result.correlations))
-    write_json(folder / "attribution.json", {"figures": result.metrics, **meta})
-    heading = (f"pachon {stamp.version}: the case with everything on.",)
-    write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
-    return "attribution.ecsv", "correlations.ecsv", "attribution.png", "attribution.json", CONFIG_NAME
+    xi = {f"{case} {kind}": c for case, each in result.correlations.items() for kind, c in each.items()}
+    return write_products(
+        folder,
+        {
+            "attribution.ecsv": ("the same stars without one cause", columns),
+            "correlations.ecsv": ("xi of each case", correlation_columns(xi)),
+        },
+        {"attribution.png": attribution_plot(result.metrics, result.correlations)},
+        {"attribution.json": {"figures": result.metrics}},
+        stamp_of(Experiment.from_config(config)).meta(),
+        config,
+        "the case with everything on.",
+    )
 
 
 def _meaning(key: str) -> str:
@@ -45,3 +51,68 @@ def _meaning(key: str) -> str:
         low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
         return f"mean xi+ of {key.split('_')[2]}, {low:g} to {high:g} arcmin"
     return "median FWHM" if key == "fwhm_arcsec" else key.replace("_", " ") + ", one component"
+
+
+def attribution_plot(
+    metrics: Mapping[str, Mapping[str, float]], correlations: Mapping[str, Mapping[str, Correlation]]
+) -> bytes:
+    """Draw rms ellipticities and residuals as bars, and xi+ as curves, for each case."""
+    cases = list(metrics)
+    colors = dict(zip(cases, matplotlib.colormaps["tab10"](np.arange(len(cases)) % 10), strict=True)) | {FULL: "black"}
+    with styled():
+        figure = new_figure(12.5, 3.4 + 0.42 * len(cases) + 3.4)
+        panels = figure.subplots(2, 2, height_ratios=[1.2 + 0.42 * len(cases), 4.6])
+        for axes, keys in zip(
+            panels[0],
+            (
+                (("rms_e_truth", TRUTH, "truth"),),
+                (
+                    ("rms_residual_at_stars", RESIDUAL, "observed - model, at the stars"),
+                    ("rms_residual_away", AWAY, "truth - model, where no star is"),
+                ),
+            ),
+            strict=True,
+        ):
+            _draw_bars(axes, metrics, keys)
+        panels[0, 0].set_title("rms of one component of e: truth", loc="left")
+        panels[0, 1].set_title("rms of one component of the residual", loc="left")
+        for axes, kind, title in (
+            (panels[1, 0], "truth", "$|\\xi_+|$ of the truth"),
+            (panels[1, 1], "away", "$|\\xi_+|$ of truth - model, where no star is"),
+        ):
+            for case, each in correlations.items():
+                _draw_curve(axes, each[kind], colors[case], case)
+            axes.set(xscale="log", yscale="log", xlabel="separation [arcmin]")
+            axes.set_title(f"{title}; open: negative", loc="left")
+            axes.grid(True, which="major", color="0.9", linewidth=0.6)
+            axes.set_axisbelow(True)
+        handles, labels = panels[1, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(cases)))
+        return png_bytes(figure)
+
+
+def _title(case: str) -> str:
+    return "everything on" if case == FULL else f"{case.replace('_', ' ')} off"
+
+
+def _draw_bars(axes: Axes, metrics: Mapping[str, Mapping[str, float]], keys: tuple[tuple[str, str, str], ...]) -> None:
+    rows = np.arange(len(metrics))
+    height = 0.7 / len(keys)
+    for i, (key, color, label) in enumerate(keys):
+        values = [each[key] for each in metrics.values()]
+        axes.barh(rows + (i - 0.5 * (len(keys) - 1)) * height, values, 0.9 * height, color=color, label=label)
+        axes.axvline(metrics[FULL][key], color=color, linewidth=0.8, linestyle=(0, (3, 2)))
+    axes.set_yticks(rows, [_title(case) for case in metrics])
+    axes.invert_yaxis()
+    axes.set_xlim(0.0)
+    if len(keys) > 1:
+        axes.legend(loc="lower right", frameon=True, framealpha=0.9, edgecolor="none")
+
+
+def _draw_curve(axes: Axes, correlation: Correlation, color: object, case: str) -> None:
+    r, xi = correlation.r_arcmin, correlation.xi_plus
+    some = np.isfinite(xi) & (xi != 0.0)
+    width = 1.8 if case == FULL else 0.9
+    axes.plot(r[some], np.abs(xi[some]), "-", color=color, linewidth=width, label=_title(case))
+    for chosen, face in ((some & (xi > 0.0), color), (some & (xi < 0.0), "white")):
+        axes.plot(r[chosen], np.abs(xi[chosen]), "o", color=color, markersize=3.5, markerfacecolor=face)

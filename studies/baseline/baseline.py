@@ -26,8 +26,7 @@ from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
 from ..metrics.optics import OPTICS
-from ..metrics.plan import make_plan
-from ..metrics.scene import Scene
+from ..metrics.scene import Scene, make_plan
 from .check import BaselineCheck, Deviation
 from .file import Baseline, BaselineMetric, read_baseline, rounded
 

@@ -17,7 +17,7 @@ from pydantic import Field
 from ...core.errors import ConfigError
 from ...core.files import write_bytes
 from ...core.schema import Positive, Real, Section, validated
-from ..metrics.plan import Plan
+from ..metrics.scene import Plan
 
 FORMAT = "pachon baseline"
 #: Version of the format, raised when an older pachon could not read the file.

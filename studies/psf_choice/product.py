@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core.files import write_bytes, write_json
-from ...core.products import write_ecsv
-from ...core.version import VERSION
-from ...pipeline.config import Configuration, to_yaml
+from ...core.products import Columns
+from ...pipeline.config import Configuration
 from ...pipeline.measure.correlation import SEPARATION_RANGES
-from ...pipeline.run_folder import CONFIG_NAME, stamp_of
+from ...pipeline.run_folder import stamp_of
+from ..product import write_products
 from .plan import INTERPOLATIONS
 from .plots import choices_plot, stars_plot
 from .study import Study, study_experiment
@@ -22,14 +21,15 @@ from .study import Study, study_experiment
 def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str, ...]:
     """Write table, metrics, plots and configuration; return the names of the files."""
     stamp = stamp_of(study_experiment(config, result.plan))
-    meta = {"pachon": stamp.version, "config_hash": stamp.config_hash, "seed": stamp.seed, "draws": result.plan.draws}
-    write_ecsv(folder / "study.ecsv", study_columns(result), {"what": "PSF models against the truth", **meta})
-    write_bytes(folder / "study_stars.png", stars_plot(result))
-    write_bytes(folder / "study_choices.png", choices_plot(result))
-    write_json(folder / "study.json", {**study_summary(result), **meta})
-    heading = (f"pachon {VERSION}: the configuration that the study is about.",)
-    write_bytes(folder / CONFIG_NAME, to_yaml(config, heading).encode())
-    return "study.ecsv", "study_stars.png", "study_choices.png", "study.json", CONFIG_NAME
+    return write_products(
+        folder,
+        {"study.ecsv": ("PSF models against the truth", study_columns(result))},
+        {"study_stars.png": stars_plot(result), "study_choices.png": choices_plot(result)},
+        {"study.json": study_summary(result)},
+        {**stamp.meta(), "draws": result.plan.draws},
+        config,
+        "the configuration that the study is about.",
+    )
 
 
 def study_summary(result: Study) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def study_summary(result: Study) -> dict[str, Any]:
     }
 
 
-def study_columns(result: Study) -> dict[str, tuple[np.ndarray, str, str]]:
+def study_columns(result: Study) -> Columns:
     """Return the columns of the table, a row for each case, those without a fit included."""
     cases = [*result.metrics, *result.problems]
     about = {

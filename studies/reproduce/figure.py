@@ -6,14 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ...core.files import write_bytes
-from ...core.products import write_ecsv, write_fits
+from ...core.products import Columns, write_ecsv, write_fits
 from ...core.version import VERSION
 from .bench import Bench
-
-Columns = dict[str, tuple[np.ndarray, str, str]]
 
 
 @dataclass(frozen=True)

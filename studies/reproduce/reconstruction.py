@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core.products import image_hdu, table_hdu
+from ...core.products import Columns, image_hdu, table_hdu
 from ...pipeline.ccd_product import CcdProduct
 from ...pipeline.report.focal_plane_plots import whiskers_plot
 from ...pipeline.report.psf_plots import eigen_psf_plot, spectrum_plot
@@ -14,8 +14,8 @@ from ...pipeline.report.report import closest_middle_farthest
 from ...pipeline.report.statistics_plots import correlation_plot, scatter_plot
 from ...pipeline.report.tables import percent
 from .bench import Bench
-from .figure import Columns, EcsvData, FitsData, Reproduced, figure
-from .optics_whiskers import optics_ellipticity
+from .figure import EcsvData, FitsData, Reproduced, figure
+from .focal_plane import optics_ellipticity
 
 #: Least number of PSFs for a comparison of the variance in 20 components.
 _ENOUGH = 200

@@ -10,13 +10,9 @@ from ...core.errors import ConfigError, unknown_name
 from ...core.files import make_folder, write_json
 from ...core.progress import Reporter
 from ...core.version import VERSION
-from . import atmosphere, encircled_energy, focal_plane, layout, optics_whiskers, reconstruction, screens, speckles
+from . import atmosphere, focal_plane, optics, reconstruction, screens
 from .bench import SCALES, Bench, Scale
 from .figure import Figure
-
-_MODULES = (
-    layout, encircled_energy, screens, speckles, atmosphere, focal_plane, optics_whiskers, reconstruction,
-)  # fmt: skip
 
 
 def _number(figure: Figure) -> tuple[str, int]:
@@ -24,7 +20,12 @@ def _number(figure: Figure) -> tuple[str, int]:
     return kind, int(figure.name.removeprefix(kind))
 
 
-_FOUND = [each for module in _MODULES for each in vars(module).values() if isinstance(each, Figure)]
+_FOUND = [
+    each
+    for module in (optics, screens, atmosphere, focal_plane, reconstruction)
+    for each in vars(module).values()
+    if isinstance(each, Figure)
+]
 #: Figures and tables in the order of the paper.
 FIGURES = {each.name: each for each in sorted(_FOUND, key=_number)}
 #: Figures of the paper that are not offered, and their requirements.

@@ -27,10 +27,10 @@ from ...pipeline.defaults import resolve
 from ...pipeline.experiment import Experiment
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
-from ..workers.workers import worker_name
 from .compensation import compensated
 from .file import SweepFile
-from .record import PointResult, SweepPoint
+from .store import PointResult, SweepPoint
+from .workers import worker_name
 
 _MOTIONS = ("dz_um", "rx_urad", "ry_urad")
 

@@ -10,6 +10,7 @@ import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from ...core.errors import ConfigError, ProductError
 from ...core.version import VERSION
 from ...pipeline.config import differences
 from .file import SweepFile, read_sweep
-from .record import PointResult, SweepPoint
 
 #: Format of the tables; stores of other formats are refused.
 FORMAT = 1
@@ -33,6 +33,26 @@ CREATE TABLE results (
     pachon TEXT NOT NULL
 );
 """
+
+
+@dataclass(frozen=True)
+class SweepPoint:
+    """A point to compute: its number, the values of its parameters, and the seed of its random numbers."""
+
+    number: int
+    parameters: dict[str, Any]
+    seed: int
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """Result of one point."""
+
+    number: int
+    metrics: dict[str, float] | None  #: None where the point could not be computed
+    problem: str | None  #: reason why it could not be computed, in one line
+    seconds: float  #: time of the computation
+    worker: str  #: machine and process of the computation
 
 
 class DamagedStoreError(ProductError):

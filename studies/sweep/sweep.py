@@ -13,15 +13,14 @@ from ...core.memory import available_bytes, readable
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...pipeline.config import Configuration
-from ..workers.workers import Measure, Workers, serial_worker
 from .design import design_points, point_count
 from .file import SweepFile
 from .point import PointMeasurement, check_sweep
-from .record import PointResult, SweepPoint
-from .store import SweepStore, check_same_sweep, create_store
+from .store import SweepPoint, SweepStore, check_same_sweep, create_store
+from .workers import Measure, Workers, serial_worker
 
 #: Function that makes workers of the function that computes a point.
-MakeWorkers = Callable[[Measure[SweepPoint, PointResult]], Workers[SweepPoint, PointResult]]
+MakeWorkers = Callable[[Measure], Workers]
 #: More points than this are a mistake: at a second each they would take a year.
 MOST_POINTS = 30_000_000
 # Size of a point in the store [bytes], and in memory while the design is made.

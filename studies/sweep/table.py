@@ -14,7 +14,7 @@ from astropy.table import Table
 
 from ...core.errors import ConfigError, ProductError
 from ...core.files import write_bytes
-from ...core.products import described_table
+from ...core.products import Columns, described_table
 from ..metrics.stars import STARS
 from .store import SweepStore, readable_rows
 
@@ -123,7 +123,7 @@ def _format(path: Path) -> str:
 
 
 def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
-    columns: dict[str, tuple[np.ndarray, str, str]] = {
+    columns: Columns = {
         "number": (table.number, "", "number of the point"),
         "seed": (table.seed, "", "seed of its random numbers"),
     }

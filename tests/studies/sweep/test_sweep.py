@@ -22,7 +22,7 @@ from pachon.studies.sweep.file import load_sweep, read_sweep
 from pachon.studies.sweep.point import point_experiment
 from pachon.studies.sweep.store import SweepPoint, SweepStore
 from pachon.studies.sweep.sweep import check_room
-from pachon.studies.workers.dask_cluster import check_versions
+from pachon.studies.sweep.workers import check_versions
 
 SWEEP = """
 name: small
@@ -232,7 +232,7 @@ def test_more_points_than_there_is_room_for_are_refused_before_starting(folder):
 
 def test_a_scheduler_that_does_not_answer_is_one_line(folder, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("pachon.studies.workers.dask_cluster.CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr("pachon.studies.sweep.workers.CONNECT_SECONDS", 1.0)
     assert main(["sweep", "small.yaml", "--scheduler", "tcp://127.0.0.1:9"]) == 2
     error = capsys.readouterr().err.strip()
     assert "--scheduler = tcp://127.0.0.1:9: no answer within 1 s" in error

@@ -8,8 +8,7 @@ from astropy.table import Table
 import pachon
 from pachon.core.errors import ConfigError, ProductError
 from pachon.studies.sweep.file import read_sweep
-from pachon.studies.sweep.record import PointResult, SweepPoint
-from pachon.studies.sweep.store import SweepStore, check_same_sweep, create_store
+from pachon.studies.sweep.store import PointResult, SweepPoint, SweepStore, check_same_sweep, create_store
 from pachon.studies.sweep.table import export_table, salvage
 
 SWEEP = read_sweep({"parameters": {"b": {"nominal": 0, "range": [0, 1]}, "a": {"nominal": 0, "range": [0, 1]}}}, "test")
