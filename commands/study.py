@@ -52,9 +52,9 @@ def study_command(
 ) -> None:
     """Choose a PSF model: number of stars, order, number of components, basis, interpolation, S/N.
 
-    Stars are simulated once, observed through several draws of noise and modelled in some 350 ways about that of the
-    configuration; each is compared with the noise-free PSFs at holdout positions. Some minutes. Table (ECSV), plots
-    and all metrics (study.json) go into one folder.
+    Stars are simulated once and observed through several draws of noise. Some 350 models, variations of that of the
+    configuration, are fitted and compared with the noise-free PSFs at holdout positions. Some minutes. Table (ECSV),
+    plots and all metrics (study.json) go into one folder.
 
     **Examples**
 

@@ -117,12 +117,13 @@ def error_context(**context: Any) -> Iterator[None]:
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameError:
     """Return the error for an unknown name of a kind, such as ``"CCD"``, with the nearest of the allowed names."""
     names = list(allowed)
-    lowered = {n.lower(): n for n in names}
-    near = [lowered[m] for m in get_close_matches(str(name).lower(), list(lowered), n=4, cutoff=0.5)]
-    if near:
-        hint = "did you mean " + " or ".join(near) + "?"
-    elif len(names) <= 12:
-        hint = "expected one of " + ", ".join(names)
-    else:
-        hint = f"expected one of {len(names)} names such as {', '.join(names[:3])}"
+    few = ", ".join(names) if len(names) <= 12 else f"{len(names)} names such as {', '.join(names[:3])}"
+    hint = nearest(name, names, n=4, cutoff=0.5) or f"expected one of {few}"
     return UnknownNameError(f"unknown {kind} {name!r}: {hint}")
+
+
+def nearest(name: object, known: Iterable[str], n: int = 2, cutoff: float = 0.6) -> str:
+    """Return the known names nearest to a name, as "did you mean"; empty where none is near."""
+    lowered = {key.lower(): key for key in known}
+    near = [lowered[key] for key in get_close_matches(str(name).lower(), list(lowered), n=n, cutoff=cutoff)]
+    return f"did you mean {' or '.join(near)}?" if near else ""

@@ -18,10 +18,7 @@ from .errors import PachonError, ProductError
 
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
-    """Write a file under a temporary name, flush it to the disk and rename it.
-
-    Where that fails, nothing is left behind, and `error` is raised with the path and the system's reason.
-    """
+    """Write a file whole, or raise `error` with the path and the system's reason and leave nothing behind."""
     partial = path.with_name(f".{path.name}.partial")
     try:
         try:

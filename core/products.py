@@ -110,7 +110,6 @@ def table_hdu(name: str, columns: Columns) -> fits.BinTableHDU:
         name=name,
     )
     for index, (key, (_, _, description)) in enumerate(columns.items(), start=1):
-        table.header.comments[f"TTYPE{index}"] = description
         table.header.set(f"TTYPE{index}", key, description)
     return table
 

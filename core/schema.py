@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import (
@@ -24,7 +23,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, core_schema
 
-from .errors import ConfigError, PachonError
+from .errors import ConfigError, PachonError, nearest
 from .yaml_reader import as_number, cut_short
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -197,21 +196,13 @@ def checked(convert: Callable[[Any], Any], text: str) -> BeforeValidator:
 mapping = checked(lambda value: value if isinstance(value, dict) else None, "a mapping of keys to values")
 
 
-def nearest(name: object, known: Iterable[str], n: int = 2) -> str:
-    """Return the known names nearest to a name, as "did you mean"; empty where none is near."""
-    near = get_close_matches(str(name), list(known), n=n, cutoff=0.6)
-    return f"did you mean {' or '.join(near)}?" if near else ""
-
-
 def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
     """Return all keys of a model, with dots between sections."""
     keys: list[str] = []
     for name, field in model.model_fields.items():
-        section = field.annotation
-        if isinstance(section, type) and issubclass(section, BaseModel):
-            keys += [f"{field.alias or name}.{key}" for key in known_keys(section)]
-        else:
-            keys.append(field.alias or name)
+        section, key = field.annotation, field.alias or name
+        is_section = isinstance(section, type) and issubclass(section, BaseModel)
+        keys += [f"{key}.{inner}" for inner in known_keys(section)] if is_section else [key]
     return tuple(keys)
 
 

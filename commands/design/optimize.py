@@ -123,7 +123,7 @@ def optimize(
     save_telescope(result.telescope, path)
     s = result.summary()
     rms = f"{s['rms_start_m'] * 1e6:.6g} -> {s['rms_end_m'] * 1e6:.6g} µm, {s['steps']} steps"
-    collinear = [f"cannot be told apart: {combination}" for combination in s["collinear"]]
+    collinear = [f"collinear: {combination}" for combination in s["collinear"]]
     return Outcome(result, notes=[f"rms of {s['merit']}: {rms}", *collinear, f"prescription: {path.resolve()}"])
 
 
