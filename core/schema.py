@@ -201,8 +201,10 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
     keys: list[str] = []
     for name, field in model.model_fields.items():
         section, key = field.annotation, field.alias or name
-        is_section = isinstance(section, type) and issubclass(section, BaseModel)
-        keys += [f"{key}.{inner}" for inner in known_keys(section)] if is_section else [key]
+        if isinstance(section, type) and issubclass(section, BaseModel):
+            keys += [f"{key}.{inner}" for inner in known_keys(section)]
+        else:
+            keys.append(key)
     return tuple(keys)
 
 
