@@ -25,7 +25,7 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
-from ..kernels.packet import LANES, RayPackets, lanes, lanes_sqrt
+from ..kernels.packet import LANES, RayPackets, components, lanes, lanes_sqrt
 from ..kernels.shape_derivatives import added_derivatives
 from ..kernels.surface import ONE, TWO, ZERO
 from ..kernels.trace import (
@@ -76,45 +76,19 @@ def backward_loop(special: bool) -> wp.Function:
         """
         n_surfaces = surfaces.kinds.shape[0]
         last = n_surfaces - 1
-        write_gap(
-            columns,
-            n_surfaces,
-            o,
-            p,
-            rays.position[last, 0, slot],
-            rays.position[last, 1, slot],
-            rays.position[last, 2, slot],
-            rays.direction[last, 0, slot],
-            rays.direction[last, 1, slot],
-            rays.direction[last, 2, slot],
-            ax,
-            ay,
-            az,
-            bx,
-            by,
-            bz,
-            matrix,
-        )
+        x, y, z = components(rays.position, last, slot)
+        u, v, w = components(rays.direction, last, slot)
+        write_gap(columns, n_surfaces, o, p, x, y, z, u, v, w, ax, ay, az, bx, by, bz, matrix)
         for back in range(n_surfaces):
             s = last - back
             before = indices[s]
             after = indices[s + 1]
-            x = rays.position[s, 0, slot]
-            y = rays.position[s, 1, slot]
-            z = rays.position[s, 2, slot]
-            du = start.direction[0, 0, slot]
-            dv = start.direction[0, 1, slot]
-            dw = start.direction[0, 2, slot]
-            px = start.position[0, 0, slot]
-            py = start.position[0, 1, slot]
-            pz = start.position[0, 2, slot]
+            x, y, z = components(rays.position, s, slot)
+            du, dv, dw = components(start.direction, 0, slot)
+            px, py, pz = components(start.position, 0, slot)
             if s > 0:
-                du = rays.direction[s - 1, 0, slot]
-                dv = rays.direction[s - 1, 1, slot]
-                dw = rays.direction[s - 1, 2, slot]
-                px = rays.position[s - 1, 0, slot]
-                py = rays.position[s - 1, 1, slot]
-                pz = rays.position[s - 1, 2, slot]
+                du, dv, dw = components(rays.direction, s - 1, slot)
+                px, py, pz = components(rays.position, s - 1, slot)
             t = dot(x - px, y - py, z - pz, du, dv, dw)
             u = du
             v = dv
@@ -277,23 +251,10 @@ def backward_rays(special: bool, module: wp.Module) -> wp.Kernel:
         item = first + wp.tid()
         o = item / n_packets
         p = item - o * n_packets
+        ax, ay, az = components(by_position, o, p)
+        bx, by, bz = components(by_direction, o, p)
         ax, ay, az, bx, by, bz = backward_through(
-            surfaces,
-            indices,
-            start,
-            rays,
-            p,
-            lanes(by_path[o]),
-            by_position[o, 0, p],
-            by_position[o, 1, p],
-            by_position[o, 2, p],
-            by_direction[o, 0, p],
-            by_direction[o, 1, p],
-            by_direction[o, 2, p],
-            columns,
-            o,
-            p,
-            matrix,
+            surfaces, indices, start, rays, p, lanes(by_path[o]), ax, ay, az, bx, by, bz, columns, o, p, matrix
         )
         for j in range(scales.shape[0]):
             polynomial_columns(polynomials, scales[j], j, o, p, matrix)

@@ -77,18 +77,7 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
             start.direction[0, 1, item] = lanes(dv)
             start.direction[0, 2, item] = lanes(dw)
             x, y, z, u, v, w, path, status = through_telescope(
-                surfaces,
-                indices,
-                0,
-                px,
-                py,
-                pz,
-                lanes(du),
-                lanes(dv),
-                lanes(dw),
-                lanes(ZERO),
-                item,
-                rays,
+                surfaces, indices, 0, px, py, pz, lanes(du), lanes(dv), lanes(dw), lanes(ZERO), item, rays
             )
             status_out[p] = statuses(status)
             weight = lanes(ONE)
@@ -107,24 +96,10 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
             matrix[0, sphere_column + 1, p] = ax
             matrix[0, sphere_column + 2, p] = ay
             matrix[0, sphere_column + 3, p] = az
-            backward_through(
-                surfaces,
-                media,
-                start,
-                rays,
-                item,
-                weight,
-                ax,
-                ay,
-                az,
-                n * wp.cw_mul(weight, wp.cw_mul(ratio, x)),
-                n * wp.cw_mul(weight, wp.cw_mul(ratio, y)),
-                n * wp.cw_mul(weight, wp.cw_mul(ratio, z)),
-                columns,
-                0,
-                p,
-                matrix,
-            )
+            bx = n * wp.cw_mul(weight, wp.cw_mul(ratio, x))
+            by = n * wp.cw_mul(weight, wp.cw_mul(ratio, y))
+            bz = n * wp.cw_mul(weight, wp.cw_mul(ratio, z))
+            backward_through(surfaces, media, start, rays, item, weight, ax, ay, az, bx, by, bz, columns, 0, p, matrix)
             column = columns[n_surfaces - 1, INDEX]
             if column >= 0:
                 # The index in front of the last surface acts up to the sphere.

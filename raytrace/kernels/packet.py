@@ -33,6 +33,12 @@ def lanes_sqrt(a: lanes):
     return out
 
 
+@wp.func
+def components(vectors: wp.array3d(dtype=lanes), row: wp.int32, packet: wp.int32):
+    """Components x, y, z of a packet of vectors [row, 3, packet]."""
+    return vectors[row, 0, packet], vectors[row, 1, packet], vectors[row, 2, packet]
+
+
 @wp.struct
 class RayPackets:
     """Packets of rays at some surfaces, in the telescope frame.

@@ -65,18 +65,7 @@ def trace_pupils(special: bool, module: wp.Module) -> wp.Kernel:
         dw = direction[b, 2]
         x, y, z = launched(pupil[0, p], pupil[1, p], pupil_z, du, dv, dw, distance)
         x, y, z, u, v, w, path, status = through_telescope(
-            surfaces,
-            indices,
-            row,
-            x,
-            y,
-            z,
-            lanes(du),
-            lanes(dv),
-            lanes(dw),
-            lanes(ZERO),
-            p,
-            no_rays,
+            surfaces, indices, row, x, y, z, lanes(du), lanes(dv), lanes(dw), lanes(ZERO), p, no_rays
         )
         x = x - lanes(reference[b, 0])
         y = y - lanes(reference[b, 1])

@@ -13,7 +13,7 @@ from .aperture import PackedApertures, through_aperture
 from .kernel_pair import kernel_pair
 from .mesh import PackedMeshes, mesh_distance
 from .obstruction import PackedObstructions, past_obstructions
-from .packet import LANES, RayPackets, lane_flags, lanes
+from .packet import LANES, RayPackets, components, lane_flags, lanes
 from .shape import PackedDeformations, deformed_distance, through_screen
 from .surface import (
     FAR,
@@ -312,19 +312,8 @@ def trace_rays(special: bool, module: wp.Module) -> wp.Kernel:
         length 1 (the last surface) or ``n_surfaces``.
         """
         p = first + wp.tid()
-        through_telescope(
-            surfaces,
-            indices,
-            0,
-            start.position[0, 0, p],
-            start.position[0, 1, p],
-            start.position[0, 2, p],
-            start.direction[0, 0, p],
-            start.direction[0, 1, p],
-            start.direction[0, 2, p],
-            start.path[0, p],
-            p,
-            out,
-        )
+        x, y, z = components(start.position, 0, p)
+        u, v, w = components(start.direction, 0, p)
+        through_telescope(surfaces, indices, 0, x, y, z, u, v, w, start.path[0, p], p, out)
 
     return trace_rays
