@@ -19,8 +19,8 @@ from .screens import draw_modes, phase_screen, slope_screen, working_bytes
 from .spline import evaluate
 from .turbulence import slope_variance
 
-#: Baseline of the slopes of the low screens [m]: a gradient proper lets waves of a metre bend light
-#: more than they do where it interferes over baselines of some tenths of a metre.
+#: Baseline of the slopes of the low screens [m]: a local gradient would deflect rays by modes of a metre more than the
+#: image moves, which forms by interference over baselines of some tenths of a metre.
 SLOPE_LAG = 0.2
 # Larger screens, of 17 GB and more, would fill the memory.
 _LARGEST_SIZE = 65536
@@ -76,8 +76,8 @@ class LayerScreens(Layers):
     def screen_bytes(self, scales: Iterable[str]) -> int:
         """Return the memory of the screens of some scales, and of the making of the last of them [bytes]."""
         grids = [self._band(scale) for scale in scales]
-        kept = sum(4 * self.layer_count * size * size for size, _, _ in grids)
-        return kept + max((working_bytes(*grid) for grid in grids), default=0)
+        stored = sum(4 * self.layer_count * size * size for size, _, _ in grids)
+        return stored + max((working_bytes(*grid) for grid in grids), default=0)
 
     def low_screen(
         self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None

@@ -108,7 +108,7 @@ def checked_layers(
 
 
 def line_of_sight(heights: np.ndarray, ground_lift: float, zenith: float) -> np.ndarray:
-    """Return distances [m] of layers at heights [m], lifted from exactly 0, along a line of sight [rad]."""
+    """Return distances [m] of layers along a line of sight, from heights [m], of which 0 stands for ``ground_lift``."""
     return np.where(heights == 0.0, ground_lift, heights) / math.cos(zenith)
 
 

@@ -28,7 +28,7 @@ def require_zenith_angle(value: Any) -> float:
 
 
 def air_refractivity(wavelength: ArrayLike, weather: Weather) -> np.ndarray:
-    """Return the refractive index of air less one (Filippenko 1982, eqs. 1 to 3), for 0.2 to 2 um in vacuum."""
+    """Return the refractive index of air less one (Filippenko 1982, eqs. 1 to 3), at 0.2 to 2 um in vacuum [m]."""
     lam = metres(wavelength, "wavelength")
     low, high = WAVELENGTH_RANGE
     outside = lam[~((lam >= low) & (lam <= high))]

@@ -8,7 +8,8 @@ eq. 1, which rounds the constant to 0.023) is
           c = \frac{\Gamma(11/6)^2}{2 \pi^{11/3}} \left[\tfrac{24}{5} \Gamma(6/5)\right]^{5/6} = 0.0228956,
 
 with :math:`\nu` in cycles per metre, the constant that makes the Kolmogorov structure function exactly
-:math:`6.88388 (r/r_0)^{5/3}` (Fried 1966; Conan 2000). Fried parameters are those at 500 nm.
+:math:`6.88388 (r/r_0)^{5/3}` (Fried 1966; Conan 2000). Lengths are in metres; Fried parameters
+are those at 500 nm.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def fried_parameter(r0: float, wavelength: ArrayLike) -> np.ndarray:
 def path_spectrum(frequency: ArrayLike, r0: float, outer_scale: float) -> np.ndarray:
     """Return the power spectrum of the optical path [m^2 per (cycles/m)^2] at frequencies [cycles/m].
 
-    It is two-sided and two-dimensional: its integral over the plane is the variance. ``r0`` [m] is that at 500 nm.
+    It is two-sided and two-dimensional: its integral over the plane is the variance.
     """
     r0, outer_scale = require_positive(r0, "r0", "metres"), require_positive(outer_scale, "outer_scale", "metres")
     nu = np.asarray(frequency, dtype=np.float64)

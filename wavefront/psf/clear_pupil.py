@@ -17,11 +17,11 @@ from ...raytrace.rays import parallel_rays
 from ...raytrace.trace import trace_packets
 from .clear_pupil_kernels import find_edges
 
-# Spokes to a ring: the phase of a blur goes round the pupil some three times faster than across its ring.
-_SPOKES_TO_A_RING = 3.2
+# Spokes per ring: the phase of a blur varies some three times faster around the pupil than across its ring.
+_SPOKES_PER_RING = 3.2
 # More rings, of polynomials of a higher degree, add nothing.
 _MOST_RINGS = 12
-# Rays on a spoke from which the rims of apertures are found, by parabolas.
+# Rays on a spoke that determine the rims of apertures, by parabolas.
 _EDGE_RINGS = 3
 
 
@@ -44,7 +44,7 @@ class SpokePupil:
         """Return approximately ``count`` points of an annulus of given diameter [m] and linear obscuration."""
         if not count >= 10:
             raise DomainError(f"n_pupil = {count!r}: expected at least 10 pupil points")
-        n_ring = min(math.ceil(math.sqrt(count / _SPOKES_TO_A_RING)), _MOST_RINGS)
+        n_ring = min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), _MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
         node = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])

@@ -1,4 +1,4 @@
-"""The kernel that finds the clear part of a pupil."""
+"""Kernel of the clear part of a pupil."""
 
 from __future__ import annotations
 

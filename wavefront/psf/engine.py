@@ -1,4 +1,4 @@
-"""The protocol of PSF engines: one set of inputs, and the steps that all engines share."""
+"""The protocol of PSF engines: one set of inputs, and the steps common to all engines."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ class PsfEngine(ABC):
         self._plane = inputs.plane
         self._atmosphere = inputs.atmosphere
         self._threads = inputs.threads
-        still = np.zeros((len(self._wavelengths), 2))
-        self._dispersion = still if inputs.dispersion is None else np.array(inputs.dispersion, dtype=np.float64)
+        zero = np.zeros((len(self._wavelengths), 2))
+        self._dispersion = zero if inputs.dispersion is None else np.array(inputs.dispersion, dtype=np.float64)
         self.focal_length = center_focal_length(self._telescope, self._wavelengths, inputs.threads, inputs.trace)
 
     @abstractmethod

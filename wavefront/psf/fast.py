@@ -38,11 +38,11 @@ from .sample_packets import indices, samples, to_packets
 
 #: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
 PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
-#: Side of the fine periodic grid over that of the stamp, with and without an atmosphere, whose wings come back round.
-#: With 1.25 they would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are,
+#: Side of the fine periodic grid over that of the stamp, with and without an atmosphere, whose wings wrap around. With
+#: 1.25 they would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are,
 #: at 1e-4 of the peak; with 2 they leave 1.1 and 1.2 times.
 GRID_MARGIN, GRID_MARGIN_STILL = 2.0, 1.25
-#: Cells to a pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
+#: Cells per pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
 #: the mean over many rays; an undisturbed spot may be no larger than one cell of a quarter of a pixel.
 OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
 # Stars of one batch, fewer where their grids would fill more than this many bytes.

@@ -11,8 +11,8 @@ pupil, less the strips along its rims where one of the two points has left it. T
 others do: to multiply the image of all rays by the transfer function of diffraction, as if those strips were spread
 evenly, would make e wrong by 1e-3 and the FWHM by 0.5 %.
 
-Rays are traced on rings and spokes. The rims of the clear pupil are found on each spoke, from how far rays pass from
-the rims of the apertures; the points of a Gauss-Lobatto rule in the square of the radius, two of which lie on the rims,
+Rays are traced on rings and spokes. The distance of rays from the rims of the apertures gives the rims of the clear
+pupil on each spoke; the points of a Gauss-Lobatto rule in the square of the radius, two of which lie on the rims,
 are put between them, and landing points interpolated along the spoke. Unlike a count of rays that pass, this moves
 smoothly when the telescope is perturbed. A strip along a rim is as wide as half the baseline across the rim; its phase
 is that of its middle, to first order.
@@ -37,7 +37,7 @@ from .sample_packets import LANES, samples
 
 #: Pupil points by default: 16 spokes of 5 rings.
 PUPIL_POINTS = 80
-#: Side of the periodic image over that of the stamp: wings that come round make the edge of a stamp of 6 arcsec 1.4
+#: Side of the periodic image over that of the stamp: wings that wrap around make the edge of a stamp of 6 arcsec 1.4
 #: times as bright as it should be, and change ellipticities by 1e-6, the FWHM by 1e-5 and the rms size by 7e-5.
 GRID_MARGIN = 1.25
 # Largest transfer function of atmosphere and detector at a frequency that is left out; with pixels of 10 um all make

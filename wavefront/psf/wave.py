@@ -14,8 +14,8 @@ points, the baselines, and the pixels are sums over these.
 
 Averaged over time, turbulence leaves no OTF at baselines beyond 1.5 m, and of what a short exposure still has there,
 charge diffusion leaves exp(-17) (4 um rms, 620 nm, f = 10.3 m). The grid then needs no padding to twice the pupil: it
-is wider than the pupil by 1.5 m, so that baselines up to there are free of those that come round. Without an
-atmosphere, or with too little diffusion, it is padded and all baselines are kept.
+is wider than the pupil by 1.5 m, so that baselines up to there are free of those that wrap around. Without an
+atmosphere, or with too little diffusion, it is padded and holds all baselines.
 
 Transforms are those of SciPy in single precision. On 480 to 512 points a side FFTW and MKL take half its time and ducc0
 as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. They
@@ -43,12 +43,12 @@ from .pupil_lattice import PupilLattice
 from .sample_packets import LANES, indices, samples
 from .wave_kernels import Screens, Taps, add_squares, pupil_fields
 
-#: Longest baseline [m] that an unpadded grid keeps.
+#: Longest baseline [m] of an unpadded grid.
 LONGEST_BASELINE = 1.5
 #: Largest distance of pupil points [m] under an atmosphere: the scale below which turbulence is left out.
 LARGEST_SPACING = 0.02
-#: Largest distance of pupil points [m] for the optics alone, which vary over metres: what limits it is the image, which
-#: repeats itself after lambda / spacing (3" at 0.04 m), and the rim of the pupil.
+#: Largest distance of pupil points [m] for the optics alone, which vary over metres: it is limited by the image, which
+#: repeats itself after lambda / spacing (3" at 0.04 m), and by the rim of the pupil.
 LARGEST_SPACING_OPTICS = 0.04
 # Largest transfer function of charge diffusion at longer baselines for a grid without padding.
 _NEGLIGIBLE = 1e-4

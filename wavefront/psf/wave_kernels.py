@@ -81,25 +81,27 @@ def blend_rows(
 
 
 @wp.func
-def lay_row(
+def add_screen(
     screens: Screens,
     layer: wp.int32,
-    scale: wp.int32,
+    screen: wp.int32,
     item: wp.int32,
     taps: Taps,
     lit: wp.array2d(dtype=wp.int32),
     blended: wp.array2d(dtype=wp.float32),
     path: wp.array2d(dtype=samples),
 ):
-    """Add one screen to the path along one row of the pupil; ``scale`` counts the screens of both scales."""
-    blend_rows(screens, layer, taps.row[scale, item], taps.row_weight[scale, item], taps.column[scale], item, blended)
+    """Add one screen to the path along one row of the pupil; ``screen`` counts the screens of both scales."""
+    blend_rows(
+        screens, layer, taps.row[screen, item], taps.row_weight[screen, item], taps.column[screen], item, blended
+    )
     for packet in range(path.shape[1]):
         if lit[item, packet] == 1:
-            at = taps.sample[scale, packet]
-            before = taps.column_weight[scale, 0, packet]
-            first = taps.column_weight[scale, 1, packet]
-            second = taps.column_weight[scale, 2, packet]
-            after = taps.column_weight[scale, 3, packet]
+            at = taps.sample[screen, packet]
+            before = taps.column_weight[screen, 0, packet]
+            first = taps.column_weight[screen, 1, packet]
+            second = taps.column_weight[screen, 2, packet]
+            after = taps.column_weight[screen, 3, packet]
             here = samples()
             for i in range(LANES):
                 k = at[i]
@@ -140,8 +142,8 @@ def pupil_fields(
     for packet in range(path.shape[1]):
         path[item, packet] = samples()
     for layer in range(n_layer):
-        lay_row(low, layer, 2 * layer, item, taps, lit, blended, path)
-        lay_row(high, layer, 2 * layer + 1, item, taps, lit, blended, path)
+        add_screen(low, layer, 2 * layer, item, taps, lit, blended, path)
+        add_screen(high, layer, 2 * layer + 1, item, taps, lit, blended, path)
     for packet in range(path.shape[1]):
         if lit[item, packet] == 1:
             for wave in range(turns_per_meter.shape[0]):
