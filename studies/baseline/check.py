@@ -84,19 +84,7 @@ class BaselineCheck:
             "figures": len(self.deviations),
             "out": len(self.out),
             "notes": list(self.notes),
-            "deviations": [
-                {
-                    "name": d.name,
-                    "unit": d.unit,
-                    "stored": d.stored,
-                    "found": d.found,
-                    "tolerance": d.tolerance,
-                    "deviation_over_tolerance": d.ratio,
-                    "checked_against": d.checked_against,
-                    "problem": d.problem,
-                }
-                for d in self.deviations
-            ],
+            "deviations": [{**vars(d), "deviation_over_tolerance": d.ratio} for d in self.deviations],
         }
 
     def text(self, everything: bool = False) -> str:

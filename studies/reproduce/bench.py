@@ -9,9 +9,6 @@ from typing import Any
 
 from ...core.products import Stamp
 from ...core.progress import Reporter
-from ...models.camera.camera import Camera
-from ...models.camera.focal_plane import FocalPlane
-from ...models.telescope import Telescope
 from ...pipeline.ccd_product import CcdProduct, product_path, read_product
 from ...pipeline.config import Configuration, digest, with_options
 from ...pipeline.experiment import Experiment
@@ -128,31 +125,11 @@ class Bench:
 
     @cached_property
     def optics(self) -> Experiment:
-        """Same telescope and focal plane without an atmosphere."""
+        """Telescope (r band), camera and CCD heights, without an atmosphere."""
         quiet = with_options(
             Configuration(), ccds=("all",), seed=self.seed, atmosphere__enabled=False, wavelengths_nm=[624.0]
         )
         return Experiment.from_config(quiet)
-
-    @property
-    def telescope(self) -> Telescope:
-        """Telescope, r band."""
-        return self.optics.telescope
-
-    @property
-    def focal_plane(self) -> FocalPlane:
-        """CCD heights."""
-        return self.optics.focal_plane
-
-    @property
-    def camera(self) -> Camera:
-        """Camera."""
-        return self.focal_plane.camera
-
-    @property
-    def field_radius(self) -> float:
-        """Radius of the field of view on the detector [m]."""
-        return self.optics.field_radius_on_detector
 
     @cached_property
     def pipeline(self) -> PipelineRun:

@@ -44,7 +44,7 @@ _R_BAND, _WEIGHT = 624e-9, 0.3 * ARCSEC
 )
 def heights(bench: Bench) -> Reproduced:
     """Draw the heights of the CCD surfaces (Fig. 7)."""
-    plane = bench.focal_plane
+    plane = bench.optics.focal_plane
     table = plane.to_table(8)
     z = np.asarray(table["z"]) * 1e6
     names = np.asarray(table["ccd"])
@@ -64,7 +64,7 @@ def heights(bench: Bench) -> Reproduced:
     }
     agrees = measured["fraction_beyond_10_um"] < 0.05 and measured["largest_um"] > 5.0
     return Reproduced(
-        {"": heights_plot(plane, (), bench.field_radius)},
+        {"": heights_plot(plane, (), bench.optics.field_radius_on_detector)},
         {"": EcsvData(columns, {"budget": "simulated", **measured})},
         f"{100 * measured['fraction_beyond_10_um']:.1f} % of the area more than 10 µm off, at most"
         f" {measured['largest_um']:.1f} µm; {measured['peak_to_valley_um']:.1f} µm peak to valley,"
@@ -83,7 +83,7 @@ def heights(bench: Bench) -> Reproduced:
 )
 def height_budget(bench: Bench) -> Reproduced:
     """Compare the drawn terms of the height budget with those of the paper (Table 1)."""
-    drawn = {name: drawn_heights(bench.camera, bench.seed, name) for name in ("specification", "simulated")}
+    drawn = {name: drawn_heights(bench.optics.camera, bench.seed, name) for name in ("specification", "simulated")}
     allowed = {
         name: np.array([b.global_height, b.raft_height, b.ccd_height, b.ccd_tilt * 1e-2, b.potato_chip]) * 1e6
         for name, b in (("specification", SPECIFICATION), ("simulated", SIMULATED))
@@ -169,13 +169,13 @@ def _budget_plot(rows: Sequence[str], values: Mapping[str, np.ndarray], units: S
 )
 def whiskers_of_optics(bench: Bench) -> Reproduced:
     """Measure ellipticities over the whole focal plane without an atmosphere (Fig. 8), by the wave engine."""
-    plane, camera = bench.focal_plane, bench.camera
+    plane, camera = bench.optics.focal_plane, bench.optics.camera
     here, across, within = _borders(camera, bench.scale.borders)
     grid = _ccd_grid(camera, bench.scale.optics_grid)
     e = optics_ellipticity(bench, np.concatenate([grid, here, across, within]))
     e, *pairs = np.split(e, np.cumsum([len(grid), len(here), len(across)]))
     jump, smooth = (float(np.sqrt(np.mean(np.abs(other - pairs[0]) ** 2))) for other in pairs[1:])
-    fields = np.rad2deg(np.hypot(*fields_at(bench.telescope, grid, _R_BAND, threads=bench.threads).T))
+    fields = np.rad2deg(np.hypot(*fields_at(bench.optics.telescope, grid, _R_BAND, threads=bench.threads).T))
     size = np.abs(e)
     measured = {
         "stars": len(e),
@@ -196,7 +196,11 @@ def whiskers_of_optics(bench: Bench) -> Reproduced:
     }
     large = measured["fraction_above_10_percent"] > 0.3 and measured["largest_e"] > 0.2 and jump > 2.0 * smooth
     return Reproduced(
-        {"": _field_whiskers_plot(grid, e, plane, bench.field_radius, "optics and CCD heights alone, 624 nm")},
+        {
+            "": _field_whiskers_plot(
+                grid, e, plane, bench.optics.field_radius_on_detector, "optics and CCD heights alone, 624 nm"
+            )
+        },
         {"": EcsvData(columns, {"engine": "wave", "wavelength_nm": _R_BAND * 1e9, "weight_fwhm_arcsec": 0.3})},
         f"{100 * measured['fraction_above_10_percent']:.0f} % of the stars exceed 10 %, at most"
         f" {100 * measured['largest_e']:.0f} %; {100 * measured['mean_e_to_0p5_deg']:.1f} % within 0.5°,"
@@ -212,10 +216,10 @@ def whiskers_of_optics(bench: Bench) -> Reproduced:
 def optics_ellipticity(bench: Bench, positions: np.ndarray) -> np.ndarray:
     """Return complex ellipticities at detector positions [m], without an atmosphere."""
     psfs = make_psfs(
-        bench.telescope,
-        fields_at(bench.telescope, positions, _R_BAND, threads=bench.threads),
+        bench.optics.telescope,
+        fields_at(bench.optics.telescope, positions, _R_BAND, threads=bench.threads),
         [_R_BAND],
-        focal_plane=bench.focal_plane,
+        focal_plane=bench.optics.focal_plane,
         engine="wave",
         pixel_size=2.5e-6,
         stamp_size=31,

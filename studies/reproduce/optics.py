@@ -48,7 +48,7 @@ _COLORS = ("black", "#7fa8d1", "#1f6fbf", "#0b2a55", RESIDUAL)
 )
 def layout(bench: Bench) -> Reproduced:
     """Draw the telescope in section with traced rays, and the CCD mosaic (Fig. 1)."""
-    telescope, camera = bench.telescope, bench.camera
+    telescope, camera = bench.optics.telescope, bench.optics.camera
     profiles = {surface.name: _profile(surface) for surface in telescope.surfaces}
     rays = {angle: _ray_paths(telescope, angle) for angle in _LAYOUT_FIELDS}
     figures = first_order(telescope)
@@ -58,7 +58,7 @@ def layout(bench: Bench) -> Reproduced:
         "f_number": figures.f_number,
         "plate_scale_arcsec_per_um": scale,
         "collecting_area_m2": figures.effective_area,
-        "field_diameter_mm": 2e3 * bench.field_radius,
+        "field_diameter_mm": 2e3 * bench.optics.field_radius_on_detector,
         "ccds": len(camera),
     }
     columns = {
@@ -73,10 +73,10 @@ def layout(bench: Bench) -> Reproduced:
     }
     agrees = abs(figures.focal_length - 10.3) < 0.05 and abs(figures.f_number - 1.23) < 0.01 and len(camera) == 189
     return Reproduced(
-        {"": _layout_plot(profiles, rays, camera, bench.field_radius)},
+        {"": _layout_plot(profiles, rays, camera, bench.optics.field_radius_on_detector)},
         {"": EcsvData(columns, {"what": f"rays through {telescope.name}, section x = 0", **measured})},
         f'f/{figures.f_number:.3f}, {figures.focal_length:.2f} m, {scale:.4f}"/µm, {figures.effective_area:.1f} m²,'
-        f" {len(camera)} CCDs, {0.2 * bench.field_radius * 1e3:.1f} cm",
+        f" {len(camera)} CCDs, {0.2 * bench.optics.field_radius_on_detector * 1e3:.1f} cm",
         agrees,
         'but for the plate scale: 206265"/10.3 m is 0.0200"/µm, so the paper\'s 0.0197 does not go with its own focal'
         " length. The four corner rafts of wavefront sensors are not modelled",

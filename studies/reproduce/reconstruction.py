@@ -85,7 +85,7 @@ def whiskers_of_stars(bench: Bench) -> Reproduced:
     e = np.concatenate([np.hypot(p.holdout.e1, p.holdout.e2) for p in made.products])
     mean, largest = float(np.nanmean(e)), float(np.nanmax(e))
     alike, ratio = _against_optics(bench)
-    png = whiskers_plot(made.products, made.experiment.focal_plane, bench.field_radius, ("truth",))
+    png = whiskers_plot(made.products, made.experiment.focal_plane, bench.optics.field_radius_on_detector, ("truth",))
     return Reproduced(
         {"": png},
         {"": EcsvData(_star_columns(made.products, "truth"), {"what": "noise-free PSFs"})},
@@ -129,7 +129,9 @@ def whiskers_of_residual(bench: Bench) -> Reproduced:
     """Show whiskers of the residual, at the stars and at holdout positions (Fig. 12)."""
     made = bench.pipeline
     figures = made.summary["all"]
-    png = whiskers_plot(made.products, made.experiment.focal_plane, bench.field_radius, ("residual", "away"))
+    png = whiskers_plot(
+        made.products, made.experiment.focal_plane, bench.optics.field_radius_on_detector, ("residual", "away")
+    )
     at, away = figures["rms_residual_at_stars"], figures["rms_residual_away"]
     observed = _rms(made.products, "observed", ("e1", "e2"))
     return Reproduced(
@@ -208,7 +210,8 @@ def correlation(bench: Bench) -> Reproduced:
     raw = correlated["observed"].mean_xi_plus("long")
     at, away = (correlated[k].mean_xi_plus("long") for k in ("residual", "away"))
     near = correlated["away"].mean_xi_plus("short")
-    every = len(made.products) == len(bench.camera)
+    count, of = len(made.products), len(bench.optics.camera)
+    every = count == of
     c = correlated["residual"]
     inside = c.within("long") & (c.n_pairs > 0)
     worst = np.argmax(np.abs(c.xi_plus[inside]))
@@ -216,7 +219,7 @@ def correlation(bench: Bench) -> Reproduced:
     reached = abs(at) < 1e-7 and 1e-5 < raw < 9e-5
     return Reproduced(
         {"": correlation_plot(correlated)},
-        {"": EcsvData(columns, {"what": "correlation of the ellipticity, TreeCorr", "ccds": len(made.products)})},
+        {"": EcsvData(columns, {"what": "correlation of the ellipticity, TreeCorr", "ccds": count})},
         f"from 10' to 3°: {raw:.1e} before; {at:+.0e} after, at the stars (one bin at most {largest:.0e}, its error"
         f" {error:.0e}); {away:+.0e} away from the stars, {near:.0e} there within 10'",
         reached if every else None,
@@ -224,7 +227,7 @@ def correlation(bench: Bench) -> Reproduced:
             "in the mean over pairs at the stars, where residuals of each CCD sum to zero by construction; where there"
             " is no star, which is where galaxies are, the residual is larger"
             if every
-            else f"{len(made.products)} of {len(bench.camera)} CCDs have too few pairs to tell 1e-8 from nothing;"
+            else f"{count} of {of} CCDs have too few pairs to tell 1e-8 from nothing;"
             " residuals of each CCD sum to zero at its stars by construction, and are larger away from them"
         ),
         {

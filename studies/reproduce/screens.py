@@ -136,7 +136,7 @@ def screens(bench: Bench) -> Reproduced:
     return Reproduced(
         {
             "": _screens_plot(
-                path, size * block * air.screen_pixel, air.altitudes, air.weights, bench.telescope.pupil_diameter
+                path, size * block * air.screen_pixel, air.altitudes, air.weights, bench.optics.telescope.pupil_diameter
             )
         },
         {"": FitsData(hdus, cards)},

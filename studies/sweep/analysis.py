@@ -30,8 +30,7 @@ class Curve:
     value: np.ndarray
     #: Mean of the metric over the replicas.
     mean: np.ndarray
-    #: Standard error of the mean change, and standard deviation over the replicas; NaN with one replica.
-    error: np.ndarray
+    #: Standard deviation over the replicas; NaN with one replica.
     spread: np.ndarray
     #: Mean change from the nominal point.
     change: np.ndarray
@@ -42,26 +41,13 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class BudgetLine:
-    """Effect of one parameter on one metric at one mark, and its standard error over the replicas."""
-
-    parameter: str
-    value: float
-    change: float
-    error: float
-    #: Fraction of the sum of all single changes.
-    fraction: float
-
-
-@dataclass(frozen=True)
 class Budget:
     """Single effects on one metric at one mark, and their sum."""
 
     metric: str
     mark: str
-    #: Largest effect first.
-    lines: tuple[BudgetLine, ...]
-    #: Sum of the single changes.
+    #: Change by each parameter alone, the largest first, and their sum.
+    changes: dict[str, float]
     total: float
     #: Change with all effects at once, and its standard error; NaN where it was not computed.
     together: float
@@ -102,29 +88,22 @@ def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
         grid[np.searchsorted(seeds, table.seed[alone]), at] = table.metrics[metric][alone]
         change = grid - grid[:, [int(np.searchsorted(values, float(parameter.nominal)))]]
         mean, spread, _ = _over_replicas(grid)
-        mean_change, _, error = _over_replicas(change)
+        mean_change = _over_replicas(change)[0]
         marks = {
             mark: (value, float(mean_change[values == value][0]))
             for mark, value in parameter.marks.items()
             if value in values
         }
-        found.append(Curve(name, metric, values, mean, error, spread, mean_change, marks, float(parameter.nominal)))
+        found.append(Curve(name, metric, values, mean, spread, mean_change, marks, float(parameter.nominal)))
     return found
 
 
 def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budget | None:
     """Return the budget of all parameters with a mark; None where there are none."""
     marked = {name: p.marks[mark] for name, p in sweep.parameters.items() if mark in p.marks}
-    lines = []
-    for curve in curves(table, sweep, metric):
-        if mark in curve.marks:
-            value, change = curve.marks[mark]
-            error = float(curve.error[curve.value == value][0])
-            lines.append(BudgetLine(curve.parameter, value, change, error, np.nan))
-    if not lines:
+    alone = {curve.parameter: curve.marks[mark][1] for curve in curves(table, sweep, metric) if mark in curve.marks}
+    if not alone:
         return None
-    total = sum(line.change for line in lines)
-    lines = [BudgetLine(n.parameter, n.value, n.change, n.error, n.change / total if total else np.nan) for n in lines]
     nominal = {name: p.nominal for name, p in sweep.parameters.items()}
     changes = []
     for seed in np.unique(table.seed):
@@ -132,8 +111,8 @@ def budget(table: SweepTable, sweep: SweepFile, metric: str, mark: str) -> Budge
         without = _at(table, nominal, seed, metric)
         changes.append(with_all - without)
     together, _, error = (float(v[0]) for v in _over_replicas(np.array(changes)[:, None]))
-    ordered = tuple(sorted(lines, key=lambda line: -abs(line.change)))
-    return Budget(metric, mark, ordered, float(total), together, error)
+    ordered = dict(sorted(alone.items(), key=lambda item: -abs(item[1])))
+    return Budget(metric, mark, ordered, float(sum(alone.values())), together, error)
 
 
 def allowances(found: Sequence[Curve], target: float) -> list[Allowance]:
@@ -190,7 +169,7 @@ def summary(table: SweepTable, sweep: SweepFile) -> dict[str, Any]:
             added = budget(table, sweep, metric, mark)
             if added is not None:
                 entry[f"budget_{mark}"] = {
-                    **{line.parameter: line.change for line in added.lines},
+                    **added.changes,
                     "sum": added.total,
                     "together": added.together,
                 }

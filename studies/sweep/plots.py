@@ -160,18 +160,18 @@ def correlations_plot(found: Mapping[str, Mapping[str, tuple[float, float]]]) ->
 
 def budget_plot(budgets: Sequence[Budget]) -> bytes:
     """Draw the sum of single effects beside the effect of all causes together, for each mark."""
-    names = list(dict.fromkeys(line.parameter for budget in budgets for line in budget.lines))
+    names = list(dict.fromkeys(name for budget in budgets for name in budget.changes))
     with styled():
         figure = new_figure(2.4 + 2.3 * len(budgets), 4.2)
         axes = figure.subplots()
         colors = _colors(len(names))
         for i, budget in enumerate(budgets):
             up, down = 0.0, 0.0
-            for line in sorted(budget.lines, key=lambda n: names.index(n.parameter)):
-                base = up if line.change >= 0 else down
-                label = line.parameter if i == 0 else None
-                axes.bar(2.0 * i, line.change, 0.7, bottom=base, color=colors[names.index(line.parameter)], label=label)
-                up, down = (up + line.change, down) if line.change >= 0 else (up, down + line.change)
+            for name, change in sorted(budget.changes.items(), key=lambda item: names.index(item[0])):
+                base = up if change >= 0 else down
+                label = name if i == 0 else None
+                axes.bar(2.0 * i, change, 0.7, bottom=base, color=colors[names.index(name)], label=label)
+                up, down = (up + change, down) if change >= 0 else (up, down + change)
             error = budget.together_error if np.isfinite(budget.together_error) else None
             axes.bar(2.0 * i + 0.8, budget.together, 0.7, yerr=error, color="0.75", edgecolor="0.3", ecolor="0.2")
         positions = [p for i in range(len(budgets)) for p in (2.0 * i, 2.0 * i + 0.8)]

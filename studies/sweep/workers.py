@@ -130,7 +130,8 @@ def dask_workers(measure: Measure, client: Any) -> Workers:
         batch = uuid4().hex[:8]
 
         def submit(point: SweepPoint) -> Any:
-            return client.submit(_on_one_thread, measure, point, key=f"pachon-{batch}-{point.number}")
+            # On one thread: Dask runs as many points side by side as a worker has threads.
+            return client.submit(measure, point, 1, key=f"pachon-{batch}-{point.number}")
 
         running = as_completed([submit(point) for point in islice(source, ahead)], loop=client.loop, raise_errors=False)
         for future in running:
@@ -226,11 +227,6 @@ def _require_distributed(option: str) -> None:
 
 def _version() -> str:
     return VERSION
-
-
-def _on_one_thread(measure: Measure, point: SweepPoint) -> PointResult:
-    # Dask runs as many points side by side as a worker has threads.
-    return measure(point, 1)
 
 
 def _first_line(error: BaseException) -> str:
