@@ -1,4 +1,4 @@
-"""How elliptical does the atmosphere alone make stars, over what angle, and how does that fade with exposure time?
+"""Ellipticity by the atmosphere alone: its size and correlation against exposure time.
 
 Run: python benchmarks/atmosphere_exposure_times.py [--seeds N] [--stars N] [--folder FOLDER]
 
@@ -6,10 +6,10 @@ This is Figure 6 of Jee & Tyson (2011): stars in one CCD (13.6 arcmin), the site
 60 s that begin together, one wavelength, no optics (the f/1000 paraboloid of atmosphere_vs_galsim.py), no charge
 diffusion. It prints mean |e| and xi+, and draws xi+ for the four exposures and the whiskers of 15 s.
 
-The ground layer is done twice: at 0 km, where all stars of an exposure look through the very same air and so share one
-ellipticity, which lifts xi+ alike at all separations; and at 200 m, which changes little within a CCD, since stars 13
-arcmin apart see it 0.8 m apart, a tenth of the pupil. In the correlation with the mean of each exposure taken out the
-shared part is gone.
+The ground layer stands at two heights. At 0 km the light of all stars of an exposure crosses the same turbulence, which
+adds one common ellipticity and a constant to xi+. At 200 m little changes within a CCD: the light of stars 13 arcmin
+apart crosses the layer 0.8 m apart, a tenth of the pupil. The common part is absent from the correlation of
+ellipticities less the mean of their exposure.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from atmosphere_vs_galsim import ARCMIN, ARCSEC, SITE, ellipticity, ideal_telescope, pachon_stars, through_screens
+from atmosphere_vs_galsim import SITE, ellipticity, ideal_telescope, pachon_stars, through_screens
 
 import pachon
 from pachon.core.random_streams import stream
+from pachon.core.units import ARCMIN, ARCSEC
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 
 EXPOSURES = (1.0, 5.0, 15.0, 60.0)
@@ -80,20 +81,20 @@ def average(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def half_width(r: np.ndarray, xi: np.ndarray) -> float:
     """Return the separation at which a correlation has fallen to half of its first bin [arcmin]."""
     below = int(np.argmax(xi < 0.5 * xi[0]))
-    part = (xi[below - 1] - 0.5 * xi[0]) / (xi[below - 1] - xi[below])
-    return float(np.exp(np.log(r[below - 1]) + part * np.log(r[below] / r[below - 1])))
+    fraction = (xi[below - 1] - 0.5 * xi[0]) / (xi[below - 1] - xi[below])
+    return float(np.exp(np.log(r[below - 1]) + fraction * np.log(r[below] / r[below - 1])))
 
 
 def draw_correlations(table: dict, r: np.ndarray, path: Path) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(11.0, 4.4), layout="constrained")
-    titles = {"xi": "as observed", "within": "mean ellipticity of each exposure taken out"}
+    titles = {"xi": "as observed", "within": "less the mean ellipticity of each exposure"}
     for panel, (name, title) in zip(axes, titles.items(), strict=True):
         for lift, style in zip(LIFTS, ("o-", "s--"), strict=True):
             for number, t in enumerate(EXPOSURES):
                 mean, error = average(table[lift, t][name])
                 label = f"{t:g} s" if lift == 0.0 else None
                 place = r * 1.03 ** (number - 1.5)
-                # Both sets look through the same screens: one set of error bars is enough.
+                # Both sets have the same screens: one set of error bars is enough.
                 error = error if lift == 0.0 else None
                 panel.errorbar(place, mean, error, fmt=style, color=f"C{number}", ms=3, lw=1, capsize=2, label=label)
         panel.set_xscale("log")
@@ -133,13 +134,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Ellipticity by the atmosphere alone against exposure time.")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--stars", type=int, default=400)
-    parser.add_argument("--folder", type=Path, help="where to draw the pictures")
+    parser.add_argument("--folder", type=Path, help="folder for the plots")
     arguments = parser.parse_args()
     print(f"pachon {pachon.__version__}; {arguments.seeds} seeds, {arguments.stars} stars in one CCD")
     table, r = study(arguments.seeds, arguments.stars)
     near = int(np.argmin(np.abs(r - 1.0)))
     print(
-        f"ground at  exposure  mean |e|            xi+ at {r[near]:.1f}'            the same, mean taken out  half at"
+        f"ground at  exposure  mean |e|            xi+ at {r[near]:.1f}'            the same, less the mean   half at"
     )
     for (lift, t), row in table.items():
         (mean, error), (xi, xi_error), (within, within_error) = (average(row[n]) for n in ("mean", "xi", "within"))

@@ -1,21 +1,21 @@
-"""Does the atmosphere alone make the same stars as GalSim's: as wide, as elliptical, as correlated?
+"""Stars by the atmosphere alone, beside those of GalSim: width, ellipticity, correlation.
 
 Run: python benchmarks/atmosphere_vs_galsim.py [--seeds N] [--exposures N] [--stars N] [--photons N] [--figure FILE]
 
 Both sides have the site's six layers (heights, weights, Fried parameter, outer scale, wind), 15 s, one wavelength, the
 annular pupil of the LSST, pixels of 0.1 arcsec, and neither optics nor charge diffusion. A seed is one set of screens a
-side with one draw of wind directions, used by both; its exposures begin a minute apart, so they see other parts of the
-screens. Stars lie within 5 arcmin of the axis, at the same places throughout. Shapes are pachon's weighted moments (0.7
-arcsec) on both sides. Two questions:
+side with one draw of wind directions, used by both; its exposures begin a minute apart, at other parts of the screens.
+Stars lie within 5 arcmin of the axis, at the same places throughout. Shapes are pachon's weighted moments (0.7 arcsec)
+on both sides. Two comparisons:
 
 1. Each side through screens of its own: mean FWHM, mean |e|^2 (all of it, and about the mean of each exposure), xi+.
-2. pachon's fast engine through GalSim's own screens, star by star beside GalSim's photons: no luck of the draw is left.
+2. pachon's fast engine through GalSim's own screens, star by star beside GalSim's photons, without sample variance.
 
 Errors come from the scatter of the seeds. Photon noise stays out of GalSim's side: every star is shot twice, |e|^2 is
 the product of the two ellipticities, and the FWHM is twice that of the sum of the two less their mean.
 
 pachon needs a telescope: here a single paraboloid of f/1000, whose coma (3 theta / 16 N^2) blurs a star 5 arcmin off
-the axis by 1e-4 arcsec rms and so has no say; the LSST itself would blur it by 0.05 arcsec.
+the axis by a negligible 1e-4 arcsec rms; the LSST itself would blur it by 0.05 arcsec.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ import scipy.fft
 
 import pachon
 from pachon.core.random_streams import stream
+from pachon.core.units import ARCMIN, ARCSEC
 from pachon.models.ideal_telescope import without_aberration
 from pachon.models.telescope import Telescope
 from pachon.pipeline.measure.shapes import fwhm
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 
-ARCSEC = math.radians(1.0 / 3600.0)
-ARCMIN = 60.0 * ARCSEC
 SITE, WAVELENGTH = "cerro_pachon", 620e-9
 PIXEL, STAMP, WEIGHT_FWHM = 0.1 * ARCSEC, 61, 0.7 * ARCSEC
 FIELD = 5.0 * ARCMIN
@@ -51,12 +50,12 @@ BINS = {"min_sep": 0.5 * ARCMIN, "max_sep": 10.0 * ARCMIN, "n_bins": 6}
 
 
 def ideal_telescope() -> Telescope:
-    """Return a telescope with the LSST's pupil and no aberration to speak of."""
+    """Return a telescope with the LSST's pupil and negligible aberration."""
     return without_aberration(pachon.load_telescope("lsst_v3.3_r"))
 
 
 def through_screens(atmosphere: Atmosphere, screens: np.ndarray, **changes) -> Atmosphere:
-    """Return an atmosphere that sees given slopes, packed as its own are, with other times, offsets or heights."""
+    """Return an atmosphere with given slopes, packed as its own are, and other times, offsets or heights."""
 
     class Borrowing(Atmosphere):
         def screens(self, kind, threads=None):
@@ -109,7 +108,7 @@ def galsim_stars(
         theta = (-tx * galsim.radians, -ty * galsim.radians)
         psf = layers.makePSF(**galsim_exposure(aper=aperture, theta=theta, t0=start, exptime=exposure))
         image = psf.drawImage(nx=stamp, ny=stamp, scale=pixel / ARCSEC, method="phot", n_photons=photons, rng=rng)
-        # It draws the sky, pachon the focal plane, turned by half a circle.
+        # It draws the sky, pachon the focal plane, rotated by half a circle.
         images.append(image.array[::-1, ::-1])
     return np.array(images)
 
@@ -145,23 +144,23 @@ def summary(fields: np.ndarray, first: np.ndarray, second: np.ndarray, width: np
 
 
 def through_galsim_screens(atmosphere: Atmosphere, layers: galsim.PhaseScreenList) -> Atmosphere:
-    """Return an atmosphere that sees GalSim's screens: the slopes that pachon would make of their modes."""
+    """Return an atmosphere with the slopes that pachon would make of the modes of GalSim's screens."""
     size, pixel = atmosphere.screen_size, atmosphere.screen_pixel
     axis = (np.arange(size) - size // 2) * pixel
     kx, ky = 2.0 * math.pi * np.fft.rfftfreq(size, pixel), 2.0 * math.pi * np.fft.fftfreq(size, pixel)[:, None]
     lag = np.sinc(np.hypot(kx, ky) * SLOPE_LAG / (2.0 * math.pi))
     cutoff = 2.0 * math.pi * layers.makePSF(**galsim_exposure()).screen_kmax
     screens = np.empty((len(layers), size, size), dtype=np.int32)
-    seen = through_screens(atmosphere, screens, offsets=np.full((len(layers), 2), -axis[0]), cutoff=cutoff)
+    result = through_screens(atmosphere, screens, offsets=np.full((len(layers), 2), -axis[0]), cutoff=cutoff)
     for number, layer in enumerate(layers):
         # GalSim's wavefronts are in nanometres, and at its own samples nothing is interpolated.
         spectrum = scipy.fft.rfft2(1e-9 * layer.wavefront(*np.meshgrid(axis, axis), 0.0)) * lag
         x_counts, y_counts = (
-            np.rint(scipy.fft.irfft2(1j * k * spectrum, s=(size, size)) / seen.slope_unit(number)).astype(np.int32)
+            np.rint(scipy.fft.irfft2(1j * k * spectrum, s=(size, size)) / result.slope_unit(number)).astype(np.int32)
             for k in (kx, ky)
         )
         screens[number] = (y_counts << 16) | (x_counts & 0xFFFF)
-    return seen
+    return result
 
 
 def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, dict[str, np.ndarray]]:
@@ -169,7 +168,7 @@ def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, d
     telescope = ideal_telescope()
     own = Atmosphere.from_site(SITE, seed, screen_size=SIZE, screen_length=LENGTH)
     layers = galsim_layers(own, seed)
-    seen = {
+    atmospheres = {
         "pachon": through_screens(own, own.screens("slopes", 1)),
         "shared": through_galsim_screens(own, layers),
     }
@@ -181,7 +180,7 @@ def one_seed(seed: int, exposures: int, stars: int, photons: int) -> dict[str, d
     width = {name: np.empty(shape) for name in ("pachon", "shared", "galsim")}
     for exposure in range(exposures):
         start = exposure * EPOCH_STEP
-        for name, atmosphere in seen.items():
+        for name, atmosphere in atmospheres.items():
             later = through_screens(atmosphere, atmosphere.screens("slopes"), times=atmosphere.times + start)
             images = pachon_stars(telescope, later, fields)
             shapes[name][exposure], width[name][exposure] = ellipticity(images), fwhm(images, PIXEL)
@@ -221,7 +220,7 @@ class Comparison:
     def ratio(self, name: str, side: str = "pachon") -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of one side over that of GalSim, and its error."""
         ours, theirs = self.sides[side][name], self.sides["galsim"][name]
-        # What both sides of a seed share (winds, or all of the screens) cancels in the difference.
+        # Winds or screens that both sides of a seed have in common cancel in the difference.
         scatter = ours / ours.mean(axis=0) - theirs / theirs.mean(axis=0)
         ratio = ours.mean(axis=0) / theirs.mean(axis=0)
         return ratio, np.abs(ratio) * scatter.std(axis=0, ddof=1) / math.sqrt(len(scatter))
@@ -256,7 +255,7 @@ def compare(seeds: range, exposures: int, stars: int, photons: int, report=lambd
 
 def endless_widths() -> tuple[float, float]:
     """Return the FWHM of an endless exposure in the same pixels [arcsec]: in theory, and as GalSim shoots it."""
-    # Slopes are made by waves of metres: small screens do, and the wind has no part in it.
+    # Waves of metres make the slopes: small screens suffice, and the wind does not matter.
     air = Atmosphere.from_site(SITE, 0, exposure=1.0, screen_size=1024, screen_length=LENGTH / 3.0)
     layers = galsim_layers(air, 0)
     u, v = stream(0, "places").uniform(0.0, air.screen_length, (2, 1_000_000))
@@ -277,7 +276,7 @@ def endless_widths() -> tuple[float, float]:
 def draw(comparison: Comparison, path: Path) -> None:
     """Draw xi+ of both sides."""
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
-    titles = {"xi": "as observed", "xi within": "mean of each exposure taken out"}
+    titles = {"xi": "as observed", "xi within": "less the mean of each exposure"}
     for panel, (name, title) in zip(axes, titles.items(), strict=True):
         for side, label, colour, shift in (("pachon", "pachon", "C0", 0.98), ("galsim", "GalSim", "C1", 1.02)):
             mean, error = comparison.mean(side, name)
@@ -298,7 +297,7 @@ def main() -> None:
     parser.add_argument("--exposures", type=int, default=16, help="exposures of 15 s through each set")
     parser.add_argument("--stars", type=int, default=16)
     parser.add_argument("--photons", type=int, default=100_000, help="photons of GalSim a star")
-    parser.add_argument("--figure", type=Path, help="where to draw xi+")
+    parser.add_argument("--figure", type=Path, help="file for a plot of xi+")
     arguments = parser.parse_args()
     print(f"pachon {pachon.__version__}, GalSim {galsim.__version__}; one thread each")
     print(

@@ -1,9 +1,9 @@
-"""How finely must the fast engine sample time, pupil and image? Each default against a finer run on the same screens.
+"""Sampling of time, pupil and image by the fast engine: each default against a finer run on the same screens.
 
     python benchmarks/convergence.py [--exposures 6] [--stars 25] [--screen-size 4096]
 
-Stars over the whole field of the LSST, five wavelengths of the r band, CCD heights, 15 s. One thing is made finer at a
-time; printed are the rms differences of e1 and e2 (weight of 0.7 arcsec), the mean ratio of sizes, and the time of a
+Stars over the whole field of the LSST, five wavelengths of the r band, CCD heights, 15 s. One sampling is made finer at
+a time; printed are the rms differences of e1 and e2 (weight of 0.7 arcsec), the mean ratio of sizes, and the time of a
 star on one thread, ray trace included.
 """
 
@@ -13,9 +13,8 @@ import time
 import numpy as np
 
 import pachon
-from pachon.wavefront.chief_rays import fields_at
+from pachon.core.units import ARCSEC
 
-ARCSEC = np.pi / 180 / 3600
 #: The engine's own defaults, and the finest values that a reference run takes.
 DEFAULT = {"time_step": 0.05, "n_pupil": 334, "oversampling": 2}
 REFERENCES = {
@@ -26,28 +25,29 @@ REFERENCES = {
 
 
 class Field:
-    """Stars and screens of some exposures, kept so that every sampling sees the same."""
+    """Stars and screens of some exposures, the same for every sampling."""
 
     def __init__(self, exposures, stars, size):
         self.telescope = pachon.load_telescope("lsst_v3.3_r")
         self.focal_plane = pachon.FocalPlane.from_budget("lsst", seed=1)
-        self.air, self.fields = [], []
+        self.atmospheres, self.fields = [], []
         rng = np.random.default_rng(5)
         centers = self.focal_plane.camera.centers
         for seed in range(exposures):
-            air = pachon.Atmosphere.from_site("cerro_pachon", seed, screen_size=size, screen_length=size * 1300 / 8192)
-            self.air.append(air)
+            screens = {"screen_size": size, "screen_length": size * 1300 / 8192}
+            self.atmospheres.append(pachon.Atmosphere.from_site("cerro_pachon", seed, **screens))
             ccds = rng.choice(np.flatnonzero(np.hypot(*centers.T) < 0.31), stars, replace=False)
-            self.fields.append(fields_at(self.telescope, centers[ccds] + rng.uniform(-0.018, 0.018, (stars, 2))))
+            self.fields.append(pachon.fields_at(self.telescope, centers[ccds] + rng.uniform(-0.018, 0.018, (stars, 2))))
 
     def shapes(self, time_step, **sampling):
         """Return e1, e2, size of all stars and the seconds of a star."""
         measured, seconds = [], 0.0
         for seed, fields in enumerate(self.fields):
-            # The screens do not depend on the time step; making them again would only take time.
-            air = self.air[seed]
-            steps = round(air.exposure / time_step)
-            atmosphere = air.at_times((np.arange(steps) + 0.5) * (air.exposure / steps), air.exposure)
+            # The screens do not depend on the time step, so one set serves all.
+            atmosphere = self.atmospheres[seed]
+            steps = round(atmosphere.exposure / time_step)
+            times = (np.arange(steps) + 0.5) * (atmosphere.exposure / steps)
+            atmosphere = atmosphere.at_times(times, atmosphere.exposure)
             atmosphere.screens("slopes")
             start = time.perf_counter()
             psfs = pachon.make_psfs(

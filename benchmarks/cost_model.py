@@ -1,15 +1,15 @@
-"""What does a run cost? Seconds and bytes against CCDs, stars, wavelengths, time steps, layers and screens.
+"""Cost of a run: seconds and bytes against CCDs, stars, wavelengths, time steps, layers and screens.
 
     python benchmarks/cost_model.py [--rounds 3] [--threads 1]
 
-Times stars over the field with one thing changed at a time, screens of two sizes, and the modelling of one CCD with two
-numbers of stars; fits by least squares (relative errors)
+Times stars over the field with one quantity changed at a time, screens of two sizes, and the modelling of one CCD with
+two numbers of stars; fits by least squares (relative errors)
 
     star   = base + wave * W + read * T * P * L + bin * T * P * W        (T time steps, P pupil points, L layers)
     screen = pixel * N^2                                                 (N samples on a side)
     model  = base + star * S                                             (S noise-free stars of one CCD)
 
-prints how far the fit is from each measurement, and predicts the paper's size and a survey from it.
+prints each measurement beside the fit, and predicts from it the cost of the paper's simulation and of a survey.
 """
 
 import argparse
@@ -35,7 +35,7 @@ LAYERS = {
         (3, [0.0, 5000.0, 15000.0], [0.5, 0.3, 0.2], [5.0, 10.0, 20.0]),
     )
 }
-# wavelengths, time steps, pupil points (asked for), layers
+# wavelengths, time steps, pupil points (requested), layers
 STARS = [
     (5, 300, 334, 6),
     (1, 300, 334, 6),
@@ -46,8 +46,9 @@ STARS = [
     (5, 300, 188, 6),
     (3, 600, 334, 6),
 ]
+#: Pupil points that the engine takes for those requested.
 POINTS = {334: 332, 188: 160}
-SURVEY_DEG2, FIELD_DEG2, CCDS, TRUTH, OBSERVED = 20_000.0, 9.6, 189, 800, 40
+SURVEY_DEG2, FIELD_DEG2, CCDS, NOISE_FREE, OBSERVED = 20_000.0, 9.6, 189, 800, 40
 
 
 def time_stars(telescope, focal_plane, rounds, threads, count=96):
@@ -80,7 +81,7 @@ def time_stars(telescope, focal_plane, rounds, threads, count=96):
 
 
 def fit_stars(seconds):
-    """Return the four coefficients [s] and what they make of each measurement."""
+    """Return the four coefficients [s] and the fitted seconds of each measurement."""
     waves, steps, points, layers = np.array([(w, t, POINTS[p], n) for w, t, p, n in STARS], dtype=float).T
     terms = np.stack([np.ones(len(STARS)), waves, steps * points * layers, steps * points * waves], axis=1)
     coefficients = np.linalg.lstsq(terms / seconds[:, None], np.ones(len(STARS)), rcond=None)[0]
@@ -102,11 +103,11 @@ def time_screens(threads):
 
 def time_models():
     """Return seconds to model a CCD and bytes of its product for two numbers of noise-free stars."""
-    figures = {}
-    for truth in (100, 400):
+    cost = {}
+    for n_star in (100, 400):
         options = {
             "ccds": ("R22_S11",),
-            "stars__truth": truth,
+            "stars__truth": n_star,
             "atmosphere__exposure_s": 1.0,
             "atmosphere__screen_size": 2048,
             "atmosphere__screen_length_m": 325.0,
@@ -118,8 +119,8 @@ def time_models():
         with tempfile.TemporaryDirectory() as folder:
             write_product(Path(folder), product, stamp_of(experiment), [])
             seconds = time.perf_counter() - start
-            figures[truth] = seconds, product_path(Path(folder), "R22_S11").stat().st_size
-    (s1, b1), (s2, b2) = figures.values()
+            cost[n_star] = seconds, product_path(Path(folder), "R22_S11").stat().st_size
+    (s1, b1), (s2, b2) = cost.values()
     return {"seconds": (s1 - (s2 - s1) / 3, (s2 - s1) / 300), "bytes": (b1 - (b2 - b1) / 3, (b2 - b1) / 300)}
 
 
@@ -150,11 +151,11 @@ def main():
     print(f"model of a CCD = {model_base:.2f} s + {1e3 * model_star:.2f} ms S (one thread)")
     print(f"product of a CCD = {file_base / 1e6:.2f} MB + {file_star / 1e3:.2f} kB S")
     star = base + 5 * wave + 300 * 332 * (6 * read + 5 * binned)
-    exposure = 6 * 8192**2 * screens[4096] + CCDS * (TRUTH + OBSERVED) * star
-    modelling = CCDS * (model_base + TRUTH * model_star)
-    size = CCDS * (file_base + TRUTH * file_star)
+    exposure = 6 * 8192**2 * screens[4096] + CCDS * (NOISE_FREE + OBSERVED) * star
+    modelling = CCDS * (model_base + NOISE_FREE * model_star)
+    size = CCDS * (file_base + NOISE_FREE * file_star)
     fields = SURVEY_DEG2 / FIELD_DEG2
-    print(f"paper's size, {CCDS} CCDs x ({TRUTH} + {OBSERVED}) stars, {options.threads} thread(s):")
+    print(f"paper's size, {CCDS} CCDs x ({NOISE_FREE} + {OBSERVED}) stars, {options.threads} thread(s):")
     print(f"  {exposure:.0f} s of PSFs and screens + {modelling:.0f} s of models on one thread beside them")
     print(f"  {size / 1e9:.2f} GB of products, {6 * 8192**2 * 4 / 2**30:.2f} GiB of screens")
     core_hours = (exposure * options.threads + modelling) / 3600

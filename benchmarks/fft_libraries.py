@@ -1,4 +1,4 @@
-"""Which FFT library for the wave engine? Complex transforms of a square in single precision, one thread, interleaved.
+"""FFT libraries for the wave engine: complex transforms of a square in single precision, one thread, interleaved.
 
     python benchmarks/fft_libraries.py [--rounds 40] [--sizes 480 500 512 1024]
 

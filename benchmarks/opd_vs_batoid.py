@@ -1,13 +1,13 @@
-"""How fast are the wavefronts of 1000 field points, end to end, beside batoid.wavefront in a loop?
+"""Time of the wavefronts of 1000 field points, end to end, beside batoid.wavefront in a loop.
 
 Run: python benchmarks/opd_vs_batoid.py [fields] [model]
 
 The model is one that batoid has too: lsst_v3.3_r (its LSST_r.yaml) or rubin_v3.14_r. Both sides make maps of 53 x 53
-points over the entrance pupil. They take turns in one process, so that both see the same machine: a round is forty of
+points over the entrance pupil. They take turns in one process, under the same load of the machine: a round is forty of
 the fields by batoid (its loop costs the same for each) and all of them by pachon. batoid's threads are OMP_NUM_THREADS,
 which it reads when it is first used, so that its loop on 2 threads is timed in a process of its own that takes turns
-with this one. Ratios are of the best rounds of each; on a machine that is busy with other things, the ratio of the
-processor times on one thread says more. The first compilation is shown apart.
+with this one. Ratios are of the best rounds of each; on a busy machine the ratio of the processor times on one thread
+is more reliable. The first compilation is shown apart.
 """
 
 import os
@@ -43,7 +43,7 @@ def peer_seconds(optic: batoid.Optic, chosen: np.ndarray) -> float:
     return (time.perf_counter() - start) / len(chosen)
 
 
-def answer() -> None:
+def serve_rounds() -> None:
     """Time a round of batoid for every line of standard input: the part of the process with other threads."""
     optic, chosen = batoid.Optic.fromYaml(PEERS[MODEL]), fields()[: PEER_FIELDS // 2]
     for _ in sys.stdin:
@@ -58,7 +58,7 @@ def main() -> None:
     angles = fields()
     chosen = angles[:PEER_FIELDS]
     axis = np.linspace(-0.5, 0.5, GRID) * optic.pupilSize
-    # batoid's map is of odd size: its grid runs from rim to rim.
+    # The grid of batoid's map, of odd size, extends from rim to rim.
     pupil = np.meshgrid(axis, axis)
     start = time.perf_counter()
     pachon.wavefront_opds(telescope, angles[:1], WAVELENGTH, pupil)
@@ -66,7 +66,7 @@ def main() -> None:
     print(f"load of the machine: {', '.join(f'{v:.1f}' for v in os.getloadavg())} on {os.cpu_count()} processors")
     print(f"first call (kernels compiled or loaded): {time.perf_counter() - start:.2f} s")
 
-    command = [sys.executable, __file__, str(FIELDS), MODEL, "--answer"]
+    command = [sys.executable, __file__, str(FIELDS), MODEL, "--serve"]
     # Its threads sleep while they wait, or on a busy machine they would wait for each other most of the time.
     environment = os.environ | {"OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": "passive"}
     seconds: dict[str, list[float]] = {"batoid 1 thread": [], "batoid 2 threads": [], "1 thread": [], "2 threads": []}
@@ -121,4 +121,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    answer() if "--answer" in sys.argv else main()
+    serve_rounds() if "--serve" in sys.argv else main()

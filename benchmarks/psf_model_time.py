@@ -1,4 +1,4 @@
-"""How long PSF models of a whole focal plane take: stamps in memory to models on disk.
+"""Time of the PSF models of a whole focal plane: stamps in memory to models on disk.
 
 Run: python benchmarks/psf_model_time.py RUN [--ccds N] [--threads N] [--repeats N]
 
@@ -33,7 +33,7 @@ def fit_and_write(product: CcdProduct, options: dict, path: Path) -> None:
 
 
 def seconds(products: list[CcdProduct], options: dict, count: int, threads: int) -> float:
-    """Return how long `count` models take."""
+    """Return the seconds that a number of models take."""
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(threads) as pool:
         jobs = [(products[i % len(products)], options, Path(folder) / f"{i}.fits") for i in range(count)]
         start = time.perf_counter()

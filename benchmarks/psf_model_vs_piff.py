@@ -1,13 +1,13 @@
-"""The PSF model beside Piff on the stars of a run: error of e and size where there was no star, and time.
+"""The PSF model beside Piff on the stars of a run: errors of e and size at holdout positions, and time.
 
 Run: python benchmarks/psf_model_vs_piff.py RUN [--order N] [--size N] [--ccds N]
 
 RUN is the folder of a `pachon run` without options: its observed stars, 31 x 31 pixels, centred to a pixel, and its
-noise-free truth PSFs elsewhere on the same CCDs. Piff fits the same stamps, with the inverse variance of their noise
-as weights, by PixelGrid of pixels of the same scale and BasisPolynomial of the same order. Both are then drawn at the
-truth places, centred, and measured as the truth is. pachon runs without weights, as in Jee & Tyson 2011, and with the
-stars' squared S/N as weights, which is nearer to what Piff does. The fits are timed alone, from stamps in memory to a
-model in memory, in one process, in turns, one thread.
+noise-free PSFs at holdout positions on the same CCDs. Piff fits the same stamps, with the inverse variance of their
+noise as weights, by PixelGrid of pixels of the same scale and BasisPolynomial of the same order. Both are then drawn at
+the holdout positions, centred, and measured as the noise-free PSFs are. pachon runs without weights, as in Jee & Tyson
+2011, and with the stars' squared S/N as weights, which is nearer to Piff's. The fits are timed alone, from stamps in
+memory to a model in memory, in one process, in turns, one thread.
 """
 
 import argparse
@@ -20,25 +20,25 @@ import piff
 from threadpoolctl import threadpool_limits
 
 import pachon
+from pachon.core.units import ARCSEC
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.measure.shapes import measure_shapes
 
-ARCSEC = np.pi / 180.0 / 3600.0
 PIXEL = 10.0e-6  # side of a pixel [m]
 WEIGHT = 0.7 * ARCSEC
 # Piff's polynomials are powers of its own world coordinates: these run from -1 to 1 over a CCD of 4000 pixels, so that
-# the powers lose it no digits.
+# the powers lose no digits.
 WCS = galsim.PixelScale(1.0 / 2000.0)
 
 
 def pixels(stars, product) -> list[tuple[int, int]]:
-    """Return the pixels on which stars stand, from the centre of the CCD."""
+    """Return the pixels that stars lie on, from the centre of the CCD."""
     x, y = ((values - centre) / PIXEL for values, centre in zip((stars.x, stars.y), product.center, strict=True))
     return [(round(a), round(b)) for a, b in zip(x, y, strict=True)]
 
 
 def piff_stars(product) -> list[piff.Star]:
-    """Return the stars that the model was fitted to, as Piff takes them."""
+    """Return the stars that the model was fitted to, as Piff's."""
     stars = product.observed
     median = np.median(product.observed_images[stars.used].astype(np.float64), axis=0)
     sky, noise = product.noise
@@ -46,7 +46,7 @@ def piff_stars(product) -> list[piff.Star]:
     for i in np.flatnonzero(stars.used):
         electrons = stars.electrons[i]
         variance = (sky + noise**2 + electrons * np.maximum(median, 0.0)) / electrons**2
-        # The stamp was shifted to the centre of its pixel, so that is where the star stands.
+        # The stamp was shifted to put the star at the centre of its pixel.
         corner = {"xmin": places[i][0] - median.shape[1] // 2, "ymin": places[i][1] - median.shape[0] // 2}
         image = galsim.ImageD(product.observed_images[i].astype(np.float64), wcs=WCS, **corner)
         weight = galsim.ImageD(1.0 / variance, wcs=WCS, **corner)
@@ -67,10 +67,9 @@ def draw_piff(psf: piff.SimplePSF, product, size: int) -> np.ndarray:
 
 
 def residuals(images: np.ndarray, product) -> np.ndarray:
-    """Return e1, e2 and relative size of drawn PSFs less the truth, [3, n]."""
-    found = measure_shapes(images, product.pixel_scale, WEIGHT)
-    truth = product.holdout
-    return np.stack([found.e1 - truth.e1, found.e2 - truth.e2, found.size / truth.size - 1.0])
+    """Return e1, e2 and relative size of drawn PSFs less those of the noise-free ones, shape [3, n]."""
+    drawn, expected = measure_shapes(images, product.pixel_scale, WEIGHT), product.holdout
+    return np.stack([drawn.e1 - expected.e1, drawn.e2 - expected.e2, drawn.size / expected.size - 1.0])
 
 
 def main() -> None:
@@ -107,16 +106,16 @@ def main() -> None:
             times[name] += time.perf_counter() - start
             drawn = draw_piff(model, product, stamps.shape[1]) if name == "Piff" else model.at(elsewhere)
             fits[name].append(residuals(drawn, product))
-        print(f"{product.name:8s} {used.sum():3d} stars: {_row([found[-1] for found in fits.values()])}", flush=True)
-    print(f"all: {_row([np.concatenate(found, axis=1) for found in fits.values()])}")
+        print(f"{product.name:8s} {used.sum():3d} stars: {_row([each[-1] for each in fits.values()])}", flush=True)
+    print(f"all: {_row([np.concatenate(each, axis=1) for each in fits.values()])}")
     print("time of a fit: " + ", ".join(f"{name} {1e3 * t / len(paths):.0f} ms" for name, t in times.items()))
     print(f"Piff's time over pachon's: {times['Piff'] / times['plain']:.0f}, {times['Piff'] / times['weighted']:.0f}")
 
 
-def _row(found: list[np.ndarray]) -> str:
+def _row(errors: list[np.ndarray]) -> str:
     """Return the rms of e, and of size, of each model."""
     parts = (slice(0, 2), slice(2, 3))
-    return "; ".join(" ".join(f"{np.sqrt(np.nanmean(f[part] ** 2)):.2e}" for f in found) for part in parts)
+    return "; ".join(" ".join(f"{np.sqrt(np.nanmean(e[part] ** 2)):.2e}" for e in errors) for part in parts)
 
 
 if __name__ == "__main__":

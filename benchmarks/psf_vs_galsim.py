@@ -1,8 +1,8 @@
-"""How fast is a star through six moving screens, beside GalSim's photons: per sample, and for the same noise?
+"""Time of a star through six moving screens, beside GalSim's photons: per sample, and for the same noise.
 
 Run: python benchmarks/psf_vs_galsim.py [--size N] [--length METRES] [--rounds N]
 
-Both look through six screens of their own over 15 s, made beforehand, on one thread, in turns in one process. pachon's
+Both have six screens of their own over 15 s, made beforehand, on one thread, in turns in one process. pachon's
 fast engine runs twice: "LSST", as production runs it (lsst_v3.3_r, five wavelengths, rays traced, charge diffusion),
 and "ideal", one wavelength without optics. GalSim shoots photons of one wavelength in the geometric approximation with
 its own second kick, through the annular pupil, without optics.
@@ -10,8 +10,8 @@ its own second kick, through the annular pupil, without optics.
 a. Per sample: GalSim shoots as many photons a star as pachon has pairs of a pupil point and a time step. pachon's five
    wavelengths share those pairs, which are counted once.
 b. For the same noise in ellipticity (weighted moments, 0.7 arcsec, 0.2 arcsec pixels; rms of a component):
-   - GalSim's is the scatter of e when the same stars are shot again and again with other photons through the same
-     screens. Its variance goes as one over the photons, which the output shows.
+   - GalSim's is the scatter of e when the same stars are shot repeatedly with other photons through the same
+     screens. Its variance is inversely proportional to the number of photons, as the output shows.
    - pachon draws no photons; its error is the rms difference of e from the same stars through the same screens with ten
      times the time steps and four times the pupil points, over several exposures.
    The ratio is the time of GalSim with so many photons that the two are equal, over pachon's. It is also the ratio in
@@ -24,7 +24,6 @@ import time
 import galsim
 import numpy as np
 from atmosphere_vs_galsim import (
-    ARCSEC,
     FIELD,
     SITE,
     WAVELENGTH,
@@ -36,6 +35,7 @@ from atmosphere_vs_galsim import (
 )
 
 import pachon
+from pachon.core.units import ARCSEC
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.psf.fast import PUPIL_POINTS
 
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--exposures", type=int, default=6, help="exposures over which the error is averaged")
     arguments = parser.parse_args()
-    # A hair less than the side, so that rounding does not make GalSim take one sample more and then twice as many.
+    # Slightly less than the side: one sample more by rounding would double GalSim's grid.
     length = arguments.length * (1.0 - 1e-12)
     options = {"screen_size": arguments.size, "screen_length": length}
     atmosphere = Atmosphere.from_site(SITE, 1, **options)
@@ -95,12 +95,14 @@ def main() -> None:
     )
     lsst, ideal = pachon.load_telescope("lsst_v3.3_r"), ideal_telescope()
 
-    def through_lsst(air, places, **more):
-        return pachon.make_psfs(lsst, places, np.linspace(545e-9, 703e-9, 5), atmosphere=air, threads=1, **more).image
+    def through_lsst(atmosphere, fields, **more):
+        waves = np.linspace(545e-9, 703e-9, 5)
+        return pachon.make_psfs(lsst, fields, waves, atmosphere=atmosphere, threads=1, **more).image
 
-    def through_ideal(air, places, **more):
+    def through_ideal(atmosphere, fields, **more):
         plane = {"pixel_size": PIXEL * ideal.reference_sphere_radius, "stamp_size": STAMP, "diffusion": 0.0}
-        return pachon.make_psfs(ideal, places, [WAVELENGTH], atmosphere=air, threads=1, **plane, **more).image
+        plane |= {"atmosphere": atmosphere, "threads": 1}
+        return pachon.make_psfs(ideal, fields, [WAVELENGTH], **plane, **more).image
 
     engines = {"LSST": through_lsst, "ideal": through_ideal}
     with galsim.utilities.single_threaded():

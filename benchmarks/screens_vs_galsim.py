@@ -1,9 +1,9 @@
-"""How fast are six phase screens of 8192 x 8192 over 1.3 km made, beside GalSim's?
+"""Time to make six phase screens of 8192 x 8192 over 1.3 km, beside GalSim's.
 
 Run: python benchmarks/screens_vs_galsim.py [--size N] [--length METRES]
 
-Layer by layer the two take turns in one process, so that both see the same machine. Both make the modes that geometric
-shooting wants and no more, each up to its own cut-off (printed; pachon's is the higher one). GalSim's screens hold the
+Layer by layer the two take turns in one process, under the same load of the machine. Both make the modes of geometric
+shooting and no more, each up to its own cut-off (printed; pachon's is the higher one). GalSim's screens hold the
 path in double precision; pachon's hold both slopes, in 16 bits each, as its fast engine reads them. pachon's high
 screen of each layer, which only its wave engine reads, is timed apart and then counted in. GalSim works on one thread;
 pachon is shown on one and on two. Ratios are GalSim's time over pachon's.
@@ -28,7 +28,7 @@ def timed(job) -> float:
 
 
 def galsim_cutoff(atmosphere: Atmosphere) -> float:
-    """What GalSim's PhaseScreenPSF asks for when photons are shot [cycles/m]: 0.2 over the Fried parameter."""
+    """Return the cut-off of GalSim's PhaseScreenPSF for photon shooting [cycles/m]: 0.2 over the Fried parameter."""
     return 0.2 / (atmosphere.r0 * (WAVELENGTH / 500.0) ** 1.2)
 
 
@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=8192, help="samples on a side: 2^n or 3 x 2^n")
     parser.add_argument("--length", type=float, default=1300.0, help="side in metres")
     arguments = parser.parse_args()
-    # A hair less than the side, so that rounding does not make GalSim take one sample more and then twice as many.
+    # Slightly less than the side: one sample more by rounding would double GalSim's grid.
     length = arguments.length * (1.0 - 1e-12)
     atmosphere = Atmosphere.from_site("cerro_pachon", 1, screen_size=arguments.size, screen_length=length)
     print(

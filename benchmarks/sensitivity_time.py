@@ -1,10 +1,10 @@
-"""How many forward traces does a sensitivity matrix of 50 degrees of freedom x 28 Zernikes x 31 fields cost?
+"""Cost of a sensitivity matrix of 50 degrees of freedom x 28 Zernikes x 31 fields, in forward traces.
 
 Run: python benchmarks/sensitivity_time.py [threads] [rays along the radius]
 
-Five motions each of M2 and the camera, twenty Zernike terms each on M1 and M2. The matrix and ten forward traces of
-the same rays take turns in one process, so that both see the same machine for about as long; the ratio is taken pair
-by pair. Every column of the matrix is compared with central differences at the end.
+Five motions each of M2 and the camera, twenty Zernike terms each on M1 and M2. The matrix and ten forward traces of the
+same rays take turns in one process, about as long each and under the same load; the ratio is taken pair by pair. Every
+column of the matrix is compared with central differences at the end.
 """
 
 import sys
@@ -16,9 +16,8 @@ import numpy as np
 import pachon
 from pachon.design.optimize.sensitivity import field_rings, sensitivity
 from pachon.design.parameters.parameters import apply, with_shape_terms
+from pachon.models.zernike_polynomials import annular_zernikes
 from pachon.raytrace.rays import field_direction, parallel_rays
-from pachon.wavefront.pupil_sampling import pupil_sampling
-from pachon.wavefront.zernike import annular_zernikes
 
 THREADS = int(sys.argv[1]) if len(sys.argv) > 1 else 1
 RINGS = int(sys.argv[2]) if len(sys.argv) > 2 else 14
@@ -30,7 +29,7 @@ PARAMETERS = [*MOTIONS, "M1.Z4-23", "M2.Z4-23"]
 def main() -> None:
     telescope = pachon.load_telescope("lsst_v3.3_r")
     fields = field_rings(telescope)
-    pupil = pupil_sampling(telescope, "gauss", RINGS)
+    pupil = pachon.pupil_sampling(telescope, "gauss", RINGS)
     light = field_direction(fields[:, 0], fields[:, 1])
     rays = parallel_rays(telescope, light, telescope.default_wavelength, pupil.points)
 
@@ -68,19 +67,19 @@ def farthest(telescope, result, pupil) -> float:
     lit = [pachon.wavefront_opd(telescope, f, shown.wavelength, pupil.points.T).lit for f in shown.fields]
 
     def zernikes(changed):
-        found = []
+        coefficients = []
         for field, use in zip(shown.fields, lit, strict=True):
             value = pachon.wavefront_opd(changed, field, shown.wavelength, pupil.points.T).value
             root = np.sqrt(pupil.weights[use])
-            found.append(np.linalg.lstsq((terms[:, use] * root).T, value[use] * root, rcond=None)[0])
-        return np.array(found)
+            coefficients.append(np.linalg.lstsq((terms[:, use] * root).T, value[use] * root, rcond=None)[0])
+        return np.array(coefficients)
 
     worst = 0.0
     for i, parameter in enumerate(shown.parameters):
-        # Zernike terms of a mirror with rims need a shape of their own, given here: without rims there are none.
+        # Zernike terms get a shape of their own from the mirror with its rim: without rims they could not.
         present = with_shape_terms(telescope, [parameter])
         start = replace(bare, surfaces=tuple(replace(s, aperture=None) for s in present.surfaces))
-        step = {"m": 2e-4, "rad": 2e-5}[parameter.unit] * (0.1 if parameter.kind == "figure" else 1.0)
+        step = {"m": 2e-4, "rad": 2e-5}[parameter.unit] * (0.1 if parameter.kind == "shape" else 1.0)
         slopes = []
         for h in (step, 2.0 * step):
             up, down = (zernikes(apply(start, {parameter.address: sign * h})) for sign in (1.0, -1.0))

@@ -1,9 +1,9 @@
-"""How long does the Table 1 study take, what do store and scheduler cost, and what does a second process bring?
+"""Time of the Table 1 study on one and two processes, and overhead of store and scheduler.
 
 Run: python benchmarks/sweep_time.py [points]
 
-One and two processes take turns over the same points of the bundled study (189 CCDs of 20 stars each), so that both see
-the same machine. Overhead is what of the wall time no worker was computing. The full study has 1000 points.
+One and two processes take turns over the same points of the bundled study (189 CCDs of 20 stars each), under the
+same load of the machine. Overhead is wall time in which no worker computes. The full study has 1000 points.
 """
 
 import resource
@@ -29,7 +29,7 @@ ROUNDS = 2
 
 
 def measure(processes: int, points, sweep, folder: Path) -> tuple[float, float]:
-    """Return the wall time of the points beyond the first of each worker, and what the workers computed in it."""
+    """Return wall and computing time of the points beyond the first of each worker [s]."""
     store = folder / f"{processes}.sweep"
     store.unlink(missing_ok=True)
     create_store(store, sweep, points, {})

@@ -1,12 +1,12 @@
-"""How fast is the trace of a million rays, beside batoid's?
+"""Time of the trace of a million rays, beside batoid's.
 
 Run: python benchmarks/trace_vs_batoid.py [rays]
 
 Three telescopes: the LSST's baseline (conics and even aspheres), Rubin as built (tilted, with Zernike terms on three
 lens surfaces), and the baseline with a bicubic grid of 201 x 201 nodes on M1. pachon on one thread and batoid take
-turns in one process, so that both see the same machine, and are given processor time, which counts little of what else
-the machine does; then pachon on two threads and on one take turns by the clock. The first compilation is timed apart.
-Ratios are of the best times: whatever else the machine does can only add to a time.
+turns in one process, under the same load; they are timed by processor time, which other work on the machine hardly
+changes. Then pachon on two threads and on one take turns by the clock. The first compilation is timed apart. Ratios are
+of the best times: other work can only add to a time.
 """
 
 import os

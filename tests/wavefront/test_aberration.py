@@ -1,4 +1,4 @@
-"""The residual of active optics: its signs and sizes against the ray trace of a moved camera, and its statistics."""
+"""Residual wavefronts of active optics: signs and sizes against the ray trace of a moved camera, and statistics."""
 
 import re
 
@@ -15,7 +15,7 @@ from pachon.wavefront.pupil_optics import trace_pupils
 WAVELENGTH = np.array([620e-9])
 FIELDS = np.radians([[0.0, 0.0], [0.8, 0.9], [-1.2, 0.3]])
 EPS = 0.612
-# 22 terms would leave out a picometre of what a moved camera does, and 3e-4 of its slopes at the rim.
+# 22 terms would leave out a picometre of the wavefront of a moved camera, and 3e-4 of its slopes at the rim.
 JMAX = 37
 
 
@@ -25,13 +25,13 @@ def pupil(annulus_points):
 
 
 def fitted(pupil, lit, opd):
-    """Coefficients of an OPD [n_pupil] and what they leave over the lit points."""
+    """Coefficients of an OPD [n_pupil], and residuals over the lit points."""
     terms = annular_zernikes(JMAX, *(pupil.T / 4.18), EPS)
     coefficients, *_ = np.linalg.lstsq(terms[:, lit].T, opd[lit], rcond=None)
     return coefficients, opd[lit] - coefficients @ terms[:, lit]
 
 
-def test_a_planted_aberration_is_what_the_opd_gains(lsst_r, pupil):
+def test_the_opd_gains_a_planted_aberration(lsst_r, pupil):
     planted = np.random.default_rng(2).normal(0.0, 1e-7, JMAX - 3)
     aberration = ResidualWavefront(planted, 8.36, EPS)
     without, with_it = (trace_pupils(lsst_r, FIELDS, WAVELENGTH, pupil, aberration=a) for a in (None, aberration))
@@ -45,21 +45,21 @@ def test_a_planted_aberration_is_what_the_opd_gains(lsst_r, pupil):
         np.testing.assert_array_equal(getattr(without, same), getattr(with_it, same))
 
 
-@pytest.mark.parametrize("moved", ["Camera", "M2"])
-def test_defocus_is_that_of_a_moved_camera_or_mirror(lsst_r, pupil, moved):
+@pytest.mark.parametrize("element", ["Camera", "M2"])
+def test_defocus_is_that_of_a_moved_camera_or_mirror(lsst_r, pupil, element):
     """Path and landing points of rays through a shifted element, and of the nominal telescope with its Zernikes."""
-    shifted = lsst_r.perturbed(moved, shift=(0.0, 0.0, 6.7e-6))
-    nominal, truth = (trace_pupils(t, FIELDS, WAVELENGTH, pupil) for t in (lsst_r, shifted))
+    shifted = lsst_r.perturbed(element, shift=(0.0, 0.0, 6.7e-6))
+    nominal, moved = (trace_pupils(t, FIELDS, WAVELENGTH, pupil) for t in (lsst_r, shifted))
     for star in range(3):
-        lit = nominal.lit[star, 0] & truth.lit[star, 0]
-        change = (nominal.path - truth.path)[star, 0]
+        lit = nominal.lit[star, 0] & moved.lit[star, 0]
+        change = (nominal.path - moved.path)[star, 0]
         coefficients, left = fitted(pupil, lit, change)
-        # Mostly 0.1 um of Noll's defocus, and nothing that the terms do not hold.
+        # Mostly 0.1 um of Noll's defocus, and nothing beyond the terms.
         assert abs(coefficients[3]) == pytest.approx(0.1e-6, rel=0.1)
         assert np.abs(left).max() < 1e-12
         aberration = ResidualWavefront(coefficients[3:], 8.36, EPS)
         ours = trace_pupils(lsst_r, FIELDS[star : star + 1], WAVELENGTH, pupil, aberration=aberration)
-        expected = (truth.displacement - nominal.displacement)[star, 0, lit]
+        expected = (moved.displacement - nominal.displacement)[star, 0, lit]
         got = (ours.displacement[0] - nominal.displacement[star])[0, lit]
         # A shift of all rays together is the tilt that is left out here. The rest: the exit pupil is the image of the
         # entrance pupil to 1e-4.
@@ -70,21 +70,21 @@ def test_defocus_is_that_of_a_moved_camera_or_mirror(lsst_r, pupil, moved):
 def test_noll_defocus_of_a_moved_camera_in_closed_form(lsst_r, pupil):
     """Light that converges on a point a distance d behind the detector gains d (1 - cos), and sin = p / f."""
     shift = 6.7e-6
-    nominal, truth = (
+    nominal, moved = (
         trace_pupils(t, FIELDS[:1], WAVELENGTH, pupil)
         for t in (lsst_r, lsst_r.perturbed("Camera", shift=(0, 0, shift)))
     )
-    coefficients, _ = fitted(pupil, nominal.lit[0, 0], (nominal.path - truth.path)[0, 0])
+    coefficients, _ = fitted(pupil, nominal.lit[0, 0], (nominal.path - moved.path)[0, 0])
     nodes, weights = np.polynomial.legendre.leggauss(20)
     square = 0.5 * (1.0 - EPS**2) * nodes + 0.5 * (1.0 + EPS**2)
     gained = shift * (1.0 - np.sqrt(1.0 - square * (4.18 / 10.31) ** 2))
     term = np.sqrt(3.0) * (2.0 * square - 1.0 - EPS**2) / (1.0 - EPS**2)
-    # The camera takes lenses and filter along, which are weak but thick glass in a converging beam: a few per cent.
+    # Lenses and filter move with the camera, weak but thick glass in a converging beam: a few per cent.
     assert coefficients[3] == pytest.approx(0.5 * np.sum(weights * gained * term), rel=0.03)
 
 
 def test_displacement_is_the_gradient_of_the_path(lsst_r, pupil):
-    """What the aberration adds to the landing points, by differences of what it adds to the path over the pupil."""
+    """Changes of landing points against finite differences over the pupil of the change of path."""
     rng = np.random.default_rng(4)
     aberration = ResidualWavefront(rng.normal(0.0, 1e-7, 19), 8.36, EPS, rng.normal(0.0, 3e-6, (19, 2)))
     h = 1e-3
@@ -103,7 +103,7 @@ def test_displacement_is_the_gradient_of_the_path(lsst_r, pupil):
 
 
 def test_terms_linear_in_the_field_hold_what_misalignment_does(lsst_r, pupil):
-    """A shifted and tilted camera and secondary, seen in places that the coefficients were not fitted at."""
+    """A shifted and tilted camera and secondary, at field points that were not fitted."""
     moved = lsst_r.perturbed("M2", shift=(30e-6, -10e-6, 2e-6), tilt=(1e-5, -2e-5, 0.0))
     moved = moved.perturbed("Camera", shift=(-20e-6, 40e-6, 0.0), tilt=(-1e-5, 1e-5, 0.0))
     angle = np.arange(12) * np.pi / 6
@@ -119,7 +119,7 @@ def test_terms_linear_in_the_field_hold_what_misalignment_does(lsst_r, pupil):
     rest = coefficients[~even] - aberration.at(np.tan(fields[~even]))
     size = np.sqrt(np.mean(np.sum(coefficients[~even] ** 2, axis=1)))
     constant = np.sqrt(np.mean(np.sum((coefficients[~even] - plane[0]) ** 2, axis=1)))
-    # What is constant over the field is not enough, and little is left beyond what is linear.
+    # Terms that are constant over the field are not enough; the residuals of linear ones are small.
     assert size > 1e-7
     assert constant > 0.5 * size
     assert np.sqrt(np.mean(np.sum(rest**2, axis=1))) < 0.1 * size
@@ -144,7 +144,7 @@ def test_rms_over_pupil_field_and_exposures(lsst_r, annulus_points):
     assert np.mean(aberration.opd(x, y, places[0]) ** 2) == pytest.approx(expected, rel=0.02)
 
 
-def test_amplitudes_fall_with_the_degree_and_share_of_the_field(lsst_r):
+def test_amplitudes_fall_with_the_degree_and_half_the_variance_is_linear_in_the_field(lsst_r):
     drawn = [ResidualWavefront.draw(lsst_r, PAPER_RMS, seed=1, epoch=e) for e in range(2000)]
     constant = np.mean([a.coefficients**2 for a in drawn], axis=0)
     slopes = np.mean([a.field_gradient**2 for a in drawn], axis=0) * lsst_r.field_radius**2 / 4.0
@@ -166,7 +166,7 @@ def test_linear_fraction_is_that_of_four_sensors_in_the_corners():
     assert linear / (linear + covariance[0, 0]) == pytest.approx(LINEAR_FRACTION)
 
 
-def test_each_exposure_and_seed_has_its_own_and_terms_do_not_meddle(lsst_r):
+def test_exposures_seeds_and_terms_are_independent(lsst_r):
     first = ResidualWavefront.draw(lsst_r, seed=5, epoch=2)
     again = ResidualWavefront.draw(lsst_r, seed=5, epoch=2)
     np.testing.assert_array_equal(first.coefficients, again.coefficients)

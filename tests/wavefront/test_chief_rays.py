@@ -13,7 +13,7 @@ POSITIONS = np.array([[0.0, 0.0], [0.21, 0.15], [-0.12, 0.25], [0.3, -0.02], [-0
 
 
 def landing(telescope, fields, projection):
-    """Where the chief rays of field angles land, in the detector's own x and y."""
+    """Landing points of the chief rays of field angles, x and y of the detector."""
     ends = [
         pachon.trace(
             telescope, pachon.launch_rays(telescope, f, telescope.default_wavelength, ([0.0], [0.0]), projection)

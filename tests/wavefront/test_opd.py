@@ -8,7 +8,6 @@ from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError
-from pachon.wavefront.chief_rays import fields_at
 
 ZEMAX = Path(__file__).parents[1] / "data" / "zemax"
 
@@ -50,7 +49,7 @@ def test_transverse_aberration_is_the_gradient_of_the_opd(lsst_r, height_um):
         "z": np.full(3 * 189, height_um * 1e-6),
     }
     focal_plane = pachon.FocalPlane.from_heights(table)
-    field = fields_at(lsst_r, [[0.15, 0.21]])[0]
+    field = pachon.fields_at(lsst_r, [[0.15, 0.21]])[0]
     n, h = 40, 0.02
     rng = np.random.default_rng(1)
     radius, angle = np.sqrt(rng.uniform(2.7**2, 4.0**2, n)), rng.uniform(0, 2 * np.pi, n)

@@ -1,4 +1,4 @@
-"""The bundle trace against the general trace, and the duality of pupil and image that both PSF engines rest on."""
+"""Landing points and paths against the general trace, and the duality of pupil and image that PSF engines rely on."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,6 @@ import pytest
 import pachon
 from pachon.core.errors import DomainError
 from pachon.raytrace.rays import RayStatus
-from pachon.wavefront.chief_rays import fields_at
 from pachon.wavefront.pupil_optics import trace_pupils
 
 WAVELENGTHS = np.array([545e-9, 624e-9, 703e-9])
@@ -26,7 +25,7 @@ def positions():
 @pytest.fixture(scope="module")
 def optics(lsst_r, focal_plane, positions, annulus_points):
     pupil = np.stack(annulus_points(70, 3), axis=-1)
-    return trace_pupils(lsst_r, fields_at(lsst_r, positions), WAVELENGTHS, pupil, focal_plane=focal_plane)
+    return trace_pupils(lsst_r, pachon.fields_at(lsst_r, positions), WAVELENGTHS, pupil, focal_plane=focal_plane)
 
 
 def test_path_and_lit_are_those_of_the_opd(lsst_r, focal_plane, optics):
@@ -77,6 +76,6 @@ def test_the_set_of_stars_and_threads_change_no_byte(lsst_r, focal_plane, optics
 
 
 def test_a_star_in_a_gap_is_refused(lsst_r, focal_plane, optics):
-    field = fields_at(lsst_r, [[0.5 * 0.04225, 0.0]])
+    field = pachon.fields_at(lsst_r, [[0.5 * 0.04225, 0.0]])
     with pytest.raises(DomainError, match=r"field = \(0\.117\d*, 0\) deg: .*between the CCDs"):
         trace_pupils(lsst_r, np.concatenate([optics.fields, field]), WAVELENGTHS, optics.pupil, focal_plane=focal_plane)

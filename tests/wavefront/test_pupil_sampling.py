@@ -56,7 +56,7 @@ def test_spiral_and_square_fill_the_annulus_evenly(obscuration):
             assert sample.weights @ (x**a * y**b) == pytest.approx(mean_power(a, b, 1.0, obscuration), abs=4e-3)
 
 
-def test_a_sampling_of_ones_own_is_normalised_and_kept(lsst_r):
+def test_a_sampling_of_given_points_is_normalised_and_returned_unchanged(lsst_r):
     own = PupilSampling([[0.0, 0.01], [0.02, 0.0]], [1.0, 3.0])
     assert own.weights.tolist() == [0.25, 0.75]
     assert pupil_sampling(lsst_r, own) is own
