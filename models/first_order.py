@@ -119,7 +119,7 @@ def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
     Raises
     ------
     DomainError
-        If a surface is decentred or tilted, the wavelength is not covered, or there is no focus.
+        If no surface acts, one is decentred or tilted, the wavelength is not covered, or there is no focus.
     """
     radius = 0.5 * telescope.pupil_diameter
     trace = _trace(telescope, wavelength, 1.0)
@@ -156,17 +156,15 @@ def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | Non
 
     Parameters
     ----------
-    telescope : Telescope
-        Prescription; its surfaces must share one axis.
-    wavelength : float or Quantity, optional
-        Vacuum wavelength [m]; the telescope's default where not given.
+    telescope, wavelength
+        As for :func:`first_order`.
     field : float, optional
         Field angle [rad] of the chief ray; the radius of the field of view where not given.
 
     Raises
     ------
     DomainError
-        If a surface is decentred or tilted, or the wavelength is not covered.
+        If no surface acts, one is decentred or tilted, or the wavelength is not covered.
     """
     angle = telescope.field_radius if field is None else field
     trace = _trace(telescope, wavelength, np.tan(angle))
@@ -192,6 +190,8 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
     """Trace the ray at the rim of the pupil, parallel to the axis, and one through its centre with a slope."""
     w = float(telescope.check_wavelength(telescope.default_wavelength if wavelength is None else wavelength))
     surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
+    if not surfaces:
+        raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     for surface in surfaces:
         axis = surface.matrix[:, 2]
         if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:
@@ -199,18 +199,13 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
     curvature = np.array([-s.shape.curvature for s in surfaces])
     h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([0.0, slope])
     z, index = telescope.stop_z, float(telescope.medium_before.index(w))
-    before, after, heights, slopes, slopes_after = [], [], [], [], []
+    rows = []
     for surface, c in zip(surfaces, curvature, strict=True):
         mirror = surface.interaction == Interaction.MIRROR
         glass = float(surface.medium_after.index(w))
         index_after = -index if mirror else np.copysign(glass, index)
         h = h + u * (z - surface.vertex[2])
-        before.append(index)
-        heights.append(h)
-        slopes.append(u)
-        u = (index * u - h * c * (index_after - index)) / index_after
-        slopes_after.append(u)
-        after.append(index_after)
-        index, z = index_after, surface.vertex[2]
-    columns = (before, after, heights, slopes, slopes_after)
-    return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in columns))
+        u_after = (index * u - h * c * (index_after - index)) / index_after
+        rows.append((index, index_after, h, u, u_after))
+        index, u, z = index_after, u_after, surface.vertex[2]
+    return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in zip(*rows, strict=True)))

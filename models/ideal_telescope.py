@@ -1,4 +1,4 @@
-"""A telescope without aberrations: what the air and the camera alone make of a star."""
+"""Telescopes without aberrations, for stars blurred by air and camera alone."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def paul_baker(
     # R2/R3 = 1 - m.
     k2 = -1 + (1 - m) ** 3
     z2 = f1 * (1 - m)
-    # In the default layout this is zero; the subtraction leaves rounding that a reader need not see.
+    # In the default layout this is zero; the subtraction would leave rounding errors.
     z3 = 0.0 if m == COPLANAR else z2 - r3
     radius = 0.5 * diameter
 
@@ -106,7 +106,7 @@ def paul_baker(
         wavelength_range=(0.3e-6, 1.2e-6),
         default_wavelength=0.6e-6,
     )
-    # Mirrors are 2 % larger than the paraxial footprint, for what the real rays add.
+    # Mirrors are 2 % larger than the paraxial footprint, for the aberrations of real rays.
     _, on_m2, on_m3 = (1.02 * float(r) for r in footprints(bare, field_radius))
     inner = max(on_m2, on_m3)
     if inner >= radius:

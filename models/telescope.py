@@ -112,9 +112,9 @@ class Telescope:
             raise PrescriptionError(f"surface name {repeated!r} occurs more than once: expected unique names")
         medium = self.medium_before
         for surface in self.surfaces:
-            what = _STAYING.get(surface.interaction)
-            if what and surface.medium_after != medium:
-                raise PrescriptionError(f"surface {surface.name!r}: expected a {what} to stay in the medium before it")
+            kind = _STAYING.get(surface.interaction)
+            if kind and surface.medium_after != medium:
+                raise PrescriptionError(f"surface {surface.name!r}: expected a {kind} to stay in the medium before it")
             medium = surface.medium_after
         for group, members in self.groups.items():
             if group in names:

@@ -1,1 +1,1 @@
-"""Where rays go: launching, tracing, landing on CCDs and meshes."""
+"""Ray tracing: launching, tracing, landing on CCDs and meshes."""

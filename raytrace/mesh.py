@@ -12,6 +12,7 @@ from ..core.launch import launch, start_warp
 from ..core.warp_arrays import warp_array
 from ..models.surface import Surface
 from .kernels.mesh import first_facet
+from .pack.meshes import warp_mesh
 
 #: Rays are started this far in front of the nominal surface [m] and followed for twice as far: heights of a focal
 #: plane are micrometres, and single precision resolves 0.1 nm over this distance.
@@ -22,9 +23,9 @@ REACH = 1.0e-3
 class MeshLanding:
     """Intersections of rays with a mesh."""
 
-    position: np.ndarray  #: on the facets, telescope frame [m], [n, 3]; NaN where no facet is met
+    position: np.ndarray  #: on the facets, telescope frame [m], [n, 3]; NaN without one
     path: np.ndarray  #: distance from the given points along the rays [m], [n]
-    facet: np.ndarray  #: index of the facet, -1 where none is met, int32 [n]
+    facet: np.ndarray  #: index of the facet, -1 for none, int32 [n]
 
 
 def land_on_mesh(
@@ -60,10 +61,10 @@ def land_on_mesh(
     d = direction @ detector.matrix
     start = p - (REACH / np.abs(d[:, 2]))[:, None] * d
 
-    found = wp.Mesh(points=warp_array(mesh.vertices, wp.vec3), indices=warp_array(mesh.faces.ravel(), wp.int32))
+    facets = warp_mesh(mesh.vertices, mesh.faces)
     facet = wp.empty(len(p), dtype=wp.int32, device="cpu")
     reach = float(2 * REACH / np.abs(d[:, 2]).min(initial=1.0))
-    inputs = [found.id, warp_array(start, wp.vec3), warp_array(d, wp.vec3), reach, facet]
+    inputs = [facets.id, warp_array(start, wp.vec3), warp_array(d, wp.vec3), reach, facet]
     launch(first_facet, len(p), inputs, threads=threads)
 
     index = facet.numpy()

@@ -176,7 +176,7 @@ def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: floa
             f"{telescope.name}: object at {telescope.object_distance:.6g} m: expected an object at infinity; "
             "rays and wavefronts of single field points can be had, this cannot"
         )
-    # Components are kept contiguous (structure of arrays), as the kernels read them.
+    # Components stay contiguous (structure of arrays), as the kernels read them.
     v = np.ascontiguousarray(directions.T)[:, :, None]
     x, y = np.moveaxis(pupil if pupil.ndim == 3 else pupil[None], -1, 0)
     points = np.stack([x, y, np.full(x.shape, telescope.stop_z)])

@@ -61,12 +61,12 @@ class PacketTrace:
     end: Any  #: RayPackets after each of the last surfaces
 
 
-def trace_packets(telescope: Telescope, rays: Rays, n_kept: int, *, threads: int | None = None) -> PacketTrace:
-    """Trace rays in packets, the last one filled up, and keep them at the last ``n_kept`` surfaces."""
+def trace_packets(telescope: Telescope, rays: Rays, n_stored: int, *, threads: int | None = None) -> PacketTrace:
+    """Trace rays in packets, the last one filled up, and store them at the last ``n_stored`` surfaces."""
     packed = pack_surfaces(telescope)
     count = packet_count(len(rays))
     indices = refractive_indices(telescope, rays.wavelength)
-    start, end = ray_packets(), ray_packets(n_kept, count)
+    start, end = ray_packets(), ray_packets(n_stored, count)
     start.position = warp_array(to_packets(rays.position.T[None]), lanes)
     start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)

@@ -21,7 +21,7 @@ from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
 from .height_fit import fit_heights
 
-# Rims of tiles read back from a file land this far [m] outside by rounding (a float32 STL keeps 0.34 m to 15 nm).
+# Rims of tiles read back from a file land this far [m] outside by rounding (in a float32 STL 0.34 m are good to 15 nm).
 _MESH_MARGIN = 1e-7
 
 

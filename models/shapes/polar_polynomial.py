@@ -62,7 +62,7 @@ class PolarPolynomial:
         return xx.real, xy.real, yy.real
 
     def _sums(self, x: Any, y: Any) -> tuple[np.ndarray, ...]:
-        """Return the complex sum and its derivatives z, s, zz, zs, ss, with z = x + iy and s held apart."""
+        """Return the complex sum and its derivatives z, s, zz, zs, ss, with z = x + iy and s independent."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         z, s = x + 1j * y, x * x + y * y
         f, f_z, f_s, f_zz, f_zs, f_ss = (np.zeros(x.shape, dtype=np.complex128) for _ in range(6))

@@ -88,7 +88,7 @@ class SphereAdjoint:
         """
         n_fields = fields.stop - fields.start
         count = n_fields * self._n_packets
-        # As many parts as threads: each thread keeps the rays of one packet at all surfaces, not more.
+        # As many parts as threads: each thread stores the rays of one packet at all surfaces, not more.
         parts = min(thread_count(threads), max(count, 1))
         matrix = wp.empty((1, self._n_columns, count), dtype=lanes, device="cpu")
         status = wp.empty(count, dtype=lane_flags, device="cpu")

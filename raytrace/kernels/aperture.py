@@ -1,4 +1,4 @@
-"""Which rays of a packet pass an aperture that set algebra makes of discs, rings, rectangles, vanes and polygons.
+"""Vignetting of packets by apertures that set algebra makes of discs, rings, rectangles, vanes and polygons.
 
 Each such aperture is a small programme in postfix order: a region puts a bit on the stack of each lane (1 inside), a
 set operation takes bits from it and puts back its own. The last bit is 1 where light passes.
@@ -52,7 +52,7 @@ def put(stack: lane_flags, inside: lane_flags):
 
 @wp.func
 def within_outline(edges: wp.array2d(dtype=wp.float64), first: wp.int32, last: wp.int32, x: lanes, y: lanes):
-    """Which lanes lie inside an outline: where a line towards +x crosses it an odd number of times."""
+    """Lanes inside an outline (1): a line towards +x crosses it an odd number of times."""
     inside = lane_flags()
     for edge in range(first, last):
         ax = edges[edge, 0]
@@ -68,41 +68,41 @@ def within_outline(edges: wp.array2d(dtype=wp.float64), first: wp.int32, last: w
 
 @wp.func
 def through_aperture(apertures: PackedApertures, s: wp.int32, x: lanes, y: lanes, status: lanes):
-    """Statuses after the general aperture of surface ``s``, met at x, y of its own frame."""
+    """Statuses after the general aperture of surface ``s``, at x, y of its own frame."""
     stack = lane_flags()
     for step in range(apertures.span[s, 0], apertures.span[s, 1]):
-        what = apertures.steps[step, 0]
+        kind = apertures.steps[step, 0]
         a = apertures.numbers[step, 4]
         b = apertures.numbers[step, 5]
         dx = x - lanes(apertures.numbers[step, 0])
         dy = y - lanes(apertures.numbers[step, 1])
         inside = lane_flags()
-        if what == DISC:
+        if kind == DISC:
             for i in range(LANES):
                 inside[i] = wp.where(dx[i] * dx[i] + dy[i] * dy[i] < a, 1, 0)
             stack = put(stack, inside)
-        elif what == RING:
+        elif kind == RING:
             for i in range(LANES):
                 r2 = dx[i] * dx[i] + dy[i] * dy[i]
                 inside[i] = wp.where(r2 >= a, wp.where(r2 < b, 1, 0), 0)
             stack = put(stack, inside)
-        elif what == BOX or what == STRIP:
+        elif kind == BOX or kind == STRIP:
             cosine = apertures.numbers[step, 2]
             sine = apertures.numbers[step, 3]
             along = cosine * dx + sine * dy
             across = cosine * dy - sine * dx
             for i in range(LANES):
-                reach = wp.where(what == BOX, a - wp.abs(along[i]), along[i] - a)
+                reach = wp.where(kind == BOX, a - wp.abs(along[i]), along[i] - a)
                 inside[i] = wp.where(wp.abs(across[i]) < b, wp.where(reach > wp.float64(0.0), 1, 0), 0)
             stack = put(stack, inside)
-        elif what == OUTLINE:
+        elif kind == OUTLINE:
             stack = put(
                 stack, within_outline(apertures.edges, apertures.steps[step, 1], apertures.steps[step, 2], x, y)
             )
-        elif what == BOTH:
+        elif kind == BOTH:
             for i in range(LANES):
                 stack[i] = (stack[i] >> 1) & (stack[i] | -2)
-        elif what == EITHER:
+        elif kind == EITHER:
             for i in range(LANES):
                 stack[i] = (stack[i] >> 1) | (stack[i] & 1)
         else:

@@ -91,7 +91,7 @@ def first_facet(
     reach: wp.float32,
     facet: wp.array(dtype=wp.int32),
 ):
-    """Index of the first facet met within ``reach`` metres, -1 where there is none."""
+    """Index of the first facet within ``reach`` metres, -1 where there is none."""
     i = first + wp.tid()
     query = wp.mesh_query_ray(mesh, origin[i], direction[i], reach)
     facet[i] = wp.where(query.result, query.face, -1)

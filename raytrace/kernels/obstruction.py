@@ -10,14 +10,14 @@ from .surface import OK, VIGNETTED
 
 wp.set_module_options(FORWARD_OPTIONS)
 
-#: Length [m] after the start and before the end of a way that is exempt: several times the resolution of single
+#: Length [m] at both ends of the path between two surfaces that is exempt: several times the resolution of single
 #: precision over 20 m.
 MARGIN = wp.constant(wp.float32(1.0e-5))
 
 
 @wp.struct
 class PackedObstructions:
-    """Meshes [obstruction], ids of ``wp.Mesh``, and ``blocks`` [surface, obstruction]: on which ways each is met."""
+    """Meshes [obstruction], ids of ``wp.Mesh``, and ``blocks`` [surface, obstruction]: 1 on the way to a surface."""
 
     meshes: wp.array(dtype=wp.uint64)
     blocks: wp.array2d(dtype=wp.int32)
@@ -36,7 +36,7 @@ def past_obstructions(
     t: lanes,
     status: lanes,
 ):
-    """Statuses after the way from (x, y, z) over a distance t to surface ``s``, all in the telescope frame."""
+    """Statuses after the path from (x, y, z) over a distance t to surface ``s``, all in the telescope frame."""
     for m in range(obstructions.meshes.shape[0]):
         if obstructions.blocks[s, m] == 1:
             for i in range(LANES):

@@ -1,4 +1,4 @@
-"""The kernel that traces the same pupil points for many stars and keeps displacement and path at the image.
+"""The kernel that traces the same pupil points for many stars, to displacements and paths at the image.
 
 A module of its own: with one caller of the surface loop in a module the compiler inlines all of it, which saves a
 tenth of the time.

@@ -90,7 +90,7 @@ def polar_sag(
                 qr = wp.cw_mul(qr, s) + block(numbers[at])
                 qi = wp.cw_mul(qi, s) + block(numbers[at + 1])
                 at += 2
-            # Each line needs what the next one changes.
+            # Each line needs the value that the next one changes.
             hr = wp.cw_mul(zr, bx) - wp.cw_mul(zi, by) + fr
             zi = wp.cw_mul(zr, by) + wp.cw_mul(zi, bx) + fi
             zr = hr
@@ -195,7 +195,7 @@ def cubic_change(numbers: wp.array(dtype=wp.float64), at: wp.int32, up: wp.float
 
 @wp.func
 def grid_sag(numbers: wp.array(dtype=wp.float64), offset: wp.int32, nx: wp.int32, ny: wp.int32, x: lanes, y: lanes):
-    """Sag and slopes of a bicubic grid; beyond the grid its outermost cells go on, and the lane is flagged."""
+    """Sag and slopes of a bicubic grid; beyond it its outermost cells are extrapolated, and the lane is flagged."""
     rate_x = numbers[offset + 2]
     rate_y = numbers[offset + 3]
     px = rate_x * (x - lanes(numbers[offset]))

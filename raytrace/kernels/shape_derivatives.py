@@ -174,7 +174,7 @@ def toroid_derivatives(numbers: wp.array(dtype=wp.float64), offset: wp.int32, x:
 def grid_derivatives(
     numbers: wp.array(dtype=wp.float64), offset: wp.int32, nx: wp.int32, ny: wp.int32, x: lanes, y: lanes
 ):
-    """Return derivatives x, y, xx, xy, yy of a bicubic grid; beyond it its outermost cells go on."""
+    """Return derivatives x, y, xx, xy, yy of a bicubic grid; beyond it its outermost cells are extrapolated."""
     rate_x = numbers[offset + 2]
     rate_y = numbers[offset + 3]
     px = rate_x * (x - lanes(numbers[offset]))

@@ -1,7 +1,7 @@
 """The kernel that traces packets of rays through a telescope.
 
 It has two variants (`kernel_pair`): code for rare kinds of surfaces slows the loop by a seventh even where no surface
-is of that kind, because it takes registers and keeps the compiler from inlining functions.
+is of that kind, because it takes registers and prevents the compiler from inlining functions.
 """
 
 from __future__ import annotations
@@ -80,32 +80,22 @@ class PackedSurfaces:
 @wp.func
 def to_local(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: lanes):
     """Components along the axes of surface ``s``, the columns of its rotation, of vectors of the telescope frame."""
+    table = surfaces.numbers
     return (
-        surfaces.numbers[s, ROTATION] * x
-        + surfaces.numbers[s, ROTATION + 3] * y
-        + surfaces.numbers[s, ROTATION + 6] * z,
-        surfaces.numbers[s, ROTATION + 1] * x
-        + surfaces.numbers[s, ROTATION + 4] * y
-        + surfaces.numbers[s, ROTATION + 7] * z,
-        surfaces.numbers[s, ROTATION + 2] * x
-        + surfaces.numbers[s, ROTATION + 5] * y
-        + surfaces.numbers[s, ROTATION + 8] * z,
+        table[s, ROTATION] * x + table[s, ROTATION + 3] * y + table[s, ROTATION + 6] * z,
+        table[s, ROTATION + 1] * x + table[s, ROTATION + 4] * y + table[s, ROTATION + 7] * z,
+        table[s, ROTATION + 2] * x + table[s, ROTATION + 5] * y + table[s, ROTATION + 8] * z,
     )
 
 
 @wp.func
 def to_telescope(surfaces: PackedSurfaces, s: wp.int32, x: lanes, y: lanes, z: lanes):
     """Components in the telescope frame of vectors along the axes of surface ``s``."""
+    table = surfaces.numbers
     return (
-        surfaces.numbers[s, ROTATION] * x
-        + surfaces.numbers[s, ROTATION + 1] * y
-        + surfaces.numbers[s, ROTATION + 2] * z,
-        surfaces.numbers[s, ROTATION + 3] * x
-        + surfaces.numbers[s, ROTATION + 4] * y
-        + surfaces.numbers[s, ROTATION + 5] * z,
-        surfaces.numbers[s, ROTATION + 6] * x
-        + surfaces.numbers[s, ROTATION + 7] * y
-        + surfaces.numbers[s, ROTATION + 8] * z,
+        table[s, ROTATION] * x + table[s, ROTATION + 1] * y + table[s, ROTATION + 2] * z,
+        table[s, ROTATION + 3] * x + table[s, ROTATION + 4] * y + table[s, ROTATION + 5] * z,
+        table[s, ROTATION + 6] * x + table[s, ROTATION + 7] * y + table[s, ROTATION + 8] * z,
     )
 
 

@@ -38,8 +38,8 @@ class _Programme:
         self.numbers: list[tuple[float, ...]] = []
         self.edges: list[tuple[float, float, float, float]] = []
 
-    def _step(self, what: Any, *numbers: float, edges: tuple[int, int] = (0, 0)) -> None:
-        self.steps.append((int(what), *edges))
+    def _step(self, kind: Any, *numbers: float, edges: tuple[int, int] = (0, 0)) -> None:
+        self.steps.append((int(kind), *edges))
         self.numbers.append(numbers or (0.0,) * 6)
 
     def add(self, aperture: Aperture) -> None:

@@ -11,6 +11,7 @@ from ...core.warp_arrays import warp_array
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ..kernels.obstruction import PackedObstructions
+from .meshes import warp_mesh
 
 
 def blocked_ways(telescope: Telescope) -> np.ndarray:
@@ -38,19 +39,11 @@ def blocked_ways(telescope: Telescope) -> np.ndarray:
 
 def pack_obstructions(telescope: Telescope, device: str = "cpu") -> Any:
     """Return the telescope's obstructions as a :class:`PackedObstructions` struct on a device."""
-    meshes = []
-    for obstruction in telescope.obstructions:
-        corners = obstruction.triangles.reshape(-1, 3)
-        meshes.append(
-            wp.Mesh(
-                points=warp_array(corners, wp.vec3, device=device),
-                indices=warp_array(np.arange(len(corners)), wp.int32, device=device),
-            )
-        )
+    corners = [obstruction.triangles.reshape(-1, 3) for obstruction in telescope.obstructions]
+    meshes = [warp_mesh(points, np.arange(len(points)), device) for points in corners]
     packed = PackedObstructions()
-    ids = warp_array([mesh.id for mesh in meshes], wp.uint64, device=device)
-    # Kernels refer to meshes by number only: the array of numbers keeps the meshes alive.
-    ids.kept = meshes
-    packed.meshes = ids
+    packed.meshes = warp_array([mesh.id for mesh in meshes], wp.uint64, device=device)
+    # Kernels refer to meshes by number only: the array of numbers owns the meshes.
+    packed.meshes.meshes = meshes
     packed.blocks = warp_array(blocked_ways(telescope), wp.int32, device=device)
     return packed

@@ -31,7 +31,7 @@ def clear_ring(aperture: Aperture | None) -> tuple[float, float, float, float] |
     if isinstance(aperture, Annulus):
         return (aperture.x, aperture.y, aperture.inner, aperture.outer)
     if isinstance(aperture, Complement) and isinstance(aperture.part, Circle):
-        # A disc in the way leaves a ring without end.
+        # The complement of a disc is a ring of infinite outer radius.
         return (aperture.part.x, aperture.part.y, aperture.part.radius, float(FAR))
     return None
 
@@ -89,10 +89,7 @@ def leading_surfaces(packed: Any, count: int) -> Any:
 
 
 def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
-    """Return the index before the first surface and after each at one wavelength, shape [n_surface + 1].
-
-    The last but one is therefore that of the medium in which the light meets the detector.
-    """
+    """Return the index before the first surface and after each, [n_surface + 1]: [-2] is that before the detector."""
     telescope.check_wavelength(wavelength)
     media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
     return np.array([medium.index(wavelength) for medium in media], dtype=np.float64)

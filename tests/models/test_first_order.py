@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conic_trace import fan_coefficients, trace
@@ -197,3 +199,7 @@ def test_what_has_no_first_order_figures_is_refused():
     mersenne = [(0.0, 4.0, -1.0, None), (1.5, 1.0, -1.0, None)]
     with pytest.raises(DomainError, match="expected one with a focus"):
         first_order(telescope_of(mersenne, stop_z=0.0, diameter=0.4))
+    detector_alone = replace(telescope, surfaces=telescope.surfaces[-1:], groups={}, group_frames={})
+    for function in (first_order, seidel_sums):
+        with pytest.raises(DomainError, match="at least one mirror or lens surface"):
+            function(detector_alone)
