@@ -107,9 +107,8 @@ def fft_psf(
             key="n_pupil",
         )
 
-    def waves(field: np.ndarray, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
-        spacing = plan.range_of_cosines / across
-        found = lattice_wavelets(telescope, field, wavelength, center, spacing, projection=projection, threads=threads)
+    def waves(one: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
+        found = lattice_wavelets(one, wavelength, center, plan.range_of_cosines / across)
         return found.wavelets, lambda x, y: lattice_sum(found, x, y)
 
     return plan.image("fft", waves, int(across), progress)
@@ -146,13 +145,13 @@ def huygens_psf(
         projection=projection,
         threads=threads,
     )
-    plan, pupil = _Plan(request, pixel, pixels, reference), request.pupil
+    plan = _Plan(request, pixel, pixels, reference)
 
-    def waves(field: np.ndarray, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
-        found = traced_wavelets(telescope, field, wavelength, center, pupil, projection, threads)
+    def waves(one: Request, wavelength: float, center: np.ndarray) -> tuple[Wavelets, _Sum]:
+        found = traced_wavelets(one, wavelength, center)
         return found, lambda x, y: wavelet_sum(found, x, y)
 
-    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(pupil) / np.pi)), progress)
+    return plan.image("huygens", waves, round(2.0 * np.sqrt(len(request.pupil) / np.pi)), progress)
 
 
 _Sum = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -218,7 +217,7 @@ class _Plan:
     def image(
         self,
         method: str,
-        waves: Callable[[np.ndarray, float, np.ndarray], tuple[Wavelets, _Sum]],
+        waves: Callable[[Request, float, np.ndarray], tuple[Wavelets, _Sum]],
         n_pupil: int,
         progress: Callable[[int], None] | None,
     ) -> DiffractionPsf:
@@ -226,10 +225,10 @@ class _Plan:
         axis = pixel_axis(self.pixel, self.pixels)
         images, lit, strehl = [], [], []
         for field, center in zip(self.request.fields, self.spots.reference_point, strict=True):
-            found: list[tuple[float, Wavelets, _Sum]] = []
+            one, found = replace(self.request, fields=field[None]), list[tuple[float, Wavelets, _Sum]]()
             total = np.zeros((self.pixels, self.pixels))
             for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):
-                wavelets, irradiance = waves(field, float(wavelength), center)
+                wavelets, irradiance = waves(one, float(wavelength), center)
                 found.append((float(weight), wavelets, irradiance))
                 total += weight * irradiance(axis, axis)
                 if progress is not None:

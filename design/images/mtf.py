@@ -12,7 +12,7 @@ sagittal modulation is across it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -180,17 +180,9 @@ def mtf(
     shape = (2, len(request.fields), len(frequency))
     transfer, perfect, rays = np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, complex)
     for i, (field, center, angle) in enumerate(zip(request.fields, diagram.reference_point, angles, strict=True)):
+        one = replace(request, fields=field[None])
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
-            found = lattice_wavelets(
-                telescope,
-                field,
-                float(wavelength),
-                center,
-                float(wavelength) * step,
-                angle=float(angle),
-                projection=projection,
-                threads=threads,
-            )
+            found = lattice_wavelets(one, float(wavelength), center, float(wavelength) * step, float(angle))
             for total, pupil in ((transfer, found.wavelets.field), (perfect, np.abs(found.wavelets.field))):
                 for axis in (0, 1):
                     overlap = _overlap(pupil if axis == 0 else pupil.T, len(frequency))
@@ -225,34 +217,6 @@ def tangential_angle(telescope: Telescope, principal: PrincipalRays) -> np.ndarr
     ends = principal.marginal_direction @ telescope.surfaces[-1].matrix
     across = ends[:, 0, :2] - ends[:, 1, :2]
     return np.arctan2(across[:, 1], across[:, 0])
-
-
-def annulus_mtf(frequency: np.ndarray, obscuration: float) -> np.ndarray:
-    """Return the modulation transfer of a perfect annular pupil (O'Neill 1956, J. Opt. Soc. Am. 46, 285).
-
-    Parameters
-    ----------
-    frequency : ndarray
-        Frequencies over the cut-off, 1 / (wavelength times focal ratio).
-    obscuration : float
-        Inner over outer diameter.
-    """
-    shift = np.asarray(frequency, dtype=np.float64)
-    whole = _discs(shift, 1.0, 1.0)
-    if obscuration > 0:
-        whole = whole + _discs(shift, obscuration, obscuration) - 2.0 * _discs(shift, 1.0, obscuration)
-    return whole / (np.pi * (1.0 - obscuration**2))
-
-
-def _discs(shift: np.ndarray, large: float, small: float) -> np.ndarray:
-    """Return the common area of two discs whose centres are twice a shift apart."""
-    d = 2.0 * np.abs(shift)
-    part = np.clip(d, max(large - small, 1e-300), large + small)
-    a = np.arccos(np.clip((part**2 + large**2 - small**2) / (2.0 * part * large), -1.0, 1.0))
-    b = np.arccos(np.clip((part**2 + small**2 - large**2) / (2.0 * part * small), -1.0, 1.0))
-    kite = (large + small + part) * (small + large - part) * (part + large - small) * (part + small - large)
-    area = large**2 * a + small**2 * b - 0.5 * np.sqrt(np.maximum(kite, 0.0))
-    return np.where(d <= large - small, np.pi * small**2, np.where(d >= large + small, 0.0, area))
 
 
 def _overlap(pupil: np.ndarray, count: int) -> np.ndarray:

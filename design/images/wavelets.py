@@ -27,7 +27,7 @@ from ...core.errors import DomainError
 from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...wavefront.bundles import Bundles
-from ...wavefront.pupil_sampling import CHIEF_RAY, PupilSampling, ring_annulus
+from ...wavefront.pupil_sampling import ring_annulus
 from ...wavefront.request import Request
 from ..metrics.principal_rays import PrincipalRays
 from ..metrics.spots import SpotDiagram
@@ -81,49 +81,32 @@ class WaveletLattice:
     spacing: float
 
 
-def traced_wavelets(
-    telescope: Telescope,
-    field: np.ndarray,
-    wavelength: float,
-    center: np.ndarray,
-    sampling: PupilSampling,
-    projection: str = "zemax",
-    threads: int | None = None,
-) -> Wavelets:
-    """Return the wavelets of rays through given points of the entrance pupil, for the one field of a request.
+def traced_wavelets(request: Request, wavelength: float, center: np.ndarray) -> Wavelets:
+    """Return the wavelets of the rays through the pupil points of a request for one field.
 
     The reference point `center` is x and y of the detector [m].
     """
+    telescope, weights, points = request.telescope, request.pupil.weights, request.pupil.points
     step = _STEP * 0.5 * telescope.pupil_diameter
-    points = sampling.points
     beside = (points, points + np.array([step, 0.0]), points + np.array([0.0, step]))
-    request = Request.of(telescope, field, wavelength, sampling=sampling, projection=projection, threads=threads)
     bundle = request.bundles(wavelength, np.concatenate(beside))
     opd, cosine = _at_reference(telescope, bundle, center)
     here, along_x, along_y = cosine.reshape(3, -1, 2)
     jacobian = np.abs(_cross(along_x - here, along_y - here)) / step**2
     lit = bundle.lit[0, : len(points)] & np.isfinite(jacobian)
     annulus = 0.25 * np.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
-    amplitude = np.where(lit, sampling.weights * np.sqrt(annulus * jacobian), 0.0)
+    amplitude = np.where(lit, weights * np.sqrt(annulus * jacobian), 0.0)
     return Wavelets(
         cosine=np.where(lit[:, None], here, 0.0),
         opd=np.where(lit, opd[: len(points)], 0.0),
         amplitude=amplitude,
-        lit_fraction=float(sampling.weights[lit].sum()),
+        lit_fraction=float(weights[lit].sum()),
         wavelength=wavelength,
     )
 
 
 def lattice_wavelets(
-    telescope: Telescope,
-    field: np.ndarray,
-    wavelength: float,
-    center: np.ndarray,
-    spacing: float,
-    *,
-    angle: float = 0.0,
-    projection: str = "zemax",
-    threads: int | None = None,
+    request: Request, wavelength: float, center: np.ndarray, spacing: float, angle: float = 0.0
 ) -> WaveletLattice:
     """Return the wavelets of rays that are aimed at a square lattice of direction cosines on the detector.
 
@@ -133,9 +116,8 @@ def lattice_wavelets(
     proportion to it. A DomainError says that no light passes, or no ray has some of the directions: the map of the
     pupil to the image is not one to one.
     """
-    radius = 0.5 * telescope.pupil_diameter
+    telescope, radius = request.telescope, 0.5 * request.telescope.pupil_diameter
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
 
     def rays(points: np.ndarray) -> tuple[Bundles, np.ndarray, np.ndarray]:
         bundle = request.bundles(wavelength, points)
@@ -158,13 +140,13 @@ def lattice_wavelets(
         off = targets - cosine
         known = np.isfinite(off).all(axis=1)
         if not (lit & known).any():
-            raise DomainError(f"{field_label(field)}: no light passes; expected a lit pupil")
+            raise DomainError(f"{field_label(request.fields[0])}: no light passes; expected a lit pupil")
         if np.abs(off[lit & known]).max() <= _AIM * spacing:
             break
         points = points + np.einsum("nij,nj->ni", jacobian, np.where(known[:, None], off, 0.0))
     else:
         raise DomainError(
-            f"{field_label(field)}: rays could not be aimed at all directions; expected a pupil that the "
+            f"{field_label(request.fields[0])}: rays could not be aimed at all directions; expected a pupil that the "
             "telescope maps one to one on its image (huygens_psf does without)"
         )
     cover = _coverage(telescope, rays, points, jacobian, lit, near, n, spacing)

@@ -15,6 +15,7 @@ from pachon.design.metrics.spots import spots
 from pachon.models.aperture import Circle
 from pachon.wavefront.opd import wavefront_opd
 from pachon.wavefront.pupil_sampling import gauss_annulus
+from pachon.wavefront.request import Request
 
 WAVE = 500e-9
 
@@ -61,7 +62,7 @@ def test_a_defocused_disc_has_the_strehl_ratio_of_theory(paraboloid):
 def test_the_lattice_sum_is_the_fast_fourier_transform(lsst_r):
     field = np.deg2rad([0.3, -0.8])
     center = spots(lsst_r, field).reference_point[0]
-    lattice = lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 96)
+    lattice = lattice_wavelets(Request.of(lsst_r, field), 620e-9, center, 0.81 / 96)
     n = 256
     pupil = np.zeros((n, n), dtype=complex)
     half = len(lattice.steps) // 2
@@ -75,9 +76,8 @@ def test_the_lattice_sum_is_the_fast_fourier_transform(lsst_r):
 
 
 def test_wavelets_are_summed_at_every_pixel(lsst_r):
-    wavelets = traced_wavelets(
-        lsst_r, np.deg2rad([0.3, -0.8]), 620e-9, np.array([0.0539, -0.1440]), gauss_annulus(4.18, 0.612, 5, 16)
-    )
+    request = Request.of(lsst_r, np.deg2rad([0.3, -0.8]), sampling=gauss_annulus(4.18, 0.612, 5, 16))
+    wavelets = traced_wavelets(request, 620e-9, np.array([0.0539, -0.1440]))
     x, y = np.array([-1e-6, 0.0, 2.5e-6]), np.array([0.7e-6, 3e-6])
     k = 2.0 * np.pi / 620e-9
     for i, b in enumerate(y):
@@ -91,7 +91,7 @@ def test_wavelets_are_summed_at_every_pixel(lsst_r):
 def test_path_differences_are_those_of_the_reference_sphere(lsst_r, field):
     sampling = gauss_annulus(4.1, 0.65, 6, 24)
     opd = wavefront_opd(lsst_r, field, 620e-9, tuple(sampling.points.T))
-    wavelets = traced_wavelets(lsst_r, np.array(field), 620e-9, opd.center[:2], sampling)
+    wavelets = traced_wavelets(Request.of(lsst_r, field, sampling=sampling), 620e-9, opd.center[:2])
     lit = opd.lit & (wavelets.amplitude > 0)
     assert lit.sum() > 100
     # Sphere and plane waves differ by q^2 / 2R: 1e-11 m for rays 10 um from the centre.

@@ -11,13 +11,14 @@ from pachon.design.images.wavelets import lattice_wavelets, spot_reach, traced_w
 from pachon.design.metrics.spots import spots
 from pachon.design.metrics.vignetting import vignetting
 from pachon.wavefront.pupil_sampling import gauss_annulus, square_annulus
+from pachon.wavefront.request import Request
 
 
 @pytest.mark.parametrize("angle", [(0.0, 0.0), (0.0, 1.75), (-0.9, 1.1)])
 def test_the_light_of_a_lattice_is_what_is_not_vignetted(lsst_r, angle):
     field = np.deg2rad(angle)
     center = spots(lsst_r, field).reference_point[0]
-    lattice = lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 128)
+    lattice = lattice_wavelets(Request.of(lsst_r, field), 620e-9, center, 0.81 / 128)
     expected = vignetting(lsst_r, [field], 620e-9, n_pupil=40000)
     # A cell that a rim crosses is known to 1/36 of it, and there are some 600 of them among 8000.
     assert lattice.wavelets.lit_fraction == pytest.approx(expected.lit_fraction[0], abs=1e-3)
@@ -26,8 +27,8 @@ def test_the_light_of_a_lattice_is_what_is_not_vignetted(lsst_r, angle):
 def test_both_kinds_have_the_same_peak_if_perfect(lsst_r):
     field = np.deg2rad([0.4, 0.9])
     center = spots(lsst_r, field).reference_point[0]
-    traced = traced_wavelets(lsst_r, field, 620e-9, center, square_annulus(4.18, 0.612, 200))
-    aimed = lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 200).wavelets
+    traced = traced_wavelets(Request.of(lsst_r, field, sampling=square_annulus(4.18, 0.612, 200)), 620e-9, center)
+    aimed = lattice_wavelets(Request.of(lsst_r, field), 620e-9, center, 0.81 / 200).wavelets
     assert aimed.perfect_peak == pytest.approx(traced.perfect_peak, rel=2e-3)
     assert aimed.lit_fraction == pytest.approx(traced.lit_fraction, rel=2e-3)
 
@@ -35,7 +36,7 @@ def test_both_kinds_have_the_same_peak_if_perfect(lsst_r):
 def test_a_turned_lattice_has_the_same_light_in_other_cells(lsst_r):
     field = np.deg2rad([0.4, 0.9])
     center = spots(lsst_r, field).reference_point[0]
-    one, other = (lattice_wavelets(lsst_r, field, 620e-9, center, 0.81 / 128, angle=a) for a in (0.0, 0.7))
+    one, other = (lattice_wavelets(Request.of(lsst_r, field), 620e-9, center, 0.81 / 128, a) for a in (0.0, 0.7))
     assert other.wavelets.lit_fraction == pytest.approx(one.wavelets.lit_fraction, abs=1e-3)
     rows = other.wavelets.cosine[:, 1:] - other.wavelets.cosine[:, :-1]
     assert rows == pytest.approx(np.broadcast_to(other.spacing * np.array([np.cos(0.7), np.sin(0.7)]), rows.shape))
@@ -46,7 +47,7 @@ def test_rays_that_go_astray_beyond_a_rim_do_no_harm():
     telescope = pachon.load_telescope("hsc")
     field = np.array([0.0, telescope.field_radius])
     center = spots(telescope, field).reference_point[0]
-    lattice = lattice_wavelets(telescope, field, 770e-9, center, 0.4 / 128)
+    lattice = lattice_wavelets(Request.of(telescope, field), 770e-9, center, 0.4 / 128)
     expected = vignetting(telescope, [field], 770e-9, n_pupil=40000).lit_fraction[0]
     assert expected < 0.7
     assert lattice.wavelets.lit_fraction == pytest.approx(expected, abs=2e-3)
