@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any, Self
@@ -112,6 +112,13 @@ def error_context(**context: Any) -> Iterator[None]:
         yield
     except PachonError as error:
         raise error.within(**context) from None
+
+
+def check_unique(kind: str, names: Sequence[str]) -> None:
+    """Raise a ConfigError if a name of a kind occurs twice."""
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{kind} {name!r} occurs more than once: expected unique names")
 
 
 def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameError:

@@ -38,6 +38,11 @@ def metres(value: Any, name: str) -> np.ndarray:
     return _si(value, u.m, name)
 
 
+def arcseconds(angle: np.ndarray) -> np.ndarray:
+    """Return angles [rad] in arc seconds."""
+    return np.rad2deg(angle) * 3600.0
+
+
 def field_label(field: np.ndarray) -> str:
     """Return a field point [rad] as error messages name it, in degrees."""
     x, y = np.rad2deg(field)

@@ -11,7 +11,8 @@ from ..core.plotting import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.legend import Legend
 
 #: Fields that a legend or a row of panels can hold; a plot of more is drawn against the distance from the axis.
 FEW = 12
@@ -41,18 +42,37 @@ def _colors(name: str, first: float, span: float, count: int) -> list[Any]:
     return [colormaps[name](first + span * i / max(count - 1, 1)) for i in range(count)]
 
 
-def panel_grid(count: int, width: float, height: float, most: int = 5) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels of a size [inches], at most `most` in a row, and the axes in use."""
-    columns = min(count, most)
-    if count > most:
-        # Rows of about equal length.
-        columns = math.ceil(count / math.ceil(count / most))
-    rows = math.ceil(count / columns)
-    figure = new_figure(max(columns * width, 4.5), rows * height + 0.6)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+def grid_shape(count: int, most: int = 5) -> tuple[int, int]:
+    """Return the number of rows, of about equal length, and of columns, at most `most`, for so many panels."""
+    columns = math.ceil(count / math.ceil(count / most))
+    return math.ceil(count / columns), columns
+
+
+def panels_of(parent: Figure | SubFigure, count: int, rows: int, columns: int, **options: Any) -> list[Axes]:
+    """Return so many panels in rows and columns of a figure; the others stay empty."""
+    panels = parent.subplots(rows, columns, squeeze=False, **options).ravel()
     for axes in panels[count:]:
         axes.set_axis_off()
-    return figure, list(panels[:count])
+    return list(panels[:count])
+
+
+def panel_grid(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels of a size [inches], and the axes in use."""
+    rows, columns = grid_shape(count)
+    figure = new_figure(max(columns * width, 4.5), rows * height + 0.6)
+    return figure, panels_of(figure, count, rows, columns)
+
+
+def legend_below(figure: Figure, axes: Axes, most: int = 7, **style: Any) -> Legend:
+    """Draw the legend of a panel below all panels of a figure, at most so many labels in a row."""
+    handles, labels = axes.get_legend_handles_labels()
+    return figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), most), **style)
+
+
+def finish_axes(axes: Axes, **properties: Any) -> None:
+    """Set labels, limits and other properties of axes over a light grid."""
+    axes.set(**properties)
+    axes.grid(True, color="0.92", linewidth=0.6)
 
 
 def round_length(value: float) -> float:

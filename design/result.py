@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..wavefront.request import Request
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -43,3 +47,8 @@ class FieldResult:
     def _nanometres(self) -> str:
         """Return the wavelengths as titles of plots give them."""
         return ", ".join(f"{w * 1e9:.4g}" for w in self.wavelengths) + " nm"
+
+    def _titled(self, figure: Figure, text: str) -> Figure:
+        """Return a figure with a title that begins with the name of the telescope."""
+        figure.suptitle(f"{self.telescope}: {text}", fontsize=11)
+        return figure

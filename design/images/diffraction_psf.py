@@ -9,7 +9,8 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from ...core.plotting import new_figure, styled
-from ..drawing import draw_circle, draw_scale_bar, field_colors, field_text, round_length
+from ...core.units import arcseconds
+from .. import drawing
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 _FINER = 4
 #: Decades below the brightest pixel that the plot shows.
 _DECADES = 4.0
-#: Panels in a row; cuts are drawn of one row.
-_MOST = 5
+#: Images whose cuts are drawn.
+_CUTS = 5
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class DiffractionPsf(FieldResult):
 
     def summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
-        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        arcsec = arcseconds(self.plate_scale)
         return {
             "telescope": self.telescope,
             "method": self.method,
@@ -119,29 +120,25 @@ class DiffractionPsf(FieldResult):
 
     def plot(self) -> Figure:
         """Draw each image on a logarithmic scale, and cuts through the first ones."""
-        count = len(self.fields)
-        rows = -(-count // _MOST)
-        columns = -(-count // rows)
+        rows, columns = drawing.grid_shape(len(self.fields))
         with styled():
             figure = new_figure(max(2.3 * columns + 0.9, 6.4), 2.95 * rows + 2.9)
             parts: Any = figure.subfigures(2, 1, height_ratios=[2.8 * rows + 0.4, 2.6])
             above, below = parts
-            panels = above.subplots(rows, columns, squeeze=False).ravel()
-            for axes in panels[count:]:
-                axes.set_axis_off()
+            panels = drawing.panels_of(above, len(self.fields), rows, columns)
             image: Any = None
-            for i, axes in enumerate(panels[:count]):
+            for i, axes in enumerate(panels):
                 image = _draw_image(axes, self, i)
             half = 0.5e6 * self.pixel * self.image.shape[-1]
-            bar = round_length(0.6 * half)
-            draw_scale_bar(panels[0], bar, f'{bar:g} µm = {_arcsec(self, 0) * bar * 1e-6:.3g}"')
-            _whiten(panels[0])
-            key = above.colorbar(image, ax=list(panels), shrink=0.85, pad=0.015, aspect=30)
+            bar = drawing.round_length(0.6 * half)
+            drawing.draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcseconds(self.plate_scale)[0] * bar * 1e-6:.3g}"')
+            for part in (*panels[0].lines, *panels[0].texts):
+                part.set_color("white")
+            key = above.colorbar(image, ax=above.axes, shrink=0.85, pad=0.015, aspect=30)
             key.set_label("light over that of\nthe brightest pixel")
             way = "Fourier sum" if self.method == "fft" else "Huygens' wavelets"
-            figure.suptitle(f"{self.telescope}: diffraction images, {self._nanometres()} ({way})", fontsize=11)
             _draw_cuts(below.subplots(1, 2, sharey=True), self)
-            return figure
+            return self._titled(figure, f"diffraction images, {self._nanometres()} ({way})")
 
 
 def pixel_axis(pixel: float, pixels: int) -> np.ndarray:
@@ -161,41 +158,27 @@ def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
         cmap="inferno",
         norm=LogNorm(10.0**-_DECADES, 1.0),
     )
-    draw_circle(axes, psf.airy_radius[i] * 1e6, color="white", style=(0, (3, 2)))
+    drawing.draw_circle(axes, psf.airy_radius[i] * 1e6, color="white", style=(0, (3, 2)))
     axes.set(xticks=[], yticks=[])
-    axes.set_title(field_text(psf.fields[i]), fontsize=9.5)
+    axes.set_title(drawing.field_text(psf.fields[i]), fontsize=9.5)
     fwhm = psf.fwhm[i]
     lit = "" if psf.lit_fraction[i] > 0.995 else f"lit {100 * psf.lit_fraction[i]:.1f} % of the pupil"
     axes.set_xlabel(
-        f'Strehl {psf.strehl[i]:.3g}\nFWHM {fwhm * 1e6:.3g} µm = {fwhm * _arcsec(psf, i):.2g}"\n{lit}', fontsize=7.5
+        f'Strehl {psf.strehl[i]:.3g}\nFWHM {fwhm * 1e6:.3g} µm = {fwhm * arcseconds(psf.plate_scale)[i]:.2g}"\n{lit}',
+        fontsize=7.5,
     )
     return shown
 
 
 def _draw_cuts(panels: Any, psf: DiffractionPsf) -> None:
-    colors = field_colors(min(len(psf.fields), _MOST))
+    colors = drawing.field_colors(min(len(psf.fields), _CUTS))
     for axes, name in zip(panels, "xy", strict=True):
         for i, color in enumerate(colors):
             density = psf.image[i] / psf.pixel**2 * 1e-12
             row, column = np.unravel_index(int(np.argmax(density)), density.shape)
             cut = density[row] if name == "x" else density[:, column]
-            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=field_text(psf.fields[i]))
-        axes.set_xlabel(f"{name} on the detector from the middle of the image [µm]")
-        axes.set_xlim(psf.axis[0] * 1e6, psf.axis[-1] * 1e6)
-        axes.set_ylim(bottom=0.0)
-        axes.grid(True, color="0.92", linewidth=0.6)
+            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=drawing.field_text(psf.fields[i]))
+        label = f"{name} on the detector from the middle of the image [µm]"
+        drawing.finish_axes(axes, xlabel=label, xlim=(psf.axis[0] * 1e6, psf.axis[-1] * 1e6), ylim=(0.0, None))
     panels[0].set_ylabel("part of the light per µm²\n(through the brightest pixel)")
     panels[1].legend(loc="upper right")
-
-
-def _whiten(axes: Axes) -> None:
-    """Make the scale bar and its label readable on a dark image."""
-    for line in axes.lines:
-        line.set_color("white")
-    for text in axes.texts:
-        text.set_color("white")
-
-
-def _arcsec(psf: DiffractionPsf, i: int) -> float:
-    """Return arc seconds per metre on the detector."""
-    return float(np.rad2deg(psf.plate_scale[i])) * 3600.0

@@ -12,10 +12,10 @@ from scipy.ndimage import zoom
 
 from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
-from ...core.units import metres
+from ...core.units import arcseconds, metres
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
-from ..drawing import FEW, field_colors, field_text, second_scale
+from ..drawing import FEW, field_colors, field_text, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, spots
 from ..result import FieldResult
 from .diffraction import DiffractionPsf, fft_psf
@@ -65,7 +65,7 @@ class EncircledEnergy(FieldResult):
 
     def summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
-        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        arcsec = arcseconds(self.plate_scale)
         radii = {f"ee{round(100 * part)}_radius": self.radius_holding(part) for part in (0.5, 0.8, 0.9)}
         return {
             "telescope": self.telescope,
@@ -87,8 +87,7 @@ class EncircledEnergy(FieldResult):
             _draw_curves(left, self)
             _draw_radii(right, self)
             kind = "with diffraction" if self.kind == "diffraction" else "of rays alone"
-            figure.suptitle(f"{self.telescope}: encircled energy {kind}, {self._nanometres()}", fontsize=11)
-            return figure
+            return self._titled(figure, f"encircled energy {kind}, {self._nanometres()}")
 
 
 def encircled_energy(
@@ -255,10 +254,13 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
     # Beyond the light of every field the curves are flat.
     full = np.flatnonzero((result.fraction >= 0.985).all(axis=0))
     edge = result.radius[full[0]] if len(full) else result.radius[-1]
-    axes.set(xlim=(0.0, max(edge, 0.25 * result.radius[-1]) * 1e6), ylim=(0.0, 1.02))
-    axes.set_xlabel("radius about the centroid of the rays [µm]")
-    axes.set_ylabel("fraction of the light within")
-    axes.grid(True, color="0.92", linewidth=0.6)
+    finish_axes(
+        axes,
+        xlim=(0.0, max(edge, 0.25 * result.radius[-1]) * 1e6),
+        ylim=(0.0, 1.02),
+        xlabel="radius about the centroid of the rays [µm]",
+        ylabel="fraction of the light within",
+    )
     second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
     if few:
         axes.legend(loc="lower right")
@@ -267,14 +269,9 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
 def _draw_radii(axes: Axes, result: EncircledEnergy) -> None:
     away = np.rad2deg(result.off_axis_angle)
     order = np.argsort(away, kind="stable")
-    scale = np.rad2deg(result.plate_scale) * 3600.0
     for part, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
-        radius = result.radius_holding(part) * scale
-        axes.plot(
-            away[order], radius[order], "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * part:.0f} %"
-        )
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("distance from the axis [deg]")
-    axes.set_ylabel("radius that holds the fraction [arcsec]")
-    axes.grid(True, color="0.92", linewidth=0.6)
+        radius = (result.radius_holding(part) * arcseconds(result.plate_scale))[order]
+        axes.plot(away[order], radius, "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * part:.0f} %")
+    label = "radius that holds the fraction [arcsec]"
+    finish_axes(axes, ylim=(0.0, None), xlabel="distance from the axis [deg]", ylabel=label)
     axes.legend(loc="best", ncols=3)

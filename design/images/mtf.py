@@ -21,9 +21,10 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, new_figure, styled
+from ...core.units import arcseconds
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
-from ..drawing import field_text, second_scale
+from ..drawing import field_text, finish_axes, grid_shape, legend_below, panels_of, second_scale
 from ..metrics.principal_rays import PrincipalRays, principal_rays_of
 from ..metrics.spots import spot_diagram
 from ..result import FieldResult
@@ -88,7 +89,7 @@ class Mtf(FieldResult):
 
     def summary(self) -> dict[str, Any]:
         """Return the results by name and unit; pairs are tangential, sagittal; lists run over the fields."""
-        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        arcsec = arcseconds(self.plate_scale)
         half = self.frequency_at(0.5)
         return {
             "telescope": self.telescope,
@@ -113,25 +114,20 @@ class Mtf(FieldResult):
     def plot(self) -> Figure:
         """Draw the contrast against the frequency, with the limit that diffraction sets."""
         count = len(self.fields)
-        rows = -(-count // _MOST)
-        columns = -(-count // rows)
+        rows, columns = grid_shape(count, _MOST)
         with styled():
             figure = new_figure(max(3.5 * columns, 5.5), 2.6 * rows + 1.0)
-            panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
-            for axes in panels[count:]:
-                axes.set_axis_off()
-            for i, axes in enumerate(panels[:count]):
+            panels = panels_of(figure, count, rows, columns, sharex=True, sharey=True)
+            for i, axes in enumerate(panels):
                 _draw_field(axes, self, i)
-            for i, axes in enumerate(panels[:count]):
+            for i, axes in enumerate(panels):
                 if i % columns == 0:
                     axes.set_ylabel("contrast")
                 if i + columns >= count:
                     axes.set_xlabel("spatial frequency [cycles/mm]")
                     axes.tick_params(labelbottom=True)
-            handles, labels = panels[0].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside lower center", ncols=3 if columns > 1 else 2)
-            figure.suptitle(f"{self.telescope}: modulation transfer, {self._nanometres()}", fontsize=11)
-            return figure
+            legend_below(figure, panels[0], 3 if columns > 1 else 2)
+            return self._titled(figure, f"modulation transfer, {self._nanometres()}")
 
 
 def mtf(
@@ -243,18 +239,10 @@ def _draw_field(axes: Axes, result: Mtf, i: int) -> None:
         axes.plot(frequency, limit[i], color=color, linewidth=0.8, alpha=0.55, label=f"{name}, perfect wavefront")
         axes.plot(frequency, rays[i], color=color, linewidth=0.8, linestyle=(0, (1, 1.5)), label=f"{name}, rays alone")
         axes.plot(frequency, solid[i], color=color, linewidth=1.5, label=name)
-    axes.set(xlim=(0.0, frequency[-1]), ylim=(0.0, 1.0))
-    axes.grid(True, color="0.92", linewidth=0.6)
+    finish_axes(axes, xlim=(0.0, frequency[-1]), ylim=(0.0, 1.0))
     half = result.frequency_at(0.5)[i] * 1e-3
-    axes.text(
-        0.97,
-        0.95,
-        f"{field_text(result.fields[i])}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)",
-        transform=axes.transAxes,
-        ha="right",
-        va="top",
-        fontsize=8,
-    )
+    text = f"{field_text(result.fields[i])}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)"
+    axes.text(0.97, 0.95, text, transform=axes.transAxes, ha="right", va="top", fontsize=8)
     if i < _MOST:
         arcsec_per_mm = float(np.rad2deg(result.plate_scale[i].mean())) * 3600e-3
         second_scale(axes, 1.0 / arcsec_per_mm, "cycles per arc second")

@@ -30,7 +30,7 @@ from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import ring_annulus
 from ...wavefront.request import Request
 from ..metrics.principal_rays import PrincipalRays
-from ..metrics.spots import SpotDiagram
+from ..metrics.spots import SpotDiagram, holding_radius
 
 #: Degree of the polynomials that start the search for aimed rays and give the Jacobian.
 _DEGREE = 7
@@ -92,7 +92,8 @@ def traced_wavelets(request: Request, wavelength: float, center: np.ndarray) -> 
     bundle = request.bundles(wavelength, np.concatenate(beside))
     opd, cosine = _at_reference(telescope, bundle, center)
     here, along_x, along_y = cosine.reshape(3, -1, 2)
-    jacobian = np.abs(_cross(along_x - here, along_y - here)) / step**2
+    (xx, xy), (yx, yy) = (along_x - here).T, (along_y - here).T
+    jacobian = np.abs(xx * yy - xy * yx) / step**2
     lit = bundle.lit[0, : len(points)] & np.isfinite(jacobian)
     annulus = 0.25 * np.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
     amplitude = np.where(lit, weights * np.sqrt(annulus * jacobian), 0.0)
@@ -128,12 +129,13 @@ def lattice_wavelets(
     n = 2 * int(np.ceil(guess.reach / spacing)) + 3
     steps = (np.arange(n) - n // 2) * spacing
     targets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    start = guess.pupil(steps).reshape(-1, 2)
+    start, slopes = guess.on_lattice(steps)
+    start = start.reshape(-1, 2)
     # A cell reaches half a spacing to all sides; beyond that the polynomials need not hold.
     margin = spacing * guess.metres_per_cosine
     near = np.flatnonzero(np.hypot(*start.T) <= radius + margin)
     targets, points = targets[near], start[near]
-    jacobian = guess.jacobian(steps).reshape(-1, 2, 2)[near]
+    jacobian = slopes.reshape(-1, 2, 2)[near]
     for _ in range(_MOST_TRACES):
         bundle, opd, cosine = rays(points)
         lit = bundle.lit[0] & _in_annulus(telescope, points)
@@ -179,10 +181,8 @@ def spot_reach(diagram: SpotDiagram) -> float:
     for distance, weight in zip(np.linalg.norm(diagram.displacement, axis=-1), diagram.weight, strict=True):
         lit = weight > 0
         if lit.any():
-            order = np.argsort(distance[lit], kind="stable")
-            held = np.cumsum(weight[lit][order])
             # A few stray rays may land anywhere; a lattice for all of them would have no end.
-            reach = max(reach, float(distance[lit][order][np.searchsorted(held, _HELD * held[-1])]))
+            reach = max(reach, holding_radius(distance[lit], weight[lit], _HELD))
     return _BEYOND * reach
 
 
@@ -220,14 +220,14 @@ class _InverseMap:
         #: Change of the pupil point with the cosines, about [m].
         self.metres_per_cosine = float(np.linalg.norm(slope[1:], 2))
 
-    def pupil(self, steps: np.ndarray) -> np.ndarray:
-        """Return points of the entrance pupil [m] for a lattice of cosines, shape [n, n, 2], the second axis first."""
-        return self._on_lattice(self._powers(steps), self._powers(steps))
+    def on_lattice(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points of the entrance pupil [m] for a lattice of cosines, and their derivatives by the cosines [m].
 
-    def jacobian(self, steps: np.ndarray) -> np.ndarray:
-        """Return the derivatives of those points by the cosines [m], shape [n, n, 2, 2]."""
+        Shapes are [n, n, 2] and [n, n, 2, 2], the second axis of the lattice first.
+        """
         plain, derived = self._powers(steps), self._powers(steps, derivative=True)
-        return np.stack([self._on_lattice(derived, plain), self._on_lattice(plain, derived)], axis=-1)
+        slopes = [self._on_lattice(derived, plain), self._on_lattice(plain, derived)]
+        return self._on_lattice(plain, plain), np.stack(slopes, axis=-1)
 
     def _on_lattice(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         return np.stack([second @ self._coefficients[..., k].T @ first.T for k in (0, 1)], axis=-1)
@@ -290,7 +290,3 @@ def _in_annulus(telescope: Telescope, points: np.ndarray) -> np.ndarray:
     radius = 0.5 * telescope.pupil_diameter
     distance = np.hypot(points[:, 0], points[:, 1])
     return (distance <= radius) & (distance >= telescope.pupil_obscuration * radius)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -12,7 +12,7 @@ from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
-from ..drawing import field_text
+from ..drawing import field_text, legend_below
 from .sections import Lens, drawn_radii, even_edges, find_lenses, ray_paths, surface_section
 
 if TYPE_CHECKING:
@@ -111,8 +111,7 @@ class Layout:
                 figure = new_figure(wide + 1.2, float(np.clip(wide * ratio[1] / ratio[0], 3.0, 7.5)) + 1.6)
                 left = figure.subplots()
                 _draw(left, drawing, whole, set(names), beams=True)
-            handles, labels = left.get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 8))
+            legend_below(figure, left, 8)
             figure.suptitle(
                 f"{self.telescope.name}: section x = 0, rays of {self.wavelength * 1e9:.4g} nm; "
                 f"light comes from {'the left' if drawing.lying else 'above'}",

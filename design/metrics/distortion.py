@@ -14,6 +14,7 @@ from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
+from ..drawing import finish_axes
 from ..result import FieldResult
 from .spots import REFERENCES, spot_diagram
 
@@ -103,12 +104,8 @@ class Distortion(FieldResult):
             picture, curve = figure.subplots(1, 2)
             _draw_picture(picture, self)
             _draw_percent(curve, self)
-            figure.suptitle(
-                f"{self.telescope}: distortion against f tan θ, {self.wavelength * 1e9:.4g} nm; "
-                f"{'chief rays' if self.reference == 'chief' else 'centroids'}",
-                fontsize=11,
-            )
-            return figure
+            points = "chief rays" if self.reference == "chief" else "centroids"
+            return self._titled(figure, f"distortion against f tan θ, {self._nanometres()}; {points}")
 
 
 def distortion(
@@ -216,10 +213,8 @@ def _draw_picture(axes: Axes, result: Distortion) -> None:
     else:
         axes.plot(*predicted.T, "+", color="0.6")
     axes.plot(*(predicted + factor * shift).T, ".", color=BLUE, markersize=3.0)
-    axes.set_aspect("equal")
+    axes.set(aspect="equal", xlabel="detector x [mm]", ylabel="detector y [mm]")
     axes.autoscale_view()
-    axes.set_xlabel("detector x [mm]")
-    axes.set_ylabel("detector y [mm]")
     axes.set_title(f"shifts drawn {factor:,.0f} times as long; the largest is {largest * 1e3:.3g} µm", loc="left")
 
 
@@ -245,8 +240,5 @@ def _draw_percent(axes: Axes, result: Distortion) -> None:
         axes.plot(radius[order], percent[order], ".", color=color, markersize=4.5, label=label)
     worst = float(np.nanmax(np.abs(result.percent)))
     axes.set_title(f"largest against the best scale: {worst:.3g} %", loc="left", color=RED if worst > 1.0 else "black")
-    axes.set_xlabel("distance from the axis [deg]")
-    axes.set_ylabel("distortion [%]")
-    axes.set_xlim(left=0.0)
-    axes.grid(True, color="0.92", linewidth=0.6)
+    finish_axes(axes, xlabel="distance from the axis [deg]", ylabel="distortion [%]", xlim=(0.0, None))
     axes.legend(loc="best")

@@ -21,7 +21,7 @@ from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus
 from ...wavefront.request import Request
-from ..drawing import FEW, draw_field_map, field_colors, field_text, spread_in_field
+from ..drawing import FEW, draw_field_map, field_colors, field_text, panels_of, spread_in_field
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -79,11 +79,8 @@ class FieldZernikes(FieldResult):
         with_maps = spread_in_field(self.fields) and len(j) > 0
         with styled():
             figure = new_figure(11.0, 8.6 if with_maps else 4.8)
-            title = (
-                f"{self.telescope}: annular Zernikes over the {self.pupil} pupil, obscuration {self.obscuration:g}, "
-                f"{self.wavelength * 1e9:.4g} nm"
-            )
-            figure.suptitle(title, fontsize=11)
+            annulus = f"the {self.pupil} pupil, obscuration {self.obscuration:g}"
+            self._titled(figure, f"annular Zernikes over {annulus}, {self._nanometres()}")
             if with_maps:
                 parts: Any = figure.subfigures(2, 1, height_ratios=(1.0, 1.35))
                 bars = parts[0].subplots()
@@ -333,10 +330,8 @@ def name_terms(axes: Axes, j: np.ndarray) -> None:
 def _draw_maps(figure: Any, result: FieldZernikes, j: np.ndarray) -> None:
     sizes = np.sqrt((result.coefficients[:, 3:] ** 2).mean(axis=0))
     largest = np.sort(j[np.argsort(-sizes, kind="stable")[:_MAPS]])
-    panels = figure.subplots(2, _MAPS // 2, sharex=True, sharey=True).ravel()
-    for axes in panels[len(largest) :]:
-        axes.set_axis_off()
-    for axes, n in zip(panels, largest, strict=False):
+    panels = panels_of(figure, len(largest), 2, _MAPS // 2, sharex=True, sharey=True)
+    for axes, n in zip(panels, largest, strict=True):
         nm = result.coefficients[:, n - 1] * 1e9
         edge = max(float(np.abs(nm).max()), 1e-6)
         image = draw_field_map(axes, result.fields, nm, cmap="RdBu_r", vmin=-edge, vmax=edge)

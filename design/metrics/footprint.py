@@ -121,8 +121,7 @@ class Footprint(FieldResult):
             if len(self.fields) > FEW:
                 handles, labels = handles[-1:], labels[-1:]
             figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 7))
-            figure.suptitle(f"{self.telescope}: footprints [mm]", fontsize=11)
-            return figure
+            return self._titled(figure, "footprints [mm]")
 
 
 def footprint(

@@ -19,10 +19,11 @@ from ...core.plotting import RED, new_figure, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
-from ..drawing import draw_circle, field_text
+from ..drawing import draw_circle, field_text, panels_of
 from ..result import FieldResult
 from .ghost_paths import Coatings, GhostLight, GhostPath, follow, ghost_pairs, ghost_path
 from .principal_rays import principal_rays_of
+from .spots import holding_radius
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -150,18 +151,16 @@ class Ghosts(FieldResult):
             left, right = parts
             _draw_map(left.subplots(), self)
             shown = self.ghosts[:_ALONE]
-            panels = right.subplots(2, _ALONE // 2, squeeze=False).ravel()
-            for axes in panels[len(shown) :]:
-                axes.set_axis_off()
+            panels = panels_of(right, len(shown), 2, _ALONE // 2)
             for axes, ghost, magnitude in zip(panels, shown, self.magnitudes, strict=False):
                 _draw_ghost(axes, ghost, float(magnitude))
             right.suptitle("the brightest: reflected at, and then at", fontsize=9.5)
-            figure.suptitle(
-                f"{self.telescope}: ghosts of a star at {field_text(self.field)}, {self.wavelength * 1e9:.4g} nm, "
-                f"{100 * self.flux:.2g} % of its light (detector reflects {100 * self.detector_reflectivity:.3g} %)",
-                fontsize=11,
+            flux, reflected = 100 * self.flux, 100 * self.detector_reflectivity
+            return self._titled(
+                figure,
+                f"ghosts of a star at {field_text(self.field)}, {self._nanometres()}, "
+                f"{flux:.2g} % of its light (detector reflects {reflected:.3g} %)",
             )
-            return figure
 
 
 def ghosts(
@@ -250,7 +249,8 @@ def ghosts(
 def _measure(landing: GhostLight, direct: float) -> Ghost:
     # Rays that graze the detector may land anywhere; position and size are those of most of the light.
     around = np.median(landing.position, axis=0)
-    core = _within(landing.position - around, landing.weight, _CORE)
+    distance = np.linalg.norm(landing.position - around, axis=-1)
+    core = distance <= holding_radius(distance, landing.weight, _CORE)
     weight, position, direction = landing.weight[core], landing.position[core], landing.direction[core]
     centroid = np.average(position, axis=0, weights=weight)
     off = position - centroid
@@ -275,14 +275,6 @@ def _measure(landing: GhostLight, direct: float) -> Ghost:
     )
 
 
-def _within(off: np.ndarray, weight: np.ndarray, fraction: float) -> np.ndarray:
-    """Return which rays lie in the circle about the origin that holds a fraction of the light."""
-    distance = np.linalg.norm(off, axis=-1)
-    order = np.argsort(distance, kind="stable")
-    held = np.cumsum(weight[order])
-    return distance <= distance[order][np.searchsorted(held, fraction * held[-1])]
-
-
 def _irradiance(landing: GhostLight, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the light per area in cells of given edges, [y, x]."""
     light, _, _ = np.histogram2d(landing.position[:, 1], landing.position[:, 0], bins=[y, x], weights=landing.weight)
@@ -303,26 +295,18 @@ def _draw_map(axes: Axes, result: Ghosts) -> None:
         key = axes.figure.colorbar(shown, ax=axes, shrink=0.82, pad=0.02)
         key.set_label("part of the star's light per mm²")
     axes.plot(*(result.star * 1e3), "+", color="white", markersize=9.0, markeredgewidth=1.2)
-    axes.annotate(
-        "star",
-        (result.star[0] * 1e3, result.star[1] * 1e3),
-        xytext=(6, 5),
-        textcoords="offset points",
-        color="white",
-        fontsize=8,
-    )
+    place = result.star[0] * 1e3, result.star[1] * 1e3
+    axes.annotate("star", place, xytext=(6, 5), textcoords="offset points", color="white", fontsize=8)
     draw_circle(axes, result.image_radius * 1e3, color="0.75", style=(0, (4, 3)))
-    axes.set(aspect="equal", xlim=(edges[0], edges[-1]), ylim=(edges[0], edges[-1]))
-    axes.set(xlabel="detector x [mm]", ylabel="detector y [mm]")
+    limits = edges[0], edges[-1]
+    axes.set(aspect="equal", xlim=limits, ylim=limits, xlabel="detector x [mm]", ylabel="detector y [mm]")
 
 
 def _draw_ghost(axes: Axes, ghost: Ghost, magnitude: float) -> None:
     light = np.where(ghost.irradiance > 0, ghost.irradiance, np.nan) * 1e-6
     x, y = ghost.edges * 1e3
     axes.pcolormesh(x, y, light, cmap="magma", vmin=0.0)
-    axes.set_facecolor("black")
-    axes.set_aspect("equal")
-    axes.set(xticks=[], yticks=[])
+    axes.set(facecolor="black", aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color("0.8")
     axes.set_title(f"{ghost.first}\n{ghost.second}", fontsize=8, color=RED)

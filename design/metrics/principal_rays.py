@@ -23,6 +23,7 @@ from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
 from ...wavefront.pupil_sampling import pupil_sampling
 from ...wavefront.request import Request
+from ..drawing import finish_axes
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -108,10 +109,9 @@ class PrincipalRays(FieldResult):
         """Draw focal ratio, plate scale, exit pupil and incidence against the distance from the axis."""
         radius = np.rad2deg(self.off_axis_angle)
         order = np.argsort(radius, kind="stable")
-        scale = np.rad2deg(self.plate_scale) * 3600e-6
         pairs = [
             ("working focal ratio", self.f_number),
-            ('plate scale ["/µm]', scale),
+            ('plate scale ["/µm]', np.rad2deg(self.plate_scale) * 3600e-6),
             ("exit pupil, from the detector [m]", self.exit_pupil_distance),
             ("diameter of the exit pupil [m]", self.exit_pupil_diameter),
         ]
@@ -127,13 +127,12 @@ class PrincipalRays(FieldResult):
             panels[4].set_ylabel("incidence of the chief ray [deg]")
             panels[5].set_axis_off()
             for axes in panels[:5]:
-                axes.grid(True, color="0.92", linewidth=0.6)
+                finish_axes(axes)
                 axes.ticklabel_format(useOffset=False)
             for axes in panels[2:5]:
                 axes.set_xlabel("distance from the axis [deg]")
                 axes.tick_params(labelbottom=True)
-            figure.suptitle(f"{self.telescope}: chief and marginal rays, {self.wavelength * 1e9:.4g} nm", fontsize=11)
-            return figure
+            return self._titled(figure, f"chief and marginal rays, {self._nanometres()}")
 
 
 def principal_rays(

@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
 from ...core.plotting import BLUE, RED, styled
+from ...core.units import arcseconds
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import bare_frame, draw_circle, draw_scale_bar, field_text, panel_grid, round_length, wavelength_colors
+from .. import drawing
 from ..result import FieldResult
 from .principal_rays import principal_rays_of
 
@@ -100,7 +101,7 @@ class SpotDiagram(FieldResult):
 
     def summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
-        arcsec = np.rad2deg(self.plate_scale) * 3600.0
+        arcsec = arcseconds(self.plate_scale)
         sizes = {
             "rms_radius": self.rms_radius,
             "radius_80_percent": self.radius_holding(0.8),
@@ -127,20 +128,15 @@ class SpotDiagram(FieldResult):
         light = np.nanmax(self.geometric_radius, initial=0.0), _FARTHEST * np.nanmax(radius, initial=0.0)
         half = 1.08e6 * max(float(min(light)), float(np.nanmax(self.airy_radius, initial=1e-9)))
         with styled():
-            figure, panels = panel_grid(len(self.fields), 2.5, 3.0)
+            figure, panels = drawing.panel_grid(len(self.fields), 2.5, 3.0)
             for i, axes in enumerate(panels):
                 _draw_spot(axes, self, i, half, radius[i])
-            bar = round_length(0.7 * half)
+            bar = drawing.round_length(0.7 * half)
             arcsec = bar * 1e-6 * float(np.rad2deg(self.plate_scale[0])) * 3600.0
-            draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcsec:.3g}"')
-            handles, labels = panels[0].get_legend_handles_labels()
-            legend = figure.legend(
-                handles, labels, loc="outside lower center", ncols=min(len(labels), 7), markerscale=3.0
-            )
-            for handle in filter(None, legend.legend_handles):
+            drawing.draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcsec:.3g}"')
+            for handle in filter(None, drawing.legend_below(figure, panels[0], markerscale=3.0).legend_handles):
                 handle.set_alpha(1.0)
-            figure.suptitle(f"{self.telescope}: spots about the centroid", fontsize=11)
-            return figure
+            return self._titled(figure, "spots about the centroid")
 
     def _mean(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted mean of values [n_field, n_wave, n_pupil, 2] over the rays of each field."""
@@ -168,9 +164,7 @@ def spots(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+    telescope, fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`.
     reference : {"centroid", "chief"}
         Origin of the displacements: the centroid, or the chief ray of the middle wavelength.
@@ -216,6 +210,13 @@ def spot_diagram(request: Request, reference: str = "centroid") -> SpotDiagram:
     return replace(diagram, displacement=moved, reference_point=chief + centroid)
 
 
+def holding_radius(distance: np.ndarray, weight: np.ndarray, fraction: float) -> float:
+    """Return the distance of the first ray, by distance, within which lies a fraction of the light."""
+    order = np.argsort(distance, kind="stable")
+    held = np.cumsum(weight[order])
+    return float(distance[order][np.searchsorted(held, fraction * held[-1])])
+
+
 def _weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> float:
     """Return where ascending values pass a fraction of their weights; values equal but for rounding count as one."""
     starts = np.flatnonzero(np.diff(values, prepend=-np.inf) > 1e-9 * values[-1])
@@ -227,15 +228,15 @@ def _weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float)
 def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: float) -> None:
     centered = (spots.displacement[i] - spots.centroid[i]) * 1e6
     names = [f"{w * 1e9:.4g} nm" for w in spots.wavelengths]
-    colors = wavelength_colors(len(names)) if len(names) > 1 else [BLUE]
+    colors = drawing.wavelength_colors(len(names)) if len(names) > 1 else [BLUE]
     step = -(-spots.weight[i].size // _DOTS)
     for xy, weight, name, color in zip(centered, spots.weight[i], names, colors, strict=True):
         lit = np.flatnonzero(weight > 0)[::step]
         axes.plot(*xy[lit].T, ".", markersize=1.6, markeredgewidth=0.0, color=color, alpha=0.7, label=name)
-    draw_circle(axes, spots.airy_radius[i] * 1e6, color="black", style="-", label="Airy disc")
-    draw_circle(axes, radius * 1e6, color=RED, style=(0, (4, 2)), label="80 % of the rays")
-    bare_frame(axes, half)
-    scale = float(np.rad2deg(spots.plate_scale[i])) * 3600.0
+    drawing.draw_circle(axes, spots.airy_radius[i] * 1e6, color="black", style="-", label="Airy disc")
+    drawing.draw_circle(axes, radius * 1e6, color=RED, style=(0, (4, 2)), label="80 % of the rays")
+    drawing.bare_frame(axes, half)
+    scale = float(arcseconds(spots.plate_scale)[i])
     rms = spots.rms_radius[i]
     text = f'rms {rms * 1e6:.3g} µm = {rms * scale:.3g}"\n80 % {radius * 1e6:.3g} µm = {radius * scale:.3g}"'
     if not np.isfinite(rms):
@@ -245,5 +246,5 @@ def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: floa
     beyond = float(spots.weight[i][np.abs(centered).max(axis=-1) > half].sum())
     if beyond > 0:
         text += f"\n{100 * beyond / spots.lit_fraction[i]:.2g} % of the rays beyond the frame"
-    axes.set_title(field_text(spots.fields[i]), fontsize=9.5)
+    axes.set_title(drawing.field_text(spots.fields[i]), fontsize=9.5)
     axes.set_xlabel(text, fontsize=7.5)

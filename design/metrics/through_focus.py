@@ -20,7 +20,7 @@ from ...models.telescope import Telescope
 from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import FEW, field_colors, field_text
+from ..drawing import FEW, field_colors, field_text, finish_axes, legend_below
 from ..result import FieldResult
 from .principal_rays import principal_rays_of
 
@@ -95,16 +95,10 @@ class ThroughFocus(FieldResult):
             figure = new_figure(12.0, 4.4)
             for axes, (values, label, best) in zip(figure.subplots(1, 3), panels, strict=True):
                 _draw_curves(axes, self, values, best)
-                axes.set_ylabel(label)
-                axes.set_ylim(bottom=0.0)
-            handles, labels = figure.axes[0].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 7))
-            figure.suptitle(
-                f"{self.telescope}: through focus; the spots of all fields together are smallest at "
-                f"{self.best_common * 1e6:+.3g} µm",
-                fontsize=11,
-            )
-            return figure
+                axes.set(ylabel=label, ylim=(0.0, None))
+            legend_below(figure, figure.axes[0])
+            common = f"{self.best_common * 1e6:+.3g} µm"
+            return self._titled(figure, f"through focus; the spots of all fields together are smallest at {common}")
 
 
 def through_focus(
@@ -123,9 +117,7 @@ def through_focus(
 
     Parameters
     ----------
-    telescope : Telescope
-        The telescope.
-    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+    telescope, fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`.
     defocus : array_like or Quantity, shape [n_height], optional
         Heights above the nominal detector [m], ascending; by default about the common best focus, to where the spots
@@ -240,6 +232,4 @@ def _draw_curves(axes: Axes, result: ThroughFocus, values: np.ndarray, best: np.
     axes.axvline(0.0, color="0.6", linewidth=0.7)
     common = result.best_common * 1e6
     axes.axvline(common, color="0.3", linewidth=0.9, linestyle=(0, (4, 3)), label="best for all together")
-    axes.set_xlim(heights[0], heights[-1])
-    axes.set_xlabel("height above the nominal detector [µm]")
-    axes.grid(True, color="0.92", linewidth=0.6)
+    finish_axes(axes, xlim=(heights[0], heights[-1]), xlabel="height above the nominal detector [µm]")

@@ -13,7 +13,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_of, new_figure, styled
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
-from ..drawing import draw_field_map, spread_in_field
+from ..drawing import draw_field_map, finish_axes, spread_in_field
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -72,12 +72,8 @@ class Vignetting(FieldResult):
             _draw_profile(panels[0], self)
             if with_map:
                 _draw_map(panels[1], self)
-            figure.suptitle(
-                f"{self.telescope}: vignetting at {self.wavelength * 1e9:.4g} nm; "
-                f"on the axis {100 * self.axis_fraction:.1f} % of the annular pupil is lit",
-                fontsize=11,
-            )
-            return figure
+            lit = f"on the axis {100 * self.axis_fraction:.1f} % of the annular pupil is lit"
+            return self._titled(figure, f"vignetting at {self._nanometres()}; {lit}")
 
 
 def vignetting(
@@ -162,16 +158,17 @@ def _draw_profile(axes: Axes, result: Vignetting) -> None:
     if len(rings) < len(radius):
         axes.plot(rings, [percent[rounded == r].mean() for r in rings], color=BLUE, linewidth=1.3, label="mean")
     axes.axhline(100.0, color="0.6", linewidth=0.7)
-    axes.set_xlim(left=0.0)
-    axes.set_ylim(top=max(101.0, float(percent.max()) + 1.0))
-    axes.set_xlabel("distance from the axis [deg]")
-    axes.set_ylabel("light relative to the axis [%]")
-    axes.grid(True, color="0.92", linewidth=0.6)
+    finish_axes(
+        axes,
+        xlim=(0.0, None),
+        ylim=(None, max(101.0, float(percent.max()) + 1.0)),
+        xlabel="distance from the axis [deg]",
+        ylabel="light relative to the axis [%]",
+    )
     axes.legend(loc="lower left")
 
 
 def _draw_map(axes: Axes, result: Vignetting) -> None:
     image = draw_field_map(axes, result.fields, 100.0 * result.relative, cmap="viridis")
-    axes.set_xlabel("field x [deg]")
-    axes.set_ylabel("field y [deg]")
+    axes.set(xlabel="field x [deg]", ylabel="field y [deg]")
     figure_of(axes).colorbar(image, ax=axes, fraction=0.046, pad=0.02).set_label("light relative to the axis [%]")

@@ -163,10 +163,8 @@ def monte_carlo(
         Tolerances of degrees of freedom by name, or of parameters by address if there are none.
     merit : {"wavefront", "spots"}
         Merit function.
-    n : int
-        Number of draws.
-    seed : int
-        Seed of the draws.
+    n, seed : int
+        Number of draws, and their seed.
     degrees_of_freedom : DegreesOfFreedom, optional
         Degrees of freedom of the names.
     compensators : iterable of str
@@ -195,9 +193,7 @@ def monte_carlo(
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{name!r} occurs more than once: expected either a tolerance or a compensator")
-    dof = degrees_of_freedom or DegreesOfFreedom.of_parameters(telescope, names)
-    dof = dof.select(names)
-
+    dof = (degrees_of_freedom or DegreesOfFreedom.of_parameters(telescope, names)).select(names)
     fields = field_rings(telescope) if fields is None else fields
     rays = Beams.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
@@ -230,15 +226,14 @@ def monte_carlo(
                 progress(1)
         still = np.concatenate([np.zeros(len(chosen)), -(setting @ residuals)])
         nominal = _merit(judge, dof.apply(telescope, still))
-    units = dof.units
     return MonteCarlo(
         telescope=telescope.name,
         merit_name=merit,
         method=method,
         tolerances=chosen,
         compensators=free,
-        units=units[: len(chosen)],
-        compensator_units=units[len(chosen) :],
+        units=dof.units[: len(chosen)],
+        compensator_units=dof.units[len(chosen) :],
         deviations=deviations,
         moves=moves,
         merit=found,

@@ -108,14 +108,12 @@ class Optimum:
             steps.semilogy(range(len(self.history)), self.history * 1e6, "o-", color=BLUE, markersize=4)
             steps.xaxis.set_major_locator(MaxNLocator(integer=True))
             steps.grid(True, which="major", linewidth=0.3)
-            steps.set_xlabel("step")
-            steps.set_ylabel(f"rms of {self.merit_name} [µm]")
+            steps.set(xlabel="step", ylabel=f"rms of {self.merit_name} [µm]", title=self.telescope.name)
             places = np.arange(len(names))
             bars.barh(places, np.abs(self.changes) * self.effect * 1e6, color=GREY, height=0.7)
             bars.set_yticks(places, names)
             bars.invert_yaxis()
             bars.set_xlabel("change of each times its effect, rms [µm]")
-            steps.set_title(self.telescope.name)
             return figure
 
 

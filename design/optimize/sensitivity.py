@@ -119,9 +119,8 @@ class Sensitivity(FieldResult):
             modes.semilogy(np.arange(1, len(values) + 1), values, "o-", color=BLUE, markersize=3.5, linewidth=0.9)
             modes.xaxis.set_major_locator(MaxNLocator(integer=True))
             modes.grid(True, which="major", linewidth=0.3)
-            modes.set_xlabel("mode")
-            modes.set_ylabel("singular value, each parameter scaled to 1")
-            modes.set_title("independent combinations")
+            label = "singular value, each parameter scaled to 1"
+            modes.set(xlabel="mode", ylabel=label, title="independent combinations")
             return figure
 
 
@@ -195,7 +194,12 @@ def sensitivity(
 
     def fit(block: WavefrontBlock) -> np.ndarray:
         part, lit = block.fields, block.status == RayStatus.OK
-        _check_lit(lit, n_zernike, points[part])
+        few = lit.sum(axis=1) < n_zernike
+        if few.any():
+            raise DomainError(
+                f"{field_label(points[part][few][0])}: only {int(lit[few][0].sum())} pupil points are lit; "
+                f"expected at least n_zernike = {n_zernike}"
+            )
         # Normal equations of the fit of each field: those of the whole pupil, less the few rays that are not lit.
         normal = whole - np.stack([products(dark) for dark in ~lit])
         value, change = block.project(weighted, columns.weights)
@@ -212,12 +216,3 @@ def sensitivity(
     # Rotation about the axis has no effect; its rounding errors become zero.
     matrix[:, :, np.abs(matrix).max(axis=(0, 1)) < _ROUNDING * terms_size] = 0.0
     return Sensitivity(request, ParameterVector(chosen), telescope.pupil_obscuration, matrix, zernikes)
-
-
-def _check_lit(lit: np.ndarray, n_zernike: int, points: np.ndarray) -> None:
-    few = lit.sum(axis=1) < n_zernike
-    if few.any():
-        raise DomainError(
-            f"{field_label(points[few][0])}: only {int(lit[few][0].sum())} pupil points are lit; "
-            f"expected at least n_zernike = {n_zernike}"
-        )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 
-from ...core.errors import ConfigError, DomainError, PachonError, unknown_name
+from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
 from ...models.shapes.shape import Shape, Sum
 from ...models.telescope import Telescope
 from ..optimize.sensitivity import Sensitivity, sensitivity
@@ -40,10 +40,8 @@ class DegreeOfFreedom:
 
     Attributes
     ----------
-    name : str
-        Name.
-    unit : str
-        Unit of the values: "um", "arcsec", "K", "1"...
+    name, unit : str
+        Name, and unit of the values: "um", "arcsec", "K", "1"...
     of : mapping of str to float
         Coefficients by address, ``<surface or group>.<parameter>`` or ``<deformation>.<mode>``: SI unit of the address
         per SI unit of the degree of freedom.
@@ -101,13 +99,8 @@ class DegreesOfFreedom:
     def __post_init__(self) -> None:
         if not self.members:
             raise ConfigError("degrees_of_freedom = []: expected at least one")
-        for kind, names in (
-            ("degree of freedom", self.names),
-            ("deformation", tuple(d.name for d in self.deformations)),
-        ):
-            for name in names:
-                if names.count(name) > 1:
-                    raise ConfigError(f"{kind} {name!r} occurs more than once: expected unique names")
+        check_unique("degree of freedom", self.names)
+        check_unique("deformation", [d.name for d in self.deformations])
         for member in self.members:
             try:
                 unit_size(member.unit)
@@ -124,10 +117,9 @@ class DegreesOfFreedom:
             As :func:`~pachon.design.parameters.parameters.parse_parameters`.
         """
         found = parse_parameters(addresses, telescope)
+        units = [p.unit if p.unit in ("m", "rad") else "1" for p in found]
         return cls(
-            tuple(
-                DegreeOfFreedom(p.address, p.unit if p.unit in ("m", "rad") else "1", {p.address: 1.0}) for p in found
-            )
+            tuple(DegreeOfFreedom(p.address, unit, {p.address: 1.0}) for p, unit in zip(found, units, strict=True))
         )
 
     def __len__(self) -> int:
@@ -209,10 +201,8 @@ class DegreesOfFreedom:
 
         Parameters
         ----------
-        telescope : Telescope
-            The telescope; it stays as it is.
-        values : array_like, shape [n], or mapping of str to float or Quantity
-            See :meth:`vector`.
+        telescope, values
+            The telescope, which stays as it is, and the vector as in :meth:`vector`.
 
         Raises
         ------
@@ -261,15 +251,8 @@ class DegreesOfFreedom:
     ) -> Sensitivity:
         """Return the sensitivity matrix of the wavefront to the degrees of freedom.
 
-        Parameters
-        ----------
-        telescope, fields, wavelength, **options
-            As in :func:`~pachon.design.optimize.sensitivity.sensitivity`.
-
-        Returns
-        -------
-        Sensitivity
-            In metres of wavefront per unit of each degree of freedom, in the order of the vector.
+        It is in metres of wavefront per unit of each degree of freedom, in the order of the vector. Arguments are those
+        of :func:`~pachon.design.optimize.sensitivity.sensitivity`.
         """
         prepared, parameters, matrix = self.parameter_matrix(telescope)
         found = sensitivity(prepared, parameters, fields, wavelength, **options)

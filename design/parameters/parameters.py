@@ -25,7 +25,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError, unknown_name
+from ...core.errors import ConfigError, DomainError, check_unique, unknown_name
 from ...models.media.medium import with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
@@ -41,10 +41,8 @@ class Parameter:
 
     Attributes
     ----------
-    address : str
-        Address.
-    target : str
-        Name of the surface, group or medium.
+    address, target : str
+        Address, and the surface, group or medium in it.
     name : str
         A motion, a term of the shape, or "n".
     kind : {"motion", "shape", "index"}
@@ -61,14 +59,7 @@ class Parameter:
 
     @classmethod
     def parse(cls, text: str, telescope: Telescope) -> Parameter:
-        """Return the parameter at an address.
-
-        Parameters
-        ----------
-        text : str
-            The address.
-        telescope : Telescope
-            Telescope with the parameter.
+        """Return the parameter of a telescope at an address.
 
         Raises
         ------
@@ -112,8 +103,7 @@ class Parameter:
         if self.kind == "index":
             first = telescope.surfaces[index_surfaces(telescope, self.target)[0]]
             return float(first.medium_after.index(telescope.default_wavelength))
-        surface = telescope.surface(self.target)
-        return float(surface.shape.parameters.get(self.name, 0.0))
+        return float(telescope.surface(self.target).shape.parameters.get(self.name, 0.0))
 
 
 class Variables(Protocol):
@@ -176,12 +166,9 @@ def parse_parameters(texts: Iterable[str | Parameter], telescope: Telescope) -> 
             found += [Parameter.parse(f"{text[:-1]}{motion}", telescope) for motion in MOTIONS]
         else:
             found.append(Parameter.parse(text, telescope))
-    addresses = [p.address for p in found]
     if not found:
         raise ConfigError("parameters = []: expected at least one, such as M2.dz")
-    if len(set(addresses)) < len(addresses):
-        address = next(a for a in addresses if addresses.count(a) > 1)
-        raise ConfigError(f"parameter {address!r} occurs more than once: expected each once")
+    check_unique("parameter", [p.address for p in found])
     return tuple(found)
 
 
@@ -232,7 +219,10 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
     telescope.
     """
     parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
-    changes = _finite(parameters, values.values())
+    changes = [float(v) for v in values.values()]
+    for parameter, change in zip(parameters, changes, strict=True):
+        if not np.isfinite(change):
+            raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
     telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
     for parameter, change in zip(parameters, changes, strict=True):
         if not change:
@@ -247,14 +237,6 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
         if motion.any():
             telescope = telescope.perturbed(body, shift=motion[:3], tilt=motion[3:])
     return telescope
-
-
-def _finite(parameters: list[Parameter], values: Iterable[float]) -> list[float]:
-    changes = [float(v) for v in values]
-    for parameter, change in zip(parameters, changes, strict=True):
-        if not np.isfinite(change):
-            raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
-    return changes
 
 
 def _media(telescope: Telescope) -> set[str]:

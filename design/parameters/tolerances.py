@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import ConfigError, DomainError, check_unique
 from ...core.random_streams import stream
 
 DISTRIBUTIONS = ("uniform", "normal", "truncated")
@@ -83,12 +83,9 @@ def draw(tolerances: Iterable[Tolerance], seed: int, n: int = 1) -> np.ndarray:
     Each tolerance has a random stream of its own, by its name, so the draws of the others do not depend on it.
     """
     chosen = tuple(tolerances)
-    names = [t.name for t in chosen]
     if not chosen:
         raise ConfigError("tolerances = []: expected at least one")
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"tolerance {name!r} occurs more than once: expected unique names")
+    check_unique("tolerance", [t.name for t in chosen])
     for key, value, least in (("n", n, 1), ("seed", seed, 0)):
         if int(value) != value or value < least:
             raise DomainError(f"{key} = {value!r}: expected a whole number of at least {least}")
