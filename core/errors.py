@@ -114,6 +114,12 @@ def error_context(**context: Any) -> Iterator[None]:
         raise error.within(**context) from None
 
 
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Raise a ConfigError if an argument is not one of the choices."""
+    if value not in (known := tuple(choices)):
+        raise ConfigError(f"{name} = {value!r}: expected one of {', '.join(known)}")
+
+
 def check_unique(kind: str, names: Sequence[str]) -> None:
     """Raise a ConfigError if a name of a kind occurs twice."""
     for name in names:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import DomainError, check_choice
 from ..models.telescope import Telescope
 
 #: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
@@ -132,8 +132,7 @@ def pupil_sampling(
     """
     if isinstance(sampling, PupilSampling):
         return sampling
-    if sampling not in _DEFAULT_N_PUPIL:
-        raise ConfigError(f"sampling = {sampling!r}: expected one of {', '.join(_DEFAULT_N_PUPIL)}")
+    check_choice("sampling", sampling, _DEFAULT_N_PUPIL)
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
     n = _DEFAULT_N_PUPIL[sampling] if n_pupil is None else n_pupil
     if sampling == "gauss":

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import DomainError, check_choice
 from ...core.units import field_label, metres
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
@@ -190,8 +190,7 @@ class _Plan:
     """Common inputs of both sums, and the reduction of irradiances to images."""
 
     def __init__(self, request: Request, pixel: Any, pixels: int, reference: str) -> None:
-        if reference not in REFERENCES:
-            raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
+        check_choice("reference", reference, REFERENCES)
         if int(pixels) != pixels or not 3 <= pixels <= 4096:
             raise DomainError(f"pixels = {pixels!r}: expected a whole number from 3 to 4096")
         self.request, self.pixels = request, int(pixels)

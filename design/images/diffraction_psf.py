@@ -132,7 +132,8 @@ class DiffractionPsf(FieldResult):
             half = 0.5e6 * self.pixel * self.image.shape[-1]
             bar = drawing.round_length(0.6 * half)
             drawing.draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcseconds(self.plate_scale)[0] * bar * 1e-6:.3g}"')
-            for part in (*panels[0].lines, *panels[0].texts):
+            bar_and_label: Any = (*panels[0].lines, *panels[0].texts)
+            for part in bar_and_label:
                 part.set_color("white")
             key = above.colorbar(image, ax=above.axes, shrink=0.85, pad=0.015, aspect=30)
             key.set_label("light over that of\nthe brightest pixel")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import zoom
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import arcseconds, metres
 from ...models.telescope import Telescope
@@ -135,8 +135,7 @@ def encircled_energy(
     DomainError
         If radii do not ascend, or no light passes.
     """
-    if kind not in KINDS:
-        raise ConfigError(f"kind = {kind!r}: expected one of {', '.join(KINDS)}")
+    check_choice("kind", kind, KINDS)
     given = None if radii is None else np.atleast_1d(metres(radii, "radii"))
     if given is not None and not (
         given.ndim == 1 and np.isfinite(given).all() and (given >= 0).all() and (np.diff(given) > 0).all()

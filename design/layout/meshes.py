@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import numpy as np
 import trimesh
 from trimesh.visual import TextureVisuals
@@ -52,19 +54,22 @@ def layout_scene(
     surfaces = {s.name: s for s in telescope.surfaces}
 
     def add(name: str, mesh: trimesh.Trimesh, look: tuple[tuple[float, float, float, float], float, float]) -> None:
-        if len(mesh.faces):
-            color, metallic, rough = look
-            mesh.visual = TextureVisuals(
-                material=PBRMaterial(
-                    name=name,
-                    baseColorFactor=color,
-                    metallicFactor=metallic,
-                    roughnessFactor=rough,
-                    alphaMode="BLEND" if color[3] < 1.0 else "OPAQUE",
-                    doubleSided=True,
-                )
-            )
-            scene.add_geometry(mesh, node_name=name, geom_name=name, transform=_UPRIGHT)
+        if not len(mesh.faces):
+            return
+        numbered = (f"{name} {number}" for number in count(2))
+        while name in scene.geometry:
+            name = next(numbered)
+        color, metallic, rough = look
+        material = PBRMaterial(
+            name=name,
+            baseColorFactor=color,
+            metallicFactor=metallic,
+            roughnessFactor=rough,
+            alphaMode="BLEND" if color[3] < 1.0 else "OPAQUE",
+            doubleSided=True,
+        )
+        mesh.visual = TextureVisuals(material=material)
+        scene.add_geometry(mesh, node_name=name, geom_name=name, transform=_UPRIGHT)
 
     for lens in lenses:
         faces = [surface_mesh(surfaces[name], reach[name]) for name in (lens.front, lens.back)]
@@ -72,20 +77,19 @@ def layout_scene(
         mirrors = [n for n in (lens.front, lens.back) if surfaces[n].interaction == Interaction.MIRROR]
         whole = trimesh.util.concatenate([*faces, edge])
         assert isinstance(whole, trimesh.Trimesh)
-        add(_unused(scene, lens.name), whole, _LOOKS["glass"])
+        add(lens.name, whole, _LOOKS["glass"])
         glass -= set(mirrors)
     for name, surface in surfaces.items():
         if name in glass or surface.interaction == Interaction.PHASE:
             continue
         look = {Interaction.MIRROR: "mirror", Interaction.DETECTOR: "detector", Interaction.PASS: "baffle"}
-        add(_unused(scene, name), surface_mesh(surface, reach[name]), _LOOKS[look.get(surface.interaction, "glass")])
+        add(name, surface_mesh(surface, reach[name]), _LOOKS[look.get(surface.interaction, "glass")])
     for obstruction in telescope.obstructions:
-        add(_unused(scene, obstruction.name), obstruction.mesh, _LOOKS["baffle"])
+        add(obstruction.name, obstruction.mesh, _LOOKS["baffle"])
     radius = 0.5 * _RAY * size
     for i, (field, bundle) in enumerate(zip(fields, bundles, strict=True)):
         x, y = np.rad2deg(field)
-        mesh = tubes(bundle, radius)
-        add(_unused(scene, f"rays {x:+.4g} {y:+.4g} deg"), mesh, (_RAY_COLORS[i % len(_RAY_COLORS)], 0.0, 0.8))
+        add(f"rays {x:+.4g} {y:+.4g} deg", tubes(bundle, radius), (_RAY_COLORS[i % len(_RAY_COLORS)], 0.0, 0.8))
     return scene
 
 
@@ -170,12 +174,3 @@ def _wall(first: np.ndarray, second: np.ndarray) -> trimesh.Trimesh:
     points = np.concatenate([first, second])
     known = np.isfinite(points[faces]).all(axis=(1, 2))
     return trimesh.Trimesh(np.where(np.isfinite(points), points, 0.0), faces[known], process=False)
-
-
-def _unused(scene: trimesh.Scene, name: str) -> str:
-    """Return a name that is not in the scene yet."""
-    taken, number = set(scene.geometry), 2
-    found = name
-    while found in taken:
-        found, number = f"{name} {number}", number + 1
-    return found

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
@@ -136,8 +136,7 @@ def distortion(
     DomainError
         If there are too few fields, or a star does not reach the detector.
     """
-    if reference not in REFERENCES:
-        raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
+    check_choice("reference", reference, REFERENCES)
     points = field_lattice(telescope, _ACROSS) if fields is None else fields
     request = Request.of(
         telescope, points, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
 from ...core.units import field_label, radians
 from ...models.telescope import Telescope
@@ -208,8 +208,7 @@ def wavefront_zernikes(
     DomainError
         If there are fewer points than terms, or rays of the full annulus do not reach the detector.
     """
-    if pupil not in PUPILS:
-        raise ConfigError(f"pupil = {pupil!r}: expected one of {', '.join(PUPILS)}")
+    check_choice("pupil", pupil, PUPILS)
     request = Request.of(
         telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     )

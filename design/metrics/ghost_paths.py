@@ -53,39 +53,26 @@ def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
         if surfaces[place].interaction not in (Interaction.REFRACT, Interaction.DETECTOR):
             raise DomainError(f"surface {surfaces[place].name!r}: expected a lens surface or the detector for a ghost")
     before = [telescope.medium_before, *(s.medium_after for s in surfaces)]
-    times: dict[int, int] = {}
+    turn = 2 * first - second
+    source = (*range(first), *range(first, second, -1), *range(second, len(surfaces)))
     path: list[Surface] = []
-    source: list[int] = []
-
-    def meet(place: int, *, reflect: bool = False, back: bool = False) -> None:
-        times[place] = times.get(place, 0) + 1
-        name = surfaces[place].name + (f"#{times[place]}" if times[place] > 1 else "")
-        step = replace(surfaces[place], name=name)
-        if reflect:
-            # Light stays in its medium: in front of the first surface, behind the second.
-            medium = before[place] if place == first else before[place + 1]
-            step = replace(step, interaction=Interaction.MIRROR, medium_after=medium)
-        elif back:
-            step = replace(step, medium_after=before[place])
-        path.append(step)
-        source.append(place)
-
-    for place in range(first):
-        meet(place)
-    meet(first, reflect=True)
-    for place in range(first - 1, second, -1):
-        meet(place, back=True)
-    meet(second, reflect=True)
-    for place in range(second + 1, len(surfaces)):
-        meet(place)
-    reflecting = np.zeros(len(path), dtype=bool)
-    reflecting[[first, 2 * first - second]] = True
+    for k, place in enumerate(source):
+        surface, times = surfaces[place], source[: k + 1].count(place)
+        path.append(
+            replace(
+                surface,
+                name=surface.name + (f"#{times}" if times > 1 else ""),
+                interaction=Interaction.MIRROR if k in (first, turn) else surface.interaction,
+                # From the first reflection to the second, light goes back: into the medium in front of a surface.
+                medium_after=before[place] if first <= k < turn else before[place + 1],
+            )
+        )
     return GhostPath(
         first=surfaces[first].name,
         second=surfaces[second].name,
         telescope=replace(telescope, surfaces=tuple(path), groups={}, group_frames={}),
-        source=tuple(source),
-        reflecting=tuple(bool(v) for v in reflecting),
+        source=source,
+        reflecting=tuple(k in (first, turn) for k in range(len(path))),
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, RED, styled
 from ...core.units import arcseconds
 from ...models.telescope import Telescope
@@ -174,8 +174,7 @@ def spots(
     ConfigError
         If the reference is unknown.
     """
-    if reference not in REFERENCES:
-        raise ConfigError(f"reference = {reference!r}: expected one of {', '.join(REFERENCES)}")
+    check_choice("reference", reference, REFERENCES)
     request = Request.of(
         telescope,
         fields,

@@ -51,9 +51,10 @@ class Beams:
         request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
         return cls(request, relative_weights(field_weights, len(request.fields), "field_weights"))
 
-    def rays(self, telescope: Telescope, wavelength: float) -> Rays:
-        """Return the rays of one wavelength, field by field."""
-        return parallel_rays(telescope, self.request.directions, wavelength, self.request.pupil.points)
+    def rays(self, telescope: Telescope, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
+        """Return the rays of one wavelength, field by field; through other pupil points [m] if these are given."""
+        points = self.request.pupil.points if pupil is None else pupil
+        return parallel_rays(telescope, self.request.directions, wavelength, points)
 
     def weights(self, telescope: Telescope) -> np.ndarray:
         """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit."""
@@ -74,15 +75,12 @@ class Merit(Protocol):
 
     def residuals(self, telescope: Telescope) -> np.ndarray:
         """Return the residuals of a telescope [m], shape [n]; NaN where rays are lost."""
-        ...
 
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:
         """Return the residuals [m], shape [n], and their derivatives, shape [n, n_parameter]."""
-        ...
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:
         """Return the size of the terms that cancel where a variable has no effect [m], shape [n_parameter]."""
-        ...
 
 
 class SpotMerit:
@@ -139,8 +137,7 @@ class SpotMerit:
         return columns.size_of_terms(forward, landing_gradient(forward), threads=self._beams.request.threads)
 
     def _chief_rays(self, telescope: Telescope) -> Rays:
-        directions = self._beams.request.directions
-        return parallel_rays(telescope, directions, float(self._beams.request.wavelengths[0]), np.zeros((1, 2)))
+        return self._beams.rays(telescope, float(self._beams.request.wavelengths[0]), np.zeros((1, 2)))
 
     def _beyond(self, telescope: Telescope, direction: np.ndarray) -> np.ndarray:
         """Return the shift of the landing points of rays [n, 3] from the detector to the heights [m], [2, n]."""

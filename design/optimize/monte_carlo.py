@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError, PachonError
+from ...core.errors import ConfigError, DomainError, PachonError, check_choice
 from ...core.plotting import BLUE, GREY, RED, new_figure, styled
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
@@ -184,8 +184,7 @@ def monte_carlo(
         If a name does not exist, a number is out of range, or no light arrives.
     """
     chosen, free = tuple(tolerances), tuple(compensators)
-    if merit not in MERITS:
-        raise ConfigError(f"merit = {merit!r}: expected one of {', '.join(MERITS)}")
+    check_choice("merit", merit, MERITS)
     if method not in ("linear", "traced"):
         raise ConfigError(f"method = {method!r}: expected 'linear' or 'traced'")
     deviations = draw(chosen, seed, n)

@@ -190,7 +190,11 @@ def optimize(
     problem = _Problem(telescope, chosen, wanted, tuple(targets))
     low, high = _bounds(telescope, chosen, bounds or {})
     start, slopes = problem.linear(np.zeros(len(chosen)))
-    effect = _checked_effect(chosen, slopes, wanted.size_of_terms(ParameterColumns.at(telescope, chosen)))
+    effect = np.linalg.norm(slopes, axis=0)
+    rounding = NO_EFFECT * wanted.size_of_terms(ParameterColumns.at(telescope, chosen))
+    idle = [p.address for p, value, least in zip(chosen, effect, rounding, strict=True) if not value > least]
+    if idle:
+        raise DomainError(f"variable {idle[0]} has no effect on the merit: leave it out")
     scale = 1.0 / effect
     history = [float(np.linalg.norm(start))]
 
@@ -252,18 +256,15 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
     )
 
 
+@dataclass
 class _Problem:
     """Merit and targets as functions of the changes of all variables."""
 
-    def __init__(
-        self,
-        telescope: Telescope,
-        variables: tuple[Parameter, ...],
-        merit: Merit,
-        targets: tuple[FocalLength | Target, ...],
-    ) -> None:
-        self.telescope, self.variables, self.merit, self.targets = telescope, variables, merit, targets
-        self.size = 0
+    telescope: Telescope
+    variables: tuple[Parameter, ...]
+    merit: Merit
+    targets: tuple[FocalLength | Target, ...]
+    size: int = 0  #: number of residuals, once they are known
 
     def _at(self, changes: np.ndarray) -> Telescope:
         return apply(self.telescope, dict(zip(self.variables, changes, strict=True)))
@@ -333,15 +334,6 @@ def _bounds(
             raise DomainError(f"bounds of {address} = ({low:g}, {high:g}): expected rising ones about its {now:.6g}")
         limits[i] = low - now, high - now
     return limits[:, 0], limits[:, 1]
-
-
-def _checked_effect(variables: tuple[Parameter, ...], slopes: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return the rms effect of each variable per unit [m]; raise if one has none."""
-    effect = np.linalg.norm(slopes, axis=0)
-    for parameter, value, size in zip(variables, effect, terms, strict=True):
-        if not value > NO_EFFECT * size:
-            raise DomainError(f"variable {parameter.address} has no effect on the merit: leave it out")
-    return effect
 
 
 def _covariance(

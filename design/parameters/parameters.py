@@ -112,16 +112,13 @@ class Variables(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Names in the order of the vector."""
-        ...
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the values; "1" for a pure number."""
-        ...
 
     def apply(self, telescope: Telescope, values: Any) -> Telescope:
         """Return the telescope with a vector of changes applied, each in its unit."""
-        ...
 
 
 @dataclass(frozen=True)

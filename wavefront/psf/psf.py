@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import ConfigError, DomainError
+from ...core.errors import DomainError, check_choice
 from ...core.units import metres, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
@@ -153,8 +153,7 @@ def make_psfs(
     DomainError
         If an argument is outside its range or of the wrong shape, or a star falls between the CCDs.
     """
-    if engine not in ENGINES:
-        raise ConfigError(f"engine = {engine!r}: expected one of {', '.join(ENGINES)}")
+    check_choice("engine", engine, ENGINES)
     angles = _table(radians(fields, "fields"), "fields", None)
     telescope.check_field(angles[:, 0], angles[:, 1])
     lengths = metres(wavelengths, "wavelengths").reshape(-1)
