@@ -43,13 +43,13 @@ def _colors(name: str, first: float, span: float, count: int) -> list[Any]:
 
 
 def grid_shape(count: int, most: int = 5) -> tuple[int, int]:
-    """Return the number of rows, of about equal length, and of columns, at most `most`, for so many panels."""
+    """Return rows of about equal length, and columns, for a number of panels, at most `most` in a row."""
     columns = math.ceil(count / math.ceil(count / most))
     return math.ceil(count / columns), columns
 
 
 def panels_of(parent: Figure | SubFigure, count: int, rows: int, columns: int, **options: Any) -> list[Axes]:
-    """Return so many panels in rows and columns of a figure; the others stay empty."""
+    """Return `count` panels in rows and columns of a figure; the others stay empty."""
     panels = parent.subplots(rows, columns, squeeze=False, **options).ravel()
     for axes in panels[count:]:
         axes.set_axis_off()
@@ -64,7 +64,7 @@ def panel_grid(count: int, width: float, height: float) -> tuple[Figure, list[Ax
 
 
 def legend_below(figure: Figure, axes: Axes, most: int = 7, **style: Any) -> Legend:
-    """Draw the legend of a panel below all panels of a figure, at most so many labels in a row."""
+    """Draw the legend of a panel below all panels of a figure, at most `most` labels in a row."""
     handles, labels = axes.get_legend_handles_labels()
     return figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), most), **style)
 

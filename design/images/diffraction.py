@@ -88,7 +88,7 @@ def fft_psf(
     side = plan.pixel * plan.pixels
     across = n_pupil
     if across is None:
-        # The period of the pattern is so many times wavelength / (range of cosines).
+        # The period of the pattern is this number times wavelength / (range of cosines).
         needed = int(np.ceil(max(_PERIODS * side, side + plan.spread) / plan.wave_over_range))
         across = max(_FEWEST, needed)
         if across > _MOST:
@@ -224,7 +224,8 @@ class _Plan:
         axis = pixel_axis(self.pixel, self.pixels)
         images, lit, strehl = [], [], []
         for field, center in zip(self.request.fields, self.spots.reference_point, strict=True):
-            one, found = replace(self.request, fields=field[None]), list[tuple[float, Wavelets, _Sum]]()
+            one = replace(self.request, fields=field[None])
+            found: list[tuple[float, Wavelets, _Sum]] = []
             total = np.zeros((self.pixels, self.pixels))
             for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):
                 wavelets, irradiance = waves(one, float(wavelength), center)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Widths are measured on images with so many times as many pixels, interpolated.
+#: Factor of the interpolated pixels along each axis, on which widths are measured.
 _FINER = 4
 #: Decades below the brightest pixel that the plot shows.
 _DECADES = 4.0

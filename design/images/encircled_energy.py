@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: Parts of a pixel along each axis, for the fraction of it within a circle.
 _PARTS = 4
-#: Diffraction images are interpolated to so many times as many pixels along each axis; they are band-limited.
+#: Factor of the interpolated pixels along each axis; diffraction images are band-limited.
 _FINER = 3
 #: Default number of radii.
 _RADII = 301

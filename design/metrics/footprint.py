@@ -35,30 +35,17 @@ _ACROSS = 700
 class SurfaceFootprint:
     """Footprints of several field points on one surface, in the surface's own x and y.
 
-    Attributes
-    ----------
-    surface : Surface
-        The surface.
-    outlines : ndarray, shape [n_field, 2, n_rim, 2]
-        Outer and inner rim of the entrance pupil on the surface [m], blocked or not. The inner rim is NaN where there
-        is no obscuration.
-    outline_arriving, arriving : ndarray of bool, shape [n_field, 2, n_rim], [n_field, n_pupil]
-        Rays of the rims and of the pupil that no earlier surface has blocked.
-    position : ndarray, shape [n_field, n_pupil, 2]
-        Intersections of the rays with the surface [m].
-    passing : ndarray of bool, shape [n_field, n_pupil]
-        Arriving rays that pass the aperture of this surface.
-    weights : ndarray, shape [n_pupil]
-        Fraction of the pupil for each ray; they sum to 1.
+    Outlines are the outer and inner rim of the entrance pupil, blocked or not; the inner rim is NaN where there is no
+    obscuration. A ray arrives if no earlier surface has blocked it, and passes if this one does not block it either.
     """
 
     surface: Surface
-    outlines: np.ndarray
-    outline_arriving: np.ndarray
-    position: np.ndarray
-    arriving: np.ndarray
-    passing: np.ndarray
-    weights: np.ndarray
+    outlines: np.ndarray  #: [n_field, 2, n_rim, 2] intersections of the rims with the surface, m
+    outline_arriving: np.ndarray  #: [n_field, 2, n_rim] bool
+    position: np.ndarray  #: [n_field, n_pupil, 2] intersections of the rays with the surface, m
+    arriving: np.ndarray  #: [n_field, n_pupil] bool
+    passing: np.ndarray  #: [n_field, n_pupil] bool
+    weights: np.ndarray  #: [n_pupil] fraction of the pupil for each ray; they sum to 1
 
     @property
     def blocked_fraction(self) -> np.ndarray:

@@ -72,7 +72,10 @@ class ParameterColumns:
                 terms.setdefault(s, {})[p] = polynomial
         blocks = []
         for s, found in terms.items():
-            scale = _scale(telescope, s)
+            # The length unit of the polynomials over a surface is its outer radius, or that of the pupil.
+            aperture = telescope.surfaces[s].aperture
+            outer = getattr(aperture, "outer", getattr(aperture, "radius", None))
+            scale = float(outer) if outer else 0.5 * telescope.pupil_diameter
             degree, weights = _polynomial_weights(found, len(parameters), scale)
             present = weights.any(axis=1)
             columns = np.where(present, used + np.cumsum(present) - 1, -1).astype(np.int32)
@@ -131,13 +134,6 @@ class ParameterColumns:
     def derivatives(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return the derivatives of every output and ray with respect to each parameter, [n_output, n, n_parameter]."""
         return np.matmul(self.adjoints(forward, gradient, threads=threads).transpose(0, 2, 1), self.weights)
-
-
-def _scale(telescope: Telescope, surface: int) -> float:
-    """Return the length unit [m] of polynomials over a surface: its outer radius, or that of the pupil."""
-    aperture = telescope.surfaces[surface].aperture
-    outer = getattr(aperture, "outer", getattr(aperture, "radius", None))
-    return float(outer) if outer else 0.5 * telescope.pupil_diameter
 
 
 def _polynomial_weights(found: dict[int, PolarPolynomial], n: int, scale: float) -> tuple[int, np.ndarray]:

@@ -53,7 +53,17 @@ def load_degrees_of_freedom(name_or_path: str | os.PathLike[str]) -> DegreesOfFr
     text = os.fspath(name_or_path)
     if text not in BUNDLED and Path(text).suffix.lower() not in (".yaml", ".yml"):
         raise unknown_name("degrees of freedom", text, BUNDLED)
-    return _read(DATA / BUNDLED[text] if text in BUNDLED else Path(text))
+    path = DATA / BUNDLED[text] if text in BUNDLED else Path(text)
+    file = validated(DegreesOfFreedomFile, read_mapping(path), str(path), PrescriptionError)
+    members = tuple(DegreeOfFreedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
+    deformations = []
+    for name, section in file.figures.items():
+        with error_context(file=path, key=f"figures.{name}"):
+            deformations.append(SurfaceDeformation(name, section.surfaces, section.shape(path.parent)))
+    try:
+        return DegreesOfFreedom(members, tuple(deformations), file.name, file.description, file.source)
+    except ConfigError as error:
+        raise PrescriptionError(str(error), file=path) from None
 
 
 def _weights(value: Any) -> Any:
@@ -124,16 +134,3 @@ class DegreesOfFreedomFile(Section):
     source: Text = ""
     figures: Annotated[dict[str, DeformationSection], BeforeValidator(_without_dots)] = Field(default_factory=dict)
     degrees_of_freedom: Annotated[tuple[FreedomSection, ...], checked(rows, "a list of mappings, one a line")]
-
-
-def _read(path: Path) -> DegreesOfFreedom:
-    file = validated(DegreesOfFreedomFile, read_mapping(path), str(path), PrescriptionError)
-    members = tuple(DegreeOfFreedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
-    deformations = []
-    for name, section in file.figures.items():
-        with error_context(file=path, key=f"figures.{name}"):
-            deformations.append(SurfaceDeformation(name, section.surfaces, section.shape(path.parent)))
-    try:
-        return DegreesOfFreedom(members, tuple(deformations), file.name, file.description, file.source)
-    except ConfigError as error:
-        raise PrescriptionError(str(error), file=path) from None

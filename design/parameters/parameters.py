@@ -229,7 +229,10 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
             value = shape.parameters[parameter.name] + change
             telescope = telescope.with_shape(parameter.target, shape.with_parameter(parameter.name, value))
         elif parameter.kind == "index":
-            telescope = _with_index(telescope, parameter.target, change)
+            surfaces = list(telescope.surfaces)
+            for i in index_surfaces(telescope, parameter.target):
+                surfaces[i] = replace(surfaces[i], medium_after=with_index_change(surfaces[i].medium_after, change))
+            telescope = replace(telescope, surfaces=tuple(surfaces))
     for body, motion in _body_motions(telescope, parameters, changes):
         if motion.any():
             telescope = telescope.perturbed(body, shift=motion[:3], tilt=motion[3:])
@@ -256,13 +259,6 @@ def index_surfaces(telescope: Telescope, target: str) -> list[int]:
         if inside:
             found.append(i)
     return found
-
-
-def _with_index(telescope: Telescope, target: str, change: float) -> Telescope:
-    surfaces = list(telescope.surfaces)
-    for i in index_surfaces(telescope, target):
-        surfaces[i] = replace(surfaces[i], medium_after=with_index_change(surfaces[i].medium_after, change))
-    return replace(telescope, surfaces=tuple(surfaces))
 
 
 def _body_motions(
