@@ -182,7 +182,7 @@ def test_bad_arguments(paul_baker, change, error, words):
 
 
 def test_no_light(paul_baker):
-    from pachon.models.surface import Circle
+    from pachon.models.aperture import Circle
 
     closed = tuple(replace(s, aperture=Circle(1e-3)) if s.name == "M2" else s for s in paul_baker.surfaces)
     with pytest.raises(DomainError, match="no ray reaches the image"):
