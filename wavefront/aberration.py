@@ -30,8 +30,6 @@ from ..models.zernike_polynomials import annular_zernike_gradients, annular_zern
 PAPER_RMS = 0.2e-6
 #: Largest rms that can be drawn [m], ten times the paper's: beyond it the blur of 1.5 arcsec extends beyond the stamps.
 LARGEST_RMS = 10.0 * PAPER_RMS
-#: Noll indices drawn by default: from defocus to the second spherical aberration. Tilt only moves stars.
-DEFAULT_TERMS = tuple(range(4, 23))
 #: Fraction of the variance, averaged over the field, that is linear in the field angle. Four sensors at the corners of
 #: a square within the field, of equal and independent errors, give a plane with as much variance in its slopes as in
 #: its mean.
@@ -86,7 +84,7 @@ class ResidualWavefront:
         seed: int = 0,
         epoch: int = 0,
         *,
-        terms: Iterable[int] = DEFAULT_TERMS,
+        terms: Iterable[int] = range(4, 23),
         linear_fraction: float = LINEAR_FRACTION,
     ) -> ResidualWavefront:
         """Draw the aberration of one exposure.
@@ -101,12 +99,10 @@ class ResidualWavefront:
             Telescope with the pupil and the field radius.
         rms : float or Quantity
             Root mean square of the OPD over pupil, field of view and exposures [m], 0 to 2 um; 0.2 um in the paper.
-        seed : int
-            Seed of the run.
-        epoch : int
-            Number of the exposure; aberrations of exposures are independent.
+        seed, epoch : int
+            Seed of the run and number of the exposure; aberrations of exposures are independent.
         terms : iterable of int
-            Noll indices to draw, from 4.
+            Noll indices to draw, from 4; to the second spherical aberration by default. Tilt only moves stars.
         linear_fraction : float
             Fraction of the variance that is linear over the field, 0 to 1; at 0 all stars have the same aberration.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.errors import DomainError
+from ..core.plotting import BLUE, figure_of, new_figure, styled
 from ..models.zernike_polynomials import NOLL_NAMES
 
 if TYPE_CHECKING:
@@ -87,8 +88,6 @@ class OpdMap(_PupilMaps):
         The title contains the ``name`` of the telescope. A map that is not on a square grid or has no lit point raises
         :class:`~pachon.DomainError`.
         """
-        from ..core.plotting import new_figure, styled
-
         if self.value.ndim != 2 or self.value.shape[0] != self.value.shape[1]:
             raise DomainError(f"opd of shape {self.value.shape}: expected one on a square grid to draw")
         tx, ty = np.rad2deg(self.field)
@@ -135,7 +134,7 @@ class OpdMaps(_PupilMaps):
 
     @property
     def rms(self) -> np.ndarray:
-        """Root mean square of each map over its lit points, piston removed [m], shape [n_field]; NaN where dark."""
+        """Values of :attr:`OpdMap.rms` [m], shape [n_field]."""
         return np.array([_rms(value, lit) for value, lit in zip(self.value, self.lit, strict=True)])
 
 
@@ -161,29 +160,23 @@ def _rms(value: np.ndarray, lit: np.ndarray) -> float:
 
 
 def _draw_map(axes: Axes, opd: OpdMap, value: np.ndarray, title: str) -> None:
-    from ..core.plotting import figure_of
-
     nm, wavelength = value * 1e9, opd.wavelength * 1e9
     edge = max(float(np.nanmax(np.abs(nm))), 1e-6)
     half = float(np.abs(opd.x).max()) + 0.5 * abs(float(opd.x[0, 1] - opd.x[0, 0]))
     image = axes.imshow(nm, extent=(-half, half, -half, half), cmap="RdBu_r", vmin=-edge, vmax=edge)
     axes.set(facecolor="0.93", aspect="equal", xlabel="entrance pupil x [m]", ylabel="entrance pupil y [m]")
     rms, span = float(np.nanstd(nm)), float(np.nanmax(nm) - np.nanmin(nm))
-    axes.set_title(
-        f"{title}\nrms {rms:.4g} nm = {rms / wavelength:.4f} waves; peak to valley {span:.4g} nm", loc="left"
-    )
+    title += f"\nrms {rms:.4g} nm = {rms / wavelength:.4f} waves; peak to valley {span:.4g} nm"
+    axes.set_title(title, loc="left")
     bar = figure_of(axes).colorbar(image, ax=axes, location="right", fraction=0.046, pad=0.02)
     bar.set_label("OPD [nm]: positive where the wavefront leads")
-    waves = bar.ax.secondary_yaxis(
-        "left", functions=(lambda v: np.divide(v, wavelength), lambda v: np.multiply(v, wavelength))
-    )
+    scales = (lambda v: np.divide(v, wavelength), lambda v: np.multiply(v, wavelength))
+    waves = bar.ax.secondary_yaxis("left", functions=scales)
     waves.tick_params(labelsize=7)
     waves.set_ylabel(f"waves at {wavelength:g} nm", fontsize=8, labelpad=2)
 
 
 def _draw_bars(axes: Axes, zernikes: ZernikeFit) -> None:
-    from ..core.plotting import BLUE
-
     j = np.arange(2, len(zernikes.coefficients) + 1)
     axes.bar(j, zernikes.coefficients[1:] * 1e9, color=BLUE, width=0.75)
     axes.axhline(0.0, color="0.3", linewidth=0.7)
@@ -197,7 +190,5 @@ def _draw_bars(axes: Axes, zernikes: ZernikeFit) -> None:
     axes.grid(True, axis="y", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.set(xlabel="Noll index", ylabel="coefficient = rms over the annulus [nm]")
-    axes.set_title(
-        f"annular Zernikes, obscuration {zernikes.obscuration:g}; residual {zernikes.residual_rms * 1e9:.3g} nm rms",
-        loc="left",
-    )
+    residual = f"residual {zernikes.residual_rms * 1e9:.3g} nm rms"
+    axes.set_title(f"annular Zernikes, obscuration {zernikes.obscuration:g}; {residual}", loc="left")
