@@ -138,10 +138,8 @@ def check_baseline(
         Telescope in place of the baseline's own.
     configuration : str or path, optional
         Run configuration in place of the baseline's own.
-    threads : int, optional
-        Number of threads; results do not depend on it.
-    progress : callable, optional
-        Called with 1 after each group of metrics.
+    threads, progress
+        As in :func:`make_baseline`.
 
     Raises
     ------

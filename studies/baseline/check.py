@@ -64,7 +64,7 @@ class BaselineCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether all metrics are within their tolerances."""
+        """True where all metrics are within their tolerances."""
         return not self.out
 
     @property

@@ -209,7 +209,7 @@ def ellipticity(bench: Bench) -> Reproduced:
     falls = levels[0] > levels[1] > levels[2] > levels[3]
     # One exposure is not another: within a factor of three is as near as a few of them can tell.
     agrees = falls and measured["mean_e_15_s"] < 0.01 and 7e-6 < levels[2] < 6e-5
-    told = ", ".join(f"{level:.0e}" for level in levels)
+    values = ", ".join(f"{level:.0e}" for level in levels)
     return Reproduced(
         {"": _atmosphere_plot(fields / ARCMIN, e, r, xi)},
         {
@@ -217,7 +217,7 @@ def ellipticity(bench: Bench) -> Reproduced:
             "_stars": EcsvData(correlated_stars, meta),
             "_correlation": EcsvData(curve, meta),
         },
-        f"mean |e| {100 * measured['mean_e_15_s']:.2f} % in 15 s; xi+ at 1' {told} for 1, 5, 15, 60 s (mean of"
+        f"mean |e| {100 * measured['mean_e_15_s']:.2f} % in 15 s; xi+ at 1' {values} for 1, 5, 15, 60 s (mean of"
         f" {scale.pair_seeds} exposures; +-{xi[_VISIT][1][near]:.0e} for 15 s)",
         agrees,
         "in all but the level at most: the ground layer at exactly 0 km gives all stars of an exposure one ellipticity"

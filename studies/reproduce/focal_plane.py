@@ -95,7 +95,7 @@ def height_budget(bench: Bench) -> Reproduced:
     }
     for name in drawn:
         columns[f"paper_{name}"] = (allowed[name], "", f"Table 1, {name}, peak to valley")
-        columns[f"drawn_{name}"] = (drawn[name], "", f"peak to valley of what was drawn from {name}")
+        columns[f"drawn_{name}"] = (drawn[name], "", f"peak to valley drawn from {name}")
     ratio = drawn["simulated"] / allowed["simulated"]
     agrees = all((drawn[n] <= 1.001 * allowed[n]).all() and (drawn[n] > 0.8 * allowed[n]).all() for n in drawn)
     values = {
@@ -104,11 +104,11 @@ def height_budget(bench: Bench) -> Reproduced:
         "specification: drawn": drawn["specification"],
         "simulated: drawn": drawn["simulated"],
     }
-    told = ", ".join(f"{v:.3g}" for v in drawn["simulated"])
+    largest = ", ".join(f"{v:.3g}" for v in drawn["simulated"])
     return Reproduced(
         {"": _budget_plot(_TERM_NAMES, values, ["µm" if u == "um" else u.replace("1e-4", "10⁻⁴") for u in units])},
         {"": EcsvData(columns, {"what": "peak to valley of each term of the focal plane's height"})},
-        f"{told} (µm; tilt in 1e-4 rad), {100 * ratio.min():.0f} to {100 * ratio.max():.0f} % of the budget",
+        f"{largest} (µm; tilt in 1e-4 rad), {100 * ratio.min():.0f} to {100 * ratio.max():.0f} % of the budget",
         agrees,
         "global and potato chip are scaled to the budget exactly; rafts, CCDs and tilts are uniform within it, so that"
         " a finite number of them falls a little short",

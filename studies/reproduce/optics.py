@@ -51,13 +51,13 @@ def layout(bench: Bench) -> Reproduced:
     telescope, camera = bench.optics.telescope, bench.optics.camera
     profiles = {surface.name: _profile(surface) for surface in telescope.surfaces}
     rays = {angle: _ray_paths(telescope, angle) for angle in _LAYOUT_FIELDS}
-    figures = first_order(telescope)
-    scale = abs(figures.arcsec_per_um)
+    paraxial = first_order(telescope)
+    scale = abs(paraxial.arcsec_per_um)
     measured = {
-        "focal_length_m": figures.focal_length,
-        "f_number": figures.f_number,
+        "focal_length_m": paraxial.focal_length,
+        "f_number": paraxial.f_number,
         "plate_scale_arcsec_per_um": scale,
-        "collecting_area_m2": figures.effective_area,
+        "collecting_area_m2": paraxial.effective_area,
         "field_diameter_mm": 2e3 * bench.optics.field_radius_on_detector,
         "ccds": len(camera),
     }
@@ -71,11 +71,11 @@ def layout(bench: Bench) -> Reproduced:
             ("z_m", [p[..., 1].ravel() for p in rays.values()], "m", "telescope z from the vertex of M1"),
         )
     }
-    agrees = abs(figures.focal_length - 10.3) < 0.05 and abs(figures.f_number - 1.23) < 0.01 and len(camera) == 189
+    agrees = abs(paraxial.focal_length - 10.3) < 0.05 and abs(paraxial.f_number - 1.23) < 0.01 and len(camera) == 189
     return Reproduced(
         {"": _layout_plot(profiles, rays, camera, bench.optics.field_radius_on_detector)},
         {"": EcsvData(columns, {"what": f"rays through {telescope.name}, section x = 0", **measured})},
-        f'f/{figures.f_number:.3f}, {figures.focal_length:.2f} m, {scale:.4f}"/µm, {figures.effective_area:.1f} m²,'
+        f'f/{paraxial.f_number:.3f}, {paraxial.focal_length:.2f} m, {scale:.4f}"/µm, {paraxial.effective_area:.1f} m²,'
         f" {len(camera)} CCDs, {0.2 * bench.optics.field_radius_on_detector * 1e3:.1f} cm",
         agrees,
         'but for the plate scale: 206265"/10.3 m is 0.0200"/µm, so the paper\'s 0.0197 does not go with its own focal'

@@ -128,11 +128,11 @@ def _against_optics(bench: Bench) -> tuple[float, float]:
 def whiskers_of_residual(bench: Bench) -> Reproduced:
     """Show whiskers of the residual, at the stars and at holdout positions (Fig. 12)."""
     made = bench.pipeline
-    figures = made.summary["all"]
+    metrics = made.summary["all"]
     png = whiskers_plot(
         made.products, made.experiment.focal_plane, bench.optics.field_radius_on_detector, ("residual", "away")
     )
-    at, away = figures["rms_residual_at_stars"], figures["rms_residual_away"]
+    at, away = metrics["rms_residual_at_stars"], metrics["rms_residual_away"]
     observed = _rms(made.products, "observed", ("e1", "e2"))
     return Reproduced(
         {"": png},

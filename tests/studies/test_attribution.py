@@ -177,7 +177,7 @@ def test_causes_that_are_off_are_no_causes(tiny):
         ({"psf__diffusion_pixels": 0.0}, "diffusion", "psf.diffusion_pixels = 0"),
         ({}, "active_optics", "active_optics.residual_um = 0"),
         ({"atmosphere__ground_lift_m": 200.0}, "ground_layer", "no layer is on the ground"),
-        ({"psf__engine": "long_exposure"}, "ground_layer", "no star sees turbulence"),
+        ({"psf__engine": "long_exposure"}, "ground_layer", "no star is imaged through turbulence"),
         ({"atmosphere__enabled": False}, OPTICS, "nothing would be left"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -73,12 +73,12 @@ def start(*arguments, **options):
 
 def said_by(process):
     """Wait for a command to end, and return what it said on standard error."""
-    process.wait(60)
+    process.wait(180)
     with open("said.txt", encoding="utf-8") as said:
         return said.read().strip()
 
 
-def wait_for(path, number, process, seconds=90.0):
+def wait_for(path, number, process, seconds=240.0):
     """Wait until a store holds so many points."""
     end = time.monotonic() + seconds
     while count(path) < number:
