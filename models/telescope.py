@@ -220,12 +220,7 @@ class Telescope:
         return self.with_shape(name, Sum((*parts, deformation)))
 
     def perturbed(
-        self,
-        name: str,
-        *,
-        shift: Any = (0.0, 0.0, 0.0),
-        tilt: Any = (0.0, 0.0, 0.0),
-        about: Any = None,
+        self, name: str, *, shift: Any = (0.0, 0.0, 0.0), tilt: Any = (0.0, 0.0, 0.0), about: Any = None
     ) -> Telescope:
         """Return the telescope with one surface, or a group of surfaces, rotated and then shifted.
 

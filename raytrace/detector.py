@@ -24,12 +24,7 @@ class Landing:
 
 
 def land_on_ccds(
-    detector: Surface,
-    focal_plane: FocalPlane,
-    position: np.ndarray,
-    direction: np.ndarray,
-    *,
-    index: float = 1.0,
+    detector: Surface, focal_plane: FocalPlane, position: np.ndarray, direction: np.ndarray, *, index: float = 1.0
 ) -> Landing:
     """Carry rays from the nominal detector surface to the CCD surfaces.
 

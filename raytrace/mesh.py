@@ -29,12 +29,7 @@ class MeshLanding:
 
 
 def land_on_mesh(
-    detector: Surface,
-    mesh: trimesh.Trimesh,
-    position: np.ndarray,
-    direction: np.ndarray,
-    *,
-    threads: int | None = None,
+    detector: Surface, mesh: trimesh.Trimesh, position: np.ndarray, direction: np.ndarray, *, threads: int | None = None
 ) -> MeshLanding:
     """Carry rays from the nominal detector surface to a mesh given in the detector's own frame.
 

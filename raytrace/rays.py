@@ -102,11 +102,7 @@ def check_wavelength(wavelength: Any) -> float:
 
 
 def launch_rays(
-    telescope: Telescope,
-    field: tuple[Any, Any],
-    wavelength: Any,
-    pupil: tuple[Any, Any],
-    projection: str = "zemax",
+    telescope: Telescope, field: tuple[Any, Any], wavelength: Any, pupil: tuple[Any, Any], projection: str = "zemax"
 ) -> Rays:
     """Launch a plane wave from one field point through given points of the entrance pupil.
 

@@ -22,27 +22,13 @@ class SphereAdjoint:
     Equal to :func:`~pachon.raytrace.adjoint.forward_pass.forward_pass` followed by
     :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, but the rays stay in the processor's cache.
 
-    Parameters
-    ----------
-    telescope : Telescope
-        Without meshes, else a DomainError is raised.
-    directions : ndarray, shape [n_field, 3]
-        Unit vectors of the light's travel.
-    indices : ndarray, shape [n_surface + 1]
-        Refractive index before the first surface and after each.
-    pupil : ndarray, shape [n_pupil, 2]
-        Entrance-pupil coordinates [m].
-    center, path : ndarray, shape [3, n_field] and [n_field]
-        Centre of each sphere [m], telescope frame; optical path of the chief ray [m], which is subtracted.
-    radius : float
-        Radius of the spheres [m].
-    columns, polynomials
-        As in :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, with four columns left free.
-    sphere_column : int
-        The first of these: the path less `path` [m] and its derivatives with respect to the landing point, which are
-        opposite to those with respect to the centre.
-    lit_only : bool
-        Whether all is zero for rays that are vignetted.
+    ``directions`` [n_field, 3] are unit vectors of the light's travel, ``indices`` [n_surface + 1] the refractive index
+    before the first surface and after each, ``pupil`` [n_pupil, 2] entrance-pupil coordinates [m]. The spheres have one
+    ``radius`` [m] and a ``center`` each [m], [3, n_field], telescope frame; ``path`` [n_field] is the optical path [m]
+    of the chief ray to the sphere, which is subtracted. ``columns`` and ``polynomials`` are as in `backward_pass`, with
+    four columns left free from ``sphere_column`` on: the path less ``path`` [m], and its derivatives with respect to
+    the landing point, which are opposite to those with respect to the centre. With ``lit_only`` all is zero for
+    vignetted rays. A mesh among the surfaces is a DomainError.
     """
 
     def __init__(
