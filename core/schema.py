@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import (
@@ -156,11 +156,22 @@ def _build(section: Parameters) -> Any:
         raise problem(f": {error}" if error.file else f".{error}") from None
 
 
+@dataclass(frozen=True, eq=False)
+class WrittenAs:
+    """Conversion of a value to what a file has, as an annotation."""
+
+    convert: Callable[[Any], Any]
+
+
 class Parameters(Section):
-    """Section whose values are the positional arguments of a constructor."""
+    """Section whose values are the positional arguments of a dataclass or function, for reading and writing alike.
+
+    The two numbers under a key of `pairs` are two arguments. A value is written by :class:`WrittenAs` of its type.
+    """
 
     make: ClassVar[Callable[..., Any]]
     parameters: ClassVar[tuple[str, ...]]
+    pairs: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def of(cls, make: Callable[..., Any], **fields: Any) -> type[Self]:
@@ -172,7 +183,26 @@ class Parameters(Section):
 
     def build(self) -> Any:
         """Return the object that the section describes."""
-        return self.make(*(getattr(self, key) for key in self.parameters))
+        values = [(getattr(self, key), key in self.pairs) for key in self.parameters]
+        return self.make(*(v for value, pair in values for v in (value if pair else (value,))))
+
+    @classmethod
+    def written(cls, built: Any) -> dict[str, Any]:
+        """Return the section of an object that it builds."""
+        values = (getattr(built, field.name) for field in fields(built))
+        found = {key: (next(values), next(values)) if key in cls.pairs else next(values) for key in cls.parameters}
+        for key, value in found.items():
+            for how in cls.model_fields[key].metadata:
+                found[key] = how.convert(value) if isinstance(how, WrittenAs) else found[key]
+        return found
+
+
+def written(classes: Mapping[str, type[Parameters]], built: Any) -> tuple[str, dict[str, Any]] | None:
+    """Return kind and section of an object, or None where no section builds objects of its class."""
+    for kind, section in classes.items():
+        if isinstance(section.make, type) and isinstance(built, section.make):
+            return kind, section.written(built)
+    return None
 
 
 def problem(text: str, key: str = "") -> PydanticCustomError:

@@ -186,38 +186,21 @@ class Configuration(Section):
 
 
 def configuration_of(content: dict[str, Any], source: str) -> Configuration:
-    """Return the configuration that plain mappings describe; `source` names them in error messages.
-
-    Raises
-    ------
-    ConfigError
-        If there is an unknown key or a value out of range.
-    """
+    """Return the configuration that plain mappings describe; `source` names them in the line of a ConfigError."""
     if isinstance(content.get("ccds"), str):
         content = {**content, "ccds": [content["ccds"]]}
     return validated(Configuration, content, source)
 
 
 def load_configuration(path: Path) -> Configuration:
-    """Read a configuration file; what it leaves out is left open, for :func:`~pachon.pipeline.setup.resolve`.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
-    """
+    """Read a configuration file; what it leaves out is left open, for :func:`~pachon.pipeline.defaults.resolve`."""
     return configuration_of(read_mapping(path, ConfigError), str(path))
 
 
 def with_options(config: Configuration, **options: Any) -> Configuration:
     """Return the configuration with command line options in place of its values; None leaves a value as it is.
 
-    Parameters
-    ----------
-    config : Configuration
-        What the file says.
-    **options : object
-        Values by dotted key, dots written as two underscores: ``stars__truth=50``.
+    Options are values by dotted key, with two underscores for each dot: ``stars__truth=50``.
     """
     given = {dotted: value for dotted, value in options.items() if value is not None}
     if not given:

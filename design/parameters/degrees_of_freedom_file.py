@@ -30,7 +30,7 @@ from ...core.schema import Section, checked, expected, mapping, problem, validat
 from ...core.yaml_reader import as_number, read_mapping
 from ...models.io.grid_file import read_grid
 from ...models.io.prescription import DATA
-from ...models.io.yaml.values import Names, Number, PositiveNumber, Text, rows
+from ...models.io.yaml.values import ROWS, Names, Number, PositiveNumber, Text
 from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.modes import GridModes
 from ...models.shapes.shape import Shape
@@ -133,4 +133,4 @@ class DegreesOfFreedomFile(Section):
     description: Text = ""
     source: Text = ""
     figures: Annotated[dict[str, DeformationSection], BeforeValidator(_without_dots)] = Field(default_factory=dict)
-    degrees_of_freedom: Annotated[tuple[FreedomSection, ...], checked(rows, "a list of mappings, one a line")]
+    degrees_of_freedom: Annotated[tuple[FreedomSection, ...], ROWS]

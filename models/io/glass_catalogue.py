@@ -43,18 +43,10 @@ IGNORED = ("CC", "GC", "ED", "OD", "IT", "BD", "MD")
 
 @dataclass(frozen=True)
 class Glass:
-    """One entry of a catalogue.
+    """An entry of a catalogue.
 
-    Parameters
-    ----------
-    name : str
-        Name, in capitals.
-    medium : Medium
-        Index relative to air, by wavelength in air.
-    nd, vd : float
-        Index at the d line and Abbe number as the catalogue states them; 0 where it does not.
-    temperature : float
-        Reference temperature [K].
+    Index and wavelength of the medium are relative to air; `nd` (index at the d line) and `vd` (Abbe number) are as the
+    catalogue states them, 0 where it does not; `temperature` [K] is that of reference; the name is in capitals.
     """
 
     name: str

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ...core.errors import PrescriptionError, error_context, unknown_name
-from ...core.schema import Section, checked, validated
+from ...core.schema import Section, validated
 from ...core.yaml_reader import read_mapping
 from ..site import Site, Weather
-from .yaml.values import Number, OptionalNumber, PositiveNumber, Text, rows
+from .yaml.values import ROWS, Number, OptionalNumber, PositiveNumber, Text
 
 DATA = Path(__file__).parents[1] / "data"
 BUNDLED = ("cerro_pachon",)
@@ -53,7 +53,7 @@ class SiteFile(Section):
     units: UnitsSection
     r0: PositiveNumber
     outer_scale: PositiveNumber
-    layers: Annotated[tuple[LayerSection, ...], checked(rows, "a list of mappings, one a line")]
+    layers: Annotated[tuple[LayerSection, ...], ROWS]
     weather: WeatherSection
 
 

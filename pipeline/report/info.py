@@ -14,7 +14,7 @@ from ...models.aperture import Annulus, Circle, Complement
 from ...models.first_order import first_order
 from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.apertures import aperture_items
-from ...models.io.yaml.values import flow
+from ...models.io.yaml.values import Turn, flow
 from ...models.io.yaml.writer import INTERACTION_NAMES
 from ...models.media.medium import ConstantIndex
 from ...models.shapes.shape import Rotational
@@ -94,8 +94,13 @@ def _row(surface: Surface, wavelength: float) -> dict[str, Any]:
         "index_after": float(medium.index(wavelength)),
         "medium_after": "" if isinstance(medium, ConstantIndex) else "glass",
         "clear_m": _clear(surface),
-        "aperture": flow(aperture_items(surface.aperture, math.degrees), "{:g}".format)[1:-1],
+        "aperture": flow(aperture_items(surface.aperture), _degrees)[1:-1],
     }
+
+
+def _degrees(value: float) -> str:
+    """Return the text of a number, angles in degrees."""
+    return f"{math.degrees(value) if isinstance(value, Turn) else value:g}"
 
 
 def _clear(surface: Surface) -> list[float | None] | None:

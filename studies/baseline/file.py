@@ -50,13 +50,7 @@ class Baseline(Section):
 
 
 def read_baseline(path: str | os.PathLike[str]) -> Baseline:
-    """Read a baseline.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is no JSON or no baseline, or is of another version of the format: one line.
-    """
+    """Read a baseline; ConfigError if it is no JSON, no baseline or of another version of the format."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_mapping)
     except FileNotFoundError:
@@ -84,13 +78,7 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
 
 
 def write_baseline(path: str | os.PathLike[str], baseline: Baseline) -> None:
-    """Write a baseline, whole or not at all.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
-    """
+    """Write a baseline, whole or not at all; ProductError if it cannot be written."""
     write_bytes(Path(path), baseline_text(baseline).encode())
 
 

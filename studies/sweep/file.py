@@ -90,13 +90,7 @@ class SweepFile(Section):
 
 
 def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
-    """Read a sweep file; the configuration that it names is read into it.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is not YAML, or a key or value is not as expected: one line.
-    """
+    """Read a sweep file and the configuration that it names; ConfigError of one line with file, key and value."""
     path = Path(path)
     content = read_mapping(path, ConfigError)
     if isinstance(content.get("base"), str):

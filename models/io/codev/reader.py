@@ -36,13 +36,7 @@ INFINITE = 1e10
 
 
 def read_codev_file(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of a CODE V lens file in the terms of a Zemax file.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be read, or a command is malformed or, unless lenient, not understood.
-    """
+    """Return the parts of a CODE V lens file in the terms of a Zemax file."""
     return _Translation(path, findings).file()
 
 

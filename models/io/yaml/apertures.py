@@ -18,13 +18,14 @@ A mesh that blocks light is ``{name: top_end, file: top_end.stl, scale: 0.001, b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
-from ....core.schema import Parameters, Section, Tagged, checked, either, expected, problem
+from ....core.errors import PrescriptionError
+from ....core.schema import Parameters, Section, Tagged, WrittenAs, checked, either, expected, problem, written
 from ...aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from ...obstruction import Obstruction
 from .values import (
+    ROWS,
     Angle,
     Flag,
     Length,
@@ -35,9 +36,8 @@ from .values import (
     Point,
     PositiveNumber,
     Text,
-    array,
+    decoded,
     encoded,
-    rows,
 )
 
 
@@ -49,18 +49,22 @@ def _region_kind(content: dict[str, Any]) -> str:
 
 
 class RegionSection(Parameters):
-    """A region of the plane."""
+    """A region of the plane; written without the values that are by default."""
 
-    def build(self) -> Aperture:
-        """Return the region; pairs of lengths are two arguments of its class."""
-        values = (getattr(self, key) for key in self.parameters)
-        return self.make(*(v for value in values for v in (value if isinstance(value, tuple) else (value,))))
+    pairs = ("annulus", "rectangle", "centre", "from")
+
+    @classmethod
+    def written(cls, built: Any) -> dict[str, Any]:  # noqa: D102
+        items = super().written(built).items()
+        return {key: value for key, value in items if value != cls.model_fields[key].default}
 
 
 #: Sections of regions by the key that tells their kind.
 REGIONS: dict[str, type[Parameters]] = {}
 _REGION = Tagged(REGIONS, _region_kind)
-_PARTS = Annotated[tuple[Annotated[Any, _REGION], ...], checked(rows, "a list of mappings, one a line")]
+_PARTS = Annotated[
+    tuple[Annotated[Any, _REGION], ...], ROWS, WrittenAs(lambda parts: [_region_items(part) for part in parts])
+]
 _CORNERS = Annotated[
     tuple[Point, ...], checked(lambda v: v if isinstance(v, list) else None, "a list of corners [x, y]")
 ]
@@ -69,11 +73,13 @@ REGIONS |= {
     "circle": RegionSection.of(Circle, circle=Length, centre=_CENTRE),
     "annulus": RegionSection.of(Annulus, annulus=Point, centre=_CENTRE),
     "rectangle": RegionSection.of(Rectangle, rectangle=Point, centre=_CENTRE, angle=_ANGLE),
-    "polygon": Parameters.of(Polygon, polygon=_CORNERS),
+    "polygon": RegionSection.of(Polygon, polygon=_CORNERS),
     "vane": RegionSection.of(Vane, vane=Length, **{"from": _CENTRE}, angle=_ANGLE, both_ways=(Flag, False)),
-    "union": Parameters.of(Union, union=_PARTS),
-    "intersection": Parameters.of(Intersection, intersection=_PARTS),
-    "complement": Parameters.of(Complement, complement=Annotated[Any, _REGION]),
+    "union": RegionSection.of(Union, union=_PARTS),
+    "intersection": RegionSection.of(Intersection, intersection=_PARTS),
+    "complement": RegionSection.of(
+        Complement, complement=Annotated[Any, _REGION, WrittenAs(lambda part: _region_items(part))]
+    ),
 }
 
 
@@ -111,11 +117,13 @@ class ApertureKeys(Section):
 class ObstructionSection(Parameters):
     """Mesh that blocks light, in a file or written out in base 64."""
 
+    make = Obstruction
+    parameters = ("name", "triangles", "before")
     name: Text
     file: OptionalFile = None
     scale: PositiveNumber = 1.0
     triangles: Annotated[
-        Any, checked(array("<f4", (-1, 3, 3)), "nine single-precision numbers a triangle, in base 64")
+        Any, decoded("<f4", (-1, 3, 3), "nine single-precision numbers a triangle, in base 64"), encoded("<f4")
     ] = None
     before: OptionalNames = None
 
@@ -127,61 +135,33 @@ class ObstructionSection(Parameters):
     def build(self) -> Obstruction:
         """Return the obstruction."""
         if self.file is None:
-            return Obstruction(self.name, self.triangles, self.before)
+            return super().build()
         return Obstruction.from_file(self.file, name=self.name, scale=self.scale, before=self.before)
 
 
-def aperture_angles(aperture: Aperture | None) -> Iterator[float]:
-    """Yield the angles [rad] in the section of an aperture."""
-    if isinstance(aperture, (Rectangle, Vane)) and aperture.angle:
-        yield aperture.angle
-    elif isinstance(aperture, Complement):
-        yield from aperture_angles(aperture.part)
-    elif isinstance(aperture, (Union, Intersection)):
-        for part in aperture.parts:
-            yield from aperture_angles(part)
-
-
-def aperture_items(aperture: Aperture | None, angle: Callable[[float], float]) -> dict[str, Any]:
-    """Return the keys of a surface for its aperture; `angle` converts radians to the unit of the file."""
+def aperture_items(aperture: Aperture | None) -> dict[str, Any]:
+    """Return the keys of a surface for its aperture."""
     if aperture is None:
         return {}
     if isinstance(aperture, (Circle, Annulus)):
-        return _region_items(aperture, angle)
+        return _region_items(aperture)
     if isinstance(aperture, Complement):
-        return {"obscuration": _region_items(aperture.part, angle)}
+        return {"obscuration": _region_items(aperture.part)}
     if isinstance(aperture, Intersection) and len(aperture.parts) == 2:
         clear, outside = aperture.parts
         if isinstance(clear, (Circle, Annulus)) and isinstance(outside, Complement):
-            return _region_items(clear, angle) | {"obscuration": _region_items(outside.part, angle)}
-    return {"aperture": _region_items(aperture, angle)}
+            return _region_items(clear) | {"obscuration": _region_items(outside.part)}
+    return {"aperture": _region_items(aperture)}
 
 
-def _region_items(region: Aperture, angle: Callable[[float], float]) -> dict[str, Any]:
-    if isinstance(region, Polygon):
-        return {"polygon": region.corners}
-    if isinstance(region, Complement):
-        return {"complement": _region_items(region.part, angle)}
-    if isinstance(region, (Union, Intersection)):
-        key = "union" if isinstance(region, Union) else "intersection"
-        return {key: [_region_items(part, angle) for part in region.parts]}
-    items: dict[str, Any]
-    if isinstance(region, Circle):
-        items = {"circle": region.radius}
-    elif isinstance(region, Annulus):
-        items = {"annulus": (region.inner, region.outer)}
-    elif isinstance(region, Rectangle):
-        items = {"rectangle": (region.width, region.height)}
-    else:
-        items = {"vane": region.width}
-    if region.x or region.y:
-        items["from" if isinstance(region, Vane) else "centre"] = (region.x, region.y)
-    if isinstance(region, (Rectangle, Vane)) and region.angle:
-        items["angle"] = angle(region.angle)
-    return items | ({"both_ways": True} if isinstance(region, Vane) and region.both_ways else {})
+def _region_items(region: Aperture) -> dict[str, Any]:
+    if (found := written(REGIONS, region)) is None:
+        raise PrescriptionError(f"aperture {type(region).__name__}: expected one of {', '.join(REGIONS)}")
+    return found[1]
 
 
 def obstruction_items(obstruction: Obstruction) -> dict[str, Any]:
     """Return the section of an obstruction, triangles included, so that a file stands by itself."""
-    before = {} if obstruction.before is None else {"before": obstruction.before}
-    return {"name": obstruction.name} | before | {"triangles": encoded(obstruction.triangles, "<f4")}
+    items = ObstructionSection.written(obstruction)
+    ordered = {key: items[key] for key in ("name", "before", "triangles")}
+    return {key: value for key, value in ordered.items() if value is not None}

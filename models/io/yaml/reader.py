@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, create_model
 
 from ....core.errors import PrescriptionError, error_context
-from ....core.schema import Section, Tagged, checked, expected, one_of, validated
+from ....core.schema import Section, Tagged, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
 from ...media.medium import Medium
 from ...obstruction import Obstruction
@@ -18,9 +18,11 @@ from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from .apertures import ApertureKeys, ObstructionSection
 from .media import AnyMedium
-from .shapes import SHAPES, ShapeSection, SumSection
+from .shapes import SURFACE_SHAPES, ShapeSection
 from .values import (
+    ROWS,
     Band,
+    FileUnits,
     Length,
     Names,
     Number,
@@ -32,10 +34,8 @@ from .values import (
     PositiveLength,
     Rotation,
     Text,
-    Units,
     Wavelength,
     names,
-    rows,
 )
 
 INTERACTIONS = {
@@ -93,17 +93,9 @@ def _surface_kind(content: dict[str, Any]) -> str:
 
 _SURFACES: dict[str, type[SurfaceKeys]] = {
     name: create_model(f"{name}_surface", __base__=(SurfaceKeys, section))  # type: ignore[arg-type]
-    for name, section in (SHAPES | {"sum": SumSection}).items()
+    for name, section in SURFACE_SHAPES.items()
 }
 _BY_SHAPE = Tagged.by_value("shape", {name: section for name, section in _SURFACES.items() if name != "sum"})
-
-
-class UnitsSection(Section):
-    """Units of the numbers in the file."""
-
-    length: Literal["m", "mm"]
-    angle: Literal["rad", "deg"]
-    wavelength: Literal["m", "um", "nm"]
 
 
 class StopSection(Section):
@@ -156,7 +148,6 @@ def _no_vacuum(media: Any) -> Any:
     return media
 
 
-_ROWS = checked(rows, "a list of mappings, one a line")
 _SURFACE = Tagged(_SURFACES, _surface_kind, built=False)
 _OBSTRUCTION = Tagged({"mesh": ObstructionSection}, lambda content: "mesh")
 
@@ -168,7 +159,7 @@ class Prescription(Section):
     description: Text = ""
     source: Text
     version: Text
-    units: UnitsSection
+    units: FileUnits
     stop: StopSection
     pupil: PupilSection
     launch_distance: PositiveLength
@@ -180,8 +171,8 @@ class Prescription(Section):
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
     groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
-    obstructions: Annotated[tuple[Annotated[Obstruction, _OBSTRUCTION], ...], _ROWS] = ()
-    surfaces: Annotated[tuple[Annotated[SurfaceKeys, _SURFACE], ...], _ROWS]
+    obstructions: Annotated[tuple[Annotated[Obstruction, _OBSTRUCTION], ...], ROWS] = ()
+    surfaces: Annotated[tuple[Annotated[SurfaceKeys, _SURFACE], ...], ROWS]
 
     def telescope(self) -> Telescope:
         """Return the telescope."""
@@ -212,25 +203,18 @@ class Prescription(Section):
             wavelength_range=self.wavelengths.range,
             default_wavelength=self.wavelengths.default,
             band=self.wavelengths.band,
+            camera=self.camera,
             medium_before=medium_before,
             groups={name: group.surfaces for name, group in self.groups.items()},
             group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},
-            camera=self.camera,
             obstructions=self.obstructions,
         )
 
 
 def read_telescope(path: Path) -> Telescope:
-    """Read a prescription file.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be read, or is malformed: one line with file, key, value and expected value.
-    """
+    """Read a prescription file; PrescriptionError of one line with file, key, value and expected value."""
     content = read_mapping(path)
-    units = Units.of(content.get("units"), path.parent)
-    prescription = validated(Prescription, content, str(path), PrescriptionError, units)
+    prescription = validated(Prescription, content, str(path), PrescriptionError, {"folder": path.parent})
     with error_context(file=path):
         return prescription.telescope()
 

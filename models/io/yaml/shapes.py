@@ -27,11 +27,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ValidationInfo
 
 from ....core.errors import PrescriptionError
-from ....core.schema import Parameters, Tagged, checked, either, expected
+from ....core.schema import Parameters, Tagged, WrittenAs, checked, either, expected, written
 from ....core.yaml_reader import as_number
 from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
 from ...shapes.grid import GridSag
@@ -39,6 +38,7 @@ from ...shapes.mesh import MeshSurface
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
 from ..grid_file import read_grid
 from .values import (
+    ROWS,
     Bare,
     Flag,
     Length,
@@ -48,10 +48,10 @@ from .values import (
     OptionalFile,
     PositiveNumber,
     Radius,
-    array,
+    decoded,
     encoded,
-    rows,
-    units,
+    to_si,
+    unit_of,
 )
 
 
@@ -59,7 +59,7 @@ def _powers(powers: range) -> AfterValidator:
     """Return the conversion of coefficients of powers of the radius: lengths over lengths to these powers."""
 
     def convert(coefficients: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
-        unit = units(info).length(1.0)
+        unit = to_si(1.0, unit_of("length", info))
         pairs = zip(powers, coefficients, strict=False)
         return tuple(a if unit == 1.0 else a * unit ** (1 - n) for n, a in pairs)
 
@@ -69,7 +69,7 @@ def _powers(powers: range) -> AfterValidator:
 def _terms(value: Any, info: ValidationInfo) -> tuple[tuple[int, int, float], ...]:
     if not isinstance(value, list) or not value:
         raise expected("a list of [power of x, power of y, coefficient]")
-    unit = units(info).length(1.0)
+    unit = to_si(1.0, unit_of("length", info))
     terms = []
     for row in value:
         i, j, a = map(as_number, row) if isinstance(row, list) and len(row) == 3 else (None, None, None)
@@ -85,6 +85,10 @@ def _equal_rows(values: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...
     return values
 
 
+_TERMS = Annotated[Any, BeforeValidator(_terms), WrittenAs(lambda terms: [(Bare(i), Bare(j), a) for i, j, a in terms])]
+_ROW = "three numbers a row, in base 64"
+
+
 class ShapeSection(Parameters):
     """A shape: its name, and its parameters as attributes of the class that it describes."""
 
@@ -94,6 +98,8 @@ class ShapeSection(Parameters):
 class GridSection(ShapeSection):
     """Grid of sag in a FITS file, or written out."""
 
+    make = GridSag
+    parameters = ("nodes_x", "nodes_y", "values")
     file: OptionalFile = None
     nodes_x: Lengths = ()
     nodes_y: Lengths = ()
@@ -106,21 +112,21 @@ class GridSection(ShapeSection):
     @classmethod
     def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
         super().check(content)
-        either(content, "file", ("nodes_x", "nodes_y", "values"))
+        either(content, "file", cls.parameters)
 
     def build(self) -> Shape:  # noqa: D102
-        if self.file is not None:
-            return read_grid(self.file)
-        return GridSag(*(np.array(v) for v in (self.nodes_x, self.nodes_y, self.values)))
+        return super().build() if self.file is None else read_grid(self.file)
 
 
 class MeshSection(ShapeSection):
     """Mesh in a file, or written out in base 64."""
 
+    make = MeshSurface
+    parameters = ("vertices", "faces", "smooth")
     file: OptionalFile = None
     scale: PositiveNumber = 1.0
-    vertices: Annotated[Any, checked(array("<f8", (-1, 3)), "three numbers a row, in base 64")] = None
-    faces: Annotated[Any, checked(array("<i4", (-1, 3)), "three numbers a row, in base 64")] = None
+    vertices: Annotated[Any, decoded("<f8", (-1, 3), _ROW), encoded("<f8")] = None
+    faces: Annotated[Any, decoded("<i4", (-1, 3), _ROW), encoded("<i4")] = None
     smooth: Flag = False
 
     @classmethod
@@ -148,38 +154,25 @@ SHAPES: dict[str, type[ShapeSection]] = {
     ),
     "biconic": ShapeSection.of(Biconic, radius_x=Radius, radius_y=Radius, conic_x=(Number, 0.0), conic_y=(Number, 0.0)),
     "toroid": ShapeSection.of(Toroid, radius_x=Radius, radius_y=Radius, conic_y=(Number, 0.0)),
-    "xy_polynomial": ShapeSection.of(XYPolynomial, terms=Annotated[Any, BeforeValidator(_terms)]),
+    "xy_polynomial": ShapeSection.of(XYPolynomial, terms=_TERMS),
     "zernike": ShapeSection.of(ZernikeSag, coefficients=Lengths, outer_radius=Length, inner_radius=(Length, 0.0)),
     "grid": GridSection,
     "mesh": MeshSection,
 }
 
 
-class SumSection(ShapeSection):
-    """Sum of shapes: their list in place of a name."""
-
-    shape: Annotated[  # type: ignore[assignment]
-        tuple[Annotated[Any, Tagged.by_value("shape", SHAPES)], ...], checked(rows, "a list of mappings, one a line")
-    ]
-
-    def build(self) -> Sum:  # noqa: D102
-        return Sum(self.shape)
-
-
 def shape_items(shape: Shape) -> dict[str, Any]:
     """Return the section of a shape, in metres; grids and meshes are written out, so that a file stands by itself."""
-    if isinstance(shape, Sum):
-        return {"shape": [shape_items(part) for part in shape.parts]}
-    if isinstance(shape, GridSag):
-        values = [[*row] for row in shape.values]
-        return {"shape": "grid", "nodes_x": [*shape.x], "nodes_y": [*shape.y], "values": values}
-    if isinstance(shape, MeshSurface):
-        points = {"vertices": encoded(shape.vertices, "<f8"), "faces": encoded(shape.faces, "<i4")}
-        return {"shape": "mesh"} | points | {"smooth": shape.smooth}
-    if isinstance(shape, XYPolynomial):
-        return {"shape": "xy_polynomial", "terms": [(Bare(i), Bare(j), a) for i, j, a in shape.terms]}
-    for name, section in SHAPES.items():
-        if type(shape) is getattr(section, "make", None):
-            items = {key: getattr(shape, key) for key in section.parameters}
-            return {"shape": name} | {key: "flat" if v in (np.inf, -np.inf) else v for key, v in items.items()}
-    raise PrescriptionError(f"shape {type(shape).__name__}: expected one of {', '.join(SHAPES)}")
+    if (found := written(SURFACE_SHAPES, shape)) is None:
+        raise PrescriptionError(f"shape {type(shape).__name__}: expected one of {', '.join(SHAPES)}")
+    kind, items = found
+    return {"shape": kind} | items
+
+
+_PARTS = Annotated[
+    tuple[Annotated[Any, Tagged.by_value("shape", SHAPES)], ...],
+    ROWS,
+    WrittenAs(lambda parts: [shape_items(part) for part in parts]),
+]
+#: Sections of shapes and, under a list in place of a name, of their sum.
+SURFACE_SHAPES = SHAPES | {"sum": ShapeSection.of(Sum, shape=_PARTS)}

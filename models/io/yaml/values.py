@@ -1,6 +1,6 @@
-"""Values of prescription files: annotated types that check and convert to SI, and their text.
+"""Values of prescription files: annotated types that check them, convert them to SI and write them.
 
-A prescription is validated with its :class:`Units` as context.
+A prescription is validated with its folder and, once they are read, its units (:class:`UnitsSection`) as context.
 """
 
 from __future__ import annotations
@@ -11,64 +11,58 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from decimal import Decimal
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, ValidationInfo
 
-from ....core.schema import checked
+from ....core.schema import Section, WrittenAs, checked
 from ....core.yaml_reader import as_number
 from ...surface import Matrix
 
-Convert = Callable[[float], float]
+#: Units but for degrees, as powers of ten of the SI unit.
+_POWERS = {"m": 0, "rad": 0, "mm": -3, "um": -6, "nm": -9}
 
 
-def _power_of_ten(exponent: int) -> Convert:
-    """Return a conversion that moves the decimal point of the number as written: 0.545 um is the float 545e-9 m."""
-    return lambda v: float(Decimal(repr(v)).scaleb(exponent))
+def to_si(value: float, unit: str) -> float:
+    """Return a value in SI; the decimal point of the number as written is moved: 0.545 um is the float 545e-9 m."""
+    return math.radians(value) if unit == "deg" else float(Decimal(repr(value)).scaleb(_POWERS[unit]))
 
 
-LENGTHS: dict[str, Convert] = {"m": _power_of_ten(0), "mm": _power_of_ten(-3)}
-ANGLES: dict[str, Convert] = {"rad": _power_of_ten(0), "deg": math.radians}
-WAVELENGTHS: dict[str, Convert] = {"m": _power_of_ten(0), "um": _power_of_ten(-6), "nm": _power_of_ten(-9)}
+class UnitsSection(Section):
+    """Units of the numbers in the file."""
+
+    length: Literal["m", "mm"]
+    angle: Literal["rad", "deg"]
+    wavelength: Literal["m", "um", "nm"]
 
 
-@dataclass(frozen=True)
-class Units:
-    """Conversions of a prescription file to SI.
+def _keep_units(section: UnitsSection, info: ValidationInfo) -> UnitsSection:
+    info.context["units"] = section
+    return section
 
-    Parameters
-    ----------
-    length, angle, wavelength : callable
-        Conversions to m, rad and m.
-    folder : Path
-        Folder of the file, from which relative paths in it start.
-    """
 
-    length: Convert
-    angle: Convert
-    wavelength: Convert
-    folder: Path
+#: Section of the units, which those after it are converted with.
+FileUnits = Annotated[UnitsSection, AfterValidator(_keep_units)]
 
-    @classmethod
-    def of(cls, content: Any, folder: Path) -> Units:
-        """Return the units that a section names; SI in place of a name that is none, which is an error by itself."""
-        names: Mapping[str, Any] = content if isinstance(content, dict) else {}
 
-        def conversion(key: str, known: dict[str, Convert]) -> Convert:
-            name = names.get(key)
-            return known.get(name, float) if isinstance(name, str) else float
+def unit_of(quantity: str, info: ValidationInfo) -> str:
+    """Return the file's unit of a quantity; SI where the units are malformed, which is an error by itself."""
+    return getattr(info.context.get("units"), quantity, "m")
 
-        return cls(
-            conversion("length", LENGTHS),
-            conversion("angle", ANGLES),
-            conversion("wavelength", WAVELENGTHS),
-            folder,
-        )
+
+class Turn(float):
+    """Angle [rad] to be written in the file's unit."""
+
+
+class Wave(float):
+    """Wavelength [m] to be written in the file's unit."""
+
+
+class Bare(str):
+    """Text that stands in a file as it is."""
 
 
 def _numbers(size: int | None) -> Callable[[Any], tuple[float, ...] | None]:
@@ -91,23 +85,19 @@ def _positive(value: Any) -> float | None:
     return number if number is not None and number > 0 else None
 
 
-def _radius(value: Any) -> float | None:
-    return math.inf if value == "flat" else as_number(value)
-
-
 def names(value: Any) -> tuple[str, ...] | None:
     """Return a list of names that is not empty as a tuple, and None for other values."""
     named = isinstance(value, list) and value and all(isinstance(v, str) for v in value)
     return tuple(value) if named else None
 
 
-def rows(value: Any) -> list[Any] | None:
-    """Return a list of mappings that is not empty, and None for other values."""
-    return value if isinstance(value, list) and value and all(isinstance(v, dict) for v in value) else None
+def encoded(kind: str) -> WrittenAs:
+    """Return the serializer of an array as numbers of a kind in base 64, quoted."""
+    return WrittenAs(lambda a: Bare(json.dumps(base64.b64encode(a.astype(kind).tobytes()).decode())))
 
 
-def array(kind: str, shape: tuple[int, ...]) -> Callable[[Any], np.ndarray | None]:
-    """Return a function that decodes an array from base 64; None where the text is none."""
+def decoded(kind: str, shape: tuple[int, ...], text: str) -> BeforeValidator:
+    """Return the validator of an array of numbers of a kind in base 64; `text` is the expected value."""
 
     def decode(value: Any) -> np.ndarray | None:
         try:
@@ -115,78 +105,70 @@ def array(kind: str, shape: tuple[int, ...]) -> Callable[[Any], np.ndarray | Non
         except (binascii.Error, ValueError, TypeError):
             return None
 
-    return decode
-
-
-def units(info: ValidationInfo) -> Units:
-    """Return the units of the file that is validated."""
-    assert isinstance(info.context, Units)
-    return info.context
+    return checked(decode, text)
 
 
 def _converted(quantity: str) -> AfterValidator:
     def convert(value: Any, info: ValidationInfo) -> Any:
-        to_si = getattr(units(info), quantity)
-        return tuple(to_si(v) for v in value) if isinstance(value, tuple) else to_si(value)
+        unit = unit_of(quantity, info)
+        return tuple(to_si(v, unit) for v in value) if isinstance(value, tuple) else to_si(value, unit)
 
     return AfterValidator(convert)
 
 
+ROWS = checked(
+    lambda v: v if isinstance(v, list) and v and all(isinstance(row, dict) for row in v) else None,
+    "a list of mappings, one a line",
+)
 _TEXT = checked(lambda v: v if isinstance(v, str) and v.strip() else None, "a text")
-_BESIDE = AfterValidator(lambda name, info: units(info).folder / name)
+_BESIDE = AfterValidator(lambda name, info: info.context["folder"] / name)
+_NAMES = checked(names, "a list of names")
 _NUMBER, _POSITIVE = checked(as_number, "a number"), checked(_positive, "a positive number")
 _LIST, _PAIR, _TRIPLE = (
     checked(_numbers(size), f"a list of {size} numbers" if size else "a list of numbers") for size in (None, 2, 3)
 )
+_LENGTH, _ANGLE, _WAVELENGTH = (_converted(quantity) for quantity in ("length", "angle", "wavelength"))
+_WAVES = WrittenAs(lambda waves: [Wave(w) for w in waves])
 
 Text = Annotated[str, _TEXT]
 OptionalText = Annotated[str | None, _TEXT]
 OptionalFile = Annotated[Any, _TEXT, _BESIDE]
-Names = Annotated[tuple[str, ...], checked(names, "a list of names")]
-OptionalNames = Annotated[tuple[str, ...] | None, checked(names, "a list of names")]
+Names = Annotated[tuple[str, ...], _NAMES]
+OptionalNames = Annotated[tuple[str, ...] | None, _NAMES]
 Flag = Annotated[bool, checked(lambda v: v if isinstance(v, bool) else None, "true or false")]
 Number = Annotated[float, _NUMBER]
 OptionalNumber = Annotated[float | None, _NUMBER]
 PositiveNumber = Annotated[float, _POSITIVE]
 Numbers = Annotated[tuple[float, ...], _LIST]
 Rotation = Annotated[Matrix, checked(_matrix, "three rows of three numbers")]
-Length = Annotated[float, _NUMBER, _converted("length")]
-OptionalLength = Annotated[float | None, _NUMBER, _converted("length")]
-PositiveLength = Annotated[float, _POSITIVE, _converted("length")]
-Radius = Annotated[float, checked(_radius, "a number"), _converted("length")]
-Lengths = Annotated[tuple[float, ...], _LIST, _converted("length")]
-Point = Annotated[tuple[float, float], _PAIR, _converted("length")]
-OptionalPoint = Annotated[tuple[float, float] | None, _PAIR, _converted("length")]
-OptionalPlace = Annotated[tuple[float, float, float] | None, _TRIPLE, _converted("length")]
-Angle = Annotated[float, _NUMBER, _converted("angle")]
-PositiveAngle = Annotated[float, _POSITIVE, _converted("angle")]
-OptionalAngles = Annotated[tuple[float, float, float] | None, _TRIPLE, _converted("angle")]
-Wavelength = Annotated[float, _POSITIVE, _converted("wavelength")]
-Wavelengths = Annotated[tuple[float, ...], _LIST, _converted("wavelength")]
-Band = Annotated[tuple[float, float], _PAIR, _converted("wavelength")]
-OptionalBand = Annotated[tuple[float, float] | None, _PAIR, _converted("wavelength")]
-
-
-class Bare(str):
-    """Text that stands in a file as it is."""
-
-
-def encoded(values: np.ndarray, kind: str) -> Bare:
-    """Return an array as numbers of a kind in base 64, quoted."""
-    return Bare(json.dumps(base64.b64encode(values.astype(kind).tobytes()).decode()))
+Length = Annotated[float, _NUMBER, _LENGTH]
+OptionalLength = Annotated[float | None, _NUMBER, _LENGTH]
+PositiveLength = Annotated[float, _POSITIVE, _LENGTH]
+Radius = Annotated[float, checked(lambda v: math.inf if v == "flat" else as_number(v), "a number"), _LENGTH]
+Lengths = Annotated[tuple[float, ...], _LIST, _LENGTH]
+Point = Annotated[tuple[float, float], _PAIR, _LENGTH]
+OptionalPoint = Annotated[tuple[float, float] | None, _PAIR, _LENGTH]
+OptionalPlace = Annotated[tuple[float, float, float] | None, _TRIPLE, _LENGTH]
+Angle = Annotated[float, _NUMBER, _ANGLE, WrittenAs(Turn)]
+PositiveAngle = Annotated[float, _POSITIVE, _ANGLE, WrittenAs(Turn)]
+OptionalAngles = Annotated[tuple[float, float, float] | None, _TRIPLE, _ANGLE]
+Wavelength = Annotated[float, _POSITIVE, _WAVELENGTH, WrittenAs(Wave)]
+Wavelengths = Annotated[tuple[float, ...], _LIST, _WAVELENGTH, _WAVES]
+Band = Annotated[tuple[float, float], _PAIR, _WAVELENGTH, _WAVES]
+OptionalBand = Annotated[tuple[float, float] | None, _PAIR, _WAVELENGTH, _WAVES]
 
 
 def number_text(value: float) -> str:
-    """Return a float as the shortest text that loads back equal, a float in YAML too."""
+    """Return a float as the shortest text that loads back equal, a float in YAML too; a radius may be flat."""
     # YAML 1.1 takes 8e-07 for text: a number needs its point.
-    return re.sub(r"^(-?\d+)e", r"\1.0e", repr(float(value) + 0.0))
+    return "flat" if math.isinf(value) else re.sub(r"^(-?\d+)e", r"\1.0e", repr(float(value) + 0.0))
 
 
 def flow(value: Any, number: Callable[[float], str] = number_text) -> str:
     """Return a value in YAML's flow style, on one line; `number` gives the text of a float."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {flow(v, number)}" for key, v in value.items()) + "}"
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, (list, tuple, np.ndarray)):
         return "[" + ", ".join(flow(v, number) for v in value) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from itertools import count
 from typing import Any
 
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
-from .apertures import aperture_angles, aperture_items, obstruction_items
-from .media import medium_items, medium_wavelengths
+from .apertures import aperture_items, obstruction_items
+from .media import medium_items
 from .reader import INTERACTIONS
 from .shapes import shape_items
-from .values import ANGLES, WAVELENGTHS, flow
+from .values import Bare, Turn, Wave, flow, number_text, to_si
 
 INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 
@@ -23,104 +22,107 @@ INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 def telescope_to_yaml(telescope: Telescope) -> str:
     """Return the text of the prescription file of a telescope; it loads back equal to the last bit."""
     t = telescope
-    band = t.band or t.wavelength_range
-    waves: tuple[float, ...] = (*t.wavelength_range, t.default_wavelength, *band)
-    glasses = [m for m in (s.medium_after for s in t.surfaces) if m != VACUUM]
-    glasses = list(dict.fromkeys([*([t.medium_before] if t.medium_before != VACUUM else []), *glasses]))
-    for glass in glasses:
-        waves += medium_wavelengths(glass)
-    turns = [turn for s in t.surfaces for turn in aperture_angles(s.aperture)]
-    angle, angles = _in_unit((t.field_radius, t.field_limit, *turns), "deg", ANGLES, "rad")
-    shown_angles = dict(zip(turns, angles[2:], strict=True))
-    wave, waves_out = _in_unit(waves, "um", WAVELENGTHS, "m")
-    shown = dict(zip(waves, waves_out, strict=True))
-    span, edges = [shown[v] for v in t.wavelength_range], [shown[v] for v in band]
+    names = _medium_names(t)
+    low, high = t.band or t.wavelength_range
+    head: dict[str, Any] = {
+        "name": t.name,
+        "description": t.description,
+        "source": t.source,
+        "version": t.version,
+        "units": {"length": "m"},
+        "stop": {"z": t.stop_z},
+        "pupil": {"diameter": t.pupil_diameter, "obscuration": t.pupil_obscuration},
+        "launch_distance": t.launch_distance,
+        "reference_sphere_radius": t.reference_sphere_radius,
+        "field": {"radius": Turn(t.field_radius), "limit": Turn(t.field_limit)},
+        "wavelengths": {
+            "range": [Wave(w) for w in t.wavelength_range],
+            "default": Wave(t.default_wavelength),
+            "band": [Wave(low), Wave(high)],
+        },
+        "object_distance": t.object_distance if math.isfinite(t.object_distance) else None,
+        "camera": t.camera,
+        "medium_before": names[t.medium_before] if t.medium_before != VACUUM else None,
+    }
+    lists = {
+        "media": [(f"  {name}: ", medium_items(medium)) for medium, name in names.items() if medium != VACUUM],
+        "groups": [(f"  {flow(name)}: ", _group_items(t, name)) for name in t.groups],
+        "obstructions": [("  - ", obstruction_items(obstruction)) for obstruction in t.obstructions],
+    }
+    surfaces = [_surface_items(surface, names) for surface in t.surfaces]
+    angles, waves = _found((head, lists, surfaces), Turn), _found((head, lists, surfaces), Wave)
+    angle, turned = _in_unit(angles, "deg", "rad")
+    wave, shown = _in_unit(waves, "um", "m")
+    head["units"] |= {"angle": angle, "wavelength": wave}
+
+    def text(value: Any) -> str:
+        return flow(value, lambda v: number_text({Turn: turned, Wave: shown}.get(type(v), {}).get(v, v)))
+
+    lines = [f"{key}: {text(value)}" for key, value in head.items() if value not in ("", None)]
+    for key, entries in lists.items():
+        lines += [f"{key}:", *(start + text(items) for start, items in entries)] if entries else []
+    rows = [{key: text(value) for key, value in items.items()} for items in surfaces]
+    return "\n".join([*lines, "surfaces:", *_aligned(rows)]) + "\n"
+
+
+def _medium_names(t: Telescope) -> dict[Medium, str]:
+    """Return a name for each medium: its own that no other medium has, else a number."""
+    media = list(dict.fromkeys(m for m in (t.medium_before, *(s.medium_after for s in t.surfaces)) if m != VACUUM))
     names: dict[Medium, str] = {VACUUM: "vacuum"}
-    taken = {glass.name for glass in glasses}
     numbered = (f"glass_{i}" for i in count(1))
-    for glass in glasses:
-        # A name of its own that no other medium has; without one, a number.
-        own = re.fullmatch(r"[A-Za-z][\w.-]*", glass.name) and glass.name not in names.values()
-        names[glass] = glass.name if own else next(n for n in numbered if n not in taken)
-
-    lines = [f"name: {flow(t.name)}"]
-    lines += [f"{key}: {flow(getattr(t, key))}" for key in ("description", "source", "version") if getattr(t, key)]
-    lines += [
-        f"units: {{length: m, angle: {angle}, wavelength: {wave}}}",
-        f"stop: {flow({'z': t.stop_z})}",
-        f"pupil: {flow({'diameter': t.pupil_diameter, 'obscuration': t.pupil_obscuration})}",
-        f"launch_distance: {flow(t.launch_distance)}",
-        f"reference_sphere_radius: {flow(t.reference_sphere_radius)}",
-        f"field: {flow({'radius': angles[0], 'limit': angles[1]})}",
-        f"wavelengths: {flow({'range': span, 'default': shown[t.default_wavelength], 'band': edges})}",
-    ]
-    if math.isfinite(t.object_distance):
-        lines.append(f"object_distance: {flow(t.object_distance)}")
-    if t.camera is not None:
-        lines.append(f"camera: {flow(t.camera)}")
-    if t.medium_before != VACUUM:
-        lines.append(f"medium_before: {names[t.medium_before]}")
-    if glasses:
-        lines.append("media:")
-    lines += [f"  {names[glass]}: {flow(medium_items(glass, shown.__getitem__))}" for glass in glasses]
-    if t.groups:
-        lines.append("groups:")
-    for group, members in t.groups.items():
-        group_items: Any = members
-        pivot, axes = t.group_frames[group]
-        first = t.surface(members[0])
-        if (pivot, axes) != (first.vertex, first.rotation):
-            group_items = {"surfaces": members, "pivot": pivot, "rotation": axes}
-        lines.append(f"  {flow(group)}: {flow(group_items)}")
-    if t.obstructions:
-        lines += ["obstructions:", *(f"  - {flow(obstruction_items(o))}" for o in t.obstructions)]
-    lines.append("surfaces:")
-    return "\n".join(lines + _surface_lines(t.surfaces, names, shown_angles.__getitem__)) + "\n"
+    for medium in media:
+        own = re.fullmatch(r"[A-Za-z][\w.-]*", medium.name) and medium.name not in names.values()
+        names[medium] = medium.name if own else next(n for n in numbered if n not in {m.name for m in media})
+    return names
 
 
-def _surface_lines(
-    surfaces: tuple[Surface, ...], names: dict[Medium, str], angle: Callable[[float], float]
-) -> list[str]:
-    rows = [_surface_items(s, names, angle) for s in surfaces]
-    # The first keys, which every surface has, are aligned so that the eye can run down a column.
-    aligned = ("name", "type", "shape", "z")
-    # A sum of shapes is a list and breaks the column: it would push all others out of sight.
-    width = {key: max((len(row[key]) for row in rows if row[key][0] != "["), default=0) for key in aligned}
-    lines = []
-    for row in rows:
-        keys = list(row)
-        cells = []
-        for key in keys:
-            comma = "" if key == keys[-1] else ","
-            cell = f"{key}: {row[key]}{comma}"
-            cells.append(cell.ljust(len(key) + 3 + width[key]) if key in aligned and comma else cell)
-        lines.append("  - {" + " ".join(cells) + "}")
-    return lines
+def _group_items(t: Telescope, name: str) -> Any:
+    members, (pivot, axes) = t.groups[name], t.group_frames[name]
+    first = t.surface(members[0])
+    framed = (pivot, axes) != (first.vertex, first.rotation)
+    return {"surfaces": members, "pivot": pivot, "rotation": axes} if framed else members
 
 
-def _surface_items(surface: Surface, names: dict[Medium, str], angle: Callable[[float], float]) -> dict[str, str]:
+def _surface_items(surface: Surface, names: dict[Medium, str]) -> dict[str, Any]:
     x, y, z = surface.vertex
     shape = shape_items(surface.shape)
     kind = INTERACTION_NAMES[surface.interaction]
     items = {"name": surface.name, "type": kind, "shape": shape.pop("shape"), "z": z}
     items |= {key: value for key, value in (("x", x), ("y", y)) if value != 0}
-    if surface.rotation != IDENTITY:
-        items["rotation"] = surface.rotation
-    items |= shape | aperture_items(surface.aperture, angle)
-    texts = {key: flow(value) for key, value in items.items()}
-    return texts | ({"medium": names[surface.medium_after]} if kind == "refract" else {})
+    items |= {} if surface.rotation == IDENTITY else {"rotation": surface.rotation}
+    items |= shape | aperture_items(surface.aperture)
+    return items | ({"medium": Bare(names[surface.medium_after])} if kind == "refract" else {})
 
 
-def _in_unit(
-    values: tuple[float, ...], unit: str, units: dict[str, Callable[[float], float]], fallback: str
-) -> tuple[str, tuple[float, ...]]:
+def _aligned(rows: list[dict[str, str]]) -> list[str]:
+    """Return the lines of surfaces; the first keys, which all have, are aligned into columns."""
+    # A sum of shapes is a list and breaks the column: it would push all others out of sight.
+    aligned = ("name", "type", "shape", "z")
+    width = {key: max((len(row[key]) for row in rows if row[key][0] != "["), default=0) for key in aligned}
+    lines = []
+    for row in rows:
+        last = [*row][-1]
+        cells = [f"{key}: {value}" + ("" if key == last else ",") for key, value in row.items()]
+        padded = [cell.ljust(len(key) + 3 + width.get(key, -99)) for key, cell in zip(row, cells, strict=True)]
+        lines.append("  - {" + " ".join([*padded[:-1], cells[-1]]) + "}")
+    return lines
+
+
+def _found(value: Any, kind: type[float]) -> list[float]:
+    """Return the angles or wavelengths within nested mappings and lists."""
+    if isinstance(value, kind):
+        return [value]
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
+    return [found for part in inner for found in _found(part, kind)]
+
+
+def _in_unit(values: list[float], unit: str, fallback: str) -> tuple[str, dict[float, float]]:
     """Return a unit and the values in it that convert back exactly: the readable unit, or SI where it cannot."""
-    convert = units[unit]
-    found = []
+    found = {}
     for value in values:
-        near = value / convert(1.0)
-        exact = [c for c in (float(f"{near:.{digits}g}") for digits in range(1, 18)) if convert(c) == value]
+        near = value / to_si(1.0, unit)
+        exact = [c for c in (float(f"{near:.{digits}g}") for digits in range(1, 18)) if to_si(c, unit) == value]
         if not exact:
-            return fallback, values
-        found.append(exact[0])
-    return unit, tuple(found)
+            return fallback, {}
+        found[value] = exact[0]
+    return unit, found

@@ -54,13 +54,7 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
 
 
 def aperture_lines(aperture: Aperture, unit: float) -> list[str]:
-    """Return the lines of a clear region.
-
-    Raises
-    ------
-    PrescriptionError
-        If Zemax surfaces have no such aperture.
-    """
+    """Return the lines of a clear region; PrescriptionError where Zemax surfaces have no such aperture."""
     clear = not isinstance(aperture, Complement)
     region = aperture.part if isinstance(aperture, Complement) else aperture
     if isinstance(region, Circle | Annulus):

@@ -35,31 +35,12 @@ IGNORED_SURFACE = frozenset(_SURFACE.split())
 
 @dataclass
 class Findings:
-    """Parts of a file that are not understood: an error, or with `lenient` a warning.
-
-    Parameters
-    ----------
-    lenient : bool
-        Whether to warn and go on.
-    """
+    """Parts of a file that are not understood: errors, or where `lenient` is set warnings."""
 
     lenient: bool = False
 
     def report(self, error: PrescriptionError, instead: str = "") -> None:
-        """Raise the error, or warn.
-
-        Parameters
-        ----------
-        error : PrescriptionError
-            The part of the file, and why it is not understood.
-        instead : str
-            The assumption in its place, for the warning.
-
-        Raises
-        ------
-        PrescriptionError
-            Unless lenient.
-        """
+        """Raise the error or, if lenient, warn; `instead` is the assumption in its place, for the warning."""
         if not self.lenient:
             raise error
         warnings.warn(f"{error}; {instead}" if instead else str(error), PrescriptionWarning, stacklevel=2)
@@ -67,18 +48,10 @@ class Findings:
 
 @dataclass
 class Block:
-    """Lines that belong together, by keyword: the header, or a surface.
+    """Lines that belong together: the header, or a surface.
 
-    Parameters
-    ----------
-    source : str
-        File, for messages.
-    place : str
-        Part of the file, such as ``"surface 3"``; empty for a header.
-    lines : list of Record
-        Lines in the order of the file.
-    used : set of str
-        Keywords that have been read.
+    `source` is the file and `place` the part of it (``"surface 3"``, empty for a header), for messages. `used` holds
+    the keywords that have been read.
     """
 
     source: str
@@ -123,19 +96,7 @@ class Block:
 
 @dataclass
 class ZemaxFile:
-    """A lens file, taken apart.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    header : Block
-        Lines before the first surface.
-    surfaces : list of Block
-        Surfaces from the object to the image.
-    trailer : Block
-        Lines after the last surface.
-    """
+    """Parts of a lens file: lines before the surfaces, surfaces from the object to the image, lines after."""
 
     path: Path
     header: Block
@@ -144,13 +105,7 @@ class ZemaxFile:
 
 
 def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
-    """Return the parts of a lens file.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be read, is not a sequential lens, or has fewer than three surfaces.
-    """
+    """Return the parts of a lens file; PrescriptionError if it is not sequential or has fewer than three surfaces."""
     text = read_text(path)
     source = str(path)
     indented = {i for i, line in enumerate(text.splitlines(), start=1) if line[:1].isspace()}

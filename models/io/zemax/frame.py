@@ -34,13 +34,7 @@ def rotated_axes(axes: np.ndarray) -> Matrix:
 
 
 def rotated_shape(shape: Shape) -> Shape:
-    """Return the shape in the rotated axes: ``-sag(-x, y)``.
-
-    Raises
-    ------
-    PrescriptionError
-        If Zemax files have no such shape.
-    """
+    """Return the shape in the rotated axes, ``-sag(-x, y)``; PrescriptionError if Zemax files have no such shape."""
     if isinstance(shape, Plane):
         return shape
     if isinstance(shape, Sphere | Conic):

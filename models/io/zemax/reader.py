@@ -21,16 +21,15 @@ import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
 from ...media.dispersion import model_glass
-from ...media.medium import Medium
+from ...media.medium import Medium, RelativeToAir
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
-from ..yaml.media import medium_wavelengths
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
-from .shape_reader import read_shape
+from .shapes import read_shape
 from .system import UNITS, ParaxialSurfaces, read_pupil, read_wavelengths
 
 #: Comment of the plane that the writer puts in front to carry the entrance pupil.
@@ -44,15 +43,9 @@ def read_lens(
     lenient: bool = False,
     glass_catalogues: Iterable[GlassCatalogue | str | os.PathLike[str]] = (),
 ) -> Telescope:
-    """Read a lens file of Zemax or CODE V, as :func:`~pachon.models.io.prescription.load_telescope` does.
+    """Read a lens file of Zemax or CODE V; `parts` reads its parts in the terms of a Zemax file.
 
-    `parts` reads the parts of the file in the terms of a Zemax file. Lengths of the telescope are in metres, indices as
-    in the file: relative to air, whose index is 1.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be read or, unless lenient, something in it is not understood.
+    Lengths are in metres, indices as in the file: relative to air, whose index is 1.
     """
     findings = Findings(lenient)
     with error_context(file=path):
@@ -249,15 +242,16 @@ class _LensReader:
     def _wavelength_range(self, waves: tuple[float, ...]) -> tuple[float, float]:
         low, high = min(0.1e-6, *waves), max(20e-6, *waves)
         for medium in (self.first_medium, *(s.medium_after for s in self.surfaces)):
-            covered = medium_wavelengths(medium)
+            glass = medium.relative if isinstance(medium, RelativeToAir) else medium
+            covered = getattr(glass, "wavelength_range", ())
             if not covered:
                 continue
-            if not covered[0] <= min(waves) <= max(waves) <= covered[-1]:
+            if not covered[0] <= min(waves) <= max(waves) <= covered[1]:
                 raise self.file.header.problem(
                     f"WAVM {min(waves) * 1e6:g} to {max(waves) * 1e6:g} um: expected "
-                    f"{covered[0] * 1e6:g} to {covered[-1] * 1e6:g} um, which glass {medium.name} covers"
+                    f"{covered[0] * 1e6:g} to {covered[1] * 1e6:g} um, which glass {medium.name} covers"
                 )
-            low, high = max(low, covered[0]), min(high, covered[-1])
+            low, high = max(low, covered[0]), min(high, covered[1])
         return low, high
 
 

@@ -32,13 +32,7 @@ class Wavelengths:
 
 
 def read_wavelengths(header: Block) -> Wavelengths:
-    """Return the wavelengths: lines WAVM, as many as FTYP counts, or the older WAVL.
-
-    Raises
-    ------
-    PrescriptionError
-        If there is none, or one is not positive.
-    """
+    """Return the wavelengths: lines WAVM, as many as FTYP counts, or the older WAVL; PrescriptionError if none."""
     lines = header.all("WAVM")
     listed = header.last("WAVL")
     count = header.number("FTYP", 0.0, 3) if (kind := header.last("FTYP")) and len(kind.words) > 3 else 0.0
@@ -88,10 +82,7 @@ class ParaxialSurfaces:
         self.stop, self.stop_radius = (0 if first else len(self.rows)), radius
 
     def trace(self, height: float, slope: float, wavelength: float) -> tuple[np.ndarray, float]:
-        """Return the height of a ray at each surface, and its slope after the last.
-
-        The ray starts in the plane of the first surface, at a height [m] and a slope.
-        """
+        """Return the heights [m] at the surfaces, and the last slope, of a ray by its first height [m] and slope."""
         heights = []
         n = float(self.rows[0][1].index(wavelength))
         for (curvature, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
@@ -121,27 +112,10 @@ class Pupil:
 def read_pupil(
     file: ZemaxFile, surfaces: ParaxialSurfaces, unit: float, wavelength: float, before: Medium, findings: Findings
 ) -> Pupil:
-    """Return the paraxial entrance pupil and the field of a file.
+    """Return the paraxial entrance pupil and the field of a file at its primary `wavelength` [m].
 
-    Parameters
-    ----------
-    file : ZemaxFile
-        The file.
-    surfaces : ParaxialSurfaces
-        Its surfaces.
-    unit : float
-        Lens unit [m].
-    wavelength : float
-        Primary wavelength [m].
-    before : Medium
-        Medium of the object space.
-    findings : Findings
-        Treatment of lines that are not understood.
-
-    Raises
-    ------
-    PrescriptionError
-        If the pupil is at infinity or has no size or, unless lenient, the aperture is given twice.
+    `unit` is the lens unit [m], `before` the medium of the object space. PrescriptionError if the pupil is at infinity
+    or has no size or, unless lenient, the aperture is given twice.
     """
     header = file.header
     # The trace starts at the first surface; a distance to a break in front of it does not count.

@@ -10,13 +10,7 @@ from ....core.errors import PrescriptionError
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or ISO 8859-1.
-
-    Raises
-    ------
-    PrescriptionError
-        If the file cannot be read, or is no text.
-    """
+    """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or ISO 8859-1."""
     try:
         raw = path.read_bytes()
     except FileNotFoundError:
@@ -43,22 +37,9 @@ def number_text(value: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One line of a file: a keyword and what follows it.
+    """A line of a file: its first word, the others, and these as they stand in the file.
 
-    Parameters
-    ----------
-    source : str
-        File, for messages.
-    line : int
-        Line number, from 1.
-    place : str
-        Part of the file, such as ``"surface 3"``; empty in a header.
-    keyword : str
-        First word of the line.
-    words : tuple of str
-        Further words.
-    text : str
-        The same as it stands in the file.
+    `source`, `line` (from 1) and `place` (``"surface 3"``, empty in a header) are for messages.
     """
 
     source: str
@@ -84,16 +65,9 @@ class Record:
         return text if len(text) <= 60 else text[:57] + "..."
 
     def number(self, position: int, default: float | None = None, *, infinite: bool = False) -> float:
-        """Return a word as a number.
+        """Return a word as a number, or a default where there are fewer words; without a default that is an error.
 
-        Parameters
-        ----------
-        position : int
-            Which of the words.
-        default : float, optional
-            Value where there are fewer words; without one that is an error.
-        infinite : bool
-            Whether "INFINITY" is a number here.
+        INFINITY is a number only where `infinite` is set.
         """
         if position >= len(self.words):
             if default is None:

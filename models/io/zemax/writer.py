@@ -25,7 +25,7 @@ from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
 from .apertures import aperture_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .reader import PUPIL_COMMENT
-from .shape_writer import shape_lines
+from .shapes import shape_lines
 from .text import number_text
 
 MM = 1e-3
@@ -36,10 +36,7 @@ CONSTANT_FORMULA = 1
 def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     """Return the text of a lens file, and that of the glass catalogue that it needs; empty where it needs none.
 
-    Raises
-    ------
-    PrescriptionError
-        If a part of the telescope has no counterpart in a Zemax file: the line names surface and part.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file.
     """
     t = telescope
     if t.surfaces[-1].interaction != Interaction.DETECTOR:

@@ -1,4 +1,4 @@
-"""Shapes of Zemax surfaces, in their own local frame (+z along the light) and in metres.
+"""Shapes of Zemax surfaces, read and written, in their own local frame (+z along the light) and in metres.
 
 The sag of each type, from the OpticStudio user guide ("Surface types"), with ``c`` CURV, ``k`` CONI, ``r^2 = x^2 +
 y^2``:
@@ -23,10 +23,13 @@ import math
 
 import numpy as np
 
+from ....core.errors import PrescriptionError
 from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
 from ...shapes.grid import GridSag
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
+from ...zernike_polynomials import annular_zernikes
 from .file import Block, Findings
+from .text import number_text
 
 TYPES = (
     *("STANDARD", "EVENASPH", "ODDASPHE", "BICONICX", "TOROIDAL"),
@@ -37,27 +40,7 @@ MOST_NODES = 4_000_000
 
 
 def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
-    """Return the shape of a surface.
-
-    Parameters
-    ----------
-    block : Block
-        Lines of the surface.
-    unit : float
-        Lens unit [m].
-    findings : Findings
-        Treatment of lines that are not understood.
-
-    Returns
-    -------
-    Shape
-        In metres, sag along the light as Zemax has it.
-
-    Raises
-    ------
-    PrescriptionError
-        If a line is malformed or, unless lenient, not understood.
-    """
+    """Return the shape of a surface [m], sag along the light as Zemax has it; `unit` is the lens unit [m]."""
     kind = block.text("TYPE").split()[0].upper() if block.text("TYPE") else "STANDARD"
     kind = "GRID_SAG" if kind == "GRIDSAG" else kind
     if kind not in TYPES:
@@ -66,14 +49,13 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
         kind = "STANDARD"
     curvature, conic = block.number("CURV", 0.0) / unit, block.number("CONI", 0.0)
     parameters = {i: v for i, v in block.table("PARM").items() if v != 0}
-    if kind == "STANDARD":
-        parts: list[Shape] = [_conic(curvature, conic)]
-    elif kind in ("EVENASPH", "SZERNSAG", "GRID_SAG"):
+    parts: list[Shape] = [_conic(curvature, conic)]
+    if kind in ("EVENASPH", "SZERNSAG", "GRID_SAG"):
         powers = [parameters.pop(i, 0.0) * unit ** (1 - 2 * i) for i in range(1, 9)]
         parts = _even_asphere(curvature, conic, powers)
     elif kind == "ODDASPHE":
         odd = tuple(_trimmed([parameters.pop(i, 0.0) * unit ** (1 - i) for i in range(1, 9)]))
-        parts = [OddAsphere(_radius(curvature), conic, odd) if odd else _conic(curvature, conic)]
+        parts = [OddAsphere(_radius(curvature), conic, odd)] if odd else parts
     elif kind == "BICONICX":
         radius_x = parameters.pop(1, math.inf) * unit
         parts = [Biconic(radius_x, _radius(curvature), parameters.pop(2, 0.0), conic)]
@@ -86,8 +68,6 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
     elif kind == "XASPHERE":
         radius, terms = _extra_data(block, unit)
         parts = _even_asphere(curvature, conic, [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)] or [0.0])
-    else:
-        parts = [_conic(curvature, conic)]
     for i, value in sorted(parameters.items()):
         findings.report(block.problem(f"PARM {i} {value:g}: not understood for TYPE {kind}"))
     if kind in ("SZERNSAG", "TOROIDAL", "XPOLYNOM"):
@@ -194,3 +174,111 @@ def _grid(block: Block, unit: float) -> GridSag:
     # The first node is at the smallest x and the largest y, and x runs first.
     x, y = (dx * (np.arange(nx) - (nx - 1) / 2), dy * (np.arange(ny) - (ny - 1) / 2))
     return GridSag(x, y, values.reshape(ny, nx)[::-1])
+
+
+def shape_lines(shape: Shape, unit: float) -> list[str]:
+    """Return the lines TYPE, CURV, CONI, PARM, XDAT, GDAT and GARR of a shape [m], sag along the light.
+
+    PrescriptionError if no type of surface has this shape.
+    """
+    parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
+    base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag | GridSag)), Plane())
+    rest = [p for p in parts if p is not base]
+    if isinstance(base, Biconic | Toroid | OddAsphere):
+        if rest:
+            raise PrescriptionError(f"sum with {type(base).__name__}: no type of Zemax surface has this shape")
+        return _special_lines(base, unit)
+    if not isinstance(base, Plane | Sphere | Conic | EvenAsphere):
+        raise PrescriptionError(f"shape {type(base).__name__}: no type of Zemax surface has this shape")
+    square, rest = _square_term(rest)
+    if len(rest) > 1:
+        raise PrescriptionError("sum of several shapes: no type of Zemax surface has this shape")
+    head = [f"CURV {number_text(base.curvature * unit)}", f"CONI {number_text(base.conic)}"]
+    powers = [square, *base.coefficients]
+    if len(powers) > 8:
+        raise PrescriptionError(f"{len(base.coefficients)} coefficients: a Zemax surface has 7 from r^4 to r^16")
+    parameters = [f"PARM {i} {number_text(a * unit ** (2 * i - 1))}" for i, a in enumerate(powers, start=1)]
+    curved = any(powers)
+    if not rest:
+        return ["TYPE EVENASPH", *head, *parameters] if curved else ["TYPE STANDARD", *head]
+    part = rest[0]
+    if isinstance(part, ZernikeSag):
+        return ["TYPE SZERNSAG", *head, *parameters, *_zernike_lines(part, unit)]
+    if isinstance(part, GridSag):
+        return ["TYPE GRID_SAG", *head, *parameters, *_grid_lines(part, unit)]
+    if isinstance(part, XYPolynomial) and not curved:
+        return ["TYPE XPOLYNOM", *head, *_polynomial_lines(part, unit)]
+    raise PrescriptionError(f"asphere with {type(part).__name__}: no type of Zemax surface has this shape")
+
+
+def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[str]:
+    def reach(radius: float) -> float:
+        return radius / unit if np.isfinite(radius) else 0.0
+
+    if isinstance(shape, OddAsphere):
+        if len(shape.coefficients) > 8:
+            raise PrescriptionError(f"{len(shape.coefficients)} coefficients: a Zemax surface has 8 from r^1 to r^8")
+        head = ["TYPE ODDASPHE", f"CURV {number_text(unit / shape.radius)}", f"CONI {number_text(shape.conic)}"]
+        terms = enumerate(shape.coefficients, start=1)
+        return [*head, *(f"PARM {i} {number_text(a * unit ** (i - 1))}" for i, a in terms)]
+    kind = "BICONICX" if isinstance(shape, Biconic) else "TOROIDAL"
+    lines = [f"TYPE {kind}", f"CURV {number_text(unit / shape.radius_y)}", f"CONI {number_text(shape.conic_y)}"]
+    lines.append(f"PARM 1 {number_text(reach(shape.radius_x))}")
+    return [*lines, f"PARM 2 {number_text(shape.conic_x)}"] if isinstance(shape, Biconic) else lines
+
+
+def _square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
+    """Return the coefficient of r^2 that a part of its own has, and the other parts."""
+    for part in parts:
+        terms = {(i, j): a for i, j, a in part.terms} if isinstance(part, XYPolynomial) else {}
+        if set(terms) == {(2, 0), (0, 2)} and terms[2, 0] == terms[0, 2]:
+            return terms[2, 0], [p for p in parts if p is not part]
+    return 0.0, parts
+
+
+def _extra(count: int, radius: float, terms: list[float], unit: float) -> list[str]:
+    data = [float(count), radius / unit, *(a / unit for a in terms)]
+    return [f"XDAT {i} {number_text(v)} 0 0 1 0 0" for i, v in enumerate(data, start=1)]
+
+
+def _zernike_lines(part: ZernikeSag, unit: float) -> list[str]:
+    terms = list(part.coefficients)
+    if part.inner_radius:
+        # Annular polynomials are sums of those of the full disc up to the same degree: three points for each unknown,
+        # on rings that tell the degrees apart, make the solution exact but for rounding.
+        size = _complete(len(terms))
+        r, theta = np.meshgrid(np.sqrt(np.linspace(0.0, 1.0, 41)), np.linspace(0, 2 * np.pi, 83, endpoint=False))
+        x, y = (r * np.cos(theta)).ravel(), (r * np.sin(theta)).ravel()
+        ratio = part.inner_radius / part.outer_radius
+        annular = annular_zernikes(len(terms), x, y, ratio)
+        disc = annular_zernikes(size, x, y)
+        terms = np.linalg.lstsq(disc.T, np.array(terms) @ annular, rcond=None)[0].tolist()
+    return _extra(len(terms), part.outer_radius, terms, unit)
+
+
+def _complete(count: int) -> int:
+    """Return the number of terms up to the end of the radial degree that a number of terms reaches."""
+    n = 0
+    while (n + 1) * (n + 2) // 2 < count:
+        n += 1
+    return (n + 1) * (n + 2) // 2
+
+
+def _polynomial_lines(part: XYPolynomial, unit: float) -> list[str]:
+    found = {(i, j): a for i, j, a in part.terms}
+    if (0, 0) in found:
+        raise PrescriptionError("polynomial of x and y with a constant term: a Zemax surface has none")
+    degree = max(i + j for i, j in found)
+    powers = polynomial_powers((degree + 1) * (degree + 2) // 2 - 1)
+    # Lengths in units of the lens unit: the normalisation radius is one of these.
+    return _extra(len(powers), unit, [found.get(p, 0.0) * unit ** sum(p) for p in powers], unit)
+
+
+def _grid_lines(part: GridSag, unit: float) -> list[str]:
+    for axis in (part.x, part.y):
+        if abs(axis[0] + axis[-1]) > 1e-9 * abs(axis[-1] - axis[0]):
+            raise PrescriptionError("grid that is not centred on the vertex: expected one that is")
+    dx, dy = part.step
+    lines = [f"GDAT {len(part.x)} {len(part.y)} {number_text(dx / unit)} {number_text(dy / unit)}"]
+    values = part.values[::-1].ravel() / unit
+    return lines + [f"GARR {i} {number_text(v)} 0 0 0 0" for i, v in enumerate(values, start=1)]
