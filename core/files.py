@@ -35,6 +35,16 @@ def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError
         raise error(f"cannot write {path}: {problem.strerror or problem}") from None
 
 
+def read_bytes(path: Path, error: type[PachonError]) -> bytes:
+    """Return the content of a file, or raise `error` where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise error("no such file", file=path) from None
+    except OSError as problem:
+        raise error(f"cannot be read ({problem.strerror})", file=path) from None
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder, and those it lies in, where they are not there yet."""
     try:

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from .errors import PachonError, PrescriptionError
+from .files import read_bytes
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -40,15 +41,9 @@ def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> di
     Raises `error` if the file cannot be read, is not YAML, or is not a mapping.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise error("no such file", file=path) from None
+        content = yaml.load(read_bytes(path, error).decode(), Loader=_StrictLoader)
     except UnicodeDecodeError:
         raise error("not a UTF-8 text file", file=path) from None
-    except OSError as problem:
-        raise error(f"cannot be read ({problem.strerror})", file=path) from None
-    try:
-        content = yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as problem:
         mark = problem.problem_mark or problem.context_mark
         place = f"line {mark.line + 1}" if mark else None

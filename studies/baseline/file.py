@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ...core.errors import ConfigError
-from ...core.files import write_bytes
+from ...core.files import read_bytes, write_bytes
 from ...core.schema import Positive, Real, Section, validated
 from ..metrics.scene import Plan
 
@@ -52,11 +52,7 @@ class Baseline(Section):
 def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     """Read a baseline; ConfigError if it is no JSON, no baseline or of another version of the format."""
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_mapping)
-    except FileNotFoundError:
-        raise ConfigError("no such file", file=path) from None
-    except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror})", file=path) from None
+        content = json.loads(read_bytes(Path(path), ConfigError).decode(), object_pairs_hook=_mapping)
     except json.JSONDecodeError as error:
         raise ConfigError(f"no JSON (line {error.lineno}, column {error.colno}: {error.msg})", file=path) from None
     except (ValueError, RecursionError) as error:
@@ -65,10 +61,9 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise ConfigError(f"format = {found!r}: expected {FORMAT!r}, as pachon baseline save writes it", file=path)
     if content.get("version") != VERSION:
-        raise ConfigError(
-            f"{path}: version = {content.get('version')!r}: expected {VERSION}; "
-            f"the file was written by pachon {content.get('pachon')}"
-        )
+        found, writer = content.get("version"), content.get("pachon")
+        problem = f"version = {found!r}: expected {VERSION}; the file was written by pachon {writer}"
+        raise ConfigError(problem, file=path, key="version")
     baseline = validated(Baseline, content, str(path))
     for name, figure in baseline.figures.items():
         if figure.reason not in baseline.reasons:

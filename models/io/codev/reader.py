@@ -77,24 +77,20 @@ class _Translation:
                 self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
                 self.values.append({})
                 current = len(self.surfaces) - 1
-                self._start(self._placed(command, current))
+                self._start(replace(command, place=f"surface {current}"))
             elif self.surfaces:
                 chosen = current
                 if command.words and re.fullmatch(r"[Ss](\d+|[OoIi])", command.words[0]):
                     chosen = self._number(command)
                     command = replace(command, words=command.words[1:])
-                self._surface(self._placed(command, chosen), chosen)
+                self._surface(replace(command, place=f"surface {chosen}"), chosen)
             else:
                 self._system(command)
         if len(self.surfaces) < 3:
             raise self.header.problem(f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
-        count = len(self.waves)
-        line = Record(str(self.path), 1, "", "FTYP", (repr(self.field_type), "0", "0", str(count)), "")
-        self.header.lines.append(line)
+        words = (repr(self.field_type), "0", "0", str(len(self.waves)))
+        self.header.lines.append(Record(str(self.path), 1, "", "FTYP", words, ""))
         return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)))
-
-    def _placed(self, command: Record, number: int) -> Record:
-        return replace(command, place=f"surface {number}")
 
     def _number(self, command: Record) -> int:
         word = command.words[0][1:].upper()
@@ -117,7 +113,7 @@ class _Translation:
             if unit not in UNITS:
                 raise command.error(f"one of {', '.join(UNITS)}")
             self.header.lines.append(replace(command, keyword="UNIT", words=(UNITS[unit],), text=UNITS[unit]))
-        elif key == "TITLE" or key == "TIT":
+        elif key in ("TITLE", "TIT"):
             self.header.lines.append(replace(command, keyword="NAME", text=command.text.strip("'\" ")))
         elif key in APERTURES:
             add(APERTURES[key], command.number(0))
@@ -190,11 +186,7 @@ class _Translation:
             # The thickness of the image is a defocus: it counts from where the surface before it leads.
             thickness += carried if number == len(self.surfaces) - 2 else 0.0
             kind = "EVENASPH" if any(values.get(p) for p in POWERS) else "STANDARD"
-            lines: list[tuple[Any, ...]] = [
-                ("TYPE", kind),
-                ("CURV", values.get("CURV", 0.0)),
-                ("CONI", values.get("K", 0.0)),
-            ]
+            lines: list[tuple[Any, ...]] = [("TYPE", kind), ("CURV", values["CURV"]), ("CONI", values.get("K", 0.0))]
             lines += [("PARM", i, values.get(p, 0.0)) for i, p in enumerate(POWERS, start=2) if values.get(p)]
             if "REX" in values or "REY" in values:
                 lines.append(("SQAP", values.get("REX", 0.0), values.get("REY", 0.0)))
@@ -223,11 +215,8 @@ class _Translation:
         return blocks
 
     def _break(self, number: int, parameters: Iterable[float], thickness: float) -> Block:
-        lines: list[tuple[Any, ...]] = [
-            ("TYPE", "COORDBRK"),
-            ("DISZ", thickness),
-            *(("PARM", i, v) for i, v in enumerate(parameters, start=1)),
-        ]
+        lines: list[tuple[Any, ...]] = [("TYPE", "COORDBRK"), ("DISZ", thickness)]
+        lines += [("PARM", i, v) for i, v in enumerate(parameters, start=1)]
         return Block(str(self.path), f"surface {number}", [self._record(number, *line) for line in lines])
 
     def _record(self, number: int, keyword: str, *values: object) -> Record:

@@ -25,29 +25,26 @@ def read_aperture(block: Block, unit: float, findings: Findings) -> Aperture | N
         if line is None:
             continue
         first, second = line.number(0, 0.0), line.number(1, 0.0)
-        if keyword == "FLAP" and block.number("DIAM", 0.0, 1) != 1:
+        if (keyword == "FLAP" and block.number("DIAM", 0.0, 1) != 1) or (keyword == "OBSC" and second == 0):
             continue
+        region: Aperture
         if keyword == "SPID":
             if not (first > 0 and 0 < second <= 1000 and second == int(second)):
                 raise line.error("a width and a number of arms")
-            turns = [2 * math.pi * arm / int(second) for arm in range(int(second))]
-            found.append(Complement(Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))))
+            turns = (2 * math.pi * arm / int(second) for arm in range(int(second)))
+            region = Union(tuple(Vane(first * unit, x, y, turn) for turn in turns))
         elif keyword in ("SQAP", "SQOB"):
             if not (first > 0 and second > 0):
                 raise line.error("two positive half widths")
-            rectangle = Rectangle(2 * first * unit, 2 * second * unit, x, y)
-            found.append(rectangle if keyword == "SQAP" else Complement(rectangle))
-        elif keyword == "OBSC" and second == 0:
-            continue
+            region = Rectangle(2 * first * unit, 2 * second * unit, x, y)
         elif not 0 <= first < second:
             raise line.error("a smallest and a largest radius")
         else:
-            ring = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
-            found.append(Complement(ring) if keyword == "OBSC" else ring)
+            region = Annulus(first * unit, second * unit, x, y) if first else Circle(second * unit, x, y)
+        found.append(Complement(region) if keyword in ("OBSC", "SQOB", "SPID") else region)
     for keyword in ("ELAP", "ELOB", "UDAD", "USAP", "USOB", "UDAP"):
-        for line in block.all(keyword):
+        for line in block.all(keyword)[:1]:
             findings.report(line.problem(f"{line.shown}: elliptical and user-defined apertures are not read"))
-            break
     if len(found) > 1:
         raise block.lines[0].error("one aperture in this surface")
     return found[0] if found else None

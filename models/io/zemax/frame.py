@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union, Vane
+from ...aperture import Aperture, Complement, Intersection, Polygon, Rectangle, Union, Vane
 from ...shapes.freeform import Biconic, OddAsphere, Toroid, XYPolynomial, ZernikeSag
 from ...shapes.grid import GridSag
 from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
@@ -63,16 +63,12 @@ def _parity(j: int) -> int:
 
 def rotated_aperture(aperture: Aperture) -> Aperture:
     """Return the clear region in the rotated axes: x changes sign."""
-    if isinstance(aperture, Circle | Annulus):
-        return replace(aperture, x=0.0 - aperture.x)
-    if isinstance(aperture, Rectangle):
-        return replace(aperture, x=0.0 - aperture.x, angle=0.0 - aperture.angle)
-    if isinstance(aperture, Vane):
-        return replace(aperture, x=0.0 - aperture.x, angle=math.pi - aperture.angle)
     if isinstance(aperture, Polygon):
         return Polygon(tuple((0.0 - x, y) for x, y in aperture.corners))
     if isinstance(aperture, Complement):
         return Complement(rotated_aperture(aperture.part))
     if isinstance(aperture, Union | Intersection):
         return type(aperture)(tuple(rotated_aperture(part) for part in aperture.parts))
-    raise PrescriptionError(f"aperture {type(aperture).__name__}: expected one that a Zemax file can hold")
+    if isinstance(aperture, Rectangle | Vane):
+        aperture = replace(aperture, angle=(math.pi if isinstance(aperture, Vane) else 0.0) - aperture.angle)
+    return replace(aperture, x=0.0 - aperture.x)

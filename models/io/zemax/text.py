@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ....core.errors import PrescriptionError
+from ....core.files import read_bytes
+from ....core.yaml_reader import cut_short
 
 
 def read_text(path: Path) -> str:
     """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or ISO 8859-1."""
-    try:
-        raw = path.read_bytes()
-    except FileNotFoundError:
-        raise PrescriptionError("no such file", file=path) from None
-    except OSError as error:
-        raise PrescriptionError(f"cannot be read ({error.strerror})", file=path) from None
+    raw = read_bytes(path, PrescriptionError)
     wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = raw.decode("utf-16" if wide else "utf-8-sig")
@@ -61,8 +58,7 @@ class Record:
     @property
     def shown(self) -> str:
         """Keyword and words, cut short."""
-        text = " ".join((self.keyword, *self.words))
-        return text if len(text) <= 60 else text[:57] + "..."
+        return cut_short(" ".join((self.keyword, *self.words)))
 
     def number(self, position: int, default: float | None = None, *, infinite: bool = False) -> float:
         """Return a word as a number, or a default where there are fewer words; without a default that is an error.
