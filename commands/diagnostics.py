@@ -34,7 +34,7 @@ def diagnose_command(
     - `pachon diagnose pachon_run --out residuals`
     - `pachon diagnose pachon_run --json`: all metrics on standard output
     """
-    from ..pipeline.measure.diagnostics import diagnose
+    from ..pipeline.report.diagnostics import diagnose
     from ..pipeline.report.tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
 
     result = diagnose(folder, out, strict=strict)

@@ -1,4 +1,4 @@
-"""Angles in radians, and conversion of numbers or astropy quantities to SI."""
+"""Angles in radians, and conversion of numbers or astropy quantities to arrays in SI."""
 
 from __future__ import annotations
 
@@ -22,15 +22,37 @@ def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
             raise DomainError(f"{name} = {value}: expected a unit that converts to {unit}") from error
     elif isinstance(value, (tuple, list)) and any(isinstance(v, u.Quantity) for v in value):
         return np.stack([_si(v, unit, name) for v in value])
+    return real_array(value, f"{name} = {value!r}: expected a number in {unit} or a quantity")
+
+
+def real_array(values: Any, expectation: str) -> np.ndarray:
+    """Return real numbers as a float64 array; DomainError with the expectation where they are none."""
     try:
-        return np.asarray(value, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise DomainError(f"{name} = {value!r}: expected a number in {unit} or a quantity") from error
+        raise DomainError(expectation) from error
+
+
+def require_positive(value: Any, name: str, unit: str = "") -> float:
+    """Return a finite, positive float, or raise :class:`DomainError` naming the argument."""
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not (np.isfinite(number) and number > 0.0):
+        raise DomainError(f"{name} = {value!r}: expected a positive, finite number{' of ' + unit if unit else ''}")
+    return number
 
 
 def radians(value: Any, name: str) -> np.ndarray:
     """Return an angle in radians as a float64 array; plain numbers are radians already."""
     return _si(value, u.rad, name)
+
+
+def positive_angle(value: Any, name: str) -> float:
+    """Return a finite, positive angle in radians; plain numbers are radians already."""
+    return require_positive(radians(value, name), name, "radians")
 
 
 def metres(value: Any, name: str) -> np.ndarray:

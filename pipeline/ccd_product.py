@@ -53,37 +53,19 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
 
 @dataclass(frozen=True)
 class Stars:
-    """Positions and shapes, one array element a star.
+    """Positions and shapes, one array element a star."""
 
-    Attributes
-    ----------
-    x, y : ndarray
-        Detector position [m].
-    field_x, field_y : ndarray
-        Field angle [rad].
-    e1, e2 : ndarray
-        Measured ellipticity, NaN where flagged.
-    size : ndarray
-        Weighted rms size [rad].
-    flags : ndarray of int
-        Flags of the shape measurement.
-    model_e1, model_e2 : ndarray
-        Ellipticity of the model at the position of the star.
-    model_size : ndarray
-        Weighted rms size of the model there [rad].
-    """
-
-    x: np.ndarray
+    x: np.ndarray  #: detector position [m]
     y: np.ndarray
-    field_x: np.ndarray
+    field_x: np.ndarray  #: field angle [rad]
     field_y: np.ndarray
-    e1: np.ndarray
+    e1: np.ndarray  #: measured ellipticity, NaN where flagged
     e2: np.ndarray
-    size: np.ndarray
-    flags: np.ndarray
-    model_e1: np.ndarray
+    size: np.ndarray  #: weighted rms size [rad]
+    flags: np.ndarray  #: :class:`~.ShapeFlag` bits, int
+    model_e1: np.ndarray  #: ellipticity of the model at the position of the star
     model_e2: np.ndarray
-    model_size: np.ndarray
+    model_size: np.ndarray  #: weighted rms size of the model there [rad]
 
     @property
     def residual_e1(self) -> np.ndarray:
@@ -101,102 +83,52 @@ class Stars:
 
 @dataclass(frozen=True)
 class HoldoutStars(Stars):
-    """Noise-free PSFs at positions without an observed star.
+    """Noise-free PSFs at positions without an observed star."""
 
-    Attributes
-    ----------
-    fwhm : ndarray
-        Full width at half maximum of the PSF, pixel included [rad].
-    """
-
-    fwhm: np.ndarray
+    fwhm: np.ndarray  #: full width at half maximum of the PSF, pixel included [rad]
 
 
 @dataclass(frozen=True)
 class ObservedStars(Stars):
-    """Observed stars.
+    """Observed stars."""
 
-    Attributes
-    ----------
-    magnitude : ndarray
-        AB magnitude.
-    electrons : ndarray
-        Electrons in the exposure.
-    snr : ndarray
-        Signal to noise of PSF photometry.
-    used : ndarray of bool
-        Whether the model was fitted to the star.
-    defects : ndarray of int
-        :class:`~.StarFlag` bits that were found: such a star has no ellipticity here. 0
-        where none was looked for.
-    leave_one_out_e1, leave_one_out_e2 : ndarray
-        Ellipticity of the model at the star with the star left out of the fit; NaN where it was not used.
-    """
-
-    magnitude: np.ndarray
-    electrons: np.ndarray
-    snr: np.ndarray
-    used: np.ndarray
+    magnitude: np.ndarray  #: AB
+    electrons: np.ndarray  #: in the exposure
+    snr: np.ndarray  #: signal to noise of PSF photometry
+    used: np.ndarray  #: bool: whether the model was fitted to the star
+    #: :class:`~.StarFlag` bits of detected defects, such a star has no ellipticity; 0 without a search.
     defects: np.ndarray
-    leave_one_out_e1: np.ndarray
+    leave_one_out_e1: np.ndarray  #: of the model fitted without the star, at the star; NaN where it was not used
     leave_one_out_e2: np.ndarray
 
 
 @dataclass(frozen=True)
 class CcdProduct:
-    """Stars, stamps and PSF models of one CCD.
-
-    Attributes
-    ----------
-    name : str
-        Name of the CCD.
-    center : tuple of float
-        Centre on the detector [m].
-    pixel_scale : float
-        Angle of a stamp's pixel [rad].
-    noise : tuple of float
-        Sky [electrons/pixel] and rms noise without light [electrons/pixel].
-    holdout : HoldoutStars
-        Noise-free PSFs at positions without an observed star.
-    observed : ObservedStars
-        Observed stars.
-    holdout_images, observed_images : ndarray of float32, shape [n, ny, nx]
-        Centred stamps of unit sum; NaN where a star could not be centred.
-    model, noise_free_model : PsfModel
-        Mean, components and polynomials fitted to the observed stars, and to the noise-free PSFs.
-    """
+    """Stars, stamps and PSF models of one CCD."""
 
     name: str
-    center: tuple[float, float]
-    pixel_scale: float
-    noise: tuple[float, float]
+    center: tuple[float, float]  #: on the detector [m]
+    pixel_scale: float  #: angle of a stamp's pixel [rad]
+    noise: tuple[float, float]  #: sky and rms noise without light [electrons/pixel]
     holdout: HoldoutStars
     observed: ObservedStars
-    holdout_images: np.ndarray
-    observed_images: np.ndarray
-    model: PsfModel
-    noise_free_model: PsfModel
+    holdout_images: np.ndarray  #: float32 [n, ny, nx], centred, unit sum; empty if not read
+    observed_images: np.ndarray  #: likewise; NaN where a star could not be centred
+    model: PsfModel  #: fitted to the observed stars
+    noise_free_model: PsfModel  #: fitted to the noise-free PSFs
 
     def stars(self, kind: str) -> HoldoutStars | ObservedStars:
-        """Return the places that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""
+        """Return the stars that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""
         if kind not in KINDS:
             raise unknown_name("kind", kind, KINDS)
         return self.holdout if kind in ("truth", "away") else self.observed
 
     def ellipticity(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the components e1, e2 of one kind of ellipticity, at the places of :meth:`stars`.
+        """Return e1 and e2 of one kind, at the positions of :meth:`stars`.
 
-        Parameters
-        ----------
-        kind : str
-            Of the noise-free PSFs (``truth``) and of the stars (``observed``); observed - model at the stars
-            (``residual``) and with the model fitted without the star (``left_out``); truth - model where no star is
-            (``away``).
-
-        Raises
-        ------
-        UnknownNameError
-            If there is no such kind.
+        Kinds: of the noise-free PSFs (``truth``) and of the stars (``observed``); observed - model at the stars
+        (``residual``) and with the model fitted without the star (``left_out``); truth - model at holdout positions
+        (``away``). Another one raises UnknownNameError.
         """
         stars = self.stars(kind)
         if kind in ("truth", "observed"):
@@ -215,24 +147,7 @@ def product_path(folder: Path, ccd: str) -> Path:
 
 
 def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[tuple[str, Any, str]]) -> None:
-    """Write the product of one CCD.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the run.
-    product : CcdProduct
-        Product of the CCD.
-    stamp : Stamp
-        Origin of the product.
-    cards : list of (keyword, value, comment)
-        Cards of the run: telescope, band, exposure.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be written.
-    """
+    """Write the product of one CCD; `cards` (keyword, value, comment) describe the run: telescope, band, exposure."""
     header = [
         ("CCD", product.name, "name of the CCD"),
         ("XCENTER", product.center[0] * 1e3, "[mm] centre of the CCD"),
@@ -254,21 +169,9 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
 
 
 def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool = True) -> CcdProduct:
-    """Read the product of one CCD.
+    """Read the product of one CCD; without `holdout_images`, its largest part, these are empty.
 
-    Parameters
-    ----------
-    path : Path
-        File to read.
-    stamp : Stamp, optional
-        Expected stamp.
-    holdout_images : bool
-        Whether to read the stamps of the noise-free PSFs, by far the largest part of the file.
-
-    Raises
-    ------
-    ProductError
-        If the file is missing or damaged, or has another stamp.
+    A missing or damaged file, or one with another stamp than the one given, raises ProductError.
     """
     hdus = read_fits(path)
     header = hdus[0].header

@@ -186,21 +186,27 @@ class Configuration(Section):
 
 
 def configuration_of(content: dict[str, Any], source: str) -> Configuration:
-    """Return the configuration that plain mappings describe; `source` names them in the line of a ConfigError."""
+    """Return the configuration of plain mappings; ConfigError names `source`, the key and the allowed values."""
     if isinstance(content.get("ccds"), str):
         content = {**content, "ccds": [content["ccds"]]}
     return validated(Configuration, content, source)
 
 
 def load_configuration(path: Path) -> Configuration:
-    """Read a configuration file; what it leaves out is left open, for :func:`~pachon.pipeline.defaults.resolve`."""
+    """Read a configuration file; values that it leaves out stay open.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
+    """
     return configuration_of(read_mapping(path, ConfigError), str(path))
 
 
 def with_options(config: Configuration, **options: Any) -> Configuration:
     """Return the configuration with command line options in place of its values; None leaves a value as it is.
 
-    Options are values by dotted key, with two underscores for each dot: ``stars__truth=50``.
+    Options are named by dotted key, dots written as two underscores: ``stars__truth=50``.
     """
     given = {dotted: value for dotted, value in options.items() if value is not None}
     if not given:
@@ -231,17 +237,13 @@ def digest(content: Any) -> str:
 def to_yaml(config: Configuration, heading: Sequence[str] = ()) -> str:
     """Return the configuration as a YAML file with a comment to each key."""
     lines = [f"# {line}" for line in heading]
-    sections = {name: field for name, field in type(config).model_fields.items() if _is_section(config, name)}
+    sections = [name for name in type(config).model_fields if isinstance(getattr(config, name), Section)]
     lines += _yaml_lines(config, [n for n in type(config).model_fields if n not in sections], "")
     for name in sections:
         section = getattr(config, name)
         lines += ["", f"# {(type(section).__doc__ or '').strip()}", f"{name}:"]
         lines += _yaml_lines(section, list(type(section).model_fields), "  ")
     return "\n".join(lines) + "\n"
-
-
-def _is_section(config: Configuration, name: str) -> bool:
-    return isinstance(getattr(config, name), Section)
 
 
 def _yaml_lines(section: Section, names: list[str], indent: str) -> list[str]:

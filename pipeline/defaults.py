@@ -38,40 +38,19 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class ResolvedConfiguration:
-    """Configuration without open values, and the models that it names.
+    """Configuration without open values, and the models that it names."""
 
-    Attributes
-    ----------
-    config : Configuration
-        Every default filled in, paths absolute.
-    telescope : Telescope
-        Telescope, changes applied.
-    camera : Camera
-        Camera of the telescope.
-    site : Site
-        Site of the atmosphere.
-    """
-
-    config: Configuration
-    telescope: Telescope
+    config: Configuration  #: every default filled in, paths absolute
+    telescope: Telescope  #: changes applied
     camera: Camera
-    site: Site
+    site: Site  #: of the atmosphere
 
 
 def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfiguration:
-    """Fill in every default, and check values that depend on each other.
+    """Fill in every default, and check values that depend on each other; a resolved configuration stays as it is.
 
-    Parameters
-    ----------
-    config : Configuration
-        Configuration of a file or a command line; a resolved one stays as it is.
-    folder : Path, optional
-        Folder that relative paths in the configuration start from; the current one by default.
-
-    Raises
-    ------
-    ConfigError, UnknownNameError, PrescriptionError, DomainError
-        If a name does not exist, or values do not fit together.
+    Relative paths start from `folder`, by default the current one. A name that does not exist, or values that do not
+    fit together, raise ConfigError, UnknownNameError, PrescriptionError or DomainError.
     """
     name, band = config.telescope, config.band
     if name is None:
@@ -131,12 +110,7 @@ def noise_free_components(config: Configuration) -> int:
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     """Return the names of CCDs in the order of the camera, each once; rafts and ``all`` stand for all of theirs.
 
-    Raises
-    ------
-    UnknownNameError
-        If there is no such CCD or raft; the nearest names are offered.
-    ConfigError
-        If none is given.
+    An unknown name raises UnknownNameError, none at all ConfigError.
     """
     indices: set[int] = set()
     for name in names:

@@ -13,7 +13,7 @@ from .experiment import Experiment
 # 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the
 # report, when the screens are gone.
 _BASE, _REPORT = 400_000_000, 600_000_000
-# What a thread of the wave engine holds: fields, intensities and spectra of a star at five wavelengths.
+# Memory of a thread of the wave engine: fields, intensities and spectra of a star at five wavelengths.
 _WAVE_THREAD = 150_000_000
 # Copies of the stamps of a CCD's stars that are held at once, in bytes a pixel.
 _STAMP_BYTES = 48
@@ -25,15 +25,7 @@ def screen_bytes(experiment: Experiment) -> int:
 
 
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
-    """Return an estimate of the peak memory of a run [bytes].
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment of the run.
-    threads : int, optional
-        Number of threads; all processors by default.
-    """
+    """Return an estimate of the peak memory of a run [bytes]."""
     config = experiment.config
     stars = config.stars.truth + config.stars.observed
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
@@ -42,13 +34,7 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
 
 
 def check_memory(experiment: Experiment, threads: int | None = None) -> None:
-    """Raise an error if a run needs more memory than is available.
-
-    Raises
-    ------
-    ConfigError
-        With the key that takes most of it, the memory needed and the memory free.
-    """
+    """Raise ConfigError, with the key that takes most of it, if a run needs more memory than is available."""
     free, needed = available_bytes(), needed_bytes(experiment, threads)
     if free is None or needed <= free:
         return

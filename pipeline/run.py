@@ -72,7 +72,7 @@ def run(
     """Simulate the CCDs of a configuration, model their PSFs and write the report.
 
     Every product but ``timings.json`` has the same bytes whenever, wherever on one machine, and with however many
-    threads the configuration is run; those of a CCD do not depend on which others are asked for.
+    threads the configuration is run; those of a CCD do not depend on the other CCDs of the run.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def run(
         # Plots and metrics need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
         correlated = correlations(products)
-        summary = {**_origin(experiment), **run_metrics(products, correlated), "not_modelled": failed}
+        origin = {**stamp.meta(), "configuration": experiment.config.as_dict()}
+        summary = {**origin, **run_metrics(products, correlated), "not_modelled": failed}
         write_json(folder / SUMMARY_NAME, summary)
     with reporter.stage("focal plane"):
         _write_focal_plane(experiment, folder)
@@ -151,17 +152,6 @@ def _write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> N
         ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
     ]
     write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), cards)
-
-
-def _origin(experiment: Experiment) -> dict[str, Any]:
-    """Return version, hash, seed and configuration for the summary."""
-    stamp = stamp_of(experiment)
-    return {
-        "pachon": stamp.version,
-        "config_hash": stamp.config_hash,
-        "seed": stamp.seed,
-        "configuration": experiment.config.as_dict(),
-    }
 
 
 def _write_focal_plane(experiment: Experiment, folder: Path) -> None:

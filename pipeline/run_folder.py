@@ -18,21 +18,8 @@ CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     """Make the folder of a run or check that its content is of the same configuration, and write config.yaml.
 
-    A run may be resumed with more CCDs than before, since no CCD depends on the others.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the run.
-    experiment : Experiment
-        Experiment of the run.
-    resume : bool
-        Whether finished CCDs are to be kept.
-
-    Raises
-    ------
-    ProductError
-        If the folder holds another configuration's run, or cannot be made or written.
+    A run may be resumed with more CCDs than before, since no CCD depends on the others. A folder with another
+    configuration's run, or one that cannot be made or written, raises ProductError.
     """
     path = folder / CONFIG_NAME
     try:
@@ -79,8 +66,6 @@ def finished_ccds(folder: Path, experiment: Experiment) -> tuple[str, ...]:
 
 
 def _is_whole(path: Path, stamp: Stamp) -> bool:
-    if not path.exists():
-        return False
     try:
         read_product(path, stamp)
     except ProductError:

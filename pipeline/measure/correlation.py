@@ -9,7 +9,7 @@ import numpy as np
 import treecorr
 
 from ...core.errors import DomainError
-from ...core.units import ARCMIN, radians
+from ...core.units import ARCMIN, radians, real_array
 
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
@@ -165,13 +165,11 @@ def shear_correlation(
         If shapes differ, separations are not positive and rising, fewer than two stars are usable, or these are all of
         one patch.
     """
-    columns = [np.asarray(radians(v, n), dtype=np.float64) for v, n in ((x, "x"), (y, "y"))]
+    columns = [radians(v, n) for v, n in ((x, "x"), (y, "y"))]
     if other is not None and len(other) != 2:
         raise DomainError(f"other: {len(other)} arrays given, expected two")
-    try:
-        columns += [np.asarray(v, dtype=np.float64) for v in (e1, e2, *(() if other is None else other))]
-    except (TypeError, ValueError) as error:
-        raise DomainError("e1, e2: expected arrays of real numbers") from error
+    ellipticities = (e1, e2, *(() if other is None else other))
+    columns += [real_array(v, "e1, e2: expected arrays of real numbers") for v in ellipticities]
     if columns[0].ndim != 1 or any(c.shape != columns[0].shape for c in columns):
         raise DomainError(f"x, y, e1, e2 have shapes {[c.shape for c in columns]}: expected [n] four times")
     labels = None if patch is None else np.asarray(patch)
@@ -223,18 +221,7 @@ def shear_correlation(
 
 
 def jackknife_error(left: np.ndarray) -> np.ndarray:
-    """Return standard errors from leave-one-out values.
-
-    Parameters
-    ----------
-    left : array, shape [n_patches, ...]
-        Values without each patch.
-
-    Returns
-    -------
-    array
-        The first axis is gone; NaN where one of the values is.
-    """
+    """Return standard errors from values without each patch, [n_patches, ...]; NaN where one of the values is."""
     scatter = ((left - left.mean(axis=0)) ** 2).sum(axis=0)
     return np.asarray(np.sqrt((1.0 - 1.0 / len(left)) * scatter))
 
@@ -242,10 +229,8 @@ def jackknife_error(left: np.ndarray) -> np.ndarray:
 def _without_each(pairs: treecorr.GGCorrelation, n_patches: int) -> tuple[np.ndarray, np.ndarray]:
     """Return xi+ and xi- without each patch in turn, [2, n_patches, n_bins], and the pairs [n_patches, n_bins] left.
 
-    NaN where no pair is left.
-
-    TreeCorr adds up the pairs of patches anew without each of the patches, which takes a time that goes as the third
-    power of their number, 20 s for 189; here what each of them takes part in is subtracted from the sum of all.
+    NaN where no pair is left. TreeCorr adds up the pairs of patches anew without each of them, which takes the third
+    power of their number, 20 s for 189; here the pairs of each patch are subtracted from the sum of all.
     """
     sums = np.zeros((1 + n_patches, 4, len(pairs.npairs)))
     for (i, j), part in pairs.results.items():

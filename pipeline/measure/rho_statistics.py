@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.units import real_array
 from .correlation import Correlation, shear_correlation
 
 
@@ -77,10 +78,9 @@ def rho_statistics(
     e1, e2 : array
         Ellipticity (a - b)/(a + b) of the stars, or of the truth.
     size : array
-        Their size (Q11 Q22 - Q12^2)^(1/4), as :class:`~.Shapes` has it, in any unit: turned into
-        T by :func:`trace_of_moments`.
+        Their size (Q11 Q22 - Q12^2)^(1/4), as of :class:`~.Shapes`, in any unit.
     model_e1, model_e2, model_size : array
-        The same of the model at these places. A star with NaN in any column is left out of all five.
+        The same of the model at these positions. A star with NaN in any column is left out of all five.
     min_sep, max_sep : float or Quantity
         Separations at which the first bin begins and the last one ends [rad].
     n_bins : int
@@ -95,10 +95,8 @@ def rho_statistics(
         :func:`~pachon.pipeline.measure.correlation.shear_correlation` raises it for.
     """
     names = ("e1", "e2", "size", "model_e1", "model_e2", "model_size")
-    try:
-        columns = [np.asarray(v, dtype=np.float64) for v in (e1, e2, size, model_e1, model_e2, model_size)]
-    except (TypeError, ValueError) as error:
-        raise DomainError(f"{', '.join(names)}: expected arrays of real numbers") from error
+    expectation = f"{', '.join(names)}: expected arrays of real numbers"
+    columns = [real_array(v, expectation) for v in (e1, e2, size, model_e1, model_e2, model_size)]
     if any(c.shape != columns[0].shape for c in columns):
         raise DomainError(f"{', '.join(names)} have shapes {[c.shape for c in columns]}: expected [n] six times")
     for name, values in (("size", columns[2]), ("model_size", columns[5])):
@@ -119,22 +117,9 @@ def rho_statistics(
 
 
 def trace_of_moments(size: Any, e1: Any, e2: Any) -> np.ndarray:
-    """Return T = Q11 + Q22 = a^2 + b^2 of (Q11 Q22 - Q12^2)^(1/4) = sqrt(a b) and e = (a - b)/(a + b).
+    """Return T = Q11 + Q22 = a^2 + b^2 of (Q11 Q22 - Q12^2)^(1/4) = sqrt(a b) and e = (a - b)/(a + b), |e| < 1.
 
-    T = 2 size^2 (1 + |e|^2)/(1 - |e|^2): twice the square of the size, but for the second order of the ellipticity.
-
-    Parameters
-    ----------
-    size : array
-        In any unit.
-    e1, e2 : array
-        Ellipticity below 1.
-
-    Returns
-    -------
-    array
-        T in the square of that unit.
+    T = 2 size^2 (1 + |e|^2)/(1 - |e|^2), in the square of the unit of `size`.
     """
     square = np.asarray(e1, dtype=np.float64) ** 2 + np.asarray(e2, dtype=np.float64) ** 2
-    result: np.ndarray = 2.0 * np.asarray(size, dtype=np.float64) ** 2 * (1.0 + square) / (1.0 - square)
-    return result
+    return np.asarray(2.0 * np.asarray(size, dtype=np.float64) ** 2 * (1.0 + square) / (1.0 - square))

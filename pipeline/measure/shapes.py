@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
-from ...core.units import radians
+from ...core.units import positive_angle, require_positive
 
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 
@@ -64,7 +64,7 @@ class Shapes:
 
     @property
     def usable(self) -> np.ndarray:
-        """Whether nothing is flagged, [n] bool."""
+        """Images without a flag, [n] bool."""
         return self.flags == 0
 
     def __len__(self) -> int:
@@ -110,7 +110,7 @@ def measure_shapes(
     max_iterations : int
         Most centroid steps.
     tolerance : float
-        The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so what is left after
+        The centroid has converged once a step is shorter than this [pixel]. Steps are Newton's, so the error after
         the last one is far smaller.
 
     Returns
@@ -124,11 +124,11 @@ def measure_shapes(
         If an argument has the wrong shape or is not positive.
     """
     stack = _stack(images)
-    scale = _positive(radians(pixel_scale, "pixel_scale"), "pixel_scale")
-    sigma = _positive(radians(weight_fwhm, "weight_fwhm"), "weight_fwhm") / np.sqrt(8.0 * np.log(2.0)) / scale
+    scale = positive_angle(pixel_scale, "pixel_scale")
+    sigma = positive_angle(weight_fwhm, "weight_fwhm") / np.sqrt(8.0 * np.log(2.0)) / scale
     if max_iterations < 1:
         raise DomainError(f"max_iterations = {max_iterations}: expected at least 1")
-    tolerance = _positive(tolerance, "tolerance")
+    tolerance = require_positive(tolerance, "tolerance", "pixels")
     count = len(stack)
     try:
         level = np.broadcast_to(np.asarray(background, dtype=np.float64), (count,))
@@ -152,30 +152,22 @@ def measure_shapes(
 
 
 def fwhm(images: Any, pixel_scale: Any, *, upsampling: int = 8) -> np.ndarray:
-    """Measure the full width at half maximum of star images.
+    """Measure the full width at half maximum of star images [rad], [n], pixel included; NaN without a positive maximum.
 
-    Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and
-    maximum are those of the band-limited function through the pixels: Fourier interpolation on a grid finer by
-    `upsampling`, a paraboloid through the highest node and its neighbours, and borders that count with the part of a
-    fine pixel above half maximum. The pixel is part of the width. For images of little noise: in a noisy one the
-    maximum is biased upwards.
+    Defined as the diameter of the circle with the area over which the image exceeds half its maximum. Image and maximum
+    are those of the band-limited function through the pixels: Fourier interpolation on a grid finer by `upsampling`, a
+    paraboloid through the highest node and its neighbours, and borders that count with the part of a fine pixel above
+    half maximum. In a noisy image the maximum is biased upwards.
 
     Parameters
     ----------
     images : array
-        [n, ny, nx], or one image [ny, nx]; background subtracted, falling to nearly zero at the edges.
+        [n, ny, nx], or one image [ny, nx]; background subtracted, nearly zero at the edges.
     pixel_scale : float or Quantity
         Side of a pixel [rad].
-    upsampling : int
-        Fine pixels along one pixel.
-
-    Returns
-    -------
-    array
-        [n] FWHM [rad], NaN for an image without a positive finite maximum.
     """
     stack = _stack(images)
-    scale = _positive(radians(pixel_scale, "pixel_scale"), "pixel_scale")
+    scale = positive_angle(pixel_scale, "pixel_scale")
     if upsampling < 2:
         raise DomainError(f"upsampling = {upsampling}: expected at least 2")
     result = np.full(len(stack), np.nan)
@@ -350,10 +342,3 @@ def _stack(images: Any) -> np.ndarray:
             "expected real numbers [n, ny, nx] or [ny, nx], at least 3 x 3"
         )
     return array
-
-
-def _positive(value: Any, name: str) -> float:
-    """Return a positive finite number, or raise the error that names the argument."""
-    if np.size(value) != 1 or not (np.isfinite(value) and value > 0.0):
-        raise DomainError(f"{name} = {value}: expected one positive number")
-    return float(value)

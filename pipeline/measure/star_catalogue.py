@@ -17,18 +17,10 @@ from ...core.errors import ProductError
 
 
 class StarCutouts(NamedTuple):
-    """Stars to fit a PSF model to.
+    """Stars to fit a PSF model to."""
 
-    Attributes
-    ----------
-    stamps : ndarray, shape [n, ny, nx]
-        As they stand in the file.
-    positions : ndarray, shape [n, 2]
-        In the unit of the table.
-    """
-
-    stamps: np.ndarray
-    positions: np.ndarray
+    stamps: np.ndarray  #: [n, ny, nx], as they stand in the file
+    positions: np.ndarray  #: [n, 2], in the unit of the table
 
 
 def load_stars(
@@ -80,7 +72,11 @@ def load_stars(
     else:
         raise ProductError("neither FITS nor ECSV, expected a table of stars", file=path)
 
-    cube = _cube(Path(images), _fits(Path(images), _bytes(Path(images)))) if images is not None else None
+    cube = None
+    if images is not None:
+        cube = _first_cube(_fits(Path(images), _bytes(Path(images))))
+        if cube is None:
+            raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
     names = {name.lower(): name for name in columns}
     if cube is None and stamp.lower() not in names and hdus is not None:
         cube = _first_cube(hdus)
@@ -99,7 +95,7 @@ def load_stars(
 
 
 def _bytes(path: Path) -> bytes:
-    """Return what is in a file."""
+    """Return the content of a file."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -107,8 +103,8 @@ def _bytes(path: Path) -> bytes:
 
 
 def _fits(path: Path, data: bytes) -> fits.HDUList:
-    """Return the parts of a FITS file in memory; other warnings than of its end are the file's own business."""
-    with warnings.catch_warnings(record=True) as told:
+    """Return the parts of a FITS file in memory; the warning that it is cut short is an error, others are dropped."""
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
@@ -116,7 +112,7 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
                 hdu.data  # noqa: B018 - reads it now, within the checks
         except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
             raise ProductError(f"damaged or not FITS ({' '.join(str(error).split())})", file=path) from None
-    cut = [str(w.message) for w in told if "truncated" in str(w.message).lower()]
+    cut = [str(w.message) for w in caught if "truncated" in str(w.message).lower()]
     if cut:
         raise ProductError(f"cut short ({' '.join(cut[0].split())})", file=path)
     return hdus
@@ -143,14 +139,6 @@ def _first_cube(hdus: fits.HDUList) -> np.ndarray | None:
         if hdu.is_image and hdu.data is not None and hdu.data.ndim == 3:
             return np.asarray(hdu.data, dtype=np.float64)
     return None
-
-
-def _cube(path: Path, hdus: fits.HDUList) -> np.ndarray:
-    """Return the first image of three axes of a file that must have one."""
-    cube = _first_cube(hdus)
-    if cube is None:
-        raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=path)
-    return cube
 
 
 def _numbers(path: Path, name: str, values: Any, axes: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...core.errors import DomainError
+from ...core.units import real_array
 
 # How far stars of one CCD may differ from their median: this fraction of the geometric mean of the pixel's value and
 # the peak's, one standard deviation.
@@ -39,17 +40,10 @@ class StarFlag(IntFlag):
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Defects found in n stars.
+    """Defects detected in n stars."""
 
-    Attributes
-    ----------
-    flags : ndarray of int, shape [n]
-        :class:`StarFlag` bits.
-    masks : ndarray of bool, shape [n, ny, nx]
-        Pixels that belong to a cosmic ray or lie at saturation: a star with nothing else may be kept with its mask.
-    """
-
-    flags: np.ndarray
+    flags: np.ndarray  #: :class:`StarFlag` bits, [n]
+    #: Pixels of cosmic rays and saturated ones, [n, ny, nx] bool: a star without other defects may stay, masked.
     masks: np.ndarray
 
     @property
@@ -60,25 +54,24 @@ class Selection:
     def keep(self, least: int = 1) -> np.ndarray:
         """Return :attr:`good`, if that leaves enough stars.
 
-        Parameters
-        ----------
-        least : int
-            Stars that are needed.
-
         Raises
         ------
         DomainError
-            If fewer are good, with the number of stars of each defect.
+            If fewer than `least` are good, with the number of stars of each defect.
         """
-        left = int(self.good.sum())
-        if left < least:
-            raise DomainError(
-                f"{left} of {len(self.flags)} stars left ({defect_counts(self.flags)}): expected at least {least}"
-            )
+        require_stars(self.good, self.flags, least)
         return self.good
 
 
-def defect_counts(flags: np.ndarray) -> str:
+def require_stars(good: np.ndarray, flags: np.ndarray, least: int) -> None:
+    """Raise DomainError, with the number of stars of each defect, if fewer are good."""
+    left = int(good.sum())
+    if left < least:
+        counts = f" ({found})" if (found := _defect_counts(flags)) else ""
+        raise DomainError(f"{left} of {len(good)} stars left{counts}: expected at least {least}")
+
+
+def _defect_counts(flags: np.ndarray) -> str:
     """Return how many stars have each flag, in words: ``3 neighbour, 1 cosmic ray``."""
     return ", ".join(
         f"{int(((flags & flag) > 0).sum())} {str(flag.name).lower().replace('_', ' ')}"
@@ -188,9 +181,9 @@ def _scale_error(variance: np.ndarray, star: np.ndarray, wings: np.ndarray) -> f
 
 
 def _sharp_pixels(residual: np.ndarray, variance: np.ndarray, fraction: float, threshold: float) -> np.ndarray:
-    """Return the pixels of cosmic rays: sharp ones, and what is bright beside them."""
+    """Return the pixels of cosmic rays: sharp ones, and bright ones beside them."""
     ones = np.ones((3, 3))
-    around = ndimage.convolve(residual, ones, mode="nearest")  # as if it went on: an edge is no sharp pixel
+    around = ndimage.convolve(residual, ones, mode="nearest")  # extended beyond the edge, which is no sharp pixel
     around_variance = ndimage.convolve(variance, ones, mode="nearest")
     excess = residual - fraction * around
     error = np.sqrt((1.0 - 2.0 * fraction) * variance + fraction**2 * around_variance)
@@ -209,16 +202,13 @@ def _matched(residual: np.ndarray, variance: np.ndarray, star: np.ndarray) -> fl
 
 
 def _origin(star: np.ndarray) -> tuple[int, ...]:
-    """Return where the star's peak lies off the middle of the stamp, as filters count it."""
+    """Return the offset of the star's peak from the middle of the stamp, in the convention of SciPy's filters."""
     return tuple(int(p) - n // 2 for p, n in zip(np.unravel_index(star.argmax(), star.shape), star.shape, strict=True))
 
 
 def _images(stamps: Any) -> np.ndarray:
     """Return the stamps as float64 [n, ny, nx]."""
-    try:
-        images = np.asarray(stamps, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError("stamps: expected real numbers [n, ny, nx]") from error
+    images = real_array(stamps, "stamps: expected real numbers [n, ny, nx]")
     if images.ndim != 3 or min(images.shape[1:]) < 5:
         raise DomainError(f"stamps have shape {images.shape}: expected [n, ny, nx], at least 5 x 5 pixels")
     return images

@@ -19,27 +19,24 @@ _BINS_PER_DECADE = 6
 
 
 def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] = CORRELATED) -> dict[str, Correlation]:
-    """Correlate ellipticities and residuals over all CCDs (Jee & Tyson 2011, Fig. 14).
+    """Correlate ellipticities and residuals, of :data:`~.KINDS`, over all CCDs (Jee & Tyson 2011, Fig. 14).
 
     Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
-    between CCDs cancels for any error of the model. Those at holdout positions apply to galaxies. Both are always
-    given. Errors are by jackknife over the CCDs where there are two or more.
-
-    Parameters
-    ----------
-    products : sequence of CcdProduct
-        CCDs.
-    kinds : sequence of str
-        Ellipticities, of :data:`~pachon.pipeline.ccd_product.KINDS`.
+    between CCDs cancels for any error of the model; those at holdout positions apply to galaxies. Errors are by
+    jackknife over the CCDs where there are two or more.
     """
     bins = separation_bins(products)
     result = {}
     for kind in kinds:
         stars = [p.stars(kind) for p in products]
         x, y = (np.concatenate([getattr(s, key) for s in stars]) for key in ("field_x", "field_y"))
-        e1, e2 = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
-        result[kind] = shear_correlation(x, y, e1, e2, patch=patches(stars), **bins)
+        result[kind] = shear_correlation(x, y, *ellipticities(products, kind), patch=patches(stars), **bins)
     return result
+
+
+def ellipticities(products: Sequence[CcdProduct], kind: str) -> np.ndarray:
+    """Return e1 and e2 of one kind on all CCDs, [2, n]."""
+    return np.concatenate([p.ellipticity(kind) for p in products], axis=1)
 
 
 def patches(stars: Sequence[Stars]) -> np.ndarray | None:
@@ -59,26 +56,18 @@ def separation_bins(products: Sequence[CcdProduct]) -> dict[str, Any]:
 
 def ccd_metrics(product: CcdProduct) -> dict[str, Any]:
     """Return the metrics of one CCD; keys end in their unit."""
-    truth, observed = product.holdout, product.observed
-    field = np.array([np.median(truth.field_x), np.median(truth.field_y)])
+    holdout, observed = product.holdout, product.observed
+    field = np.array([np.median(holdout.field_x), np.median(holdout.field_y)])
     return {
         "x_mm": product.center[0] * 1e3,
         "y_mm": product.center[1] * 1e3,
         "field_deg": float(np.rad2deg(np.hypot(*field))),
-        "truth_psfs": len(truth),
-        "stars": len(observed),
-        "stars_used": int(observed.used.sum()),
         "stars_with_defects": int((observed.defects != 0).sum()),
+        "fwhm_arcsec": _median(holdout.fwhm) / ARCSEC,
         "pixels_rejected": product.model.n_rejected,
-        "fwhm_arcsec": _median(truth.fwhm) / ARCSEC,
-        "mean_e_truth": finite_mean(np.hypot(truth.e1, truth.e2)),
-        "mean_e_observed": finite_mean(np.hypot(observed.e1, observed.e2)),
-        "rms_residual_at_stars": _rms(observed.residual_e1, observed.residual_e2),
-        "rms_residual_left_out": _rms(observed.e1 - observed.leave_one_out_e1, observed.e2 - observed.leave_one_out_e2),
-        "rms_residual_away": _rms(truth.residual_e1, truth.residual_e2),
-        "truth_variance_in_components": product.noise_free_model.explained,
         "kink_observed": product.model.elbow,
         "kink_truth": product.noise_free_model.elbow,
+        **_common_metrics([product]),
     }
 
 
@@ -88,33 +77,15 @@ def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
     ``xi_plus_..._short`` is the mean of xi+ over pairs closer than 10 arcmin, ``xi_plus_..._long`` over those from 10
     to 180 arcmin.
     """
-    each = {p.name: ccd_metrics(p) for p in products}
-    truth = [p.holdout for p in products]
-    observed = [p.observed for p in products]
-
-    def column(stars: Sequence[Stars], key: str) -> np.ndarray:
-        return np.concatenate([getattr(s, key) for s in stars])
-
-    fwhm = np.concatenate([t.fwhm for t in truth]) / ARCSEC
+    fwhm = np.concatenate([p.holdout.fwhm for p in products]) / ARCSEC
     together = {
         "ccds": len(products),
-        "truth_psfs": sum(map(len, truth)),
-        "stars": sum(map(len, observed)),
-        "stars_used": sum(figures["stars_used"] for figures in each.values()),
-        "snr_min": float(column(observed, "snr").min()),
+        "snr_min": float(min(p.observed.snr.min() for p in products)),
         "fwhm_arcsec": _median(fwhm),
         "fwhm_min_arcsec": float(np.nanmin(fwhm)),
         "fwhm_max_arcsec": float(np.nanmax(fwhm)),
-        "mean_e_truth": finite_mean(np.hypot(column(truth, "e1"), column(truth, "e2"))),
-        "max_e_truth": float(np.nanmax(np.hypot(column(truth, "e1"), column(truth, "e2")))),
-        "mean_e_observed": finite_mean(np.hypot(column(observed, "e1"), column(observed, "e2"))),
-        "rms_residual_at_stars": _rms(column(observed, "residual_e1"), column(observed, "residual_e2")),
-        "rms_residual_left_out": _rms(
-            column(observed, "e1") - column(observed, "leave_one_out_e1"),
-            column(observed, "e2") - column(observed, "leave_one_out_e2"),
-        ),
-        "rms_residual_away": _rms(column(truth, "residual_e1"), column(truth, "residual_e2")),
-        "truth_variance_in_components": min(p.noise_free_model.explained for p in products),
+        "max_e_truth": float(np.nanmax(np.hypot(*ellipticities(products, "truth")))),
+        **_common_metrics(products),
     }
     for kind, correlation in correlated.items():
         for name in SEPARATION_RANGES:
@@ -122,8 +93,21 @@ def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
             together[f"error_xi_plus_{kind}_{name}"] = correlation.error_mean_xi_plus(name)
     return {
         "all": together,
-        "ccd": each,
+        "ccd": {p.name: ccd_metrics(p) for p in products},
         "correlation": {kind: c.as_dict() for kind, c in correlated.items()},
+    }
+
+
+def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
+    """Return the metrics of which a run has the same as each of its CCDs."""
+    residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
+    return {
+        "truth_psfs": sum(len(p.holdout) for p in products),
+        "stars": sum(len(p.observed) for p in products),
+        "stars_used": sum(int(p.observed.used.sum()) for p in products),
+        **{f"mean_e_{k}": finite_mean(np.hypot(*ellipticities(products, k))) for k in ("truth", "observed")},
+        **{f"rms_residual_{name}": rms(ellipticities(products, kind)) for name, kind in residuals.items()},
+        "truth_variance_in_components": min(p.noise_free_model.explained for p in products),
     }
 
 
@@ -133,13 +117,11 @@ def finite_mean(values: np.ndarray) -> float:
     return float(finite.mean()) if finite.size else np.nan
 
 
+def rms(values: np.ndarray) -> float:
+    """Return the root of the mean square of the finite values; NaN where there are none."""
+    return float(np.sqrt(finite_mean(values**2)))
+
+
 def _median(values: np.ndarray) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else np.nan
-
-
-def _rms(e1: np.ndarray, e2: np.ndarray) -> float:
-    """Return the root mean square of one component, of both together."""
-    squares = np.concatenate([e1, e2]) ** 2
-    finite = squares[np.isfinite(squares)]
-    return float(np.sqrt(finite.mean())) if finite.size else np.nan

@@ -22,37 +22,18 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """A mean and components.
+    """A mean and components."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape [n_pixels]
-        Unit sum.
-    vectors : ndarray, shape [k, n_pixels]
-        Orthonormal, each of sum zero, but for the pixels' own, which are the unit vectors.
-    spectrum : ndarray
-        Singular values of the stars' deviations from their mean, falling.
-    scale : float
-        Of shapelets [pixel]; NaN else.
-    """
-
-    mean: np.ndarray
-    vectors: np.ndarray
-    spectrum: np.ndarray
-    scale: float = np.nan
+    mean: np.ndarray  #: [n_pixels], unit sum
+    vectors: np.ndarray  #: [k, n_pixels], orthonormal, each of sum zero; of pixels the unit vectors
+    spectrum: np.ndarray  #: singular values of the stars' deviations from their mean, falling
+    scale: float = np.nan  #: of shapelets [pixel]
 
 
 def principal_components(mean: np.ndarray, deviations: np.ndarray, count: int) -> Basis:
-    """Return the eigen-PSFs of largest eigenvalue, the element of largest magnitude of each positive.
+    """Return the `count` eigen-PSFs of largest eigenvalue, the element of largest magnitude of each positive.
 
-    Parameters
-    ----------
-    mean : array
-        Mean PSF, [n_pixels].
-    deviations : array
-        Stars less their mean, [n_stars, n_pixels].
-    count : int
-        Components to keep.
+    `deviations` [n_stars, n_pixels] are the stars less their mean [n_pixels].
     """
     _, singular, vectors = np.linalg.svd(deviations, full_matrices=False)
     vectors = vectors[:count]
@@ -68,30 +49,14 @@ def pixel_grid(mean: np.ndarray, deviations: np.ndarray) -> Basis:
 def shapelets(
     mean: np.ndarray, deviations: np.ndarray, count: int, shape: tuple[int, int], scale: float | None
 ) -> Basis:
-    """Return Gauss-Hermite functions, Refregier 2003, of the scale that leaves least of the stars.
+    """Return Gauss-Hermite functions (Refregier 2003) of the scale with the least residual of the stars.
 
     The first `count` + 1 shapelets by total order, sampled at the centres of the pixels about the centre of the stamp,
-    and restricted to unit sum, make a mean and `count` components. The mean is the mean star as the shapelets hold it:
-    what they truncate is left out, as in the shapelet method that Jee & Tyson 2011, sec. 3, compare with.
-
-    Parameters
-    ----------
-    mean : array
-        Mean PSF, [n_pixels].
-    deviations : array
-        Stars less their mean, [n_stars, n_pixels].
-    count : int
-        Components.
-    shape : tuple of int
-        (ny, nx) of the stamps.
-    scale : float or None
-        rms width of the Gaussian under the shapelets [pixel]; None chooses the one with the least squares of what is
-        left of all stars.
-
-    Raises
-    ------
-    ConfigError
-        If the stamps have too few pixels for independent shapelets.
+    and restricted to unit sum, make a mean and `count` components. The mean is the projection of the mean star: what
+    the shapelets truncate is left out, as in the shapelet method that Jee & Tyson 2011, sec. 3, compare with. `mean`
+    and `deviations` are as in :func:`principal_components`, `shape` is (ny, nx). `scale` is the rms width of the
+    Gaussian [pixel]; None chooses the one with the least squares of the residuals of all stars. ConfigError if the
+    stamps have too few pixels for independent shapelets.
     """
     if scale is None:
         scale = _best_scale(mean + deviations, min(count, _FOR_SCALE), shape)
@@ -103,16 +68,8 @@ def shapelets(
 def shapelet_images(count: int, shape: tuple[int, int], scale: float) -> np.ndarray:
     """Return the first shapelets by total order, [count, ny, nx], sampled at the centres of the pixels.
 
-    Within an order the one along x comes first. Each has unit square integral over the plane [pixel^-1].
-
-    Parameters
-    ----------
-    count : int
-        How many.
-    shape : tuple of int
-        (ny, nx).
-    scale : float
-        rms width of the Gaussian of order zero [pixel].
+    Within an order the one along x comes first. Each has unit square integral over the plane [pixel^-1]. `scale` is the
+    rms width of the Gaussian of order zero [pixel].
     """
     # An order's amplitude is exp(-r^2 / 2 beta^2): the Gaussian of order zero has rms width beta.
     order = 0
@@ -144,14 +101,14 @@ def _unit_sum_shapelets(count: int, shape: tuple[int, int], scale: float) -> tup
     size = np.abs(np.diagonal(r))
     if count > len(base) - 1 or size.min() < 1e-8 * size.max():
         raise ConfigError(
-            f"n_components = {count}: stamps of {shape[1]} x {shape[0]} pixels do not tell that many shapelets of "
-            f"scale {scale:.3g} pixels apart"
+            f"n_components = {count}: stamps of {shape[1]} x {shape[0]} pixels do not resolve that many shapelets "
+            f"of scale {scale:.3g} pixels"
         )
     return base, (q * np.where(np.diagonal(r) < 0.0, -1.0, 1.0)).T
 
 
 def _best_scale(stars: np.ndarray, count: int, shape: tuple[int, int]) -> float:
-    """Return the scale at which the shapelets leave least of the stars [n, n_pixels], by golden section."""
+    """Return the scale with the least residual of the stars [n, n_pixels], by golden section."""
     width = _rms_width(stars.mean(axis=0).reshape(shape))
 
     def left(log_scale: float) -> float:
@@ -183,7 +140,7 @@ def _best_scale(stars: np.ndarray, count: int, shape: tuple[int, int]) -> float:
 
 
 def _rms_width(image: np.ndarray) -> float:
-    """Return the rms width [pixel] of the part of a star above a tenth of its peak, cheap and deaf to the wings."""
+    """Return the rms width [pixel] of the part of a star above a tenth of its peak, without the wings."""
     y, x = np.indices(image.shape)
     light = np.where(image > 0.1 * image.max(), image, 0.0).ravel()
     light /= light.sum()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError
+from ...core.units import real_array
 from .polynomial import Extent, term_count
 
 #: Signal-to-noise ratio above which softened weights grow no more.
@@ -14,14 +15,8 @@ SOFTENING = 100.0
 
 
 def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stamps as finite float64 numbers and the masks as bool, both [n, ny, nx].
-
-    Masked pixels may hold anything and become zero.
-    """
-    try:
-        images = np.asarray(stamps, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError("stamps: expected real numbers [n, ny, nx]") from error
+    """Return the stamps as finite float64, masked pixels zero, and the masks as bool, both [n, ny, nx]."""
+    images = real_array(stamps, "stamps: expected real numbers [n, ny, nx]")
     if images.ndim != 3 or len(images) < 2:
         raise DomainError(f"stamps have shape {images.shape}: expected [n, ny, nx] with at least 2 stars")
     bad = np.zeros(images.shape, dtype=bool)
@@ -30,11 +25,11 @@ def as_stamps(stamps: Any, masks: Any = None) -> tuple[np.ndarray, np.ndarray]:
         images = np.where(bad, 0.0, images)
     finite = np.isfinite(images).all(axis=(1, 2))
     if not finite.all():
-        raise DomainError(f"stamps[{int(np.flatnonzero(~finite)[0])}] has pixels that are not finite")
+        raise DomainError(f"stamps[{finite.argmin()}] has pixels that are not finite")
     dark = images.sum(axis=(1, 2)) <= 0.0
     if dark.any():
         unmasked = " outside its mask" if bad.any() else ""
-        raise DomainError(f"stamps[{int(np.flatnonzero(dark)[0])}] sums to zero or less{unmasked}: expected a star")
+        raise DomainError(f"stamps[{dark.argmax()}] sums to zero or less{unmasked}: expected a star")
     return images, bad
 
 
@@ -49,7 +44,7 @@ def _masks(masks: Any, shape: tuple[int, ...]) -> np.ndarray:
         raise DomainError("masks: every pixel of every star is masked, no star is left")
     blind = bad.all(axis=(1, 2))
     if blind.any():
-        raise DomainError(f"masks[{int(np.flatnonzero(blind)[0])}] masks the whole star: expected it to be left out")
+        raise DomainError(f"masks[{blind.argmax()}] masks the whole star: expected it to be left out")
     never = bad.all(axis=0)
     if never.any():
         y, x = np.argwhere(never)[0]
@@ -61,34 +56,21 @@ def as_weights(weights: Any, n_stars: int) -> np.ndarray | None:
     """Return one weight for each star, or None where none are given."""
     if weights is None:
         return None
-    try:
-        values = np.asarray(weights, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError(f"weights: expected {n_stars} numbers, one for each star") from error
+    values = real_array(weights, f"weights: expected {n_stars} numbers, one for each star")
     if values.shape != (n_stars,):
         raise DomainError(f"weights have shape {values.shape}: expected [{n_stars}], one for each star")
     wrong = ~(np.isfinite(values) & (values >= 0.0))
     if wrong.any():
-        first = int(np.flatnonzero(wrong)[0])
+        first = wrong.argmax()
         raise DomainError(f"weights[{first}] = {values[first]}: expected a finite number that is not negative")
     return values
 
 
 def snr_weights(kind: str, snr: np.ndarray) -> np.ndarray | None:
-    """Return weights of stars in the polynomials by their signal-to-noise ratios, [n]; None for equal ones.
+    """Return weights of stars in the polynomials from their signal-to-noise ratios S, [n]; None for equal ones.
 
-    Parameters
-    ----------
-    kind : str
-        ``equal``; ``snr``: S/N squared, the inverse variance of the noise; ``softened``: 1/(1/S^2 + 1/100^2), since
-        the residual of the polynomial itself does not fall with brightness.
-    snr : array
-        S, signal-to-noise ratio of each star, [n].
-
-    Raises
-    ------
-    ConfigError
-        If there is no such kind.
+    ``snr`` is S^2, the inverse variance of the noise; ``softened`` is 1/(1/S^2 + 1/100^2), since the residual of the
+    polynomial itself does not fall with brightness. Another kind raises ConfigError.
     """
     if kind == "equal":
         return None
@@ -114,18 +96,9 @@ def as_extent(extent: Any, positions: np.ndarray) -> Extent:
 
 
 def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: np.ndarray | None = None) -> None:
-    """Raise an error if the stars do not determine the polynomials.
+    """Raise an error if the stars do not determine the polynomials of total degree `order`.
 
-    Parameters
-    ----------
-    terms : array
-        Terms of the polynomials at the stars, [n, n_terms].
-    order : int
-        Their total degree.
-    positions : array
-        Of the stars, [n, 2].
-    weights : array, optional
-        Of the stars, [n]; those of weight zero count as absent.
+    `terms` [n, n_terms] are those of the polynomials at the stars; stars of weight zero count as absent.
     """
     if weights is not None:
         terms, positions = terms[weights > 0.0], positions[weights > 0.0]
@@ -148,7 +121,7 @@ def check_apart(positions: np.ndarray) -> None:
 
 
 def same_place(positions: np.ndarray) -> tuple[int, int] | None:
-    """Return the first two stars that stand at one place, or None."""
+    """Return the indices of the first two stars at one position, or None."""
     first: dict[tuple[float, float], int] = {}
     for index, (x, y) in enumerate(positions.tolist()):
         earlier = first.setdefault((x, y), index)

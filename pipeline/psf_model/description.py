@@ -13,24 +13,12 @@ from .outliers import find_outliers, restore_predicted
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Stars in a basis.
-
-    Attributes
-    ----------
-    basis : Basis
-        Mean and components.
-    coefficients : ndarray, shape [n_stars, k]
-        Projections of the stars.
-    unexplained : ndarray, shape [n_stars]
-        Sum of squares over pixels of the residual of the basis.
-    rejected : ndarray of bool, shape [n_stars, n_pixels]
-        Outliers.
-    """
+    """Stars in a basis."""
 
     basis: Basis
-    coefficients: np.ndarray
-    unexplained: np.ndarray
-    rejected: np.ndarray
+    coefficients: np.ndarray  #: projections of the stars, [n_stars, k]
+    unexplained: np.ndarray  #: squares of the residual summed over pixels, [n_stars]
+    rejected: np.ndarray  #: outliers, [n_stars, n_pixels] bool
 
 
 def describe(
@@ -45,19 +33,10 @@ def describe(
     max_iterations: int,
     replacement: str,
 ) -> Description:
-    """Describe the stars of a CCD in a basis.
+    """Describe the stars of a CCD in a basis; options as in :meth:`~.PsfModel.fit`.
 
-    Parameters
-    ----------
-    images : array
-        [n_stars, ny, nx], finite, of any flux.
-    masked : array of bool
-        [n_stars, ny, nx] pixels not to be used.
-    terms : array
-        Of the polynomials at the stars, [n_stars, n_terms]; they keep stars whose deviation the others predict, and
-        fill masked pixels.
-    basis, count, scale, clip_sigma, max_iterations, replacement
-        As in :meth:`~pachon.pipeline.psf_model.model.PsfModel.fit`.
+    `images` [n_stars, ny, nx] are finite and of any flux; pixels in `masked` are not used. The polynomial terms at the
+    stars [n_stars, n_terms] keep stars whose deviation the others predict, and fill masked pixels.
     """
     shape = images.shape[1:]
     pixels, missing = images.reshape(len(images), -1), masked.reshape(len(images), -1)

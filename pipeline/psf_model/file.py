@@ -15,8 +15,8 @@ from .basis import BASES
 def model_hdus(fields: Mapping[str, Any], name: str) -> list[fits.ImageHDU | fits.BinTableHDU]:
     """Return the fields of a model as extensions NAME_MEAN and so on.
 
-    What only other models than polynomials of principal components have is written only where it differs: header
-    cards BASIS and SCALE, the star's weight and alpha, and NAME_KERNEL.
+    Fields that polynomials of principal components lack are written only for other models: header cards BASIS and
+    SCALE, the star's weight and alpha (column ``pull``), and NAME_KERNEL.
     """
     mean = fits.ImageHDU(fields["mean"], name=f"{name}_MEAN")
     mean.header["ORDER"] = (fields["order"], "total degree of the polynomials")
@@ -53,13 +53,7 @@ def model_hdus(fields: Mapping[str, Any], name: str) -> list[fits.ImageHDU | fit
 
 
 def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
-    """Return the fields of a model from extensions written by :func:`model_hdus`.
-
-    Raises
-    ------
-    ProductError
-        If an extension, a column or a card is missing, or the parts do not belong together.
-    """
+    """Return the fields of a model from extensions of :func:`model_hdus`; ProductError if parts are missing."""
     found = {hdu.name: hdu for hdu in hdus}
 
     def part(key: str) -> Any:

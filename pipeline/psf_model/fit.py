@@ -43,9 +43,9 @@ def fit_fields(
     """
     images, bad = as_stamps(stamps, masks)
     n_stars, ny, nx = images.shape
-    places = as_positions(positions)
-    if len(places) != n_stars:
-        raise DomainError(f"positions: {len(places)} given, expected one for each of the {n_stars} stamps")
+    points = as_positions(positions)
+    if len(points) != n_stars:
+        raise DomainError(f"positions: {len(points)} given, expected one for each of the {n_stars} stamps")
     for option, value, known in (
         ("basis", basis, BASES),
         ("interpolation", interpolation, ("polynomial", "gp")),
@@ -66,12 +66,12 @@ def fit_fields(
     star_weights = as_weights(weights, n_stars)
     if interpolation == "gp":
         if star_weights is not None:
-            raise ConfigError("weights: expected none with interpolation = 'gp', which finds the noise itself")
-        check_apart(places)
-    span = as_extent(extent, places)
-    terms = design_matrix(places, span, order)
+            raise ConfigError("weights: expected none with interpolation = 'gp', which fits the noise itself")
+        check_apart(points)
+    span = as_extent(extent, points)
+    terms = design_matrix(points, span, order)
     with one_blas_thread():
-        check_terms(terms, order, places, star_weights)
+        check_terms(terms, order, points, star_weights)
         stars = describe(
             images,
             bad,
@@ -86,9 +86,9 @@ def fit_fields(
         coefficients = stars.coefficients
         kernel = alpha = None
         if interpolation == "gp":
-            points = mapped(places, span)
-            kernel = gaussian_process.fit_kernels(points, coefficients, terms, shared=basis == "pixels")
-            polynomial, alpha, _ = gaussian_process.krige(points, coefficients, terms, kernel)
+            mapped_points = mapped(points, span)
+            kernel = gaussian_process.fit_kernels(mapped_points, coefficients, terms, shared=basis == "pixels")
+            polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel)
         else:
             q, r = np.linalg.qr(weighted(terms, star_weights))
             polynomial = scipy.linalg.solve_triangular(r, q.T @ weighted(coefficients, star_weights))
@@ -98,7 +98,7 @@ def fit_fields(
             coefficients=coefficients,
             polynomial=polynomial,
             eigenvalues=stars.basis.spectrum[:limit] ** 2 / (n_stars - 1),
-            positions=places,
+            positions=points,
             order=int(order),
             extent=span,
             unexplained=stars.unexplained,

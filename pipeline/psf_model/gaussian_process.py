@@ -16,35 +16,18 @@ _LENGTHS = (0.05, 20.0)
 _NOISES = (1e-10, 10.0)
 _VARIANCES = (1e-3, 1e6)
 _BOUNDS = (_VARIANCES, _LENGTHS, _NOISES)
-# The likelihood is first looked over at so many lengths, and so many ratios of the noise's variance to the process's,
-# and then only so many times above and below the best of these, which is several times their steps.
+# The likelihood is evaluated on a grid of lengths and of ratios of the noise's variance to the process's, and then
+# maximised within this factor of the best of these, which is several of their steps.
 _NEAR = 8.0
 _LENGTHS_TRIED, _RATIOS_TRIED = np.geomspace(*_LENGTHS, 25), np.geomspace(1e-8, 1e4, 49)
 
 
 def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, shared: bool) -> np.ndarray:
-    """Find variance, correlation length and noise of each column of values by their likelihood (scikit-learn).
+    """Fit variance, correlation length and noise variance [k, 3] to each column by likelihood (scikit-learn).
 
-    Parameters
-    ----------
-    points : array
-        Places, [n, 2], mapped to [-1, 1].
-    values : array
-        [n, k].
-    terms : array
-        Of the trend, [n, n_terms]; the process is what an unweighted fit of them leaves.
-    shared : bool
-        Whether all columns have one kernel.
-
-    Returns
-    -------
-    array
-        [k, 3] variance, length and variance of the noise; variances zero for a column without any.
-
-    Raises
-    ------
-    ConfigError
-        If scikit-learn is not installed.
+    `points` [n, 2] are mapped to [-1, 1], `values` are [n, k], and the process is the residual of an unweighted fit of
+    the trend's `terms` [n, n_terms]. With `shared` all columns have one kernel. Variances are zero for a column without
+    any. ConfigError if scikit-learn is not installed.
     """
     try:
         from sklearn.gaussian_process import GaussianProcessRegressor
@@ -63,8 +46,7 @@ def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, sh
         power = float((rest[:, group] ** 2).mean())
         if np.sqrt(power) <= 1e-15 * largest:
             continue
-        # From near the top a few steps are enough. Kept near it, they can neither end on a lower one nor be thrown to
-        # where the covariance is singular.
+        # From near the maximum a few steps are enough. Bounds near it exclude lower maxima and singular covariances.
         rough = _rough_kernel(spectra, rest[:, group] / np.sqrt(power))
         near = [(max(v / _NEAR, low), min(v * _NEAR, high)) for v, (low, high) in zip(rough, _BOUNDS, strict=True)]
         variance, length, noise = rough
@@ -83,14 +65,8 @@ def _rough_kernel(spectra: Sequence[tuple[np.ndarray, np.ndarray]], values: np.n
 
     With the eigenvalues l of the correlation matrix, values y along its eigenvectors and g the ratio of the noise to
     the variance c, the logarithm of the likelihood of n values is, but for a constant,
-    -(n ln c + sum ln(l + g) + sum y^2/(l + g)/c)/2, and largest for c = sum y^2/(l + g)/n.
-
-    Parameters
-    ----------
-    spectra : sequence of tuple of array
-        Eigenvalues and eigenvectors of the correlation matrix for each of the lengths tried.
-    values : array
-        [n, k] of one kernel, of mean square 1.
+    -(n ln c + sum ln(l + g) + sum y^2/(l + g)/c)/2, and largest for c = sum y^2/(l + g)/n. `spectra` holds eigenvalues
+    and eigenvectors for each of the lengths; `values` [n, k] of one kernel have mean square 1.
     """
     count = values.shape[0]
     best, found = -np.inf, (1.0, 1.0, 0.1)
@@ -111,19 +87,9 @@ def krige(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve for the trend and the stars' weights, and predict each value from the others.
 
-    Parameters
-    ----------
-    points, values, terms, kernels : array
-        As in :func:`fit_kernels`, and its result.
-
-    Returns
-    -------
-    trend : array
-        Coefficients of the terms by generalised least squares, [n_terms, k].
-    weights : array
-        Inverse covariance times values less trend, [n, k]: :func:`predict` multiplies covariances with them.
-    left_out : array
-        Value minus its prediction by the others with the same kernel, [n, k] (Dubrule 1983).
+    Arguments are as in :func:`fit_kernels`, and its result. Returns the coefficients of the terms by generalised least
+    squares [n_terms, k]; the inverse covariance times values less trend [n, k], the weights of :func:`predict`; and
+    each value minus its prediction by the others with the same kernel [n, k] (Dubrule 1983).
     """
     trend = np.zeros((terms.shape[1], values.shape[1]))
     weights, left_out = np.zeros(values.shape), np.zeros(values.shape)
@@ -152,16 +118,9 @@ def krige(
 
 
 def predict(points: np.ndarray, at: np.ndarray, kernels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the process, without its trend, [m, k]; each place on its own, star after star: no batch size matters.
+    """Return the process, without its trend, at places [m, 2] mapped like the points: [m, k].
 
-    Parameters
-    ----------
-    points : array
-        Of the stars, [n, 2], mapped to [-1, 1].
-    at : array
-        Places, [m, 2], mapped likewise.
-    kernels, weights : array
-        [k, 3] and [n, k].
+    Each place on its own, star after star: no batch size matters.
     """
     different, which = np.unique(kernels, axis=0, return_inverse=True)
     result = np.zeros((len(at), len(kernels)))

@@ -17,8 +17,8 @@ _LEAST_ROOM = 0.02
 def mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean PSF [n_pixels], of unit sum, and the flux of each star [n_stars].
 
-    A star with its rejected pixels replaced by the mean PSF is to have unit sum as well: its flux is the sum of the
-    good pixels over the mean PSF's sum there. The mean depends on the fluxes in turn, so both are iterated.
+    The flux of a star is the sum of its good pixels over the mean PSF's sum there: with rejected pixels replaced by the
+    mean PSF it has unit sum. The mean depends on the fluxes in turn, so both are iterated.
     """
     flux = pixels.sum(axis=1)
     used = ~rejected
@@ -30,32 +30,18 @@ def mean_and_flux(pixels: np.ndarray, rejected: np.ndarray) -> tuple[np.ndarray,
         if rejected.any():
             flux = np.where(used, pixels, 0.0).sum(axis=1) / np.where(used, mean, 0.0).sum(axis=1)
     if not np.all(flux > 0.0):
-        raise DomainError(f"stamps[{int(np.flatnonzero(~(flux > 0.0))[0])}] has no flux left outside its outliers")
+        raise DomainError(f"stamps[{(flux > 0.0).argmin()}] has no flux left outside its outliers")
     return mean, flux
 
 
 def fill_masked(stars: np.ndarray, missing: np.ndarray, replaced: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Fill masked pixels with the polynomial through the stars in which they are good.
+    """Fill masked pixels of stars [n_stars, n_pixels] with the polynomial through the stars in which they are good.
 
     A filled pixel then has no influence on the interpolation over the CCD: with the hat matrix H of all stars, the
     values f of the stars b in which a pixel is masked lie on the polynomial of the others, g, if f = H_bb f + H_bg y.
-    Filling changes the sum of a star, and so its flux and the mean, so all are iterated.
-
-    Parameters
-    ----------
-    stars : array
-        [n_stars, n_pixels] of unit sum, the masked pixels filled with a first guess.
-    missing : array of bool
-        [n_stars, n_pixels].
-    replaced : array of bool
-        [n_stars, n_pixels] that hold the mean of all stars instead.
-    terms : array
-        Of the polynomial at the stars, [n_stars, n_terms], linearly independent.
-
-    Returns
-    -------
-    array
-        The filled stars, of unit sum.
+    Filling changes the sum of a star, and so its flux and the mean, so all are iterated. Stars have unit sum before,
+    with a first guess in the masked pixels, and after; pixels in `replaced` hold the mean of all stars instead. The
+    polynomial terms at the stars [n_stars, n_terms] are linearly independent.
     """
     q, _ = np.linalg.qr(terms)
     predictors = []

@@ -136,7 +136,7 @@ class PsfModel:
         extent : tuple of float, optional
             (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions. Where left out, that of the stars.
         scale : float, optional
-            rms width of the Gaussian under the shapelets [pixel]; where left out, the one that leaves least of the
+            rms width of the Gaussian under the shapelets [pixel]; by default the one with the least residual of the
             stars.
         clip_sigma : float or None
             Pixels that deviate by more standard deviations are rejected; None rejects nothing, as befits stars without

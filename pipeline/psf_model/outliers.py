@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# How far the PSF itself may stray from its mean within a CCD, as one standard deviation: this fraction of the geometric
-# mean of the pixel's value and the peak's. The wings may change by more of themselves than the core.
+# Standard deviation of the PSF itself within a CCD: this fraction of the geometric mean of the pixel's value and the
+# peak's. The wings may change by more of themselves than the core.
 _PSF_CHANGE = 0.04
 # ... and of the peak anywhere: what deviates less is no cosmic ray, however quiet the stamps are.
 _FLOOR = 1e-4
@@ -14,29 +14,15 @@ _PREDICTED = 0.1
 
 
 def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) -> np.ndarray:
-    """Find pixels that stand out from the mean PSF.
+    """Return the pixels that stand out from the mean PSF, bool; stars [n_stars, n_pixels] need not be normalised.
 
-    A pixel's deviation is held against three standard deviations in quadrature: that of the pixel over the stars,
-    that of the star over its pixels, and an allowance for the PSF's change within the CCD. The first is taken from
-    the 80th percentile, which unlike the median includes the few stars in the corners, where the PSF differs most;
-    three times what the median gives bounds it, should more than a fifth of the stars be hit in that pixel. Mean and
-    fluxes come from the pixels not rejected, and all pixels are judged anew until nothing changes. Stars are scaled
-    to the mean by least squares: the sum over a thousand pixels of sky noise would be off by far more than the star's
-    own noise.
-
-    Parameters
-    ----------
-    images : array
-        [n_stars, n_pixels], not normalised.
-    clip_sigma : float
-        Deviations beyond this many standard deviations are rejected.
-    max_iterations : int
-        Most passes.
-
-    Returns
-    -------
-    array of bool
-        [n_stars, n_pixels] True where rejected.
+    A pixel's deviation is compared with `clip_sigma` times three standard deviations in quadrature: that of the pixel
+    over the stars, that of the star over its pixels, and an allowance for the PSF's change within the CCD. The first is
+    taken from the 80th percentile, which unlike the median includes the few stars in the corners, where the PSF differs
+    most; three times the one from the median is its upper bound, should more than a fifth of the stars be hit in that
+    pixel. Mean and fluxes come from the pixels not rejected, and all pixels are compared anew until nothing changes.
+    Stars are scaled to the mean by least squares: the sum over a thousand pixels of sky noise would be off by far more
+    than the star's own noise.
     """
     mean, flux = _first_guess(images)
     rejected = np.zeros(images.shape, dtype=bool)
@@ -59,27 +45,11 @@ def find_outliers(images: np.ndarray, clip_sigma: float, max_iterations: int) ->
 
 
 def restore_predicted(values: np.ndarray, mean: np.ndarray, rejected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Restore rejected stars whose deviation from the mean the other stars predict.
+    """Return the rejected pixels without those of stars whose deviation from the mean the other stars predict.
 
-    Where the PSF changes by much, a star in a corner of the CCD may stand out from the mean. A smooth change is
-    foreseen by the polynomial in position through the other stars, in all of the star's rejected pixels, to a tenth
-    of the deviation; a cosmic ray is not.
-
-    Parameters
-    ----------
-    values : array
-        [n_stars, n_pixels] of unit sum.
-    mean : array
-        Mean PSF, [n_pixels].
-    rejected : array of bool
-        [n_stars, n_pixels].
-    terms : array
-        [n_stars, n_terms] of the polynomial, linearly independent.
-
-    Returns
-    -------
-    array of bool
-        [n_stars, n_pixels] still rejected.
+    Where the PSF changes by much, a star in a corner of the CCD may stand out from the mean. The polynomial in position
+    through the other stars predicts a smooth change in all of the star's rejected pixels, to a tenth of the deviation,
+    but no cosmic ray. `values` [n_stars, n_pixels] have unit sum; `terms` [n_stars, n_terms] are linearly independent.
     """
     q, _ = np.linalg.qr(terms)
     residual = values - q @ (q.T @ values)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import ConfigError, DomainError
+from ...core.units import real_array
 
 Extent = tuple[float, float, float, float]
 
@@ -17,20 +18,11 @@ def term_count(order: int) -> int:
 
 
 def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:
-    """Return the polynomial terms at each position, [n, n_terms].
+    """Return the polynomial terms at each position, [n, n_terms], of total degree up to `order`.
 
     The terms are products of Legendre polynomials P_l(u) P_m(v), l + m <= order, in which (u, v) is the position mapped
     from the extent to [-1, 1]. They span the same functions as x^l y^m (Jee & Tyson 2011, sec. 3) and stay nearly
     orthogonal for stars spread over the CCD, so that the fit loses no digits.
-
-    Parameters
-    ----------
-    positions : array
-        [n, 2], in the unit of the extent.
-    extent : tuple of float
-        (xmin, xmax, ymin, ymax).
-    order : int
-        Largest total degree.
     """
     if order < 0:
         raise ConfigError(f"order = {order}: expected a polynomial order that is not negative")
@@ -50,14 +42,12 @@ def mapped(positions: Any, extent: Extent) -> np.ndarray:
 
 def as_positions(positions: Any) -> np.ndarray:
     """Return positions as a float64 array [n, 2] (one position may be given as [2])."""
-    try:
-        points = np.asarray(positions, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError("positions: expected real numbers [n, 2]") from error
+    points = real_array(positions, "positions: expected real numbers [n, 2]")
     if points.ndim == 1:
         points = points[None]
     if points.ndim != 2 or points.shape[1] != 2:
         raise DomainError(f"positions have shape {np.shape(positions)}: expected [n, 2]")
-    if not np.all(np.isfinite(points)):
-        raise DomainError(f"positions[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        raise DomainError(f"positions[{finite.argmin()}] is not finite")
     return points

@@ -19,6 +19,11 @@ from ...models.camera.camera import Camera
 
 #: Colour of each quantity in every plot; blue and red for observed and residual as in Jee & Tyson 2011.
 TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
+RESIDUAL_TITLES = {
+    "residual": "at the stars: observed - model",
+    "left_out": "at stars left out: observed - model",
+    "away": "where no star is: truth - model",
+}
 
 
 def ccd_corners(camera: Camera, indices: Iterable[int]) -> np.ndarray:

@@ -1,21 +1,28 @@
-"""Plots over the focal plane: heights of the CCDs, and whiskers of the ellipticity."""
+"""Plots over the focal plane: heights of the CCDs, whiskers of the ellipticity, residuals of each CCD."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
 
 from ...core.plotting import new_figure, png_bytes, styled
+from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ..ccd_product import CcdProduct, Stars
+from ..measure.summary import ellipticities
 from .focal_plane_axes import (
     AWAY,
     OBSERVED,
     RESIDUAL,
+    RESIDUAL_TITLES,
     TRUTH,
+    ccd_corners,
     draw_field_circle,
     draw_key_whisker,
     draw_outlines,
@@ -25,7 +32,6 @@ from .focal_plane_axes import (
     whiskers,
 )
 
-_HEIGHT_MAP = "RdBu_r"
 #: More CCDs than this are many: each is small on the page.
 _MANY = 30
 #: Whiskers on one CCD, and a fifth of them where CCDs are many: more make one dark mass.
@@ -35,14 +41,7 @@ _MOST_WHISKERS = 200
 def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
     """Draw the heights of all CCDs, the used ones framed and named (Jee & Tyson 2011, Fig. 7).
 
-    Parameters
-    ----------
-    focal_plane : FocalPlane
-        Heights.
-    used : sequence of str
-        CCDs of the run.
-    field_radius : float
-        Radius of the field of view on the detector [m].
+    `field_radius` is the radius of the field of view on the detector [m].
     """
     camera = focal_plane.camera
     indices = [camera.ccd_index(name) for name in used]
@@ -58,26 +57,17 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
         frame_axes(axes, limits)
         framed = f"; framed: the {len(used)} CCDs of this run" if used else ""
         axes.set_title(f"CCD heights{framed}; dashed: edge of the field of view")
-        bar = figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02)
-        bar.set_label("height along +z, towards the sky [µm]")
+        figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, label="height along +z, towards the sky [µm]")
         return png_bytes(figure)
 
 
 def whiskers_plot(
     products: Sequence[CcdProduct], focal_plane: FocalPlane, field_radius: float, kinds: Sequence[str] | None = None
 ) -> bytes:
-    """Draw whiskers of truth, observed stars and residual over the CCDs of the run, all on one scale (Figs. 8, 11, 12).
+    """Draw whiskers over the CCDs of the run, all on one scale, CCD heights faintly behind (Figs. 8, 11, 12).
 
-    Parameters
-    ----------
-    products : sequence of CcdProduct
-        CCDs of the run.
-    focal_plane : FocalPlane
-        Heights, drawn faintly behind.
-    field_radius : float
-        Radius of the field of view on the detector [m].
-    kinds : sequence of str, optional
-        Panels to draw, of ``truth``, ``observed``, ``residual``, ``away``; the first three by default.
+    Panels are `kinds` of ``truth``, ``observed``, ``residual``, ``away``, by default the first three; `field_radius` is
+    the radius of the field of view on the detector [m].
     """
     kinds = ("truth", "observed", "residual") if kinds is None else kinds
     centers = np.array([p.center for p in products]) * 1e3
@@ -99,7 +89,7 @@ def whiskers_plot(
         else:
             figure = new_figure(wide + 1.5, (wide + 1.5) / len(kinds) / across + 0.9, "compressed")
             panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-        image, bounds = None, height_range(focal_plane)
+        bounds = height_range(focal_plane)
         most = _MOST_WHISKERS if len(products) <= _MANY else _MOST_WHISKERS // 5
         for i, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
             image = draw_heights(axes, focal_plane, limits, 700, alpha=0.35, bounds=bounds)
@@ -110,9 +100,7 @@ def whiskers_plot(
             frame_axes(axes, limits, x_label=not stacked or i == len(kinds) - 1, y_label=stacked or i == 0)
             axes.set_title(_titled(_TITLES[kind], products, kind, most), loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
-        if image is not None:
-            bar = figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30)
-            bar.set_label("CCD height [µm]")
+        figure.colorbar(image, ax=list(panels), fraction=0.02, pad=0.01, aspect=30, label="CCD height [µm]")
         return png_bytes(figure)
 
 
@@ -126,7 +114,7 @@ def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> by
     with styled():
         figure = new_figure(13.0, 3.35 * len(products) + 0.4)
         panels = figure.subplots(len(products), len(kinds), squeeze=False)
-        image, bounds = None, height_range(focal_plane)
+        bounds = height_range(focal_plane)
         for last, row, product in zip(range(len(products) - 1, -1, -1), panels, products, strict=True):
             x, y = np.array(product.center) * 1e3
             limits = (x - 1.04 * half, x + 1.04 * half, y - 1.04 * half, y + 1.04 * half)
@@ -139,9 +127,7 @@ def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> by
                 title = name + _SHORT_TITLES[kind]
                 axes.set_title(_titled(title, [product], kind, _MOST_WHISKERS) if i == 0 else title, loc="left")
                 draw_key_whisker(axes, key, scale, 1.2)
-        if image is not None:
-            bar = figure.colorbar(image, ax=panels.ravel().tolist(), fraction=0.02, pad=0.01, aspect=40)
-            bar.set_label("CCD height [µm]")
+        figure.colorbar(image, ax=list(panels.flat), fraction=0.02, pad=0.01, aspect=40, label="CCD height [µm]")
         return png_bytes(figure)
 
 
@@ -178,8 +164,7 @@ def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: 
 
 def _common_key(products: Sequence[CcdProduct]) -> float:
     """Return the ellipticity of the key whisker, from truth and observed stars together."""
-    stars: list[Stars] = [s for p in products for s in (p.holdout, p.observed)]
-    return key_ellipticity(np.concatenate([np.hypot(s.e1, s.e2) for s in stars]))
+    return key_ellipticity(np.concatenate([np.hypot(*ellipticities(products, k)) for k in ("truth", "observed")]))
 
 
 def height_range(focal_plane: FocalPlane) -> float:
@@ -210,9 +195,74 @@ def draw_heights(
     return axes.imshow(
         height,
         extent=(x[0] - 0.5 * step, x[-1] + 0.5 * step, y[0] - 0.5 * step, y[-1] + 0.5 * step),
-        cmap=_HEIGHT_MAP,
+        cmap="RdBu_r",
         vmin=-bounds,
         vmax=bounds,
         alpha=alpha,
         aspect="equal",
     )
+
+
+def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
+    """Draw the residuals of each CCD: rms and mean ellipticity above, mean size below; the same scale across a row.
+
+    `columns` are those of the table of CCDs of :class:`~.Diagnostics`.
+    """
+    indices = [camera.ccd_index(str(name)) for name in columns["ccd"]]
+    corners = ccd_corners(camera, indices)
+    low, high = corners.min(axis=(0, 1)) - 8.0, corners.max(axis=(0, 1)) + 8.0
+    limits = (low[0], high[0], low[1], high[1])
+    across = float((high[0] - low[0]) / (high[1] - low[1]))
+    means = np.concatenate([np.hypot(columns[f"mean_e1_{k}"], columns[f"mean_e2_{k}"]) for k in RESIDUAL_TITLES])
+    key = key_ellipticity(means)
+    scale = 0.7 * camera.half_size * 1e3 / key
+    worst = _largest(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
+    sizes = _largest(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
+    with styled():
+        figure = new_figure(12.5, min(max(2 * 3.6 / across, 2.6) + 1.4, 9.5))
+        rows = figure.subplots(2, 3, squeeze=False)
+        above = ScalarMappable(Normalize(0.0, worst), "viridis")
+        below = ScalarMappable(Normalize(-sizes, sizes), "RdBu_r")
+        for i, (kind, title) in enumerate(RESIDUAL_TITLES.items()):
+            axes = rows[0, i]
+            _draw_ccds(axes, camera, indices, columns[f"rms_e_{kind}"], above)
+            ends = whiskers(
+                columns["x_mm"], columns["y_mm"], columns[f"mean_e1_{kind}"], columns[f"mean_e2_{kind}"], scale
+            )
+            draw_whiskers(axes, ends, "white", 2.6)
+            draw_whiskers(axes, ends, "black", 1.2)
+            frame_axes(axes, limits, x_label=kind == "left_out", y_label=i == 0)
+            axes.set_title(title, loc="left", fontsize=8.5)
+            draw_key_whisker(axes, key, scale, 1.0)
+        for i, kind in ((0, "residual"), (2, "away")):
+            axes = rows[1, i]
+            _draw_ccds(axes, camera, indices, columns[f"mean_dt_{kind}"], below)
+            frame_axes(axes, limits, y_label=i == 0)
+            axes.set_title(RESIDUAL_TITLES[kind], loc="left", fontsize=8.5)
+        rows[1, 1].set_axis_off()
+        rows[1, 1].annotate(
+            "Above: colour, rms of one component of e;\nwhisker, mean residual of the CCD.\n"
+            "Below: mean of $(T - T_{model})/T$, $T = Q_{11} + Q_{22}$.",
+            (0.5, 0.5),
+            xycoords="axes fraction",
+            ha="center",
+            va="center",
+            fontsize=8.5,
+        )
+        figure.colorbar(above, ax=list(rows[0]), fraction=0.03, pad=0.01, extend="max", label="rms of e")
+        label = "mean $\\delta T/T$"
+        figure.colorbar(below, ax=list(rows[1]), fraction=0.03, pad=0.01, extend="both", label=label)
+        return png_bytes(figure)
+
+
+def _largest(values: np.ndarray) -> float:
+    """Return the 98th percentile of finite values, or one where it is zero."""
+    finite = values[np.isfinite(values)]
+    largest = float(np.quantile(finite, 0.98)) if finite.size else 0.0
+    return largest if largest > 0.0 else 1.0
+
+
+def _draw_ccds(axes: Axes, camera: Camera, indices: list[int], values: np.ndarray, shades: ScalarMappable) -> None:
+    corners = ccd_corners(camera, indices)
+    axes.add_collection(PolyCollection(list(corners), facecolors=shades.to_rgba(values), edgecolors="none"))
+    draw_outlines(axes, camera, range(len(camera)), "0.75", 0.4)

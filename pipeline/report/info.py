@@ -45,14 +45,14 @@ def describe(telescope: Telescope) -> dict[str, Any]:
     """
     first: dict[str, float | None] = dict.fromkeys(FIRST_ORDER_KEYS)
     with contextlib.suppress(DomainError):
-        figures = first_order(telescope)
+        optics = first_order(telescope)
         first = {
-            "focal_length_m": figures.focal_length,
-            "f_number": figures.f_number,
-            "plate_scale_arcsec_per_um": abs(figures.plate_scale) / ARCSEC * 1e-6,
-            "exit_pupil_z_m": figures.exit_pupil_z,
-            "exit_pupil_diameter_m": figures.exit_pupil_diameter,
-            "focus_z_m": figures.focus_z,
+            "focal_length_m": optics.focal_length,
+            "f_number": optics.f_number,
+            "plate_scale_arcsec_per_um": abs(optics.plate_scale) / ARCSEC * 1e-6,
+            "exit_pupil_z_m": optics.exit_pupil_z,
+            "exit_pupil_diameter_m": optics.exit_pupil_diameter,
+            "focus_z_m": optics.focus_z,
         }
     wavelength = telescope.default_wavelength
     low, high = telescope.band or telescope.wavelength_range

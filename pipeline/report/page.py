@@ -12,24 +12,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of a report.
-
-    Attributes
-    ----------
-    title : str
-        Heading.
-    png : bytes
-        The picture.
-    shows : str
-        Caption.
-    paper : str
-        The corresponding figure of Jee & Tyson 2011; empty where there is none.
-    """
+    """One picture of a report."""
 
     title: str
     png: bytes
-    shows: str
-    paper: str = ""
+    shows: str  #: caption
+    paper: str = ""  #: corresponding figure of Jee & Tyson 2011; empty where there is none
 
     @property
     def source(self) -> str:

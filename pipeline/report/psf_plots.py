@@ -15,15 +15,7 @@ from .tables import percent
 
 
 def eigen_psf_plot(product: CcdProduct, noise_free: bool) -> bytes:
-    """Draw the mean PSF and the eigen-PSFs of one CCD (Jee & Tyson 2011, Fig. 9).
-
-    Parameters
-    ----------
-    product : CcdProduct
-        The CCD.
-    noise_free : bool
-        Whether to draw the components of the noise-free PSFs, or of the observed stars.
-    """
+    """Draw mean and eigen-PSFs of one CCD, of the noise-free PSFs or the observed stars (Jee & Tyson 2011, Fig. 9)."""
     model = product.noise_free_model if noise_free else product.model
     count = min(model.n_components, 20)
     columns = 7
@@ -36,7 +28,6 @@ def eigen_psf_plot(product: CcdProduct, noise_free: bool) -> bytes:
             axes.set_axis_off()
         panels[0].imshow(np.sqrt(np.maximum(model.mean, 0.0)), extent=extent, cmap="viridis", vmin=0.0)
         panels[0].set_title("mean (square root)", fontsize=8)
-        image = None
         for k, axes in enumerate(panels[1 : count + 1]):
             component = model.components[k]
             edge = float(np.abs(component).max())
@@ -52,9 +43,8 @@ def eigen_psf_plot(product: CcdProduct, noise_free: bool) -> bytes:
             if i + columns > count:
                 axes.set_xlabel("x [arcsec]")
                 axes.tick_params(labelbottom=True)
-        if image is not None:
-            bar = figure.colorbar(image, ax=list(panels), fraction=0.015, pad=0.01, aspect=40)
-            bar.set_label("eigen-PSF, each over its largest magnitude")
+        label = "eigen-PSF, each over its largest magnitude"
+        figure.colorbar(image, ax=list(panels), fraction=0.015, pad=0.01, aspect=40, label=label)
         kind = "noise-free PSFs" if noise_free else "observed stars"
         figure.suptitle(
             f"{product.name}: mean and eigen-PSFs of {model.n_stars} {kind}; "
@@ -82,9 +72,7 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
         count = products[0].model.n_components
         for axes in (left, right):
             axes.axvline(count + 0.5, color="0.5", linewidth=0.8, linestyle=(0, (4, 3)))
-            axes.set_yscale("log")
-            axes.set_xlabel("component n")
-            axes.set_xlim(0, 2.2 * count)
+            axes.set(yscale="log", xlabel="component n", xlim=(0, 2.2 * count))
         right.axhline(0.01, color=AWAY, linewidth=0.8)
         right.annotate("1 %", (0.99, 0.01), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
         values = [m.eigenvalues[: 2 * count] for p in products for m in (p.model, p.noise_free_model)]
@@ -103,21 +91,15 @@ def spectrum_plot(products: Sequence[CcdProduct]) -> bytes:
 
 
 def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
-    """Draw observed stars, the model at their places, and the residuals in units of the noise.
+    """Draw observed stars, the model at their positions, and the residuals in units of the noise.
 
-    Parameters
-    ----------
-    products : sequence of CcdProduct
-        CCDs to take stars from, a group of columns each.
-    per_ccd : int
-        Stars on each, from the brightest to the faintest.
+    Columns are `per_ccd` stars of each CCD, from the brightest to the faintest.
     """
     chosen = [(p, i) for p in products for i in _bright_to_faint(p, per_ccd)]
     extent = _extent(products[0].observed_images.shape[1], products[0].pixel_scale)
     with styled():
         figure = new_figure(1.45 * len(chosen) + 1.3, 5.6)
         panels = figure.subplots(3, len(chosen), sharex=True, sharey=True, squeeze=False)
-        light = noise = None
         for column, (product, i) in zip(panels.T, chosen, strict=True):
             stars, position = product.observed, np.array([[product.observed.x[i], product.observed.y[i]]])
             model = product.model.at(position)[0]
@@ -129,27 +111,24 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
             light = column[0].imshow(_stretched(observed / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
             column[1].imshow(_stretched(model / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
             noise = column[2].imshow(
-                left_over, extent=extent, cmap="RdBu_r", norm=SymLogNorm(3.0, vmin=-_FAR_OFF, vmax=_FAR_OFF)
+                left_over, extent=extent, cmap="RdBu_r", norm=SymLogNorm(3.0, vmin=-100.0, vmax=100.0)
             )
             column[0].set_title(f"{product.name}\n{stars.magnitude[i]:.1f} mag, S/N {stars.snr[i]:.0f}", fontsize=8)
             column[2].set_xlabel("x [arcsec]")
         for axes, name in zip(panels[:, 0], ("observed", "model", "observed - model"), strict=True):
             axes.set_ylabel(f"{name}\ny [arcsec]")
-        if light is not None and noise is not None:
-            bar = figure.colorbar(light, ax=panels[:2].ravel().tolist(), fraction=0.02, pad=0.01, aspect=30)
-            ticks = np.array([0.0, 0.01, 0.1, 0.5, 1.0])
-            bar.set_ticks(_stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
-            bar.set_label("over the model's peak (asinh)")
-            bar = figure.colorbar(noise, ax=panels[2].tolist(), fraction=0.02, pad=0.01, aspect=15)
-            steps = (-100, -30, -10, -3, 0, 3, 10, 30, 100)
-            bar.set_ticks(steps, labels=[f"{t}" for t in steps], minor=False)
-            bar.ax.minorticks_off()
-            bar.set_label("pixel noise σ")
+        label = "over the model's peak (asinh)"
+        bar = figure.colorbar(light, ax=list(panels[:2].flat), fraction=0.02, pad=0.01, aspect=30, label=label)
+        ticks = np.array([0.0, 0.01, 0.1, 0.5, 1.0])
+        bar.set_ticks(_stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
+        bar = figure.colorbar(noise, ax=list(panels[2]), fraction=0.02, pad=0.01, aspect=15, label="pixel noise σ")
+        steps = (-100, -30, -10, -3, 0, 3, 10, 30, 100)
+        bar.set_ticks(steps, labels=[f"{t}" for t in steps], minor=False)
+        bar.ax.minorticks_off()
         return png_bytes(figure)
 
 
 _SOFTENING = 0.02
-_FAR_OFF = 100.0
 
 
 def _stretched(values: np.ndarray) -> np.ndarray:
@@ -163,8 +142,8 @@ def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
     """Return used stars spread evenly over the magnitudes, brightest first."""
     used = np.flatnonzero(product.observed.used)
     ordered = used[np.argsort(product.observed.magnitude[used], kind="stable")]
-    places = np.unique(np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int))
-    return [int(i) for i in ordered[places]]
+    ranks = np.unique(np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int))
+    return [int(i) for i in ordered[ranks]]
 
 
 def _extent(size: int, pixel_scale: float) -> tuple[float, float, float, float]:

@@ -24,17 +24,7 @@ OBSERVED_COMPONENTS = "Eigen-PSFs of the observed stars"
 
 
 def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
-    """Return the report of a run as HTML that refers to no other file.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment of the run.
-    summary : dict
-        Metrics, as in ``summary.json``.
-    pictures : sequence of Picture
-        Pictures, as :func:`draw_pictures` gives them.
-    """
+    """Return the report of a run as HTML that refers to no other file."""
     return render(
         "report.html",
         config=experiment.config,
@@ -51,7 +41,7 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
 
 
 def _model_words(fit: ReconstructionConfig) -> str:
-    """Return how the PSF is modelled, in words."""
+    """Return the PSF model in words."""
     described = {"pca": "principal components a CCD", "shapelets": "shapelets a CCD", "pixels": "each pixel on its own"}
     basis = described[fit.basis] if fit.components is None else f"{fit.components} {described[fit.basis]}"
     process = "a Gaussian process over " if fit.interpolation == "gp" else ""
@@ -95,8 +85,8 @@ def draw_pictures(
         Picture(
             "Whiskers close up",
             close_up_plot(close, plane),
-            "The CCD closest to the axis, one half-way out and the farthest one. The last column is what a galaxy "
-            "sees: the error of the model at places where there was no star to fit.",
+            "The CCD closest to the axis, one half-way out and the farthest one. The last column is the error "
+            "for galaxies: that of the model at places where there was no star to fit.",
             "The paper notes a small-scale variation even within a CCD, from tilt and potato chip, and so fits "
             "polynomials CCD by CCD.",
         ),
@@ -115,13 +105,13 @@ def draw_pictures(
             "The paper keeps 20 components for observed stars too.",
         ),
         Picture(
-            "How many components are needed",
+            "Number of components needed",
             spectrum_plot(products),
             "Eigenvalues of every CCD, and the part of the variance that components beyond n hold. Where the "
             "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
             "is the elbow, the point farthest below the straight line from the first eigenvalue to the last.",
-            "The paper finds it by eye and that about 20 components suffice; physics asks for over 99 % of the "
-            "variance of the truth.",
+            "The paper finds it by eye and that about 20 components suffice; they should hold over 99 % "
+            "of the variance of the truth.",
         ),
         Picture(
             "Ellipticity before and after",
@@ -136,7 +126,7 @@ def draw_pictures(
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
             f"{errors}, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
             "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
-            "triangles, away from the stars, are what a galaxy sees. Where the CCDs lie in a row, long pairs all point "
+            "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
             "along it, and an ellipticity common to the field does not average out of ξ-.",
             "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
             "1e-7 from 10 arcmin to 3 degrees; ξ- similar.",
@@ -148,7 +138,6 @@ def draw_pictures(
             "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
             "only that noise is left. A bright star can show more: mean and components are fitted without weights, "
             "so the noise of the faint stars is in the model.",
-            "",
         ),
     ]
     # Single pixels and shapelets look the same whatever the stars are.

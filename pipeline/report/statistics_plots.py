@@ -1,16 +1,18 @@
-"""Plots of ellipticities: their scatter, and their correlation against separation."""
+"""Plots of ellipticities: their scatter; correlations and rho statistics against separation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from ...core.plotting import new_figure, png_bytes, styled
-from ..ccd_product import CcdProduct, Stars
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, png_bytes, styled
+from ..ccd_product import CcdProduct
 from ..measure.correlation import Correlation
-from .focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
+from ..measure.rho_statistics import RhoStatistics
+from ..measure.summary import ellipticities
+from .focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
 
 _LABELS = {
     "truth": (TRUTH, "o", "truth, where no star is"),
@@ -19,36 +21,37 @@ _LABELS = {
     "left_out": (LEFT_OUT, "v", "observed - model fitted without the star"),
     "away": (AWAY, "^", "truth - model, where no star is"),
 }
+_RHO_STYLES = {
+    "rho1": (RED, "D", "$\\rho_1 = \\langle\\delta e^*\\,\\delta e\\rangle$"),
+    "rho2": (BLUE, "s", "$\\rho_2 = \\langle e^*\\,\\delta e\\rangle$"),
+    "rho3": (ORANGE, "^", "$\\rho_3 = \\langle (e\\,\\delta T/T)^* (e\\,\\delta T/T)\\rangle$"),
+    "rho4": (PURPLE, "v", "$\\rho_4 = \\langle\\delta e^* (e\\,\\delta T/T)\\rangle$"),
+    "rho5": (GREY, "o", "$\\rho_5 = \\langle e^* (e\\,\\delta T/T)\\rangle$"),
+}
 
 
 def scatter_plot(products: Sequence[CcdProduct]) -> bytes:
     """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
-    panels: tuple[tuple[str, Sequence[Stars], str, str, str, str], ...] = (
-        ("at the observed stars", [p.observed for p in products], OBSERVED, RESIDUAL, "observed", "observed - model"),
-        ("where no star is", [p.holdout for p in products], TRUTH, AWAY, "truth", "truth - model"),
-    )
+    panels = (("at the observed stars", "observed", "residual"), ("where no star is", "truth", "away"))
     with styled():
         figure = new_figure(10.0, 5.2)
         both = figure.subplots(1, 2, sharex=True, sharey=True)
-        for axes, (title, stars, before, after, name, residual) in zip(both, panels, strict=True):
-            _draw_cloud(axes, stars, ("e1", "e2"), before, name)
-            _draw_cloud(axes, stars, ("residual_e1", "residual_e2"), after, residual)
+        for axes, (title, before, after) in zip(both, panels, strict=True):
+            for kind, name in ((before, before), (after, f"{before} - model")):
+                _draw_cloud(axes, *ellipticities(products, kind), _LABELS[kind][0], name)
             axes.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
             axes.axvline(0.0, color="0.7", linewidth=0.6, zorder=0)
-            axes.set_aspect("equal")
-            axes.set_xlabel("$e_1$: $(a-b)/(a+b)$ along x")
+            axes.set(aspect="equal", xlabel="$e_1$: $(a-b)/(a+b)$ along x")
             axes.set_title(title, loc="left")
             axes.legend(loc="upper right")
         both[0].set_ylabel("$e_2$: along the diagonal x = y")
-        values = np.concatenate([np.abs([s.e1, s.e2]).ravel() for p in products for s in (p.holdout, p.observed)])
-        edge = 1.1 * float(np.nanmax(values))
-        both[0].set_xlim(-edge, edge)
-        both[0].set_ylim(-edge, edge)
+        values = np.concatenate([ellipticities(products, kind) for _, kind, _ in panels], axis=1)
+        edge = 1.1 * float(np.nanmax(np.abs(values)))
+        both[0].set(xlim=(-edge, edge), ylim=(-edge, edge))
         return png_bytes(figure)
 
 
-def _draw_cloud(axes: Axes, stars: Sequence[Stars], keys: tuple[str, str], color: str, name: str) -> None:
-    e1, e2 = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
+def _draw_cloud(axes: Axes, e1: np.ndarray, e2: np.ndarray, color: str, name: str) -> None:
     finite = np.isfinite(e1) & np.isfinite(e2)
     rms = np.sqrt(0.5 * np.mean(e1[finite] ** 2 + e2[finite] ** 2)) if finite.any() else np.nan
     # Many points would hide those below them.
@@ -65,12 +68,8 @@ def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
         for axes, sign in zip(panels, ("plus", "minus"), strict=True):
             for kind, correlation in correlated.items():
                 draw_correlation(axes, correlation, sign, *_LABELS[kind])
-            axes.set_xscale("log")
-            axes.set_yscale("log")
+            log_axes(axes, f"$\\xi_{'+' if sign == 'plus' else '-'}$")
             axes.set_xlabel("separation [arcmin]")
-            axes.set_title(f"$\\xi_{'+' if sign == 'plus' else '-'}$", loc="left")
-            axes.grid(True, which="major", color="0.9", linewidth=0.6)
-            axes.set_axisbelow(True)
         panels[0].set_ylabel("$|\\xi|$ of the ellipticity")
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(max(low, 1e-10), high * 2)
@@ -89,13 +88,37 @@ def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
         handles, labels = panels[0].get_legend_handles_labels()
         filled = panels[0].plot([], [], "o", color="0.4", markersize=4.5)[0]
         hollow = panels[0].plot([], [], "o", color="0.4", markersize=4.5, markerfacecolor="white")[0]
-        figure.legend(
-            [*handles, filled, hollow],
-            [*labels, "positive", "negative"],
-            loc="outside lower center",
-            ncols=3,
-        )
+        handles, labels = [*handles, filled, hollow], [*labels, "positive", "negative"]
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
         return png_bytes(figure)
+
+
+def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
+    """Draw rho statistics, grouped as in Jarvis et al. 2016: ``residual`` above, ``away`` (where no star is) below."""
+    with styled():
+        figure = new_figure(11.0, 4.1 * len(rho) + 0.5)
+        panels = figure.subplots(len(rho), 2, sharex=True, sharey="col", squeeze=False)
+        for row, (kind, statistics) in zip(panels, rho.items(), strict=True):
+            found = dict(statistics.items())
+            for axes, names in zip(row, (("rho1", "rho3", "rho4"), ("rho2", "rho5")), strict=True):
+                for name in names:
+                    draw_correlation(axes, found[name], "plus", *_RHO_STYLES[name])
+                log_axes(axes, RESIDUAL_TITLES[kind])
+                axes.legend(loc="best")
+            row[0].set_ylabel("$|\\rho|$: filled positive, open negative")
+        for axes in panels[0]:
+            low, high = axes.get_ylim()
+            axes.set_ylim(max(low, 1e-12), 2.0 * high)
+        for axes in panels[-1]:
+            axes.set_xlabel("separation [arcmin]")
+        return png_bytes(figure)
+
+
+def log_axes(axes: Axes, title: str) -> None:
+    """Give axes logarithmic scales, a grid and a title."""
+    axes.set(xscale="log", yscale="log", axisbelow=True)
+    axes.set_title(title, loc="left")
+    axes.grid(True, which="major", color="0.9", linewidth=0.6)
 
 
 def draw_correlation(axes: Axes, correlation: Correlation, sign: str, color: str, marker: str, label: str) -> None:

@@ -18,27 +18,26 @@ _NAMES = {
 
 def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the metrics of a run: name, and value with unit."""
-    figures = summary["all"]
+    metrics = summary["all"]
     rows = [
-        ("CCDs", f"{figures['ccds']}"),
-        ("PSFs known without noise", f"{figures['truth_psfs']}"),
-        ("observed stars, used in the fit", f"{figures['stars']}, {figures['stars_used']}"),
+        ("CCDs", f"{metrics['ccds']}"),
+        ("PSFs known without noise", f"{metrics['truth_psfs']}"),
+        ("observed stars, used in the fit", f"{metrics['stars']}, {metrics['stars_used']}"),
         (
             "FWHM, median and range",
-            f'{_figure(figures["fwhm_arcsec"])}", '
-            f'{_figure(figures["fwhm_min_arcsec"])} to {_figure(figures["fwhm_max_arcsec"])}"',
+            '{fwhm_arcsec:.3f}", {fwhm_min_arcsec:.3f} to {fwhm_max_arcsec:.3f}"'.format(**metrics),
         ),
-        ("mean |e|, truth", _percent(figures["mean_e_truth"])),
-        ("mean |e|, observed stars", _percent(figures["mean_e_observed"])),
-        ("rms e residual, at the stars", _percent(figures["rms_residual_at_stars"])),
-        ("rms e residual, each star left out in turn", _percent(figures["rms_residual_left_out"])),
-        ("rms e residual, where no star is (no noise)", _percent(figures["rms_residual_away"])),
-        ("truth's variance in the components, worst CCD", percent(figures["truth_variance_in_components"])),
+        ("mean |e|, truth", _percent(metrics["mean_e_truth"])),
+        ("mean |e|, observed stars", _percent(metrics["mean_e_observed"])),
+        ("rms e residual, at the stars", _percent(metrics["rms_residual_at_stars"])),
+        ("rms e residual, each star left out in turn", _percent(metrics["rms_residual_left_out"])),
+        ("rms e residual, where no star is (no noise)", _percent(metrics["rms_residual_away"])),
+        ("truth's variance in the components, worst CCD", percent(metrics["truth_variance_in_components"])),
     ]
     low, high = SEPARATION_RANGES["long"]
     for kind in CORRELATED:
         near, far = (
-            f"{_power(figures[f'xi_plus_{kind}_{name}'])} ± {_power(figures[f'error_xi_plus_{kind}_{name}'])}"
+            f"{_power(metrics[f'xi_plus_{kind}_{name}'])} ± {_power(metrics[f'error_xi_plus_{kind}_{name}'])}"
             for name in ("short", "long")
         )
         rows.append((f"ξ+ of {_NAMES[kind]}, below {low:g}' / {low:g}' to {high:g}'", f"{near} / {far}"))
@@ -60,8 +59,8 @@ PER_CCD_COLUMNS = (
 PER_CCD_CAPTION = (
     "Mean |e| of the truth, and rms of one component of the residual: observed - model at the stars; the same with "
     "each star left out of the polynomial fit in turn; truth - model where no star is, which holds no noise of a star. "
-    "Variance: part of the truth's variance that the components hold. Kink: components before the eigenvalues flatten, "
-    "of the observed stars and of the truth."
+    "Variance: part of the truth's variance that the components hold. Elbow: components before the eigenvalues "
+    "flatten, of the observed stars and of the truth."
 )
 
 
@@ -71,7 +70,7 @@ def per_ccd(summary: dict[str, Any]) -> list[tuple[str, ...]]:
         (
             name,
             f"{f['field_deg']:.2f}",
-            _figure(f["fwhm_arcsec"]),
+            f"{f['fwhm_arcsec']:.3f}",
             _bare_percent(f["mean_e_truth"]),
             _bare_percent(f["rms_residual_at_stars"]),
             _bare_percent(f["rms_residual_left_out"]),
@@ -126,7 +125,7 @@ ATTRIBUTION_CAPTION = (
 )
 
 
-def attribution_rows(figures: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
+def attribution_rows(metrics: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
     """Return a row for each case of an attribution, in the columns of :data:`ATTRIBUTION_COLUMNS`."""
 
     def change(each: dict[str, float]) -> str:
@@ -144,7 +143,7 @@ def attribution_rows(figures: dict[str, dict[str, float]]) -> list[tuple[str, ..
             change(each),
             _power(each["xi_plus_away_long"]),
         )
-        for case, each in figures.items()
+        for case, each in metrics.items()
     ]
 
 
@@ -153,10 +152,6 @@ def percent(fraction: float) -> str:
     if fraction < 0.99:
         return f"{100 * fraction:.3g} %"
     return f"{100 * fraction:.2f} %" if fraction < 0.99985 else "> 99.98 %"
-
-
-def _figure(value: float) -> str:
-    return f"{value:.3f}"
 
 
 def _bare_percent(value: float) -> str:

@@ -18,18 +18,10 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class SimulatedCcds(Generic[_T]):
-    """Results of :func:`simulate_ccds`, in the order of the CCDs.
+    """Results of :func:`simulate_ccds`, in the order of the CCDs."""
 
-    Attributes
-    ----------
-    results : dict of str to object
-        Result of each CCD.
-    not_modelled : dict of str to str
-        CCDs that cannot be modelled, each with the reason.
-    """
-
-    results: dict[str, _T] = field(default_factory=dict)
-    not_modelled: dict[str, str] = field(default_factory=dict)
+    results: dict[str, _T] = field(default_factory=dict)  #: by CCD
+    not_modelled: dict[str, str] = field(default_factory=dict)  #: reason by CCD
 
 
 def simulate_ccds(
@@ -44,24 +36,10 @@ def simulate_ccds(
 ) -> SimulatedCcds[_T]:
     """Expose CCDs one after the other, and model each beside the next exposure.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Telescope, focal plane, atmosphere and settings.
-    model : callable
-        Model of one exposure, such as :func:`~pachon.pipeline.simulate.ccd_model.model_ccd` or any reduction of the
-        exposure. It runs on a thread of its own, one CCD at a time, in the order of the CCDs.
-    names : sequence of str, optional
-        CCDs; by default those of the configuration.
-    title : str, optional
-        Title of the progress bar.
-    strict : bool
-        Whether a CCD that cannot be modelled ends the loop, after the models under way; otherwise the CCD is reported
-        and left out.
-    threads : int, optional
-        Number of threads; all processors by default. No byte depends on it.
-    reporter : Reporter, optional
-        Progress display; silent by default.
+    `model` is any reduction of an exposure, such as :func:`~.model_ccd`. It runs on a thread of its own, one CCD at a
+    time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of the
+    configuration, `title` is that of the progress bar. A CCD that cannot be modelled ends the loop with `strict`, after
+    the models under way; otherwise it is reported and left out.
 
     Raises
     ------

@@ -8,6 +8,7 @@ from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
 from ..defaults import noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
+from ..measure.star_selection import require_stars
 from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
 from ..psf_model.polynomial import term_count
@@ -17,25 +18,12 @@ from .photometry import effective_fwhm, signal_to_noise
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
-    """Add noise to the stars of one CCD, and model the PSF from them.
+    """Add noise and defects to the stars of one CCD, unless not `noisy`, and model the PSF from them.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Telescope, focal plane, atmosphere and settings.
-    exposure : CcdExposure
-        Noise-free stars.
-    noisy : bool
-        Whether the stars have noise and defects. Without noise no pixel is rejected: deviations from the mean are the
-        variation of the PSF.
-
-    Raises
-    ------
-    PachonError
-        If a stage fails.
+    Without noise no pixel is rejected: deviations from the mean are the variation of the PSF.
     """
     config = experiment.config
-    name, places, holdout, observed = exposure.name, exposure.places, exposure.holdout, exposure.observed
+    name, positions, holdout, observed = exposure.name, exposure.positions, exposure.holdout, exposure.observed
     holdout_images = holdout.image.astype(np.float64)
     holdout_shapes = measure_shapes(holdout_images, holdout.pixel_scale, experiment.weight_fwhm)
     # Positions do not depend on the magnitude limits, which follow from the vignetting of the stars.
@@ -48,7 +36,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     observation = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
     fit, used = config.reconstruction, observation.used
     least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
-    observation.require(max(least, term_count(fit.order or 0)))
+    require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
     model = PsfModel.fit(
         observation.images[used],
         stars.observed[used],
@@ -57,23 +45,23 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         weights=snr_weights(fit.weights, snr[used]),
         n_components=fit.components,
         order=fit.order,
-        extent=places.bounds,
+        extent=positions.bounds,
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
     # Noise-free stars have no outliers: deviations from the mean are the variation of the PSF.
     noise_free_model = PsfModel.fit(
         holdout_images,
-        places.holdout,
+        positions.holdout,
         n_components=noise_free_components(config),
         order=fit.truth_order,
-        extent=places.bounds,
+        extent=positions.bounds,
         clip_sigma=None,
     )
 
     def shapes_of(images: np.ndarray) -> Shapes:
         return measure_shapes(images, observed.pixel_scale, experiment.weight_fwhm)
 
-    at_holdout, at_stars = shapes_of(model.at(places.holdout)), shapes_of(model.at(stars.observed))
+    at_holdout, at_stars = shapes_of(model.at(positions.holdout)), shapes_of(model.at(stars.observed))
     x, y = experiment.camera.centers[experiment.camera.ccd_index(name)]
     left_out = shapes_of(model.leave_one_out())
     leave_one_out_e1, leave_one_out_e2 = np.full((2, len(used)), np.nan)
@@ -84,7 +72,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         pixel_scale=holdout.pixel_scale,
         noise=observation.noise,
         holdout=HoldoutStars(
-            **_positions(places.holdout, holdout.fields),
+            **_positions(positions.holdout, holdout.fields),
             **_shapes(holdout_shapes, at_holdout),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),

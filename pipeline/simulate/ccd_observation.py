@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, measure_shapes
-from ..measure.star_selection import StarFlag, defect_counts, flag_stars
+from ..measure.star_selection import StarFlag, flag_stars
 from .photometry import instrument_noise, sky_electrons_per_pixel
 from .stamps import center_stamps, observe_stamps
 from .star_defects import add_defects
@@ -18,63 +17,22 @@ from .star_defects import add_defects
 
 @dataclass(frozen=True)
 class Observation:
-    """Observed stars of a CCD.
+    """Observed stars of a CCD."""
 
-    Attributes
-    ----------
-    noise : tuple of float
-        Sky [electrons/pixel] and rms noise without light [electrons/pixel].
-    images : ndarray, shape [n, size, size]
-        Stamps centred on a pixel, of unit sum; NaN where a star could not be centred.
-    shapes : Shapes
-        Of the stamps; e and size are NaN where a defect was found.
-    defects : ndarray of int, shape [n]
-        :class:`~pachon.pipeline.measure.star_selection.StarFlag` bits of the defects found; 0 without a search.
-    used : ndarray of bool, shape [n]
-        Whether the star is good enough for the PSF model.
-    """
-
-    noise: tuple[float, float]
-    images: np.ndarray
-    shapes: Shapes
-    defects: np.ndarray
-    used: np.ndarray
-
-    def require(self, least: int) -> None:
-        """Raise an error if fewer stars can be used.
-
-        Raises
-        ------
-        DomainError
-            With the number of stars of each defect.
-        """
-        left = int(self.used.sum())
-        if left < least:
-            counts = defect_counts(self.defects)
-            raise DomainError(
-                f"{left} of {len(self.used)} stars left{f' ({counts})' if counts else ''}: expected at least {least}"
-            )
+    noise: tuple[float, float]  #: sky and rms noise without light [electrons/pixel]
+    images: np.ndarray  #: [n, size, size], centred on a pixel, unit sum; NaN where not possible
+    shapes: Shapes  #: of the images; e and size are NaN where a defect was detected
+    defects: np.ndarray  #: :class:`~.StarFlag` bits of detected defects, [n]; 0 without a search
+    used: np.ndarray  #: [n] bool: whether the star is good enough for the PSF model
 
 
 def observe_ccd(
     experiment: Experiment, name: str, images: np.ndarray, pixel_scale: float, electrons: np.ndarray, *, noisy: bool
 ) -> Observation:
-    """Observe the stars of a CCD.
+    """Observe the stars of a CCD, with noise and defects if `noisy`.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Settings of noise, defects and selection.
-    name : str
-        Name of the CCD, in the key of its random streams.
-    images : array
-        [n, ny, nx] noise-free stars of unit sum, where they fall on their pixels.
-    pixel_scale : float
-        Angle of a pixel [rad].
-    electrons : array
-        [n] electrons of each star.
-    noisy : bool
-        Whether there are noise and defects.
+    `images` [n, ny, nx] are noise-free stars of unit sum at their sub-pixel positions, `pixel_scale` [rad] and
+    `electrons` [n] theirs; the name of the CCD is part of the key of its random streams.
     """
     config = experiment.config
     seconds = config.atmosphere.exposure_s

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import erf
 
 from ...core.errors import DomainError, unknown_name
-from ...core.units import ARCSEC, radians
+from ...core.units import ARCSEC, positive_angle, require_positive
 
 PIXEL_SCALE = 0.2 * ARCSEC
 """Angle of one LSST pixel [rad]."""
@@ -31,34 +31,20 @@ DARK_CURRENT = 0.2
 FULL_WELL = 1.0e5
 """Largest signal of an unsaturated pixel [e-]: just under the lower of the two measured turn-offs of the photon
 transfer curve, 103 000 (e2v) and 129 000 (ITL) (SITCOMTN-148, Table 6)."""
+# Noise-equivalent pixels of a Gaussian whose FWHM is one pixel (SMTN-002).
+_PIXELS_PER_SQUARE_FWHM = 2.266
 
 
 @dataclass(frozen=True)
 class Band:
-    """One LSST filter at the zenith under a dark sky.
+    """One LSST filter at the zenith under a dark sky; all but the range of wavelengths from SMTN-002."""
 
-    Parameters
-    ----------
-    name : str
-        ``"u"`` to ``"y"``.
-    zero_point : float
-        AB magnitude of a star that gives one electron a second, atmosphere at airmass 1 included (SMTN-002).
-    dark_sky : float
-        Sky brightness at the zenith [AB mag/arcsec^2] (SMTN-002).
-    extinction : float
-        Loss in the atmosphere [mag/airmass] (SMTN-002, ``kAtm``).
-    effective_wavelength : float
-        [m] (SMTN-002).
-    wavelength_range : tuple of float
-        Where the total throughput is at half its maximum [m] (LSST throughputs v1.9, airmass 1.2).
-    """
-
-    name: str
-    zero_point: float
-    dark_sky: float
-    extinction: float
-    effective_wavelength: float
-    wavelength_range: tuple[float, float]
+    name: str  #: ``u`` to ``y``
+    zero_point: float  #: AB magnitude of one electron a second, atmosphere at airmass 1 included
+    dark_sky: float  #: brightness [AB mag/arcsec^2]
+    extinction: float  #: loss in the atmosphere, ``kAtm`` [mag/airmass]
+    effective_wavelength: float  #: [m]
+    wavelength_range: tuple[float, float]  #: [m] at half the maximum throughput (LSST throughputs v1.9, airmass 1.2)
 
 
 BANDS = {
@@ -86,14 +72,14 @@ def band_named(band: str | Band) -> Band:
 def electrons(magnitude: Any, band: str | Band, exposure: float) -> np.ndarray:
     """Return the electrons of a star in one exposure, at airmass 1."""
     band = band_named(band)
-    exposure = _positive("exposure", exposure, "s")
+    exposure = require_positive(exposure, "exposure", "seconds")
     return exposure * 10.0 ** (0.4 * (band.zero_point - np.asarray(magnitude, dtype=np.float64)))
 
 
 def magnitude_of(counts: Any, band: str | Band, exposure: float) -> np.ndarray:
     """Return the AB magnitude of a number of electrons: the inverse of :func:`electrons`."""
     band = band_named(band)
-    exposure = _positive("exposure", exposure, "s")
+    exposure = require_positive(exposure, "exposure", "seconds")
     counts = np.asarray(counts, dtype=np.float64)
     if not np.all(counts > 0.0):
         raise DomainError(f"counts = {counts}: expected positive numbers of electrons")
@@ -109,32 +95,30 @@ def sky_electrons_per_pixel(
     the zero point without the atmosphere, ``zero_point + extinction``, applies (SMTN-002, "Sky Counts").
     """
     band = band_named(band)
-    exposure = _positive("exposure", exposure, "s")
-    area = (_positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad") / ARCSEC) ** 2
+    exposure = require_positive(exposure, "exposure", "seconds")
+    area = (positive_angle(pixel_scale, "pixel_scale") / ARCSEC) ** 2
     brightness = band.dark_sky if sky is None else float(sky)
     return float(exposure * area * 10.0 ** (0.4 * (band.zero_point + band.extinction - brightness)))
 
 
 def instrument_noise(exposure: float) -> float:
     """Return the rms of read noise and dark current in one pixel and exposure [e-] (SMTN-002)."""
-    return float(np.sqrt(READ_NOISE**2 + DARK_CURRENT * _positive("exposure", exposure, "s")))
+    return float(np.sqrt(READ_NOISE**2 + DARK_CURRENT * require_positive(exposure, "exposure", "seconds")))
 
 
 def effective_pixels(fwhm: Any, pixel_scale: Any = PIXEL_SCALE) -> float:
     """Return the noise-equivalent number of pixels of a star, ``2.266 (FWHM/pixel)^2`` (SMTN-002)."""
-    fwhm = _positive("fwhm", radians(fwhm, "fwhm"), "rad")
-    pixel = _positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad")
-    return float(2.266 * (fwhm / pixel) ** 2)
+    width, pixel = positive_angle(fwhm, "fwhm"), positive_angle(pixel_scale, "pixel_scale")
+    return _PIXELS_PER_SQUARE_FWHM * (width / pixel) ** 2
 
 
 def effective_fwhm(images: np.ndarray, pixel_scale: float) -> float:
     """Return the FWHM of the Gaussian with as many noise-equivalent pixels as the median star [rad].
 
-    The noise-equivalent number of pixels of an image P of unit sum is 1/sum(P^2), and 2.266 FWHM^2 pixels that of a
-    Gaussian (SMTN-002).
+    The noise-equivalent number of pixels is 1/sum(P^2) for an image P of unit sum.
     """
     pixels = 1.0 / np.median((images**2).sum(axis=(1, 2)))
-    return float(np.sqrt(pixels / 2.266) * pixel_scale)
+    return float(np.sqrt(pixels / _PIXELS_PER_SQUARE_FWHM) * pixel_scale)
 
 
 def signal_to_noise(
@@ -161,7 +145,7 @@ def limiting_magnitude(
     sky: float | None = None,
 ) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio: :func:`signal_to_noise` solved for C."""
-    square = _positive("snr", snr, "a ratio") ** 2
+    square = require_positive(snr, "snr") ** 2
     variance = _footprint_variance(band, exposure, fwhm, pixel_scale, sky)
     counts = 0.5 * (square + np.sqrt(square**2 + 4.0 * square * variance))
     return float(magnitude_of(counts, band, exposure))
@@ -179,17 +163,12 @@ def saturation_magnitude(
     """Return the magnitude at which the central pixel of a star reaches the full well [e-].
 
     The star is a Gaussian centred on the pixel. A turbulent PSF has more light in its wings and a lower peak, so the
-    limit is a safe one.
-
-    Raises
-    ------
-    DomainError
-        If the sky alone fills the well.
+    limit is a safe one. DomainError if the sky alone fills the well.
     """
-    sigma = _positive("fwhm", radians(fwhm, "fwhm"), "rad") / np.sqrt(8.0 * np.log(2.0))
-    pixel = _positive("pixel_scale", radians(pixel_scale, "pixel_scale"), "rad")
+    sigma = positive_angle(fwhm, "fwhm") / np.sqrt(8.0 * np.log(2.0))
+    pixel = positive_angle(pixel_scale, "pixel_scale")
     background = sky_electrons_per_pixel(band, exposure, pixel, sky=sky)
-    room = _positive("full_well", full_well, "electrons") - background
+    room = require_positive(full_well, "full_well", "electrons") - background
     if room <= 0.0:
         raise DomainError(f"full_well = {full_well}: expected more than the {background:.0f} electrons of the sky")
     central = erf(0.5 * pixel / (np.sqrt(2.0) * sigma)) ** 2
@@ -200,14 +179,3 @@ def _footprint_variance(band: str | Band, exposure: float, fwhm: Any, pixel_scal
     """Return the variance of sky and instrument under a star [e-^2]."""
     background = sky_electrons_per_pixel(band, exposure, pixel_scale, sky=sky)
     return effective_pixels(fwhm, pixel_scale) * (background + instrument_noise(exposure) ** 2)
-
-
-def _positive(name: str, value: Any, unit: str) -> float:
-    """Return a positive finite number, or raise the error that names the argument."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise DomainError(f"{name} = {value!r}: expected one positive number ({unit})") from error
-    if not (np.isfinite(number) and number > 0.0):
-        raise DomainError(f"{name} = {value}: expected a positive number ({unit})")
-    return number

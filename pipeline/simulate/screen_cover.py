@@ -18,21 +18,10 @@ from ..config import Configuration
 
 
 def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> np.ndarray:
-    """Return the length of each layer crossed by the light to the chosen CCDs during the exposure [m].
+    """Return the length of each layer crossed by the light to the chosen CCDs during the exposure [m], [n_layer].
 
     Sum of the drift by the wind, in any direction, and of the extent of field of view and pupil along x or y at the
     distance of the layer.
-
-    Parameters
-    ----------
-    config : Configuration
-        Resolved configuration.
-    telescope, camera, site
-        Models of the configuration.
-
-    Returns
-    -------
-    ndarray, shape [n_layer]
     """
     air = config.atmosphere
     chosen = camera.centers[[camera.ccd_index(name) for name in config.ccds or ()]]
@@ -45,13 +34,7 @@ def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, s
 
 
 def check_screens(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> None:
-    """Raise an error if a periodic screen repeats within the light to the chosen CCDs.
-
-    Raises
-    ------
-    ConfigError
-        With the layer and the screen length that it takes.
-    """
+    """Raise ConfigError, with layer and length, if a periodic screen repeats within the light to the chosen CCDs."""
     air = config.atmosphere
     if not air.enabled or not ENGINES[config.psf.engine].screens:
         return
@@ -62,7 +45,7 @@ def check_screens(config: Configuration, telescope: Telescope, camera: Camera, s
     least = math.ceil(swept[layer])
     size = scipy.fft.next_fast_len(math.ceil(air.screen_size * least / air.screen_length_m), real=True)
     raise ConfigError(
-        f"atmosphere.exposure_s = {air.exposure_s:g}: the chosen CCDs see {least} m of the layer at"
+        f"atmosphere.exposure_s = {air.exposure_s:g}: the light to the chosen CCDs crosses {least} m of the layer at"
         f" {site.altitudes[layer]:g} m, whose periodic screen comes round after {air.screen_length_m:g} m: expected"
         f" atmosphere.screen_length_m of at least {least} (and atmosphere.screen_size = {size} to keep its pixel)"
     )

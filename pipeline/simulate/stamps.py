@@ -8,6 +8,7 @@ import numpy as np
 from scipy import fft
 
 from ...core.errors import DomainError
+from ...core.units import real_array
 
 
 def observe_stamps(
@@ -19,26 +20,24 @@ def observe_stamps(
 ) -> np.ndarray:
     """Expose noise-free PSF images: Poisson noise of star and sky, Gaussian read noise, expected sky subtracted.
 
-    The stars are drawn one after the other from the same stream, so the first n stay as they are when more follow.
+    Stars are drawn one after the other from the same stream, so the first n stay as they are when more follow. Pixels
+    below zero, from Fourier ringing, count as zero in the Poisson mean of star and sky if they outweigh the sky.
 
     Parameters
     ----------
     psf_images : array
-        [n, ny, nx] images of unit sum. Pixels below zero, as Fourier ringing leaves them, count as zero in the Poisson
-        mean of star and sky if they outweigh the sky.
+        [n, ny, nx] images of unit sum.
     electrons : float or array
         Electrons of each star, one for all or [n].
-    sky : float
-        Expected electrons of the sky in one pixel.
-    read_noise : float
-        Rms noise of one pixel without light [e-].
+    sky, read_noise : float
+        Expected electrons of the sky, and rms noise without light [e-], in one pixel.
     rng : numpy.random.Generator
-        The stream to draw from.
+        Random stream.
 
     Returns
     -------
     array
-        [n, ny, nx] electrons, sky subtracted.
+        [n, ny, nx] electrons.
 
     Raises
     ------
@@ -46,8 +45,9 @@ def observe_stamps(
         If an argument is negative, not finite or of the wrong shape.
     """
     images = _images(psf_images, "psf_images")
-    if not np.all(np.isfinite(images)):
-        raise DomainError(f"psf_images[{_first_bad(images)}] has pixels that are not finite")
+    finite = np.isfinite(images).all(axis=(1, 2))
+    if not finite.all():
+        raise DomainError(f"psf_images[{finite.argmin()}] has pixels that are not finite")
     try:
         counts = np.broadcast_to(np.asarray(electrons, dtype=np.float64), (len(images),))
     except ValueError as error:
@@ -135,17 +135,9 @@ def _shift(image: np.ndarray, dx: float, dy: float) -> np.ndarray:
 
 def _images(images: Any, name: str) -> np.ndarray:
     """Return the images as a float64 array [n, ny, nx]."""
-    try:
-        array = np.asarray(images, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError(f"{name}: expected real numbers [n, ny, nx]") from error
+    array = real_array(images, f"{name}: expected real numbers [n, ny, nx]")
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3:
         raise DomainError(f"{name} has shape {array.shape}: expected [n, ny, nx] or [ny, nx]")
     return array
-
-
-def _first_bad(images: np.ndarray) -> int:
-    """Return the index of the first image with a pixel that is not finite."""
-    return int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])

@@ -20,15 +20,15 @@ def add_defects(
     cosmic_rays: float = 0.0,
     full_well: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inject defects into simulated stars.
+    """Inject defects into simulated stars; return [n, ny, nx] images [e-] and :class:`~.StarFlag` bits [n].
 
-    Each star draws the same numbers whatever its defects: a larger fraction adds defects to more stars and
-    leaves the others unchanged.
+    Each star draws the same numbers whatever its defects: a larger fraction adds defects to more stars and leaves the
+    others unchanged.
 
     Parameters
     ----------
     stamps : array
-        [n, ny, nx] electrons, sky subtracted, as :func:`~pachon.pipeline.simulate.stamps.observe_stamps` gives them.
+        [n, ny, nx] electrons, sky subtracted, as from :func:`~.observe_stamps`.
     psf_images : array
         [n, ny, nx] noise-free stars of unit sum: the shape of a star's neighbour.
     rng : numpy.random.Generator
@@ -40,18 +40,6 @@ def add_defects(
         Fraction of the stars crossed by a straight track of 2 to 8 pixels of 500 to 5000 electrons each.
     full_well : float, optional
         Electrons at which a pixel saturates.
-
-    Returns
-    -------
-    images : array
-        [n, ny, nx] electrons.
-    flags : array of int
-        [n] :class:`~pachon.pipeline.measure.star_selection.StarFlag` bits of the injected defects.
-
-    Raises
-    ------
-    DomainError
-        If the shapes differ, or a fraction lies outside 0 to 1.
     """
     images, shapes = (np.array(a, dtype=np.float64) for a in (stamps, psf_images))
     if images.ndim != 3 or images.shape != shapes.shape:

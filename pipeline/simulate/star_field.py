@@ -9,59 +9,28 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.random_streams import stream
-from ...core.units import metres
+from ...core.units import metres, require_positive
 from . import photometry
 
 COUNT_SLOPE = 0.2
 """Star counts go as 10^(0.2 m) (Jee & Tyson 2011, sec. 4)."""
-SNR_LIMIT = 30.0
-"""Least signal-to-noise ratio of an observed star (Jee & Tyson 2011, sec. 4)."""
-PIXEL_SIZE = 10.0e-6
-"""Side of an LSST pixel [m]."""
 
 
 @dataclass(frozen=True)
 class StarField:
-    """The stars of one CCD.
-
-    Parameters
-    ----------
-    ccd_name : str
-        Name of the CCD.
-    bounds : tuple of float
-        (xmin, xmax, ymin, ymax) of the CCD on the focal plane [m], outer edges of its pixels.
-    pixel_size : float
-        [m].
-    holdout, observed : array
-        Focal-plane positions (x, y) [m], [n, 2].
-    magnitude : array
-        AB magnitudes of the observed stars.
-    electrons : array
-        Electrons that the observed stars give.
-    band : str
-        Name of the filter.
-    exposure : float
-        [s].
-    bright, faint : float
-        Magnitude limits of the observed stars.
-    """
+    """Stars of one CCD."""
 
     ccd_name: str
-    bounds: tuple[float, float, float, float]
-    pixel_size: float
-    holdout: np.ndarray
-    observed: np.ndarray
-    magnitude: np.ndarray
-    electrons: np.ndarray
+    bounds: tuple[float, float, float, float]  #: (xmin, xmax, ymin, ymax), outer edges of the pixels [m]
+    pixel_size: float  #: [m]
+    holdout: np.ndarray  #: focal-plane positions (x, y) [m], [n, 2]
+    observed: np.ndarray  #: likewise
+    magnitude: np.ndarray  #: AB, of the observed stars
+    electrons: np.ndarray  #: of the observed stars
     band: str
-    exposure: float
-    bright: float
+    exposure: float  #: [s]
+    bright: float  #: magnitude limits of the observed stars
     faint: float
-
-    @property
-    def holdout_pixel(self) -> np.ndarray:
-        """Holdout positions [pixel] on the CCD, [n, 2]."""
-        return self.to_pixel(self.holdout)
 
     @property
     def observed_pixel(self) -> np.ndarray:
@@ -82,57 +51,40 @@ def make_star_field(
     seed: int,
     *,
     fwhm: Any,
+    pixel_size: Any,
     band: str | photometry.Band = "r",
     exposure: float = 15.0,
-    snr: float = SNR_LIMIT,
+    snr: float = 30.0,
     bright: float | None = None,
     faint: float | None = None,
     margin: int = 20,
-    pixel_size: Any = PIXEL_SIZE,
 ) -> StarField:
-    """Draw the stars of one CCD.
+    """Draw the stars of one CCD, uniform over it; counts per magnitude of the observed ones go as 10^(0.2 m).
 
-    Every attribute of every CCD has its own random stream, named after the CCD. The stars do not depend on the other
-    CCDs of a run, and the first n of them not on how many follow.
+    Every attribute of every CCD has its own random stream, with the name of the CCD in its key. The stars do not depend
+    on the other CCDs of a run, and the first n of them not on how many follow.
 
     Parameters
     ----------
-    ccd_name : str
-        Name of the CCD; part of the key of its streams.
     bounds : tuple of float or Quantity
         (xmin, xmax, ymin, ymax) of the CCD on the focal plane [m].
-    n_holdout : int
-        Holdout positions, uniform over the CCD.
-    n_observed : int
-        Observed stars, uniform over the CCD but for the margin, counts per magnitude going as 10^(0.2 m).
-    seed : int
-        Seed of the run.
     fwhm : float or Quantity
         Effective FWHM of the stars [rad], which sets the magnitude limits.
-    band : str or Band
-        Filter.
+    pixel_size : float or Quantity
+        [m].
     exposure : float
         [s].
     snr : float
-        Signal-to-noise ratio at the faint limit.
+        Signal-to-noise ratio at the faint limit; 30 as in Jee & Tyson 2011, sec. 4.
     bright, faint : float, optional
-        Magnitude limits; where left out, the magnitude at which the brightest pixel saturates and the one at which the
+        Magnitude limits; by default the magnitude at which the brightest pixel saturates and the one at which the
         signal-to-noise ratio is `snr`.
     margin : int
-        Pixels that observed stars keep from the edge of the CCD, so that their stamps fit.
-    pixel_size : float or Quantity
-        [m].
-
-    Raises
-    ------
-    DomainError, UnknownNameError
-        If a count is negative, the limits are in the wrong order, the margins leave no room, or the band is unknown.
+        Distance of observed stars from the edge of the CCD [pixel], so that their stamps fit.
     """
     band = photometry.band_named(band)
     edges = _edges(bounds)
-    pixel = float(metres(pixel_size, "pixel_size"))
-    if not (np.isfinite(pixel) and pixel > 0.0):
-        raise DomainError(f"pixel_size = {pixel_size}: expected a positive length")
+    pixel = require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres")
     for name, count in (("n_holdout", n_holdout), ("n_observed", n_observed), ("margin", margin)):
         if count < 0:
             raise DomainError(f"{name} = {count}: expected a number that is not negative")
@@ -161,15 +113,13 @@ def make_star_field(
     )
 
 
-def draw_magnitudes(
-    rng: np.random.Generator, count: int, bright: float, faint: float, slope: float = COUNT_SLOPE
-) -> np.ndarray:
-    """Draw magnitudes whose counts go as 10^(slope m) between two limits, through the inverse of their distribution.
+def draw_magnitudes(rng: np.random.Generator, count: int, bright: float, faint: float) -> np.ndarray:
+    """Draw magnitudes whose counts go as 10^(0.2 m) between two limits, through the inverse of their distribution.
 
     The first magnitudes of a stream stay as they are when `count` grows.
     """
-    span = 10.0 ** (slope * (faint - bright)) - 1.0
-    return bright + np.log10(1.0 + rng.random(count) * span) / slope
+    span = 10.0 ** (COUNT_SLOPE * (faint - bright)) - 1.0
+    return bright + np.log10(1.0 + rng.random(count) * span) / COUNT_SLOPE
 
 
 def _uniform(seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float, float, float, float]) -> np.ndarray:

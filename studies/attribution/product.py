@@ -13,8 +13,9 @@ from ...core.plotting import new_figure, png_bytes, styled
 from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation
-from ...pipeline.measure.diagnostics import correlation_columns
+from ...pipeline.report.diagnostics import correlation_columns
 from ...pipeline.report.focal_plane_axes import AWAY, RESIDUAL, TRUTH
+from ...pipeline.report.statistics_plots import log_axes
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
 from .attribution import Attribution
@@ -82,10 +83,8 @@ def attribution_plot(
         ):
             for case, each in correlations.items():
                 _draw_curve(axes, each[kind], colors[case], case)
-            axes.set(xscale="log", yscale="log", xlabel="separation [arcmin]")
-            axes.set_title(f"{title}; open: negative", loc="left")
-            axes.grid(True, which="major", color="0.9", linewidth=0.6)
-            axes.set_axisbelow(True)
+            log_axes(axes, f"{title}; open: negative")
+            axes.set_xlabel("separation [arcmin]")
         handles, labels = panels[1, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(cases)))
         return png_bytes(figure)

@@ -7,7 +7,7 @@ import numpy as np
 from ...core.units import ARCSEC
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.measure.summary import ccd_metrics
-from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_places
+from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_positions
 from ...pipeline.simulate.ccd_model import model_ccd
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.pupil_optics import trace_pupils
@@ -51,7 +51,7 @@ def psf(scene: Scene) -> dict[str, float]:
     experiment = scene.camera_experiment
     camera = experiment.camera
     centers = camera.centers[[camera.ccd_index(name) for name in scene.plan.ccds]]
-    stars = expose_places(experiment, centers, scene.threads)
+    stars = expose_positions(experiment, centers, scene.threads)
     shapes = measure_shapes(stars.image, stars.pixel_scale, experiment.weight_fwhm)
     values = {"fwhm": fwhm(stars.image, stars.pixel_scale) / ARCSEC, "e1": shapes.e1, "e2": shapes.e2}
     return {f"psf {key} {name}": float(values[key][i]) for i, name in enumerate(scene.plan.ccds) for key in values}

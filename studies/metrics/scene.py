@@ -19,7 +19,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from ...pipeline.measure.summary import SHORTEST_ARCMIN
-from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_places, holdout_positions
+from ...pipeline.simulate.ccd_exposure import NoiseFreeStars, expose_positions, holdout_positions
 from ...wavefront.request import Request, field_points, wavelength_points
 
 #: Fields of a plan, in units of the field's radius; no symmetry of the telescope leaves all of them as they are.
@@ -161,7 +161,7 @@ class Scene:
     @cached_property
     def stars(self) -> NoiseFreeStars:
         """Noise-free stars at :attr:`positions`."""
-        return expose_places(self.camera_experiment, np.concatenate(self.positions), self.threads)
+        return expose_positions(self.camera_experiment, np.concatenate(self.positions), self.threads)
 
     @cached_property
     def shapes(self) -> Shapes:

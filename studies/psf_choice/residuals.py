@@ -52,7 +52,7 @@ def measure_residuals(
     for i, (ccd, stars, whole) in enumerate(zip(ccds, observed, models, strict=True)):
         model = whole.truncated(min(case.components, whole.n_components)) if case.basis == "pca" else whole
         used = used_stars(case, stars)
-        exposure, places = ccd.exposure, ccd.exposure.places
+        exposure, places = ccd.exposure, ccd.exposure.positions
         jobs = (
             (
                 places.observed[used],

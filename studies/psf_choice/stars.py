@@ -60,7 +60,7 @@ def simulate(experiment: Experiment, threads: int | None, reporter: Reporter) ->
 def _look_at(experiment: Experiment, exposure: CcdExposure, images: np.ndarray) -> Observation:
     """Centre and measure images of the stars of a CCD, noise included."""
     scale = exposure.observed.pixel_scale
-    return observe_ccd(experiment, exposure.name, images, scale, exposure.places.electrons, noisy=False)
+    return observe_ccd(experiment, exposure.name, images, scale, exposure.positions.electrons, noisy=False)
 
 
 def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int) -> ObservedCcd:
@@ -68,7 +68,7 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
 
     `snr_min` is the signal-to-noise ratio of the faintest star where the lit fraction is least; infinite for no noise.
     """
-    exposed, places, name = ccd.exposure.observed, ccd.exposure.places, ccd.exposure.name
+    exposed, places, name = ccd.exposure.observed, ccd.exposure.positions, ccd.exposure.name
     n_stars = len(exposed.image)
     if snr_min == NOISE_FREE:
         return ObservedCcd(ccd.noise_free, np.full(n_stars, np.inf), np.zeros(n_stars))
@@ -77,7 +77,16 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
     # The same stars in the same order; the limit alone changes.
     stars = make_star_field(
-        name, places.bounds, 0, n_stars, seed, fwhm=width, band=places.band, exposure=places.exposure, faint=faint
+        name,
+        places.bounds,
+        0,
+        n_stars,
+        seed,
+        fwhm=width,
+        pixel_size=places.pixel_size,
+        band=places.band,
+        exposure=places.exposure,
+        faint=faint,
     )
     sky = sky_electrons_per_pixel(places.band, places.exposure, exposed.pixel_scale)
     rng = stream(seed, "study", "noise", name, draw)
@@ -94,14 +103,14 @@ def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
     used = used_stars(case, observed)
     return PsfModel.fit(
         observed.observation.images[used],
-        ccd.exposure.places.observed[used],
+        ccd.exposure.positions.observed[used],
         basis=case.basis,  # type: ignore[arg-type]
         interpolation="gp" if case.interpolation == "gp" else "polynomial",
         weights=None if case.interpolation == "gp" else snr_weights(case.interpolation, observed.snr[used]),
         # A star that is not usable costs one principal component.
         n_components=min(case.components, used.sum() - 1) if case.basis == "pca" else case.components or None,
         order=case.order,
-        extent=ccd.exposure.places.bounds,
+        extent=ccd.exposure.positions.bounds,
         clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers
     )
 

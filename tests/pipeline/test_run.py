@@ -276,7 +276,7 @@ def test_stars_of_a_product_lie_on_their_ccd_and_stamps_are_centred(finished_run
     np.testing.assert_allclose(product.holdout_images.sum(axis=(1, 2)), 1.0, rtol=1e-5)
     peaks = product.holdout_images.reshape(14, -1).argmax(axis=1)
     assert np.all(np.abs(np.stack(np.unravel_index(peaks, (31, 31))) - 15) <= 1)
-    # The faintest star is still at the limit asked for, S/N 30.
+    # The faintest star is still at the limit, S/N 30.
     assert product.observed.snr.min() >= 30.0 * (1 - 1e-9)
     assert product.observed.used.all()
     # At 1.66 deg the camera and the mirrors' rims take some 5 to 10 % of the light.

@@ -26,7 +26,9 @@ SCALE = 0.2 * ARCSEC
 
 def _planted(name, degree, n_stars, n_holdout, half=0.02):
     """A CCD whose PSF is a Gaussian plus two even shapes, their amplitudes polynomials of this degree; centred."""
-    places = make_star_field(name, (-half, half, -half, half), n_holdout, n_stars, 3, fwhm=0.7 * ARCSEC)
+    places = make_star_field(
+        name, (-half, half, -half, half), n_holdout, n_stars, 3, fwhm=0.7 * ARCSEC, pixel_size=1e-5
+    )
     rng = np.random.default_rng([degree, *name.encode()])
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     amplitudes = rng.normal(0.0, 0.01, (2, len(powers)))
@@ -88,8 +90,8 @@ def test_noise_leaves_what_the_law_says(experiment, order, interpolation):
     for ccd in ccds:
         seen = observe(experiment, ccd, case.snr, 0)
         weights = np.ones(60) if interpolation == "equal" else 1.0 / (seen.snr**-2 + 1e-4)
-        u, v = mapped(ccd.exposure.places.observed, ccd.exposure.places.bounds).T
-        at, bt = mapped(ccd.exposure.places.holdout, ccd.exposure.places.bounds).T
+        u, v = mapped(ccd.exposure.positions.observed, ccd.exposure.positions.bounds).T
+        at, bt = mapped(ccd.exposure.positions.holdout, ccd.exposure.positions.bounds).T
         powers = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
         terms, there = (np.stack([x**i * y**j for i, j in powers], axis=1) for x, y in ((u, v), (at, bt)))
         solve = there @ np.linalg.solve(terms.T @ (weights[:, None] * terms), terms.T * weights)
@@ -140,7 +142,7 @@ def test_stars_are_nested_and_noise_is_common(experiment):
     np.testing.assert_array_equal(seen.snr, other.snr)
     for n in (6, 12, 24):
         model = fit(Case(n, 30.0, components=4, order=1), ccd, seen)
-        np.testing.assert_array_equal(model.positions, ccd.exposure.places.observed[:n])
+        np.testing.assert_array_equal(model.positions, ccd.exposure.positions.observed[:n])
     # The same star at another limit: its place among the magnitudes stays.
     bright = observe(experiment, ccd, 100.0, 0)
     assert seen.snr.min() >= 30.0

@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.units import metres
+from ...core.units import metres, require_positive
 from ...models.io.site_file import load_site
 from ...models.site import Site
 from .layer_screens import LayerScreens, screen_samples
 from .layers import check_drift, checked_layers, layer_random, line_of_sight
 from .refraction import require_zenith_angle
-from .turbulence import require_positive
 
 #: Default cut-off in units of 1/r0 [rad/m]. Of 1.0, 1.2, 1.4 and 2.0 this brings the fast PSF engine's ellipticities
 #: nearest to the wave engine's (docs/accuracy.md); beyond it geometric optics makes the image too wide.
@@ -244,5 +243,4 @@ class Atmosphere(LayerScreens):
 
 
 def _length(value: Any, name: str) -> float:
-    array = metres(value, name)
-    return require_positive(array.item() if array.size == 1 else value, name, "metres")
+    return require_positive(metres(value, name), name, "metres")

@@ -20,8 +20,9 @@ import scipy.fft
 
 from ...core.errors import DomainError
 from ...core.threads import thread_count
+from ...core.units import require_positive
 from .spline import stencil_gain
-from .turbulence import path_spectrum, require_positive
+from .turbulence import path_spectrum
 
 # Blocks of the two Fourier passes: fixed, so that no byte depends on the number of threads, and small enough for the
 # cache of one core.

@@ -22,6 +22,7 @@ from scipy.optimize import brentq
 from scipy.special import gamma, j0, kv
 
 from ...core.errors import DomainError
+from ...core.units import require_positive
 
 #: Wavelength at which Fried parameters are given [m].
 REFERENCE_WAVELENGTH = 500e-9
@@ -32,17 +33,6 @@ _PATH_PER_RADIAN = REFERENCE_WAVELENGTH / (2.0 * math.pi)
 # The exponent of the closed forms, and the number of terms with which its series is exact to rounding below unity.
 _NU = 5.0 / 6.0
 _SERIES_TERMS = 10
-
-
-def require_positive(value: float, name: str, unit: str = "") -> float:
-    """Return a finite, positive float, or raise :class:`DomainError` naming the argument."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (math.isfinite(number) and number > 0.0):
-        raise DomainError(f"{name} = {value!r}: expected a positive, finite number{' of ' + unit if unit else ''}")
-    return number
 
 
 def fried_parameter(r0: float, wavelength: ArrayLike) -> np.ndarray:

@@ -142,19 +142,19 @@ def test_leave_one_out_equals_fitting_without_the_star():
 
 
 def test_cosmic_rays_change_little():
-    # One star in ten is hit in three pixels by a few tenths of its flux.
+    # One star in ten has three struck pixels, off by a few tenths of its flux.
     stamps, places = noisy()
     elsewhere = positions(100, 9)
     truth = psf(elsewhere)
-    hit = stamps.copy()
+    struck = stamps.copy()
     rng = np.random.default_rng(7)
     struck = rng.choice(40, 4, replace=False)
     for i in struck:
         x, y = rng.integers(3, 28, 2)
-        hit[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3)
+        struck[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3)
     clean = PsfModel.fit(stamps, places, extent=EXTENT)
-    model = PsfModel.fit(hit, places, extent=EXTENT)
-    spoiled = PsfModel.fit(hit, places, extent=EXTENT, clip_sigma=None)
+    model = PsfModel.fit(struck, places, extent=EXTENT)
+    unclipped = PsfModel.fit(struck, places, extent=EXTENT, clip_sigma=None)
 
     def rms(m):
         return np.sqrt(((m.at(elsewhere) - truth) ** 2).mean())
@@ -162,7 +162,7 @@ def test_cosmic_rays_change_little():
     assert model.rejected[struck].min() >= 3
     assert model.n_rejected <= 16  # 5 sigma of 38 000 pixels: none but the cosmic rays and a few by bad luck
     assert rms(model) < 1.3 * rms(clean)
-    assert rms(spoiled) > 5.0 * rms(clean)
+    assert rms(unclipped) > 5.0 * rms(clean)
 
 
 @pytest.mark.parametrize("fraction", [0.01, 0.05])
@@ -172,7 +172,7 @@ def test_bad_pixels_in_every_star(fraction):
     truth = psf(elsewhere)
     rng = np.random.default_rng(8)
     bad = rng.random(stamps.shape) < fraction
-    hit = np.where(bad, rng.uniform(0.0, 0.1, stamps.shape), stamps)  # up to 1.6 times the peak
+    struck = np.where(bad, rng.uniform(0.0, 0.1, stamps.shape), stamps)  # up to 1.6 times the peak
 
     def rms(pixels, clip):
         model = PsfModel.fit(pixels, places, extent=EXTENT, n_components=7, clip_sigma=clip)
@@ -181,8 +181,8 @@ def test_bad_pixels_in_every_star(fraction):
     # The bad pixels that are found get the mean PSF, which costs the star's own change there: a small part of the
     # change that the model is to follow, where without rejection far more than all of it is lost.
     change = np.sqrt(((truth - truth.mean(axis=0)) ** 2).mean())
-    assert rms(hit, 5.0) < 0.5 * change
-    assert rms(hit, None) > 5.0 * change
+    assert rms(struck, 5.0) < 0.5 * change
+    assert rms(struck, None) > 5.0 * change
 
 
 def test_order_of_the_stars_does_not_matter():
@@ -228,7 +228,7 @@ def test_bytes_do_not_depend_on_blas_threads():
     assert len(sums) == 1
 
 
-def test_kink_is_where_the_eigenvalues_flatten():
+def test_elbow_is_where_the_eigenvalues_flatten():
     rng = np.random.default_rng(2)
     patterns = rng.normal(size=(SIZE * SIZE, 5))
     basis = np.linalg.qr(patterns - patterns.mean(axis=0))[0].T.reshape(

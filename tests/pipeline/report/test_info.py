@@ -1,4 +1,4 @@
-"""What `pachon info` says of telescopes that are not centred, and of apertures that are not discs."""
+"""Description of telescopes that are not centred, and of apertures that are not discs."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Defects, selection and the kinds of models, as a configuration asks for them."""
+"""Defects, selection and the kinds of models of a configuration."""
 
 import dataclasses
 
@@ -33,16 +33,16 @@ def plain(experiment, exposure):
     return model_ccd(experiment, exposure)
 
 
-def asked(experiment, **options):
+def configured(experiment, **options):
     """The experiment with other stars or another model; the PSFs of its stars do not depend on them."""
     return dataclasses.replace(
         experiment, config=Experiment.from_config(with_options(experiment.config, **options)).config
     )
 
 
-def seen(experiment, exposure, electrons=2e5, **options):
+def observed(experiment, exposure, electrons=2e5, **options):
     stars = exposure.observed
-    chosen = asked(experiment, **options)
+    chosen = configured(experiment, **options)
     return observe_ccd(chosen, NAME, stars.image, stars.pixel_scale, np.full(N, electrons), noisy=True)
 
 
@@ -52,23 +52,23 @@ def test_without_defects_nothing_is_looked_for(plain):
 
 
 def test_defects_spoil_as_many_stars_as_asked_and_leave_the_others(experiment, exposure):
-    clean = seen(experiment, exposure)
+    clean = observed(experiment, exposure)
     for options in ({"stars__neighbours": 0.25}, {"stars__cosmic_rays": 0.25}):
-        spoilt = seen(experiment, exposure, **options)
-        same = (spoilt.images == clean.images).all(axis=(1, 2))
+        defective = observed(experiment, exposure, **options)
+        same = (defective.images == clean.images).all(axis=(1, 2))
         # Binomial: 10 +- 2.7 of 40, three standard deviations.
         assert 2 <= N - same.sum() <= 18
     # All have the same electrons, so that the peaks' order is that of their noise; a tenth of 40 is four.
-    full = seen(experiment, exposure, stars__saturated=0.1)
+    full = observed(experiment, exposure, stars__saturated=0.1)
     assert (full.images != clean.images).any(axis=(1, 2)).sum() == 4
 
 
 def test_stars_with_defects_are_found_and_left_out(experiment, exposure):
     options = {"stars__neighbours": 0.15, "stars__cosmic_rays": 0.15, "stars__saturated": 0.1}
-    clean, spoilt = seen(experiment, exposure), seen(experiment, exposure, **options)
-    found = seen(experiment, exposure, reconstruction__flag_stars=True, **options)
-    np.testing.assert_array_equal(found.images, spoilt.images)
-    touched = (spoilt.images != clean.images).any(axis=(1, 2))
+    clean, defective = observed(experiment, exposure), observed(experiment, exposure, **options)
+    found = observed(experiment, exposure, reconstruction__flag_stars=True, **options)
+    np.testing.assert_array_equal(found.images, defective.images)
+    touched = (defective.images != clean.images).any(axis=(1, 2))
     # Stars of S/N over 200: the study of the selection found every such defect, and flagged 2 good stars of 640.
     assert np.array_equal(found.defects != 0, touched)
     assert ((found.defects & StarFlag.SATURATED) != 0).sum() == 4
@@ -76,19 +76,19 @@ def test_stars_with_defects_are_found_and_left_out(experiment, exposure):
     assert np.isnan(found.shapes.e1[touched]).all()
     np.testing.assert_array_equal(found.shapes.e1[~touched], clean.shapes.e1[~touched])
     # Who does not look uses them all.
-    assert spoilt.used.sum() > found.used.sum()
+    assert defective.used.sum() > found.used.sum()
 
 
 def test_without_noise_there_are_no_defects(experiment, exposure):
     product = model_ccd(
-        asked(experiment, stars__neighbours=1.0, reconstruction__flag_stars=True), exposure, noisy=False
+        configured(experiment, stars__neighbours=1.0, reconstruction__flag_stars=True), exposure, noisy=False
     )
     assert product.observed.used.all()
 
 
 def test_a_ccd_all_of_whose_stars_are_rejected_is_one_line(experiment, exposure):
     defects = {"stars__neighbours": 1.0, "stars__cosmic_rays": 1.0, "stars__snr_min": 200.0}
-    chosen = asked(experiment, reconstruction__flag_stars=True, **defects)
+    chosen = configured(experiment, reconstruction__flag_stars=True, **defects)
     with pytest.raises(DomainError, match=r"^\d of 40 stars left \(\d+ neighbour.*\): expected at least 5$"):
         model_ccd(chosen, exposure)
 
@@ -111,7 +111,7 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
             experiment, config=Experiment.from_config(config.model_copy(update={"reconstruction": fit})).config
         )
     else:
-        chosen = asked(experiment, stars__truth=60, **options)
+        chosen = configured(experiment, stars__truth=60, **options)
     product = model_ccd(chosen, exposure)
     model = product.model
     assert (model.basis, model.n_components, model.order) == (basis, components, 1)

@@ -1,4 +1,4 @@
-"""How much of a periodic screen a run looks at, against the places that its light crosses, one by one."""
+"""Length of a periodic screen that a run crosses, against the positions that its light crosses, one by one."""
 
 import math
 import re
@@ -27,9 +27,9 @@ def test_the_default_and_all_ccds_fit():
     lengths = swept(Experiment.from_config(Configuration()).config)
     assert lengths.max() < 1300.0
     everything = swept(Experiment.from_config(with_options(Configuration(), ccds=("all",))).config)
-    # The top layer: 20 m/s for 15 s, 15.46 km seen from +-0.3167 m of focal plane at 10.31 m, and the pupil.
+    # The top layer: 20 m/s for 15 s, 15.46 km under +-0.3167 m of focal plane at 10.31 m, and the pupil.
     assert everything[5] == pytest.approx(300.0 + 2 * 15460.0 * 0.3167 / 10.31 + 8.36, rel=2e-3)
-    # The ground layer is not seen from different places.
+    # The ground layer is the same for all fields.
     assert everything[0] == pytest.approx(75.0 + 8.36)
     assert everything.max() < 1300.0
 

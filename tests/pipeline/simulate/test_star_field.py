@@ -11,7 +11,7 @@ FWHM = 0.7 * photometry.ARCSEC
 
 
 def field(ccd="R22_S11", n_holdout=100, n_observed=40, seed=1, **options):
-    return make_star_field(ccd, BOUNDS, n_holdout, n_observed, seed, fwhm=FWHM, **options)
+    return make_star_field(ccd, BOUNDS, n_holdout, n_observed, seed, **{"fwhm": FWHM, "pixel_size": 1e-5, **options})
 
 
 def test_positions_and_pixels():
@@ -106,6 +106,6 @@ def test_bad_arguments(options, name):
 def test_bad_bounds_and_band():
     for bounds in ((0.0, 1.0, 2.0), (1.0, 0.0, 0.0, 1.0), (0.0, np.nan, 0.0, 1.0)):
         with pytest.raises(DomainError, match="bounds"):
-            make_star_field("R22_S11", bounds, 1, 1, 1, fwhm=FWHM)
+            make_star_field("R22_S11", bounds, 1, 1, 1, fwhm=FWHM, pixel_size=1e-5)
     with pytest.raises(UnknownNameError, match="band"):
         field(band="x")

@@ -22,12 +22,12 @@ from ...core.products import Stamp, described_table, write_ecsv
 from ..ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
 from ..experiment import Experiment
-from ..report.diagnostics_plots import residual_plot, rho_plot
-from ..report.statistics_plots import correlation_plot
+from ..measure.correlation import Correlation
+from ..measure.rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
+from ..measure.summary import correlations, ellipticities, finite_mean, patches, rms, separation_bins
 from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
-from .correlation import Correlation
-from .rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
-from .summary import correlations, finite_mean, patches, separation_bins
+from .focal_plane_plots import residual_plot
+from .statistics_plots import correlation_plot, rho_plot
 
 #: Residuals: at the stars, of stars left out, away from them.
 RESIDUALS = ("residual", "left_out", "away")
@@ -43,37 +43,19 @@ _MEANINGS = {
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Diagnostics of a run.
-
-    Attributes
-    ----------
-    folder : Path
-        Folder of the diagnostics.
-    files : tuple of str
-        Names of the files.
-    missing : dict of str to str
-        CCDs without a readable product, each with the reason.
-    table : Table
-        A row for each CCD: means and rms of the residuals.
-    overall : dict
-        The same over all CCDs, and figures of the correlations; keys end in their unit.
-    correlations : dict of str to Correlation
-        Of each of :data:`~pachon.pipeline.ccd_product.KINDS`, with errors by jackknife over the CCDs where there are
-        two or more.
-    rho : dict of str to RhoStatistics
-        At the stars (``residual``), and where no star is (``away``).
-    """
+    """Diagnostics of a run."""
 
     folder: Path
-    files: tuple[str, ...]
-    missing: dict[str, str]
-    table: Table
-    overall: dict[str, Any]
+    files: tuple[str, ...]  #: names of the files in the folder
+    missing: dict[str, str]  #: reason by CCD without a readable product
+    table: Table  #: means and rms of the residuals, a row for each CCD
+    overall: dict[str, Any]  #: the same over all CCDs, and metrics of the correlations; keys end in their unit
+    #: Of each of :data:`~.KINDS`, with errors by jackknife over the CCDs where there are two or more.
     correlations: dict[str, Correlation]
-    rho: dict[str, RhoStatistics]
+    rho: dict[str, RhoStatistics]  #: at the stars (``residual``), and at holdout positions (``away``)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all figures as plain mappings and arrays."""
+        """Return all metrics as plain mappings and arrays."""
         return {
             "all": self.overall,
             "ccd": {row["ccd"]: {k: row[k] for k in self.table.colnames[1:]} for row in self.table},
@@ -85,22 +67,13 @@ class Diagnostics:
 
 
 def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> Diagnostics:
-    """Read the products of a run, and write tables and pictures of the residuals.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of a run, finished or not.
-    out : Path, optional
-        Folder of the diagnostics; ``diagnostics`` within the run's by default.
-    strict : bool
-        Whether a CCD without a product, or with one that cannot be read, is an error; else it is reported and left out.
+    """Read the products of a run, finished or not, and write tables and pictures of the residuals.
 
     Raises
     ------
     PachonError
         If this is no run, no CCD is finished, the products are of another configuration, or nothing can be written;
-        with `strict`, if a single product is missing or damaged.
+        with `strict`, if a single product is missing or damaged, which is otherwise reported.
     """
     path = folder / CONFIG_NAME
     if not path.exists():
@@ -132,17 +105,23 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     out = folder / FOLDER_NAME if out is None else out
     make_folder(out)
     meta = {"run": stamp.config_hash, "pachon": stamp.version, "seed": stamp.seed}
-    write_ecsv(out / "ccds.ecsv", columns, {"what": "residuals of each CCD", **meta})
-    write_ecsv(out / "correlations.ecsv", correlation_columns(correlated), {"what": "xi of ellipticities", **meta})
-    everything = {f"{kind} {name}": c for kind, r in rho.items() for name, c in r.items()}
-    write_ecsv(out / "rho.ecsv", correlation_columns(everything), {"what": "rho statistics 1 to 5", **meta})
-    figures = {name: columns[name][0] for name in columns}
-    write_bytes(out / "residuals.png", residual_plot(experiment.camera, figures))
-    write_bytes(out / "correlations.png", correlation_plot(correlated))
-    write_bytes(out / "rho.png", rho_plot(rho))
-    files = ("ccds.ecsv", "correlations.ecsv", "rho.ecsv", "residuals.png", "correlations.png", "rho.png")
-    table = described_table(columns, meta)
-    result = Diagnostics(out, (*files, "diagnostics.json"), missing, table, overall, correlated, rho)
+    all_rho = {f"{kind} {name}": c for kind, r in rho.items() for name, c in r.items()}
+    tables = {
+        "ccds.ecsv": ("residuals of each CCD", columns),
+        "correlations.ecsv": ("xi of ellipticities", correlation_columns(correlated)),
+        "rho.ecsv": ("rho statistics 1 to 5", correlation_columns(all_rho)),
+    }
+    pictures = {
+        "residuals.png": residual_plot(experiment.camera, {name: values for name, (values, _, _) in columns.items()}),
+        "correlations.png": correlation_plot(correlated),
+        "rho.png": rho_plot(rho),
+    }
+    for name, (what, content) in tables.items():
+        write_ecsv(out / name, content, {"what": what, **meta})
+    for name, png in pictures.items():
+        write_bytes(out / name, png)
+    files = (*tables, *pictures, "diagnostics.json")
+    result = Diagnostics(out, files, missing, described_table(columns, meta), overall, correlated, rho)
     write_json(out / "diagnostics.json", {**meta, **result.as_dict()})
     return result
 
@@ -159,7 +138,7 @@ def _product(folder: Path, name: str, stamp: Stamp) -> CcdProduct:
 
 
 def _growth(stars: Stars) -> np.ndarray:
-    """Return (T - T of the model)/T with T = Q11 + Q22, [n]."""
+    """Return (T - T of the model)/T, T = Q11 + Q22, [n]."""
     model = trace_of_moments(stars.model_size, stars.model_e1, stars.model_e2)
     result: np.ndarray = 1.0 - model / trace_of_moments(stars.size, stars.e1, stars.e2)
     return result
@@ -174,16 +153,12 @@ def _rho(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
 
 def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
     """Return means and rms of the residuals of some CCDs together."""
-    e = np.concatenate([p.ellipticity(kind) for p in products], axis=1)
-    figures = {
-        f"mean_e1_{kind}": finite_mean(e[0]),
-        f"mean_e2_{kind}": finite_mean(e[1]),
-        f"rms_e_{kind}": float(np.sqrt(finite_mean(e**2))),
-    }
+    e = ellipticities(products, kind)
+    metrics = {f"mean_e1_{kind}": finite_mean(e[0]), f"mean_e2_{kind}": finite_mean(e[1]), f"rms_e_{kind}": rms(e)}
     if kind in SIZED:
         growth = np.concatenate([_growth(p.stars(kind)) for p in products])
-        figures |= {f"mean_dt_{kind}": finite_mean(growth), f"rms_dt_{kind}": float(np.sqrt(finite_mean(growth**2)))}
-    return figures
+        metrics |= {f"mean_dt_{kind}": finite_mean(growth), f"rms_dt_{kind}": rms(growth)}
+    return metrics
 
 
 def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, str, str]]:
@@ -198,7 +173,7 @@ def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, 
     for kind in RESIDUALS:
         rows = [_moments([p], kind) for p in products]
         for key in rows[0]:
-            what = {"mean": "mean", "rms_": "rms"}[key[:4]]
+            what = key.partition("_")[0]
             of = "(T - T model)/T" if "_dt_" in key else "e1" if "_e1_" in key else "e2" if "_e2_" in key else "e1, e2"
             values = np.array([row[key] for row in rows])
             columns[key] = (values, "", f"{what} of {of}: {_MEANINGS[kind]}")
@@ -206,20 +181,20 @@ def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, 
 
 
 def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlation]) -> dict[str, Any]:
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "ccds": len(products),
         "stars": sum(len(p.observed) for p in products),
         "truth_psfs": sum(len(p.holdout) for p in products),
     }
     for kind in RESIDUALS:
-        figures |= _moments(products, kind)
+        metrics |= _moments(products, kind)
     for kind, correlation in correlated.items():
         r = correlation.r_arcmin
         inside = np.flatnonzero(correlation.within("long") & (correlation.n_pairs > 0))
         largest = inside[np.argmax(np.abs(correlation.xi_plus[inside]))] if len(inside) else None
         for key, values in (("r_arcmin", r), ("xi_plus", correlation.xi_plus), ("error_plus", correlation.error_plus)):
-            figures[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])
-    return figures
+            metrics[f"largest_{kind}_{key}"] = np.nan if largest is None else float(values[largest])
+    return metrics
 
 
 def correlation_columns(correlated: Mapping[str, Correlation]) -> dict[str, tuple[np.ndarray, str, str]]:

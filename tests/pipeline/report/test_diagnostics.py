@@ -10,11 +10,12 @@ from pachon.commands.cli import main
 from pachon.core.errors import ProductError
 from pachon.models.camera.camera import load_camera
 from pachon.pipeline.ccd_product import KINDS, product_path, read_product
-from pachon.pipeline.measure import diagnostics
-from pachon.pipeline.measure.diagnostics import FOLDER_NAME, diagnose
 from pachon.pipeline.measure.rho_statistics import rho_statistics
 from pachon.pipeline.measure.shapes import measure_shapes
-from pachon.pipeline.report.diagnostics_plots import residual_plot, rho_plot
+from pachon.pipeline.report import diagnostics
+from pachon.pipeline.report.diagnostics import FOLDER_NAME, diagnose
+from pachon.pipeline.report.focal_plane_plots import residual_plot
+from pachon.pipeline.report.statistics_plots import rho_plot
 
 CCDS = ("R22_S11", "R24_S12")
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -27,7 +28,7 @@ def diagnosed(finished_run, tmp_path_factory):
 
 @pytest.fixture
 def run_copy(finished_run, tmp_path):
-    """A run that a test may spoil."""
+    """A run that a test may damage."""
     shutil.copytree(finished_run, tmp_path / "run")
     return tmp_path / "run"
 
@@ -139,10 +140,10 @@ def test_an_unfinished_run_of_one_ccd(run_copy):
     assert "scatter" in Table.read(result.folder / "correlations.ecsv")["error_plus"].description
 
 
-@pytest.mark.parametrize("spoilt", [b"", b"no FITS at all", None], ids=["empty", "no FITS", "cut short"])
-def test_a_damaged_product_is_left_out_and_the_others_stay_as_they_were(diagnosed, run_copy, no_pictures, spoilt):
+@pytest.mark.parametrize("damaged", [b"", b"no FITS at all", None], ids=["empty", "no FITS", "cut short"])
+def test_a_damaged_product_is_left_out_and_the_others_stay_as_they_were(diagnosed, run_copy, no_pictures, damaged):
     path = product_path(run_copy, CCDS[0])
-    path.write_bytes(path.read_bytes()[:5000] if spoilt is None else spoilt)
+    path.write_bytes(path.read_bytes()[:5000] if damaged is None else damaged)
     result = diagnose(run_copy)
     assert list(result.missing) == [CCDS[0]]
     assert str(path) in result.missing[CCDS[0]]
