@@ -42,6 +42,10 @@ class Stamp:
             ("SEED", self.seed, "seed of all random numbers"),
         ]
 
+    def meta(self) -> dict[str, Any]:
+        """Return the entries of a table's header or a JSON file."""
+        return {"pachon": self.version, "config_hash": self.config_hash, "seed": self.seed}
+
     def matches(self, header: fits.Header) -> bool:
         """Return whether a header has this stamp."""
         return all(header.get(key) == value for key, value, _ in self.cards())

@@ -38,7 +38,8 @@ def scatter_plot(products: Sequence[CcdProduct]) -> bytes:
         both = figure.subplots(1, 2, sharex=True, sharey=True)
         for axes, (title, before, after) in zip(both, panels, strict=True):
             for kind, name in ((before, before), (after, f"{before} - model")):
-                _draw_cloud(axes, *ellipticities(products, kind), _LABELS[kind][0], name)
+                e1, e2 = ellipticities(products, kind)
+                _draw_cloud(axes, e1, e2, _LABELS[kind][0], name)
             axes.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
             axes.axvline(0.0, color="0.7", linewidth=0.6, zorder=0)
             axes.set(aspect="equal", xlabel="$e_1$: $(a-b)/(a+b)$ along x")

@@ -243,4 +243,5 @@ class Atmosphere(LayerScreens):
 
 
 def _length(value: Any, name: str) -> float:
-    return require_positive(metres(value, name), name, "metres")
+    array = metres(value, name)
+    return require_positive(array.item() if array.size == 1 else value, name, "metres")
