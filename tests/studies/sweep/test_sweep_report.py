@@ -1,0 +1,44 @@
+"""Report of a sweep against closed forms: effects of two parameters that add in their squares."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from pachon.studies.sweep.file import read_sweep
+from pachon.studies.sweep.report import write_report
+from pachon.studies.sweep.store import PointResult, SweepStore, create_store
+from pachon.studies.sweep.sweep import numbered_points
+
+SWEEP = read_sweep(
+    {
+        "parameters": {
+            "a": {"nominal": 0, "range": [0, 4], "marks": {"budget": 2}},
+            "b": {"nominal": 0, "range": [0, 2], "marks": {"budget": 1}},
+        },
+        "design": {"points": 5, "replicas": 2},
+        "xi_target": 5e-6,
+    },
+    "test",
+)
+
+
+def test_effects_budget_and_allowances_are_those_of_a_sum_of_squares(tmp_path):
+    points = numbered_points(SWEEP, Path())
+    create_store(tmp_path / "s.sweep", SWEEP, points, {})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            # Random numbers of a replica, in common to its points, cancel in every effect.
+            xi = 1e-6 * (p.parameters["a"] ** 2 + 3.0 * p.parameters["b"] ** 2) + 1e-7 * (p.seed % 7)
+            store.write(PointResult(p.number, {"xi_raw_short": xi}, None, 0.1, "here"))
+        report = write_report(store, tmp_path / "report")
+    found = json.loads((report.parent / "summary.json").read_text())["metrics"]["xi_raw_short"]
+    assert found["largest_change"] == pytest.approx({"a": 16e-6, "b": 12e-6})
+    assert found["budget_budget"] == pytest.approx({"a": 4e-6, "b": 3e-6, "sum": 7e-6, "together": 7e-6})
+    for name, factor in (("a", 1e-6), ("b", 3e-6)):
+        expected = {"power": 2.0, "alone": math.sqrt(5e-6 / factor), "shared": math.sqrt(2.5e-6 / factor)}
+        assert found["allowance"][name] == pytest.approx(expected)
+    pictures = {path.name for path in report.parent.glob("*.png")}
+    assert pictures == {f"{kind}xi_raw_short.png" for kind in ("curves_", "budget_", "allowance_")} | {"tornado.png"}
+    assert "they add, as far as this tells" in report.read_text()
