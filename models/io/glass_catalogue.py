@@ -37,7 +37,7 @@ NUMBERED = {
     13: "extended_3",
 }
 SELLMEIER_TERMS = {2: 3, 6: 4, 11: 5}
-#: Lines that say nothing about the index: comments, expansion, cost and resistance, transmission, stress, mechanics.
+#: Lines without effect on the index: comments, expansion, cost and resistance, transmission, stress, mechanics.
 IGNORED = ("CC", "GC", "ED", "OD", "IT", "BD", "MD")
 
 

@@ -51,7 +51,7 @@ class SweptParameter(Section):
 
 
 class Design(Section):
-    """Which combinations of values are computed."""
+    """Combinations of values that are computed."""
 
     kind: Literal["one_at_a_time", "grid", "monte_carlo", "latin_hypercube", "sobol", "table"] = Field(
         "one_at_a_time", description="how points are chosen"

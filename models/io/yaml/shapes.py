@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator
 
 from ....core.errors import PrescriptionError
 from ....core.schema import Parameters, Tagged, WrittenAs, checked, either, expected, written
@@ -41,6 +41,7 @@ from .values import (
     ROWS,
     Bare,
     Flag,
+    Info,
     Length,
     Lengths,
     Number,
@@ -58,7 +59,7 @@ from .values import (
 def _powers(powers: range) -> AfterValidator:
     """Return the conversion of coefficients of powers of the radius: lengths over lengths to these powers."""
 
-    def convert(coefficients: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+    def convert(coefficients: tuple[float, ...], info: Info) -> tuple[float, ...]:
         unit = to_si(1.0, unit_of("length", info))
         pairs = zip(powers, coefficients, strict=False)
         return tuple(a if unit == 1.0 else a * unit ** (1 - n) for n, a in pairs)
@@ -66,7 +67,7 @@ def _powers(powers: range) -> AfterValidator:
     return AfterValidator(convert)
 
 
-def _terms(value: Any, info: ValidationInfo) -> tuple[tuple[int, int, float], ...]:
+def _terms(value: Any, info: Info) -> tuple[tuple[int, int, float], ...]:
     if not isinstance(value, list) or not value:
         raise expected("a list of [power of x, power of y, coefficient]")
     unit = to_si(1.0, unit_of("length", info))

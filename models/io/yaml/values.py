@@ -22,6 +22,8 @@ from ....core.schema import Section, WrittenAs, checked
 from ....core.yaml_reader import as_number
 from ...surface import Matrix
 
+#: Context of the validators: the folder of the file, and its units.
+Info = ValidationInfo[dict[str, Any]]
 #: Units but for degrees, as powers of ten of the SI unit.
 _POWERS = {"m": 0, "rad": 0, "mm": -3, "um": -6, "nm": -9}
 
@@ -39,7 +41,7 @@ class UnitsSection(Section):
     wavelength: Literal["m", "um", "nm"]
 
 
-def _keep_units(section: UnitsSection, info: ValidationInfo) -> UnitsSection:
+def _keep_units(section: UnitsSection, info: Info) -> UnitsSection:
     info.context["units"] = section
     return section
 
@@ -48,7 +50,7 @@ def _keep_units(section: UnitsSection, info: ValidationInfo) -> UnitsSection:
 FileUnits = Annotated[UnitsSection, AfterValidator(_keep_units)]
 
 
-def unit_of(quantity: str, info: ValidationInfo) -> str:
+def unit_of(quantity: str, info: Info) -> str:
     """Return the file's unit of a quantity; SI where the units are malformed, which is an error by itself."""
     return getattr(info.context.get("units"), quantity, "m")
 
@@ -109,7 +111,7 @@ def decoded(kind: str, shape: tuple[int, ...], text: str) -> BeforeValidator:
 
 
 def _converted(quantity: str) -> AfterValidator:
-    def convert(value: Any, info: ValidationInfo) -> Any:
+    def convert(value: Any, info: Info) -> Any:
         unit = unit_of(quantity, info)
         return tuple(to_si(v, unit) for v in value) if isinstance(value, tuple) else to_si(value, unit)
 
