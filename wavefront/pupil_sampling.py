@@ -135,6 +135,8 @@ def pupil_sampling(
     check_choice("sampling", sampling, _DEFAULT_N_PUPIL)
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
     n = _DEFAULT_N_PUPIL[sampling] if n_pupil is None else n_pupil
+    if int(n) != n or n < 1:
+        raise DomainError(f"n_pupil = {n!r}: expected a whole number of at least 1", key="n_pupil")
     if sampling == "gauss":
         return gauss_annulus(radius, obscuration, n, 4 * n)
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)

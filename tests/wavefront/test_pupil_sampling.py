@@ -72,7 +72,7 @@ def test_the_default_fills_the_telescopes_pupil(lsst_r):
 def test_bad_input_is_refused(lsst_r):
     with pytest.raises(ConfigError, match="sampling = 'hexagonal': expected one of gauss, rings, spiral, square"):
         pupil_sampling(lsst_r, "hexagonal")
-    with pytest.raises(DomainError, match=r"rings = 0: expected a whole number"):
+    with pytest.raises(DomainError, match=r"n_pupil = 0: expected a whole number"):
         pupil_sampling(lsst_r, "gauss", 0)
     with pytest.raises(DomainError, match="expected more points"):
         square_annulus(1.0, 0.999, 2)
