@@ -75,6 +75,13 @@ def settings_file(tmp_path):
     return path
 
 
+def pytest_collection_modifyitems(items):
+    # A finished run takes seconds, and every process makes its own.
+    for item in items:
+        if "finished_run" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.long)
+
+
 @pytest.fixture(scope="session")
 def finished_run(tiny, tmp_path_factory):
     """The folder of a finished run on one thread; tests only read it."""

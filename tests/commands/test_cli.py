@@ -158,6 +158,7 @@ def test_info_lists_models_and_shows_one(capsys):
     assert "…" not in table
 
 
+@pytest.mark.long
 def test_opd_writes_a_picture_and_prints_its_zernikes(capsys, in_folder):
     arguments = ["opd", "lsst_v3.3_r", "--field-deg", "0,1.2", "--wavelength-nm", "622", "--grid", "48"]
     assert main(arguments) == 0
@@ -240,6 +241,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     assert "not enough memory" in refused(capsys, "run")
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_with_130_and_resume_goes_on(finished_run, settings_file, tmp_path):
     folder = tmp_path / "out"
     # Eighteen CCDs: plenty of time between the first product and the last.

@@ -49,6 +49,7 @@ def test_json_is_the_only_output_and_the_picture_has_its_name(capsys, in_folder,
     assert (in_folder / metrics["picture"]).read_bytes().startswith(MAGIC["png"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_table_and_the_path_of_the_picture(capsys, in_folder, command):
     options, words = COMMANDS[command]
@@ -132,6 +133,7 @@ def test_the_model_in_three_dimensions(capsys, in_folder):
     assert (in_folder / "model.glb").read_bytes().startswith(b"glTF")
 
 
+@pytest.mark.long
 def test_coatings(capsys, in_folder):
     metrics = []
     for options in (["0.01"], ["Filter_exit=0.01", "--reflectivity", "Filter_entrance=0.01"]):

@@ -135,6 +135,7 @@ def test_files_as_they_are_work(case, tmp_path):
     use(tmp_path / "file.yaml")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_mutated_files_end_in_a_run_or_one_clear_line(case, tmp_path):
     fuzz(case, tmp_path, 60)

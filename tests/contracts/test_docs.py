@@ -25,6 +25,7 @@ def test_the_pages_that_users_begin_with_have_examples():
     assert {"design_study.md", "design_metrics.md", "derivatives.md"} <= set(EXAMPLES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_examples_run(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -36,6 +36,7 @@ def test_import_is_silent_and_loads_no_warp():
     assert done.stderr == ""
 
 
+@pytest.mark.long
 def test_tracing_is_silent():
     code = (
         "import pachon; t = pachon.load_telescope('lsst_v3.3_r');"

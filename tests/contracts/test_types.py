@@ -11,6 +11,7 @@ pytest.importorskip("mypy")
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.long
 def test_mypy(tmp_path):
     # The folders stand at the top level and become one package only when installed. mypy cannot follow the import hook
     # of an editable installation, and installing in strict mode (CONTRIBUTING.md) would change the environment of the

@@ -321,6 +321,7 @@ def test_zemax_is_named_where_it_has_the_figure():
     assert sum(n.startswith("landing") for n in named) == 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", PEERS)
 @pytest.mark.parametrize(
     "kind", ["opd", "landing", "zernike", "spot", "ee80", "distortion", "vignetting", "defocus", "psf"]

@@ -43,6 +43,7 @@ def test_rays_end_on_the_surface_and_on_their_own_line(lsst_r, focal_plane, bund
         assert np.array_equal(end.ccd, focal_plane.ccd_at(x, y))
 
 
+@pytest.mark.long
 def test_mesh_agrees_to_the_facet_error(lsst_r, focal_plane, bundles):
     cells = 24
     mesh = focal_plane.to_mesh(cells)
@@ -62,6 +63,7 @@ def test_mesh_agrees_to_the_facet_error(lsst_r, focal_plane, bundles):
     assert worst > 0.05
 
 
+@pytest.mark.long
 def test_finer_mesh_converges_as_the_square_of_its_cells(lsst_r, focal_plane, bundles):
     errors = []
     for cells in (8, 32):

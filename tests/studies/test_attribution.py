@@ -22,6 +22,9 @@ from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, 
 from pachon.studies.attribution.product import write_attribution
 from pachon.wavefront.atmosphere.turbulence import structure_function
 
+#: All of them need a finished study, of seconds.
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def attributed(tiny):

@@ -26,6 +26,9 @@ from pachon.studies.metrics.camera import CAMERA
 from pachon.studies.metrics.optics import OPTICS
 from pachon.testing import assert_matches_baseline
 
+#: All of them need a finished study, of seconds.
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 PARTS = {"rays": ("opd", "landing", "zernike", "spot"), "camera": CAMERA}
 RUN = {"seed": 3, "stars": {"truth": 30, "observed": 24}, "reconstruction": {"components": 5, "order": 2}}

@@ -21,6 +21,9 @@ from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals,
 from pachon.studies.psf_choice.stars import SimulatedCcd, fit, observe, simulate
 from pachon.studies.psf_choice.study import Study, study, study_experiment
 
+#: All of them need a finished study, of seconds.
+pytestmark = pytest.mark.long
+
 SCALE = 0.2 * ARCSEC
 
 

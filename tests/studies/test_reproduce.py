@@ -29,6 +29,9 @@ from pachon.studies.reproduce.reproduce import FIGURES, chosen_figures, expected
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.refraction import air_refractivity
 
+#: All of them need a finished study, of seconds.
+pytestmark = pytest.mark.long
+
 ARCSEC = math.radians(1 / 3600)
 # Far too small for figures that mean anything; every step is real.
 TINY = Scale(

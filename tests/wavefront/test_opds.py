@@ -35,6 +35,7 @@ def assert_same(telescope, fields, **options):
     return maps
 
 
+@pytest.mark.long
 def test_maps_equal_those_of_single_fields(lsst_r):
     maps = assert_same(lsst_r, field_disc(6), grid=21)
     # Part of the pupil is lit, and vignetting differs from field to field.
@@ -42,6 +43,7 @@ def test_maps_equal_those_of_single_fields(lsst_r):
     assert np.allclose(maps.waves, maps.value / 620e-9, equal_nan=True)
 
 
+@pytest.mark.long
 def test_a_disturbed_telescope_and_any_pupil_points(lsst_r, annulus_points):
     tilted = lsst_r.perturbed("Camera", shift=(1e-3, 0, 1e-4), tilt=(1e-3, -2e-3, 0.3))
     tilted = tilted.with_deformation("M1", ZernikeSag((0, 0, 0, 0, 1e-7), 4.18, 2.558))

@@ -89,6 +89,7 @@ def test_the_expansion_gives_the_coefficients_back(lsst_r):
     assert (table.coefficients[:, 3:] ** 2).sum() == pytest.approx(square, rel=1e-6)
 
 
+@pytest.mark.long
 def test_summaries_and_pictures(lsst_r):
     few = wavefront_zernikes(lsst_r, jmax=11)
     assert np.shape(few.summary()["zernike_nm"]) == (5, 11)

@@ -242,6 +242,7 @@ def test_units_of_columns_are_honoured():
         assert np.allclose(FocalPlane.from_heights(other).polynomial, plain.polynomial, rtol=0, atol=1e-19)
 
 
+@pytest.mark.long
 def test_table_and_mesh_round_trip():
     truth = FocalPlane.from_budget("lsst", seed=1)
     rng = np.random.default_rng(9)

@@ -146,15 +146,15 @@ def test_cosmic_rays_change_little():
     stamps, places = noisy()
     elsewhere = positions(100, 9)
     truth = psf(elsewhere)
-    struck = stamps.copy()
+    with_rays = stamps.copy()
     rng = np.random.default_rng(7)
     struck = rng.choice(40, 4, replace=False)
     for i in struck:
         x, y = rng.integers(3, 28, 2)
-        struck[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3)
+        with_rays[i, y : y + 3, x] += rng.uniform(0.05, 0.3, 3)
     clean = PsfModel.fit(stamps, places, extent=EXTENT)
-    model = PsfModel.fit(struck, places, extent=EXTENT)
-    unclipped = PsfModel.fit(struck, places, extent=EXTENT, clip_sigma=None)
+    model = PsfModel.fit(with_rays, places, extent=EXTENT)
+    unclipped = PsfModel.fit(with_rays, places, extent=EXTENT, clip_sigma=None)
 
     def rms(m):
         return np.sqrt(((m.at(elsewhere) - truth) ** 2).mean())
@@ -209,6 +209,7 @@ def test_same_bytes_and_splitting():
     assert one.at(elsewhere[3]).tobytes() == whole[3].tobytes()
 
 
+@pytest.mark.long
 def test_bytes_do_not_depend_on_blas_threads():
     code = (
         "import numpy as np, zlib; from pachon.pipeline.psf_model.model import PsfModel; g = np.random.default_rng(0);"

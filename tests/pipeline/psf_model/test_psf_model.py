@@ -281,6 +281,7 @@ def test_splitting_changes_no_byte(basis, interpolation):
     assert model.at(ELSEWHERE[3]).tobytes() == whole[3].tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [{"basis": "shapelets"}, {"interpolation": "gp"}, {"masks": True}])
 def test_bytes_do_not_depend_on_blas_threads(options):
     if "interpolation" in options:

@@ -9,6 +9,9 @@ from pachon.raytrace.trace import trace
 from pachon.studies.sweep.compensation import compensated
 from pachon.wavefront.chief_rays import fields_at
 
+#: All of them need a finished study, of seconds.
+pytestmark = pytest.mark.long
+
 NAMES = ("Camera.dz_um", "Camera.rx_urad", "Camera.ry_urad")
 #: Corners and middle of the focal plane, so that tilts have a lever.
 CCDS = ("R01_S11", "R10_S11", "R22_S11", "R34_S11", "R43_S11")

@@ -25,6 +25,9 @@ from pachon.studies.sweep.store import SweepPoint, SweepStore
 from pachon.studies.sweep.sweep import check_room
 from pachon.studies.sweep.workers import check_versions
 
+#: All of them need a finished study, of seconds.
+pytestmark = pytest.mark.long
+
 SWEEP = """
 name: small
 base: {ccds: [R23], wavelengths_nm: [624], stars: {truth: 12}, psf: {engine: long_exposure},

@@ -74,6 +74,7 @@ def test_expected_structure_function_of_both_scales(direction):
     np.testing.assert_allclose(ratio[b >= 0.32], 1.0, atol=0.005)
 
 
+@pytest.mark.long
 def test_random_screens_follow_theory():
     """Gaussian screens, averaged: measured by differences of samples, from two pixels to the outer scale."""
     lags = np.array([2, 8, 32, 156])  # 0.32 m to 24.96 m
@@ -94,6 +95,7 @@ def test_random_screens_follow_theory():
     np.testing.assert_allclose(ratio, 1.0, atol=0.03)
 
 
+@pytest.mark.long
 def test_long_exposure_image_of_random_screens():
     """The mean of exp(i k dpsi) over Gaussian screens is exp(-D/2), and its image is as wide as theory says."""
     pixel, size, wavelength, count = 0.08, 2048, 600e-9, 8
@@ -139,6 +141,7 @@ def test_power_is_split_without_loss_or_overlap():
         assert total == pytest.approx(variance * (1.0 - 0.265 * (L0 / LENGTH) ** 2), rel=3e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("band", [LOW, HIGH])
 def test_modes_stay_in_their_band_with_their_power(band):
     pixel = PIXEL if band == LOW else FINE_PIXEL

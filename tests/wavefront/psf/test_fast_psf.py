@@ -258,6 +258,7 @@ def full_width(image):
     return 2 * brentq(lambda r: np.exp(fit(r * r) - fit(0.0)) - 0.5, 0.5, 8.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cutoff", [6.25, 8.75])
 def test_mean_of_many_exposures_has_the_long_exposure_width(polynomial_pupil, cutoff):
     telescope = polynomial_pupil()

@@ -51,6 +51,7 @@ def full_width(image):
     return 2 * np.interp(np.log(2.0), fit(0.0) - fit(r * r), r)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ["fast", "wave"])
 @pytest.mark.parametrize("turbulent", [False, True])
 def test_what_comes_back(lsst_r, engine, turbulent):
@@ -89,6 +90,7 @@ def test_what_comes_back(lsst_r, engine, turbulent):
         np.testing.assert_allclose(moments(image.astype(float))[1], offset, atol=1.5 if turbulent else 0.5)
 
 
+@pytest.mark.long
 def test_engines_agree_on_single_stars_outside_the_atmosphere(lsst_r):
     """Defocus beyond diffraction: moments in pixels of either engine's image, by ray or wave optics."""
     telescope = lsst_r.perturbed("Camera", shift=(0.0, 0.0, 30e-6))
@@ -118,6 +120,7 @@ def engines_apart(telescope, stars, *, wavelengths, threads, focal_plane=None, *
     return apart, ratio
 
 
+@pytest.mark.long
 def test_engines_agree_through_the_same_screens(lsst_r):
     rng = np.random.default_rng(3)
     apart, ratio = engines_apart(

@@ -153,6 +153,7 @@ def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
     np.testing.assert_allclose(images[0], images[1], atol=3e-6 * images[1].max())
 
 
+@pytest.mark.long
 def test_grid_is_padded_where_it_must_be(polynomial_pupil):
     """All baselines are kept without an atmosphere, and where charge diffusion leaves some of the long ones."""
     sharp = ImagePlane(31, 10e-6, 0.5e-6)
@@ -224,6 +225,7 @@ def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
     np.testing.assert_array_equal(images(slice(1, 2), 2), everything[1:2])
 
 
+@pytest.mark.long
 def test_heights_of_the_ccds_defocus_the_image(lsst_r):
     """A flat CCD plane gives the image of no CCDs at all; that of a height budget does not."""
     field = np.radians([[0.02, 0.03]])
