@@ -44,6 +44,7 @@ def test_version(capsys):
     assert capsys.readouterr().out == "pachon 0.1.0\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
@@ -139,6 +140,7 @@ def test_screens_too_large_for_the_memory_are_one_line(capsys, in_folder, monkey
     assert not (in_folder / "pachon_run").exists()
 
 
+@pytest.mark.long
 def test_info_lists_models_and_shows_one(capsys):
     assert main(["info", "--json"]) == 0
     assert [m["name"] for m in json.loads(capsys.readouterr().out)["models"]] == list(bundled_names())
@@ -190,6 +192,7 @@ def test_run_prints_its_metrics_and_the_path_of_the_report(capsys, monkeypatch, 
     assert "\x1b" not in out + err
 
 
+@pytest.mark.long
 def test_json_is_all_that_standard_output_holds(capsys, monkeypatch, settings_file, tmp_path):
     monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
     out_folder = tmp_path / "out"

@@ -38,6 +38,7 @@ def model_of(command):
     return ("lsst_v3.3_r", 624.0) if command == "ghosts" else ("paul_baker", 600.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", COMMANDS)
 def test_json_is_the_only_output_and_the_picture_has_its_name(capsys, in_folder, command):
     model, wavelength = model_of(command)
@@ -72,6 +73,7 @@ def test_help_has_examples(capsys, command):
         assert option in out
 
 
+@pytest.mark.long
 def test_spots_across_the_band_and_over_fields(capsys, in_folder):
     fields = ["--field-deg", "0", "--field-deg", "0.3,0.4"]
     assert main(["spots", "lsst_v3.3_r", *fields, "--across-band", "3", "--json", "-o", "s.pdf"]) == 0
@@ -81,6 +83,7 @@ def test_spots_across_the_band_and_over_fields(capsys, in_folder):
     assert (in_folder / "s.pdf").read_bytes().startswith(MAGIC["pdf"])
 
 
+@pytest.mark.long
 def test_equal_commands_leave_equal_bytes(in_folder, capsys):
     for kind in ("png", "svg"):
         for name in ("a", "b"):
@@ -106,6 +109,7 @@ def test_equal_commands_leave_equal_bytes(in_folder, capsys):
         assert one.startswith(MAGIC[kind])
 
 
+@pytest.mark.long
 def test_maps_and_double_zernikes(capsys, in_folder):
     assert main(["zernikes", "paul_baker", "--jmax", "6", "--map", "-o", "map.png"]) == 0
     assert "4 defocus" in capsys.readouterr().out
@@ -115,6 +119,7 @@ def test_maps_and_double_zernikes(capsys, in_folder):
     assert (in_folder / "double_zernikes_paul_baker.png").exists()
 
 
+@pytest.mark.long
 def test_images_go_to_fits_and_the_two_ways_agree(capsys, in_folder):
     common = ["--field-deg", "0.4", "--pixels", "32", "--pixel-um", "0.4", "--json"]
     assert main(["psf", "paul_baker", *common, "--fits", "one.fits"]) == 0
@@ -127,6 +132,7 @@ def test_images_go_to_fits_and_the_two_ways_agree(capsys, in_folder):
     capsys.readouterr()
 
 
+@pytest.mark.long
 def test_the_model_in_three_dimensions(capsys, in_folder):
     assert main(["draw", "lsst_v3.3_r", "--glb", "model.glb"]) == 0
     assert f"model: {in_folder / 'model.glb'}" in capsys.readouterr().out
@@ -148,6 +154,7 @@ def test_coatings(capsys, in_folder):
     assert metrics[0]["total_flux"] < metrics[1]["total_flux"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [

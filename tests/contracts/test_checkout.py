@@ -24,6 +24,7 @@ def checkout(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_checkout_imports_from_its_root(checkout):
     # The metadata of the distribution are those of the installed pachon; all code is that of the copy.
     code = (

@@ -59,6 +59,7 @@ def test_imports_point_backwards(layer):
     assert wrong == set()
 
 
+@pytest.mark.long
 def test_there_are_no_circles_between_files():
     graph = {name: {n for n in imports_of(path) if n in MODULES} - {name} for name, path in MODULES.items()}
     try:

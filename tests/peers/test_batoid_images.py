@@ -65,6 +65,7 @@ def test_fourier_images_by_moments(angle):
     assert mine_second == pytest.approx(second, abs=0.02 * size)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angle", [0.0, 1.0, 1.4, 1.75])
 def test_radius_of_80_percent_of_the_light(angle):
     telescope = pachon.load_telescope("lsst_v3.3_i")

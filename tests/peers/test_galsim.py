@@ -28,6 +28,7 @@ def study():
     del sys.modules[spec.name]
 
 
+@pytest.mark.long
 def test_screens_have_the_structure_function_of_galsims_von_karman_profile():
     # A fixed modulus leaves no luck of the draw in the mean over a periodic screen.
     air = Atmosphere.from_site(
@@ -52,6 +53,7 @@ def test_screens_have_the_structure_function_of_galsims_von_karman_profile():
         assert phase == pytest.approx(profile._structure_function(lag * 0.16), rel=0.01)
 
 
+@pytest.mark.long
 def test_screens_are_as_strong_as_galsims_screens(study):
     """Both draw the modes up to GalSim's own cut-off, 0.2/r0 cycles a metre; only the random numbers differ."""
     size = 1024

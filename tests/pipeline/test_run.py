@@ -224,6 +224,7 @@ def test_who_wants_no_progress_hears_of_a_ccd_left_out(settings_file, tmp_path, 
     assert capsys.readouterr().err == f"pachon: CCD R22_S11 is left out, it cannot be modelled: {failing_ccd}\n"
 
 
+@pytest.mark.long
 def test_a_run_of_which_no_ccd_can_be_modelled_is_one_line(tmp_path, tiny, failing_ccd):
     with pytest.raises(DomainError, match=r"^none of 1 CCDs can be modelled; CCD R22_S11: 3 of 12 stars left"):
         run(tiny(ccds=("R22_S11",)), tmp_path / "out")
@@ -293,6 +294,7 @@ def computed(config):
     return model_ccd(experiment, ccd_exposure.expose_ccd(experiment, config.ccds[0]))
 
 
+@pytest.mark.long
 def test_visits_have_the_same_stars_and_other_noise(tiny):
     """Without an atmosphere nothing but the noise tells two visits apart."""
     options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
@@ -304,6 +306,7 @@ def test_visits_have_the_same_stars_and_other_noise(tiny):
     assert not np.any(np.all(first.observed_images == second.observed_images, axis=(1, 2)))
 
 
+@pytest.mark.long
 def test_residual_aberration_and_jitter_reach_the_stars(tiny):
     options = {"ccds": ("R22_S11",), "atmosphere__enabled": False, "psf__stamp": 31, "psf__n_pupil": 200}
     plain, bent, shaken = (

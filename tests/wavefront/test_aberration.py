@@ -45,6 +45,7 @@ def test_the_opd_gains_a_planted_aberration(lsst_r, pupil):
         np.testing.assert_array_equal(getattr(without, same), getattr(with_it, same))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("element", ["Camera", "M2"])
 def test_defocus_is_that_of_a_moved_camera_or_mirror(lsst_r, pupil, element):
     """Path and landing points of rays through a shifted element, and of the nominal telescope with its Zernikes."""
@@ -125,6 +126,7 @@ def test_terms_linear_in_the_field_hold_what_misalignment_does(lsst_r, pupil):
     assert np.sqrt(np.mean(np.sum(rest**2, axis=1))) < 0.1 * size
 
 
+@pytest.mark.long
 def test_rms_over_pupil_field_and_exposures(lsst_r, annulus_points):
     x, y = annulus_points(400, 1)
     rng = np.random.default_rng(6)
@@ -144,6 +146,7 @@ def test_rms_over_pupil_field_and_exposures(lsst_r, annulus_points):
     assert np.mean(aberration.opd(x, y, places[0]) ** 2) == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.long
 def test_amplitudes_fall_with_the_degree_and_half_the_variance_is_linear_in_the_field(lsst_r):
     drawn = [ResidualWavefront.draw(lsst_r, PAPER_RMS, seed=1, epoch=e) for e in range(2000)]
     constant = np.mean([a.coefficients**2 for a in drawn], axis=0)
@@ -243,6 +246,7 @@ def moments(image):
     return np.array([(xx - yy) / scale, 2 * xy / scale, cx, cy])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("coefficients", "signs"),
     [

@@ -77,6 +77,7 @@ def test_a_telescope_without_apertures(lsst_r):
     assert maps.lit.all()
 
 
+@pytest.mark.long
 def test_neither_batches_nor_threads_matter(lsst_r):
     fields, done = field_disc(5), []
     # Of a million points a batch holds a few fields only.

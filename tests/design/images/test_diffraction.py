@@ -30,6 +30,7 @@ def annulus_pattern(radius, scale, obscuration):
     return amplitude**2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("obscuration", [0.0, 0.6])
 @pytest.mark.parametrize("method", [fft_psf, huygens_psf])
 def test_a_perfect_pupil_makes_the_pattern_of_airy(paraboloid, obscuration, method):
@@ -59,6 +60,7 @@ def test_a_defocused_disc_has_the_strehl_ratio_of_theory(paraboloid):
     assert psf.strehl[0] == pytest.approx(np.sinc(waves) ** 2, abs=2e-3)
 
 
+@pytest.mark.long
 def test_the_lattice_sum_is_the_fast_fourier_transform(lsst_r):
     field = np.deg2rad([0.3, -0.8])
     center = spots(lsst_r, field).reference_point[0]
@@ -98,6 +100,7 @@ def test_path_differences_are_those_of_the_reference_sphere(lsst_r, field):
     assert wavelets.opd[lit] == pytest.approx(opd.value[lit], abs=3e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angle", [(0.0, 0.0), (0.9, -1.1), (0.0, 1.75)])
 def test_fourier_sum_and_huygens_wavelets_agree(angle):
     telescope = pachon.load_telescope("lsst_v3.3_i")
@@ -114,6 +117,7 @@ def test_fourier_sum_and_huygens_wavelets_agree(angle):
     assert both[0].centroid == pytest.approx(both[1].centroid, abs=3e-8)
 
 
+@pytest.mark.long
 def test_without_a_cut_rim_they_agree_to_a_thousandth():
     telescope = pachon.load_telescope("paul_baker")
     field = [[0.0, np.deg2rad(0.4)]]
@@ -123,6 +127,7 @@ def test_without_a_cut_rim_they_agree_to_a_thousandth():
     assert np.abs(one.image - other.image).max() < 1.5e-3 * one.image.max()
 
 
+@pytest.mark.long
 def test_the_image_points_the_same_way_as_the_spot(lsst_r):
     # Coma and astigmatism of a decentred secondary, and defocus: some ten Airy discs of aberration.
     telescope = lsst_r.perturbed("M2", shift=(1e-3, 4e-4, 0.0), tilt=(0.0, 1e-4, 0.0))
@@ -154,6 +159,7 @@ def test_the_image_points_the_same_way_as_the_spot(lsst_r):
         assert np.linalg.norm(a - b) < 0.15 * np.linalg.norm(a)
 
 
+@pytest.mark.long
 def test_all_the_light_lands(paraboloid):
     telescope = paraboloid(f_number=20.0, obscuration=0.3)
     psf = fft_psf(telescope, [[0.0, 0.0]], WAVE, pixels=600, pixel=20.0 * WAVE / 4, n_pupil=512)
@@ -161,6 +167,7 @@ def test_all_the_light_lands(paraboloid):
     assert psf.inside[0] == pytest.approx(1.0 - 2.0 / (math.pi**2 * (1.0 - 0.3) * 75.0), abs=2e-3)
 
 
+@pytest.mark.long
 def test_several_wavelengths_add_up(lsst_r):
     field = np.deg2rad([[0.0, 1.6]])
     common = dict(pixels=32, pixel=0.4e-6, reference="chief", n_pupil=128)

@@ -33,6 +33,7 @@ def test_pixels_are_squares_of_even_light():
     assert np.interp(3.6, radius, light) == pytest.approx(50.0, abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("obscuration", [0.0, 0.6])
 def test_a_perfect_pupil(paraboloid, obscuration):
     telescope = paraboloid(f_number=50.0, obscuration=obscuration)
@@ -67,6 +68,7 @@ def test_light_that_falls_beside_the_image_is_missed(paraboloid):
         energy_of_psf(psf, np.array([1.0]))
 
 
+@pytest.mark.long
 def test_over_the_field_of_the_lsst():
     telescope = pachon.load_telescope("lsst_v3.3_i")
     fields = np.deg2rad([[0.0, 0.0], [0.0, 0.7], [0.0, 1.0], [0.0, 1.4], [0.0, 1.75]])

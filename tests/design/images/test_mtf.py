@@ -46,6 +46,7 @@ def _discs(shift: np.ndarray, large: float, small: float) -> np.ndarray:
     return np.where(d <= large - small, np.pi * small**2, np.where(d >= large + small, 0.0, area))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("obscuration", [0.0, 0.3, 0.62])
 def test_closed_form_of_an_annulus(obscuration):
     shift = np.array([0.0, 0.05, 0.19, 0.31, 0.5, 0.62, 0.81, 0.95, 1.0, 1.2])
@@ -63,6 +64,7 @@ def test_a_perfect_pupil(paraboloid, obscuration):
     assert result.cutoff[0] == pytest.approx(1.0 / (WAVE * 30.0), rel=1e-3)
 
 
+@pytest.mark.long
 def test_it_is_the_transform_of_the_image(lsst_r):
     field = [np.deg2rad([0.0, 1.2])]
     result = mtf(lsst_r, field, [560e-9, 690e-9], n_pupil=192)
@@ -75,6 +77,7 @@ def test_it_is_the_transform_of_the_image(lsst_r):
         assert np.abs(phase @ profile) == pytest.approx(row[some], abs=0.03)
 
 
+@pytest.mark.long
 def test_tangential_turns_with_the_field(lsst_r):
     angles = np.deg2rad([[0.0, 1.2], [1.2, 0.0], [-0.72, 0.96]])
     # Rotating the slopes, not the angles, keeps the telescope the same.
@@ -98,6 +101,7 @@ def test_rays_alone_are_the_transform_of_the_spot(lsst_r):
     assert result.geometric_tangential[0] == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.long
 def test_bounds_and_summary(lsst_r):
     result = mtf(lsst_r, n_pupil=96)
     assert (result.tangential <= result.tangential_limit + 5e-3).all()

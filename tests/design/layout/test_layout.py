@@ -119,6 +119,7 @@ def test_tubes_are_thin_and_as_long_as_their_lines():
     assert mesh.bounds == pytest.approx(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]]), abs=1.1e-3)
 
 
+@pytest.mark.long
 def test_a_glb_can_be_read_back_and_stands_upright():
     telescope = pachon.load_telescope("lsst_v3.3_r_obstructed")
     scene = trimesh.load_scene(io.BytesIO(layout(telescope).glb()), file_type="glb")
@@ -132,6 +133,7 @@ def test_a_glb_can_be_read_back_and_stands_upright():
     assert scene.geometry["L1"].visual.material.alphaMode == "BLEND"
 
 
+@pytest.mark.long
 def test_obstructions_are_drawn_too(lsst_r):
     beam = trimesh.creation.box((9.0, 0.05, 0.5), transform=trimesh.transformations.translation_matrix((0, 0, 7.0)))
     telescope = replace(lsst_r, obstructions=(Obstruction.from_mesh("beam", beam),))
@@ -141,6 +143,7 @@ def test_obstructions_are_drawn_too(lsst_r):
     assert png_bytes(found.plot()).startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["lsst_v3.3_r_obstructed", "paul_baker", "hsc", "auxtel"])
 def test_bundled_telescopes_can_be_drawn(name):
     found = layout(pachon.load_telescope(name))

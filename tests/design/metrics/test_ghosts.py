@@ -87,6 +87,7 @@ def test_ghosts_by_the_detector(with_plate):
     assert back.focus == pytest.approx(-2.0 * way, rel=3e-3)
 
 
+@pytest.mark.long
 def test_the_maps_hold_the_light(lsst_r):
     found = ghosts(lsst_r, n_pupil=4000)
     cell = np.diff(found.edges)[0] ** 2
@@ -99,6 +100,7 @@ def test_the_maps_hold_the_light(lsst_r):
     assert 0.8 * sum(g.flux for g in sharp) < (found.irradiance * cell).sum() <= found.flux
 
 
+@pytest.mark.long
 def test_the_ghosts_of_the_lsst(lsst_r):
     found = ghosts(lsst_r, detector_reflectivity=0.3, n_pupil=10000)
     assert len(ghost_pairs(lsst_r)) == 36

@@ -132,6 +132,7 @@ def test_the_lsst_is_as_sharp_as_designed(lsst_r):
     assert summary["lit_fraction"][-1] == pytest.approx(0.9, abs=0.01)
 
 
+@pytest.mark.long
 def test_quantities_threads_and_blocks_change_nothing(lsst_r):
     plain = spots(lsst_r, np.deg2rad([[0.3, 1.0], [0.0, 1.7]]), [600e-9], threads=1)
     same = spots(lsst_r, [[0.3, 1.0], [0.0, 1.7]] * u.deg, [600] * u.nm, threads=2)
@@ -159,6 +160,7 @@ def test_a_field_without_light_says_so(paraboloid):
     assert png_bytes(result.plot()).startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fields", [[[0.0, 0.0]], np.deg2rad([[0.0, 0.1 * i] for i in range(14)])])
 def test_pictures_of_one_and_many_fields(lsst_r, fields):
     result = spots(lsst_r, fields, np.linspace(*lsst_r.band, 3), n_pupil=8)

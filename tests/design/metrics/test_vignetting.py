@@ -59,6 +59,7 @@ def test_it_says_how_far_it_is(lsst_r):
     assert done == [2, 2, 2]
 
 
+@pytest.mark.long
 def test_profile_and_map(lsst_r):
     result = vignetting(lsst_r, field_disc(lsst_r, 4, 12), n_pupil=500)
     assert png_bytes(result.plot()).startswith(b"\x89PNG")
@@ -101,6 +102,7 @@ def test_what_surfaces_block_adds_up_to_the_vignetting(lsst_r):
     assert result.surfaces[0].largest_radius == pytest.approx([4.18] * 3, rel=2e-6)
 
 
+@pytest.mark.long
 def test_pictures_of_footprints(lsst_r, paraboloid):
     assert png_bytes(footprint(lsst_r, "M2").plot()).startswith(b"\x89PNG")
     assert png_bytes(footprint(lsst_r, ["L1_exit", "Detector"], field_disc(lsst_r, 2, 8)).plot()).startswith(b"\x89P")

@@ -189,6 +189,7 @@ def test_no_light(paul_baker):
         optimize(replace(paul_baker, surfaces=closed), ["Detector.dz"], "spots", FIELDS)
 
 
+@pytest.mark.long
 def test_a_start_from_which_rays_get_lost_on_the_way(paul_baker):
     """A step that throws rays off the mirrors is taken back, not raised."""
     poor = apply(paul_baker, {"M2.dz": -1.5, "Detector.dz": 0.5})

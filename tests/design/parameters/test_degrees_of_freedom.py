@@ -389,6 +389,7 @@ def test_bad_temperatures(lsst_r):
         thermal(lsst_r, {"M9": 1e-6})
 
 
+@pytest.mark.long
 def test_the_command(tmp_path, monkeypatch, capsys, lsst_r, dof):
     monkeypatch.chdir(tmp_path)
     place = ["--field-deg", "0,1", "--zernikes", "11"]

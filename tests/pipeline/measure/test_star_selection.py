@@ -37,12 +37,14 @@ def observed(seed=0, count=40):
     return observe_stamps(shapes, electrons, SKY, READ, rng), shapes, places
 
 
+@pytest.mark.long
 def test_good_stars_stay():
     # Noise reaches six standard deviations once in 1e9, and 120 000 pixels are looked at twice.
     found = [flag_stars(observed(seed)[0], NOISE).flags for seed in (1, 2, 3)]
     assert np.count_nonzero(found) <= 1  # the star that differs most from the median, at S/N 1000, may go
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["neighbours", "cosmic_rays"])
 def test_defects_are_found_and_named(kind):
     for seed in (0, 1, 2):
@@ -56,6 +58,7 @@ def test_defects_are_found_and_named(kind):
         assert found.masks[hit].any() == (kind == "cosmic_rays")
 
 
+@pytest.mark.long
 def test_masks_hold_the_cosmic_ray():
     stamps, _, _ = observed(4)
     stamps[7, 3:9, 20] += 3000.0
@@ -66,6 +69,7 @@ def test_masks_hold_the_cosmic_ray():
     assert selection.masks.sum() == selection.masks[7].sum()
 
 
+@pytest.mark.long
 def test_saturated_cores():
     stamps, shapes, _ = observed(5)
     full = 0.4 * stamps.max()

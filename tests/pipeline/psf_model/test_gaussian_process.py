@@ -74,6 +74,7 @@ def test_each_place_alone():
     assert predict(points, at[9:10], kernels, weights).tobytes() == whole[9].tobytes()
 
 
+@pytest.mark.long
 def test_kernel_of_a_drawn_process_is_found():
     pytest.importorskip("sklearn")
     rng = np.random.default_rng(3)
@@ -119,6 +120,7 @@ def test_fields_that_are_no_polynomials():
     assert one < 0.3 * min(error(order=n) for n in (2, 3, 4, 5))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("basis", "n_components"), [("pca", 6), ("pixels", None), ("shapelets", 27)])
 def test_smooth_fields_without_noise(basis, n_components):
     pytest.importorskip("sklearn")
@@ -173,6 +175,7 @@ def test_bad_input():
         PsfModel.fit(psf(places), places, n_components=3, interpolation="gp")
 
 
+@pytest.mark.long
 def test_no_kernel_is_likelier():
     """Where stars are few and noisy, a likelihood has several tops: of these eight, two from one start end lower."""
     pytest.importorskip("sklearn")

@@ -143,6 +143,7 @@ def test_weighted_polynomials(basis):
     np.testing.assert_allclose(equal.at(ELSEWHERE), plain.at(ELSEWHERE), atol=1e-14)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("basis", BASES)
 def test_masked_pixels_have_no_say(basis):
     places = positions(40, 1)

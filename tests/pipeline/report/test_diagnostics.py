@@ -228,6 +228,7 @@ def test_pictures_of_ccds_without_figures(diagnosed):
     assert residual_plot(camera, figures).startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_picture_of_a_perfect_model():
     rng = np.random.default_rng(0)
     x, y, e1, e2 = rng.uniform(0.0, 0.01, (4, 50))

@@ -119,6 +119,7 @@ def test_the_ccds_shown_large_are_the_closest_the_middle_and_the_farthest(finish
     assert [p.name for p in closest_middle_farthest(products)] == ["R22_S11", "R24_S12"]
 
 
+@pytest.mark.long
 def test_figures_do_not_depend_on_the_users_matplotlib(lsst_r):
     opd = wavefront_opd(lsst_r, (0.0, 0.01), 620e-9, grid=32)
     fit = fit_zernikes(opd, 4.18, 0.612, 11)

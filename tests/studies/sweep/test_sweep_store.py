@@ -75,6 +75,7 @@ def test_stores_that_are_none_are_refused(tmp_path):
         SweepStore(tmp_path / "empty.db")
 
 
+@pytest.mark.long
 def test_a_full_disk_is_one_line_and_loses_nothing(store, monkeypatch):
     store.write(result(0))
     connect = sqlite3.connect
@@ -127,6 +128,7 @@ def test_exports_without_points_or_of_unknown_kind_are_refused(store, tmp_path):
         export_table(store, tmp_path / "t.xls")
 
 
+@pytest.mark.long
 def test_what_can_be_read_of_a_damaged_store_is_saved(tmp_path):
     path = tmp_path / "sweep.db"
     points = [SweepPoint(i, {"b": 0.1 * i, "a": 0.3}, 7) for i in range(2000)]

@@ -61,6 +61,7 @@ def structure_along(modes, pixel, separations, direction):
     return np.array(values)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (math.sqrt(0.5), math.sqrt(0.5))])
 def test_expected_structure_function_of_both_scales(direction):
     """Low and high screens together follow theory from 4 cm to the outer scale."""
@@ -131,6 +132,7 @@ def coherence(phase):
     return scipy.fft.ifft2(spectrum).real / phase.size
 
 
+@pytest.mark.long
 def test_power_is_split_without_loss_or_overlap():
     variance = path_variance(R0, L0)
     for cutoff in (0.6 * CUTOFF, CUTOFF, 1.4 * CUTOFF):

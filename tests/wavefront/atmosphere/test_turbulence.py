@@ -73,6 +73,7 @@ def test_structure_function_is_smooth_where_its_two_forms_meet():
     assert structure_function(0.0, R0, L0) == 0.0
 
 
+@pytest.mark.long
 def test_annular_transfer_function_is_the_overlap_of_two_pupils():
     diameter, obscuration, n = 8.36, 0.61, 2001
     axis = (np.arange(n) - n // 2) * (diameter * 1.02 / n)

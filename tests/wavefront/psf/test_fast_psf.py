@@ -106,6 +106,7 @@ def test_rest_structure_function_starts_as_that_of_the_high_modes_and_never_fall
     np.testing.assert_allclose(both, np.exp(-0.5 * wavenumber**2 * structure_function(b, 0.16, 25.0)), atol=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_rays_through_the_layers_against_plain_numpy(polynomial_pupil, seed):
     """The image as a plain sum over rays and frequencies: exp(-i k x) of every ray, times the filter."""
@@ -178,6 +179,7 @@ def test_perfect_optics_give_the_airy_pattern_of_the_annulus(polynomial_pupil):
     np.testing.assert_allclose(image, expected, atol=5e-4 * expected.max())
 
 
+@pytest.mark.long
 def test_strong_seeing_gives_the_long_exposure_within_one_star(polynomial_pupil):
     """With the cut-off far below 1/r0 nearly all is in the filter, and one star is the ensemble mean."""
     telescope = polynomial_pupil()
@@ -198,6 +200,7 @@ def test_strong_seeing_gives_the_long_exposure_within_one_star(polynomial_pupil)
     np.testing.assert_allclose(image, expected, atol=0.03 * expected.max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tilt", [(3e-6, 0.0), (0.0, -2e-6)])
 def test_tilt_dispersion_and_offset_move_the_image(polynomial_pupil, tilt):
     jacobian = np.array([[10.3, 0.5], [-0.4, 10.6]])
@@ -325,6 +328,7 @@ def test_no_light_of_a_vignetted_star_is_lost_or_won(lsst_r, n_pupil):
     np.testing.assert_allclose(psfs.inside[1:], psfs.inside[0], rtol=1e-4)
 
 
+@pytest.mark.long
 def test_batches_shrink_with_the_stamp(polynomial_pupil):
     telescope = polynomial_pupil()
     batches = [

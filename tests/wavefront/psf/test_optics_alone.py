@@ -60,6 +60,7 @@ def test_ellipticity_jumps_at_ccd_borders_and_only_there(ellipticity, borders):
     assert no_step < 0.01
 
 
+@pytest.mark.long
 def test_ellipticity_is_large_off_axis_and_turns_with_the_sign_of_the_height(ellipticity):
     centers = pachon.lsst_camera().centers
     radius = np.hypot(*centers.T)

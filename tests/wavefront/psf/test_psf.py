@@ -141,6 +141,7 @@ def test_engines_agree_through_the_same_screens(lsst_r):
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ENGINES)
 def test_recentred_stars_are_those_drawn_at_the_other_place(lsst_r, engine):
     """Told where a star is seen, an engine draws it where it then is seen at the centre of a pixel."""

@@ -27,6 +27,7 @@ def small_atmosphere(seed=4, **options):
     return Atmosphere.from_site("cerro_pachon", seed, **(small | options))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fine_pixel", "allowed"), [(None, 2e-6), (0.02, 1e-4), (0.0173, 1e-4)])
 def test_against_a_plain_sum_over_the_pupil(polynomial_pupil, fine_pixel, allowed):
     """Sign and scale: |sum A exp(i k (w + psi - X.J^-T p))|^2, averaged over time and, by Gauss's rule, pixels."""
@@ -84,6 +85,7 @@ def test_against_a_plain_sum_over_the_pupil(polynomial_pupil, fine_pixel, allowe
     np.testing.assert_allclose(image, expected, atol=allowed * expected.max())
 
 
+@pytest.mark.long
 def test_perfect_optics_have_the_transfer_function_of_the_annulus(polynomial_pupil):
     telescope = polynomial_pupil()
     engine = WavePsfEngine(telescope.inputs(ONE_WAVE, PLANE, threads=1, pupil_spacing=0.02))
@@ -140,6 +142,7 @@ def test_layers_bend_light_by_their_gradient_where_it_crosses_them(polynomial_pu
         np.testing.assert_allclose(image, expected, atol=5e-3 * expected.max())
 
 
+@pytest.mark.long
 def test_padding_changes_nothing_that_the_detector_sees(polynomial_pupil):
     telescope = polynomial_pupil(defocus=0.5e-6)
     atmosphere = small_atmosphere()
@@ -208,6 +211,7 @@ def test_image_points_the_way_of_the_spot_diagram(lsst_r, field_deg):
     np.testing.assert_allclose(third, ray_third, atol=0.35 * np.hypot(*ray_third))
 
 
+@pytest.mark.long
 def test_bytes_do_not_depend_on_threads_batches_or_company(lsst_r):
     atmosphere = small_atmosphere(exposure=0.1)
     fields = np.array([[0.0, 0.0], [0.01, 0.02], [-0.02, 0.005]])
