@@ -1,4 +1,10 @@
+from .core.errors import ConfigError as ConfigError
+from .core.errors import DomainError as DomainError
 from .core.errors import PachonError as PachonError
+from .core.errors import PrescriptionError as PrescriptionError
+from .core.errors import PrescriptionWarning as PrescriptionWarning
+from .core.errors import ProductError as ProductError
+from .core.errors import UnknownNameError as UnknownNameError
 from .design.images.diffraction import fft_psf as fft_psf
 from .design.images.diffraction import huygens_psf as huygens_psf
 from .design.images.diffraction_psf import DiffractionPsf as DiffractionPsf
@@ -52,8 +58,10 @@ from .models.aperture import Polygon as Polygon
 from .models.aperture import Rectangle as Rectangle
 from .models.aperture import Union as Union
 from .models.aperture import Vane as Vane
+from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
 from .models.camera.focal_plane import FocalPlane as FocalPlane
+from .models.camera.height_budget import HeightBudget as HeightBudget
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums
 from .models.first_order import first_order as first_order
@@ -88,6 +96,7 @@ from .models.shapes.shape import Shape as Shape
 from .models.shapes.shape import Sphere as Sphere
 from .models.shapes.shape import Sum as Sum
 from .models.site import Site as Site
+from .models.site import Weather as Weather
 from .models.surface import Interaction as Interaction
 from .models.surface import Surface as Surface
 from .models.telescope import Telescope as Telescope
@@ -130,6 +139,9 @@ from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
 from .wavefront.chief_rays import fields_at as fields_at
 from .wavefront.opd import wavefront_opd as wavefront_opd
 from .wavefront.opd import wavefront_opds as wavefront_opds
+from .wavefront.opd_map import OpdMap as OpdMap
+from .wavefront.opd_map import OpdMaps as OpdMaps
+from .wavefront.opd_map import ZernikeFit as ZernikeFit
 from .wavefront.psf.psf import Psfs as Psfs
 from .wavefront.psf.psf import make_psfs as make_psfs
 from .wavefront.pupil_sampling import PupilSampling as PupilSampling

@@ -37,7 +37,7 @@ FOLDER_NAME = "diagnostics"
 _MEANINGS = {
     "residual": "observed - model, at the stars",
     "left_out": "observed - model fitted without the star",
-    "away": "truth - model, where no star is",
+    "away": "noise-free - model, at holdout positions",
 }
 
 

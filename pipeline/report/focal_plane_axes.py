@@ -22,7 +22,7 @@ TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
 RESIDUAL_TITLES = {
     "residual": "at the stars: observed - model",
     "left_out": "at stars left out: observed - model",
-    "away": "where no star is: truth - model",
+    "away": "holdout positions: noise-free - model",
 }
 
 

@@ -105,7 +105,7 @@ def whiskers_plot(
 
 
 def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> bytes:
-    """Draw whiskers of some CCDs large, one a row: truth, observed, residual at the stars and away from them."""
+    """Draw whiskers of some CCDs large, one a row: noise-free, observed, residuals at stars and holdout positions."""
     camera = focal_plane.camera
     kinds = ("truth", "observed", "residual", "away")
     key = _common_key(products)
@@ -132,16 +132,16 @@ def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> by
 
 
 _TITLES = {
-    "truth": "truth: noise-free PSFs",
+    "truth": "noise-free PSFs",
     "observed": "observed stars",
     "residual": "residual at the stars: observed - model",
-    "away": "residual away from the stars: truth - model",
+    "away": "residual at the holdout positions: noise-free - model",
 }
 _SHORT_TITLES = {
-    "truth": "truth",
+    "truth": "noise-free",
     "observed": "observed",
     "residual": "residual at stars",
-    "away": "residual elsewhere",
+    "away": "residual, holdout",
 }
 _COLORS = {"truth": TRUTH, "observed": OBSERVED, "residual": RESIDUAL, "away": AWAY}
 
@@ -163,7 +163,7 @@ def _draw_kind(axes: Axes, product: CcdProduct, kind: str, scale: float, width: 
 
 
 def _common_key(products: Sequence[CcdProduct]) -> float:
-    """Return the ellipticity of the key whisker, from truth and observed stars together."""
+    """Return the ellipticity of the key whisker, from noise-free PSFs and observed stars together."""
     return key_ellipticity(np.concatenate([np.hypot(*ellipticities(products, k)) for k in ("truth", "observed")]))
 
 

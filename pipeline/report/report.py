@@ -111,7 +111,7 @@ def draw_pictures(
             "eigenvalues of the observed stars bend away from those of the noise-free PSFs, noise takes over; the dot "
             "is the elbow, the point farthest below the straight line from the first eigenvalue to the last.",
             "The paper finds it by eye and that about 20 components suffice; they should hold over 99 % "
-            "of the variance of the truth.",
+            "of the variance of the noise-free PSFs.",
         ),
         Picture(
             "Ellipticity before and after",

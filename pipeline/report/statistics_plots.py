@@ -15,11 +15,11 @@ from ..measure.summary import ellipticities
 from .focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
 
 _LABELS = {
-    "truth": (TRUTH, "o", "truth, where no star is"),
+    "truth": (TRUTH, "o", "noise-free PSFs, at holdout positions"),
     "observed": (OBSERVED, "s", "observed stars"),
     "residual": (RESIDUAL, "D", "observed - model, at the stars"),
     "left_out": (LEFT_OUT, "v", "observed - model fitted without the star"),
-    "away": (AWAY, "^", "truth - model, where no star is"),
+    "away": (AWAY, "^", "noise-free - model, at holdout positions"),
 }
 _RHO_STYLES = {
     "rho1": (RED, "D", "$\\rho_1 = \\langle\\delta e^*\\,\\delta e\\rangle$"),
@@ -32,12 +32,15 @@ _RHO_STYLES = {
 
 def scatter_plot(products: Sequence[CcdProduct]) -> bytes:
     """Draw the ellipticity components before and after the model is subtracted (Jee & Tyson 2011, Fig. 13)."""
-    panels = (("at the observed stars", "observed", "residual"), ("where no star is", "truth", "away"))
+    panels = (
+        ("at the observed stars", "observed", "observed", "residual"),
+        ("at the holdout positions", "noise-free", "truth", "away"),
+    )
     with styled():
         figure = new_figure(10.0, 5.2)
         both = figure.subplots(1, 2, sharex=True, sharey=True)
-        for axes, (title, before, after) in zip(both, panels, strict=True):
-            for kind, name in ((before, before), (after, f"{before} - model")):
+        for axes, (title, label, before, after) in zip(both, panels, strict=True):
+            for kind, name in ((before, label), (after, f"{label} - model")):
                 e1, e2 = ellipticities(products, kind)
                 _draw_cloud(axes, e1, e2, _LABELS[kind][0], name)
             axes.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
@@ -46,7 +49,7 @@ def scatter_plot(products: Sequence[CcdProduct]) -> bytes:
             axes.set_title(title, loc="left")
             axes.legend(loc="upper right")
         both[0].set_ylabel("$e_2$: along the diagonal x = y")
-        values = np.concatenate([ellipticities(products, kind) for _, kind, _ in panels], axis=1)
+        values = np.concatenate([ellipticities(products, kind) for *_, kind, _ in panels], axis=1)
         edge = 1.1 * float(np.nanmax(np.abs(values)))
         both[0].set(xlim=(-edge, edge), ylim=(-edge, edge))
         return png_bytes(figure)
@@ -95,7 +98,7 @@ def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
 
 
 def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
-    """Draw rho statistics, grouped as in Jarvis et al. 2016: ``residual`` above, ``away`` (where no star is) below."""
+    """Draw rho statistics, grouped as in Jarvis et al. 2016: ``residual`` above, ``away`` (holdout) below."""
     with styled():
         figure = new_figure(11.0, 4.1 * len(rho) + 0.5)
         panels = figure.subplots(len(rho), 2, sharex=True, sharey="col", squeeze=False)

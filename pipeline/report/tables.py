@@ -9,10 +9,10 @@ from ..measure.correlation import SEPARATION_RANGES
 from ..measure.summary import CORRELATED
 
 _NAMES = {
-    "truth": "truth",
+    "truth": "noise-free PSFs",
     "observed": "observed",
     "residual": "observed - model, at the stars",
-    "away": "truth - model, where no star is",
+    "away": "noise-free - model, at holdout positions",
 }
 
 
@@ -27,12 +27,12 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
             "FWHM, median and range",
             '{fwhm_arcsec:.3f}", {fwhm_min_arcsec:.3f} to {fwhm_max_arcsec:.3f}"'.format(**metrics),
         ),
-        ("mean |e|, truth", _percent(metrics["mean_e_truth"])),
+        ("mean |e|, noise-free PSFs", _percent(metrics["mean_e_truth"])),
         ("mean |e|, observed stars", _percent(metrics["mean_e_observed"])),
         ("rms e residual, at the stars", _percent(metrics["rms_residual_at_stars"])),
-        ("rms e residual, each star left out in turn", _percent(metrics["rms_residual_left_out"])),
-        ("rms e residual, where no star is (no noise)", _percent(metrics["rms_residual_away"])),
-        ("truth's variance in the components, worst CCD", percent(metrics["truth_variance_in_components"])),
+        ("rms e residual, leave-one-out", _percent(metrics["rms_residual_left_out"])),
+        ("rms e residual, at holdout positions (noise-free)", _percent(metrics["rms_residual_away"])),
+        ("variance of noise-free PSFs in the components, worst CCD", percent(metrics["truth_variance_in_components"])),
     ]
     low, high = SEPARATION_RANGES["long"]
     for kind in CORRELATED:
@@ -48,19 +48,19 @@ PER_CCD_COLUMNS = (
     ("CCD", ""),
     ("field", "deg"),
     ("FWHM", "arcsec"),
-    ("truth |e|", "%"),
+    ("|e|", "%"),
     ("at stars", "%"),
-    ("left out", "%"),
-    ("no star", "%"),
+    ("leave-one-out", "%"),
+    ("holdout", "%"),
     ("variance", "%"),
     ("elbow", ""),
     ("stars used", ""),
 )
 PER_CCD_CAPTION = (
-    "Mean |e| of the truth, and rms of one component of the residual: observed - model at the stars; the same with "
-    "each star left out of the polynomial fit in turn; truth - model where no star is, which holds no noise of a star. "
-    "Variance: part of the truth's variance that the components hold. Elbow: components before the eigenvalues "
-    "flatten, of the observed stars and of the truth."
+    "Mean |e| of the noise-free PSFs, and rms of one component of the residual: observed - model at the stars; the "
+    "same, leave-one-out; noise-free - model at the holdout positions. Variance: part of the variance of the "
+    "noise-free PSFs in the components. Elbow: components before the eigenvalues flatten, of the observed stars and of "
+    "the noise-free PSFs."
 )
 
 
@@ -112,16 +112,16 @@ ATTRIBUTION_COLUMNS = (
     "off",
     "rms e [%]",
     "at stars",
-    "no star",
-    "ξ+ truth, below 10'",
+    "holdout",
+    "ξ+, below 10'",
     "beyond",
     "change",
-    "ξ+ no star, beyond",
+    "ξ+ holdout, beyond",
 )
 ATTRIBUTION_CAPTION = (
-    "The same stars without one cause. rms of one component of the truth, and of the residuals at the stars and where "
-    "no star is; mean ξ+ below 10' and from there to 3 deg; change: full case less this one beyond 10', with the "
-    "jackknife error over the CCDs."
+    "The same stars without one cause. rms of one component of the noise-free PSFs, and of the residuals at the stars "
+    "and at the holdout positions; mean ξ+ below 10' and from there to 3 deg; change: full case less this one beyond "
+    "10', with the jackknife error over the CCDs."
 )
 
 

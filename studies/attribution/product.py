@@ -66,20 +66,20 @@ def attribution_plot(
         for axes, keys in zip(
             panels[0],
             (
-                (("rms_e_truth", TRUTH, "truth"),),
+                (("rms_e_truth", TRUTH, "noise-free PSFs"),),
                 (
                     ("rms_residual_at_stars", RESIDUAL, "observed - model, at the stars"),
-                    ("rms_residual_away", AWAY, "truth - model, where no star is"),
+                    ("rms_residual_away", AWAY, "noise-free - model, at holdout positions"),
                 ),
             ),
             strict=True,
         ):
             _draw_bars(axes, metrics, keys)
-        panels[0, 0].set_title("rms of one component of e: truth", loc="left")
+        panels[0, 0].set_title("rms of one component of e: noise-free PSFs", loc="left")
         panels[0, 1].set_title("rms of one component of the residual", loc="left")
         for axes, kind, title in (
-            (panels[1, 0], "truth", "$|\\xi_+|$ of the truth"),
-            (panels[1, 1], "away", "$|\\xi_+|$ of truth - model, where no star is"),
+            (panels[1, 0], "truth", "$|\\xi_+|$ of the noise-free PSFs"),
+            (panels[1, 1], "away", "$|\\xi_+|$ of noise-free - model, at holdout positions"),
         ):
             for case, each in correlations.items():
                 _draw_curve(axes, each[kind], colors[case], case)

@@ -206,7 +206,7 @@ def test_command_line(finished_run, tmp_path, capsys, no_pictures):
     assert {key: written[key] for key in figures} == figures
     assert main(["diagnose", str(finished_run), "--out", str(tmp_path / "b")]) == 0
     out = capsys.readouterr().out
-    assert "truth - model, where no star is" in out
+    assert "noise-free - model, at holdout positions" in out
     assert "at [arcmin]" in out
     assert "…" not in out
     assert out.endswith(f"diagnostics: {(tmp_path / 'b').resolve()}\n")
