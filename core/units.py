@@ -22,7 +22,11 @@ def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
             raise DomainError(f"{name} = {value}: expected a unit that converts to {unit}") from error
     elif isinstance(value, (tuple, list)) and any(isinstance(v, u.Quantity) for v in value):
         return np.stack([_si(v, unit, name) for v in value])
-    return real_array(value, f"{name} = {value!r}: expected a number in {unit} or a quantity")
+    # The text is made where it is needed: that of a large array takes longer than many a trace.
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"{name} = {value!r}: expected a number in {unit} or a quantity") from error
 
 
 def real_array(values: Any, expectation: str) -> np.ndarray:
