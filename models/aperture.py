@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import PrescriptionError
 
@@ -54,7 +55,7 @@ class Circle(Region):
             f"circle = {self.radius!r} m: expected a positive radius and finite centre",
         )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         dx, dy = _shifted(x, y, self.x, self.y)
         return dx**2 + dy**2 < self.radius**2
 
@@ -74,7 +75,7 @@ class Annulus(Region):
             f"annulus = [{self.inner!r}, {self.outer!r}] m: expected 0 <= inner < outer and finite centre",
         )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         dx, dy = _shifted(x, y, self.x, self.y)
         r2 = dx**2 + dy**2
         return (r2 >= self.inner**2) & (r2 < self.outer**2)
@@ -103,7 +104,7 @@ class Rectangle(Region):
             f"rectangle at ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite centre and angle",
         )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
         return (np.abs(along) < 0.5 * self.width) & (np.abs(across) < 0.5 * self.height)
 
@@ -128,7 +129,7 @@ class Vane(Region):
             f"vane from ({self.x!r}, {self.y!r}) m, {self.angle!r} rad: expected finite point and angle",
         )
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         along, across = _rotated(*_shifted(x, y, self.x, self.y), self.angle)
         beside = np.abs(across) < 0.5 * self.width
         return beside if self.both_ways else beside & (along > 0.0)
@@ -162,7 +163,7 @@ class Polygon(Region):
         start = np.array(self.corners, dtype=np.float64)
         return start, np.roll(start, -1, axis=0)
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return whether points lie inside, by the number of edges that a line towards +x crosses.
 
         See Shimrat (1962), Communications of the ACM 5, 434 (algorithm 112).
@@ -221,14 +222,14 @@ class _Combination(Region):
 class Union(_Combination):
     """Points of at least one of several regions."""
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
 
 
 class Intersection(_Combination):
     """Points of all of several regions."""
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
 
 
@@ -241,7 +242,7 @@ class Complement(Region):
     def __post_init__(self) -> None:
         _check_parts("complement", (self.part,))
 
-    def contains(self, x: Any, y: Any) -> np.ndarray:  # noqa: D102
+    def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         return np.logical_not(self.part.contains(x, y))
 
 

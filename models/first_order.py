@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import DomainError
 from ..core.units import ARCSEC
@@ -106,7 +107,7 @@ class _Trace:
     u_after: np.ndarray
 
 
-def first_order(telescope: Telescope, wavelength: Any = None) -> FirstOrder:
+def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> FirstOrder:
     """Return the first-order properties of a centred telescope.
 
     Parameters
@@ -151,7 +152,7 @@ def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np
     return np.abs(_trace(telescope, wavelength, np.tan(field)).h).sum(axis=1)
 
 
-def seidel_sums(telescope: Telescope, wavelength: Any = None, field: float | None = None) -> SeidelSums:
+def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field: float | None = None) -> SeidelSums:
     """Return the Seidel sums of a centred telescope.
 
     Parameters

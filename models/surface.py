@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import PrescriptionError
 from .aperture import Aperture
@@ -82,15 +83,17 @@ class Surface:
         matrix.flags.writeable = False
         return matrix
 
-    def to_local(self, points: Any) -> np.ndarray:
+    def to_local(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the telescope frame in the surface's own frame."""
         return (np.asarray(points, dtype=np.float64) - np.array(self.vertex)) @ self.matrix
 
-    def to_telescope(self, points: Any) -> np.ndarray:
+    def to_telescope(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the surface's own frame in the telescope frame."""
         return np.asarray(points, dtype=np.float64) @ self.matrix.T + np.array(self.vertex)
 
-    def moved(self, *, rotation: Any = IDENTITY, about: Any = (0.0, 0.0, 0.0), shift: Any = (0, 0, 0)) -> Surface:
+    def moved(
+        self, *, rotation: ArrayLike = IDENTITY, about: ArrayLike = (0.0, 0.0, 0.0), shift: ArrayLike = (0, 0, 0)
+    ) -> Surface:
         """Return the surface rotated about a point, then shifted, all in the telescope frame.
 
         Parameters

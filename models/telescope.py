@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import DomainError, PrescriptionError, unknown_name
 from ..core.units import metres, radians
@@ -220,7 +221,12 @@ class Telescope:
         return self.with_shape(name, Sum((*parts, deformation)))
 
     def perturbed(
-        self, name: str, *, shift: Any = (0.0, 0.0, 0.0), tilt: Any = (0.0, 0.0, 0.0), about: Any = None
+        self,
+        name: str,
+        *,
+        shift: ArrayLike = (0.0, 0.0, 0.0),
+        tilt: ArrayLike = (0.0, 0.0, 0.0),
+        about: ArrayLike | None = None,
     ) -> Telescope:
         """Return the telescope with one surface, or a group of surfaces, rotated and then shifted.
 
@@ -289,7 +295,7 @@ class Telescope:
         """
         return replace(self, obstructions=(*self.obstructions, *obstructions))
 
-    def check_wavelength(self, wavelength: Any) -> np.ndarray:
+    def check_wavelength(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the wavelength [m] as a float64 array.
 
         Raises
@@ -299,7 +305,7 @@ class Telescope:
         """
         return wavelengths_within(wavelength, self.wavelength_range, self.name)
 
-    def check_field(self, tx: Any, ty: Any) -> tuple[np.ndarray, np.ndarray]:
+    def check_field(self, tx: ArrayLike, ty: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the field angles [rad] as float64 arrays.
 
         Raises

@@ -7,6 +7,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import ConfigError, DomainError
 from ..core.units import metres, radians
@@ -102,7 +103,11 @@ def check_wavelength(wavelength: Any) -> float:
 
 
 def launch_rays(
-    telescope: Telescope, field: tuple[Any, Any], wavelength: Any, pupil: tuple[Any, Any], projection: str = "zemax"
+    telescope: Telescope,
+    field: tuple[ArrayLike, ArrayLike],
+    wavelength: ArrayLike,
+    pupil: tuple[ArrayLike, ArrayLike],
+    projection: str = "zemax",
 ) -> Rays:
     """Launch a plane wave from one field point through given points of the entrance pupil.
 

@@ -96,7 +96,7 @@ def encircled_energy(
     wavelengths: ArrayLike | None = None,
     *,
     kind: str = "diffraction",
-    radii: Any = None,
+    radii: ArrayLike | None = None,
     wavelength_weights: ArrayLike | None = None,
     reference: str = "centroid",
     sampling: str | PupilSampling = "spiral",

@@ -123,7 +123,7 @@ class DoubleZernikes:
     at_nodes: FieldZernikes
     residual_rms: np.ndarray
 
-    def at(self, fields: Any) -> np.ndarray:
+    def at(self, fields: ArrayLike) -> np.ndarray:
         """Return the pupil coefficients [m] of the expansion at field angles [rad], shape [n_field, jmax]."""
         x, y = np.atleast_2d(np.asarray(fields, dtype=np.float64)).T / self.field_radius
         return annular_zernikes(len(self.coefficients), x, y).T @ self.coefficients

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
 from ...models.shapes.shape import Shape, Sum
@@ -156,7 +157,7 @@ class DegreesOfFreedom:
             raise unknown_name(f"degree of freedom{f' of {self.name}' if self.name else ''}", name, self.names)
         return self.names.index(name)
 
-    def vector(self, values: Any) -> np.ndarray:
+    def vector(self, values: ArrayLike) -> np.ndarray:
         """Return values as a vector, shape [n], each in its unit.
 
         Parameters
@@ -192,7 +193,7 @@ class DegreesOfFreedom:
                 raise DomainError(f"{name} = {float(value)!r}: expected a finite number")
         return vector
 
-    def apply(self, telescope: Telescope, values: Any) -> Telescope:
+    def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
         """Return the telescope with a vector of degrees of freedom applied.
 
         Deformations are added to the surfaces first, then other parameters change, then bodies move, groups before
@@ -247,7 +248,7 @@ class DegreesOfFreedom:
         return bending.telescope, parse_parameters(rows, bending.telescope), np.array(list(rows.values()))
 
     def sensitivity(
-        self, telescope: Telescope, fields: Any = None, wavelength: Any = None, **options: Any
+        self, telescope: Telescope, fields: ArrayLike | None = None, wavelength: ArrayLike | None = None, **options: Any
     ) -> Sensitivity:
         """Return the sensitivity matrix of the wavefront to the degrees of freedom.
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from ...core.errors import unknown_name
@@ -71,7 +71,7 @@ class Camera:
             raise unknown_name(f"raft of {self.name}", raft, self.raft_names)
         return tuple(n for n, r in zip(self.ccd_names, self.raft_of, strict=True) if r == raft)
 
-    def ccd_at(self, x: Any, y: Any, *, margin: float = 0.0) -> np.ndarray:
+    def ccd_at(self, x: ArrayLike, y: ArrayLike, *, margin: float = 0.0) -> np.ndarray:
         """Return the index of the CCD at points [m], or at most a margin [m] outside its rim; -1 without one."""
         px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
         index = np.full(px.shape, -1, dtype=np.int64)

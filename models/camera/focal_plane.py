@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from astropy.table import Table
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, unknown_name
 from ...core.units import metres, radians
@@ -175,7 +176,7 @@ class FocalPlane:
         """Coefficients [m] of uniform cubic B-splines, index order CCD, y, x, shape (n_ccd, m, m), or None."""
         return self.surfaces.grid
 
-    def ccd_at(self, x: Any, y: Any) -> np.ndarray:
+    def ccd_at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the index of the CCD at (x, y) [m]; -1 in a gap or outside."""
         return self.camera.ccd_at(x, y)
 
@@ -183,7 +184,7 @@ class FocalPlane:
         """Return the index of the CCD of that name."""
         return self.camera.ccd_index(name)
 
-    def with_moved(self, name: str, *, dz: Any = 0.0, rx: Any = 0.0, ry: Any = 0.0) -> FocalPlane:
+    def with_moved(self, name: str, *, dz: ArrayLike = 0.0, rx: ArrayLike = 0.0, ry: ArrayLike = 0.0) -> FocalPlane:
         """Return the focal plane with one CCD, or all CCDs of a raft, moved as a rigid body.
 
         Angles are small: the surface is sheared by their tangents, which for 1e-3 rad is right to 1e-6 of its height.
@@ -218,7 +219,7 @@ class FocalPlane:
         polynomial[members, 2] += camera.half_size * np.tan(turn_x)
         return replace(self, surfaces=replace(self.surfaces, polynomial=polynomial))
 
-    def height(self, x: Any, y: Any) -> np.ndarray:
+    def height(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the height of the CCD surface.
 
         Parameters
@@ -233,11 +234,11 @@ class FocalPlane:
         """
         return self._on_ccds(self.surfaces.height, x, y)
 
-    def gradient(self, x: Any, y: Any) -> np.ndarray:
+    def gradient(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the slopes (dh/dx, dh/dy) of the CCD surface [rad], shape (..., 2); arguments as for `height`."""
         return self._on_ccds(self.surfaces.gradient, x, y, 2)
 
-    def _on_ccds(self, function: Callable[..., np.ndarray], x: Any, y: Any, *values: int) -> np.ndarray:
+    def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
         px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
         ccd = self.camera.ccd_at(px, py)

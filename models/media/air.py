@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
@@ -89,7 +89,7 @@ class Air(Medium):
         """Shortest and longest wavelength [m] that the formula covers."""
         return WAVELENGTH_RANGES[self.formula]
 
-    def refractivity(self, wavelength: Any) -> np.ndarray:
+    def refractivity(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the index less one, without the rounding of adding one.
 
         Parameters
@@ -109,7 +109,7 @@ class Air(Medium):
             return filippenko_refractivity(s2, self.pressure / MMHG, celsius, self.water_vapour / MMHG)
         return self._ciddor(s2)
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         return 1.0 + self.refractivity(wavelength)
 
     def _ciddor(self, s2: np.ndarray) -> np.ndarray:

@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import PrescriptionError
 from .medium import ConstantIndex, Medium, check_wavelength_range, real_index, wavelengths_within
@@ -100,7 +100,7 @@ class Dispersion(Medium):
             )
         check_wavelength_range(self.wavelength_range)
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         w = wavelengths_within(wavelength, self.wavelength_range, "this glass")
         formula = FORMULAS[self.formula]
         padded = (*self.coefficients, *[0.0] * (formula.size - len(self.coefficients)))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, PrescriptionError
 from ...core.units import metres
@@ -47,7 +48,7 @@ class Medium(ABC):
     name: str
 
     @abstractmethod
-    def index(self, wavelength: Any) -> np.ndarray:
+    def index(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the refractive index against vacuum.
 
         Parameters
@@ -99,7 +100,7 @@ class ConstantIndex(Medium):
         if not (np.isfinite(self.n) and self.n > 0):
             raise PrescriptionError(f"n = {self.n!r}: expected a positive refractive index")
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         return np.full_like(metres(wavelength, "wavelength"), self.n)
 
 
@@ -133,7 +134,7 @@ class Sellmeier(Medium):
                 raise PrescriptionError(f"{name} = {value!r}: expected {size} finite numbers, as many in B as in C")
         check_wavelength_range(self.wavelength_range)
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         w = wavelengths_within(wavelength, self.wavelength_range, "this glass")
         squared = (w * 1e6) ** 2
         with np.errstate(all="ignore"):
@@ -161,7 +162,7 @@ class RelativeToAir(Medium):
     air: Medium
     name: str = field(default="", compare=False)
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         w = metres(wavelength, "wavelength")
         n_air = self.air.index(w)
         return n_air * self.relative.index(w / n_air)
@@ -189,7 +190,7 @@ class ChangedIndex(Medium):
         if not np.isfinite(self.change):
             raise PrescriptionError(f"change = {self.change!r}: expected a finite change of the refractive index")
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         return self.medium.index(wavelength) + self.change
 
 

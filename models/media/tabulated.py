@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 from ...core.errors import PrescriptionError
@@ -57,7 +57,7 @@ class TabulatedIndex(Medium):
         """Shortest and longest wavelength of the table [m]."""
         return self.wavelengths[0], self.wavelengths[-1]
 
-    def index(self, wavelength: Any) -> np.ndarray:  # noqa: D102
+    def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
         w = np.clip(wavelengths_within(wavelength, self.wavelength_range, "this table"), *self.wavelength_range)
         if self.interpolation == "linear":
             return np.asarray(np.interp(w, self.wavelengths, self.indices))

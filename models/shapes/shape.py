@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import PrescriptionError, unknown_name
 
@@ -63,15 +64,15 @@ class Shape(ABC):
     Positions x, y [m] are in the surface's own frame, scalars or arrays; results have their common shape.
     """
 
-    def sag(self, x: Any, y: Any) -> np.ndarray:
+    def sag(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the height over the vertex plane [m]; NaN beyond the rim of the shape."""
         return self._sag(*coordinates(x, y))
 
-    def gradient(self, x: Any, y: Any) -> Pair:
+    def gradient(self, x: ArrayLike, y: ArrayLike) -> Pair:
         """Return the slopes dz/dx and dz/dy."""
         return self._gradient(*coordinates(x, y))
 
-    def hessian(self, x: Any, y: Any) -> Triple:
+    def hessian(self, x: ArrayLike, y: ArrayLike) -> Triple:
         """Return the second derivatives of the sag along xx, xy and yy [1/m]."""
         return self._hessian(*coordinates(x, y))
 
@@ -113,7 +114,7 @@ class Shape(ABC):
         self._check_parameter(name)
         return self._changed(name, float(value))
 
-    def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:
+    def sag_derivative(self, name: str, x: ArrayLike, y: ArrayLike) -> Triple:
         """Return the derivative of the sag by a parameter.
 
         Parameters
@@ -357,7 +358,7 @@ class Sum(Shape):
         i, inner = self._places[name]
         return self.parts[i], inner
 
-    def sag_derivative(self, name: str, x: Any, y: Any) -> Triple:  # noqa: D102
+    def sag_derivative(self, name: str, x: ArrayLike, y: ArrayLike) -> Triple:  # noqa: D102
         part, inner = self.place(name)
         return part.sag_derivative(inner, x, y)
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import treecorr
+from astropy.units import Quantity
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.units import ARCMIN, radians, real_array
@@ -107,17 +109,17 @@ class Correlation:
 
 
 def shear_correlation(
-    x: Any,
-    y: Any,
-    e1: Any,
-    e2: Any,
+    x: ArrayLike,
+    y: ArrayLike,
+    e1: ArrayLike,
+    e2: ArrayLike,
     *,
-    min_sep: Any,
-    max_sep: Any,
+    min_sep: float | Quantity,
+    max_sep: float | Quantity,
     n_bins: int = 20,
     subtract_mean: bool = False,
     exact: bool | None = None,
-    patch: Any = None,
+    patch: ArrayLike | None = None,
     other: tuple[Any, Any] | None = None,
 ) -> Correlation:
     r"""Correlate ellipticities of star pairs (Jee & Tyson 2011, eq. 7).

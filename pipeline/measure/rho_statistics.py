@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from astropy.units import Quantity
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.units import real_array
@@ -51,20 +53,20 @@ class RhoStatistics:
 
 
 def rho_statistics(
-    x: Any,
-    y: Any,
-    e1: Any,
-    e2: Any,
-    size: Any,
-    model_e1: Any,
-    model_e2: Any,
-    model_size: Any,
+    x: ArrayLike,
+    y: ArrayLike,
+    e1: ArrayLike,
+    e2: ArrayLike,
+    size: ArrayLike,
+    model_e1: ArrayLike,
+    model_e2: ArrayLike,
+    model_size: ArrayLike,
     *,
-    min_sep: Any,
-    max_sep: Any,
+    min_sep: float | Quantity,
+    max_sep: float | Quantity,
     n_bins: int = 20,
     exact: bool | None = None,
-    patch: Any = None,
+    patch: ArrayLike | None = None,
 ) -> RhoStatistics:
     """Compute the rho statistics 1 to 5 of a PSF model (Rowe 2010; Jarvis et al. 2016, sec. 3.4).
 
@@ -110,8 +112,9 @@ def rho_statistics(
     e, de, w = (s1, s2), (s1 - m1, s2 - m2), (s1 * growth, s2 * growth)
 
     def correlate(f: tuple[np.ndarray, np.ndarray], g: tuple[np.ndarray, np.ndarray] | None = None) -> Correlation:
-        options = {"min_sep": min_sep, "max_sep": max_sep, "n_bins": n_bins, "exact": exact, "patch": patch}
-        return shear_correlation(x, y, *f, other=g, **options)
+        return shear_correlation(
+            x, y, *f, other=g, min_sep=min_sep, max_sep=max_sep, n_bins=n_bins, exact=exact, patch=patch
+        )
 
     return RhoStatistics(correlate(de), correlate(e, de), correlate(w), correlate(de, w), correlate(e, w))
 

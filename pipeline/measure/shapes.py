@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
@@ -73,11 +74,11 @@ class Shapes:
 
 
 def measure_shapes(
-    images: Any,
-    pixel_scale: Any,
-    weight_fwhm: Any,
+    images: ArrayLike,
+    pixel_scale: ArrayLike,
+    weight_fwhm: ArrayLike,
     *,
-    background: Any = 0.0,
+    background: ArrayLike = 0.0,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
 ) -> Shapes:

@@ -7,6 +7,7 @@ from enum import IntFlag
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from ...core.errors import DomainError
@@ -81,7 +82,7 @@ def _defect_counts(flags: np.ndarray) -> str:
 
 
 def flag_stars(
-    stamps: Any, noise: Any, *, gain: float = 1.0, saturation: float | None = None, threshold: float = 6.0
+    stamps: ArrayLike, noise: ArrayLike, *, gain: float = 1.0, saturation: float | None = None, threshold: float = 6.0
 ) -> Selection:
     """Flag stars with neighbours, cosmic rays and saturated cores by comparison with the median star.
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from astropy.io import fits
+from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, ProductError
 from ...core.products import read_fits, write_fits
@@ -89,16 +90,16 @@ class PsfModel:
     @classmethod
     def fit(
         cls,
-        stamps: Any,
-        positions: Any,
+        stamps: ArrayLike,
+        positions: ArrayLike,
         *,
         basis: Literal["pca", "pixels", "shapelets"] = "pca",
         interpolation: Literal["polynomial", "gp"] = "polynomial",
-        weights: Any = None,
-        masks: Any = None,
+        weights: ArrayLike | None = None,
+        masks: ArrayLike | None = None,
         n_components: int | Literal["auto"] | None = None,
         order: int | None = None,
-        extent: Any = None,
+        extent: ArrayLike | None = None,
         scale: float | None = None,
         clip_sigma: float | None = CLIP_SIGMA,
         max_iterations: int = 20,
@@ -245,7 +246,7 @@ class PsfModel:
             q, _ = np.linalg.qr(weighted(design_matrix(self.positions, self.extent, self.order), self.weights))
         return (q**2).sum(axis=1)
 
-    def at(self, positions: Any) -> np.ndarray:
+    def at(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the PSF at positions of any number, [m, ny, nx], unit sum.
 
         Outside the extent the polynomials are extrapolated. Each position is evaluated on its own: splitting a batch
@@ -262,7 +263,7 @@ class PsfModel:
         """Evaluate the PSF at one position, [ny, nx], unit sum."""
         return self.at((x, y))[0]
 
-    def amplitudes(self, positions: Any) -> np.ndarray:
+    def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the amplitudes of the components at positions, [m, k]."""
         terms = design_matrix(positions, self.extent, self.order)
         result = np.zeros((len(terms), self.n_components))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, check_choice
 from ...core.units import metres, radians
@@ -62,20 +63,20 @@ class Psfs:
 
 def make_psfs(
     telescope: Telescope,
-    fields: Any,
-    wavelengths: Any,
+    fields: ArrayLike,
+    wavelengths: ArrayLike,
     *,
     focal_plane: FocalPlane | None = None,
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
     engine: str = "fast",
     stamp_size: int = 31,
-    pixel_size: Any = 10e-6,
-    diffusion: Any = 4e-6,
-    jitter: Any = 0.0,
-    offsets: Any = None,
+    pixel_size: ArrayLike = 10e-6,
+    diffusion: ArrayLike = 4e-6,
+    jitter: ArrayLike = 0.0,
+    offsets: ArrayLike | None = None,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
-    dispersion: Any = None,
+    dispersion: ArrayLike | None = None,
     n_pupil: int | None = None,
     oversampling: int | None = None,
     padding: bool | None = None,
