@@ -104,6 +104,10 @@ from .models.zernike_polynomials import annular_zernikes as annular_zernikes
 from .pipeline.config import Configuration as Configuration
 from .pipeline.config import load_configuration as load_configuration
 from .pipeline.experiment import Experiment as Experiment
+from .pipeline.focal_plane_psf.model import FocalPlanePsf as FocalPlanePsf
+from .pipeline.focal_plane_psf.stars import FocalPlaneStars as FocalPlaneStars
+from .pipeline.focal_plane_psf.static_heights import StaticHeights as StaticHeights
+from .pipeline.focal_plane_psf.static_heights import fit_static_heights as fit_static_heights
 from .pipeline.measure.correlation import Correlation as Correlation
 from .pipeline.measure.correlation import shear_correlation as shear_correlation
 from .pipeline.measure.rho_statistics import RhoStatistics as RhoStatistics

@@ -1,0 +1,1 @@
+"""The PSF over the whole focal plane from one exposure: optics, CCD heights and turbulence together."""

@@ -1,0 +1,219 @@
+"""Focal-plane PSF models as FITS extensions, telescope and camera included."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from ...core.errors import ProductError
+from ...models.camera.camera import Camera
+from ...models.camera.ccd_surfaces import CcdSurfaces
+from ...models.camera.focal_plane import FocalPlane
+from ...models.io.yaml.reader import read_telescope
+from ...models.io.yaml.writer import telescope_to_yaml
+from ...models.telescope import Telescope
+from ...wavefront.aberration import ResidualWavefront
+from ...wavefront.atmosphere.atmosphere import Atmosphere
+from .covariance import Covariance, Places
+from .field import ShapeField
+from .fit import ShapeData
+from .heights import HeightPrior
+from .images import ResidualImages
+from .mosaic import Mosaic, PsfShapes
+from .optics_part import OpticsPart
+from .response import ExposureResponse, Instrument
+
+
+def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
+    """Return a focal-plane model as FITS extensions."""
+    field: ShapeField = model.field
+    mosaic, data = field.mosaic, field.data
+    about: dict[str, Any] = {
+        "chi2": model.chi2,
+        "evidence": model.evidence if np.isfinite(model.evidence) else None,
+        "warnings": list(model.warnings),
+        "weight_fwhm": model.weight_fwhm,
+        "pixel_scale": model.pixel_scale,
+        "stamp_size": model.stamp_size,
+        "half_size": mosaic.half_size,
+        "ccds": list(mosaic.names),
+    }
+    camera: Camera | None = mosaic.camera
+    if camera is not None:
+        about["camera"] = {
+            "name": camera.name,
+            "rafts": list(camera.raft_names),
+            "raft_index": camera.raft_index.tolist(),
+            "pixels": camera.pixels,
+            "pixel_size": camera.pixel_size,
+        }
+    left = model.leave_one_out
+    hdus = [
+        _image("CENTERS", mosaic.centers),
+        _image("POSITION", data.places.xy),
+        _image("STAR_CCD", data.places.ccd),
+        _image("SHAPE", data.values),
+        _image("NOISE", data.noise),
+        _image("RESIDUAL", field.residuals),
+        _image("COVARIANCE", np.stack([_packed(c) for c in field.covariances])),
+        _image("USED", model.used.astype(np.int16)),
+        _image("LEFT_OUT", np.stack([left.e1, left.e2, left.size], axis=1)),
+    ]
+    if model.mean_star is not None:
+        hdus.append(_image("MEAN", model.mean_star))
+    if model.pca is not None:
+        pca = model.pca
+        hdus += [
+            _image("PCA", pca.components),
+            _image("PCA_POSITION", pca.places.xy),
+            _image("PCA_CCD", pca.places.ccd),
+            _image("PCA_COEFFICIENT", pca.coefficients),
+            _image("PCA_NOISE", pca.noise),
+            _image("PCA_COVARIANCE", np.stack([_packed(c) for c in pca.covariances])),
+        ]
+    if field.optics is not None and field.design is not None:
+        optics = field.optics
+        instrument, air = optics.instrument, optics.instrument.atmosphere
+        about["telescope"] = telescope_to_yaml(instrument.telescope)
+        about["seeing"] = optics.seeing
+        about["atmosphere"] = {"r0": air.r0, "outer_scale": air.outer_scale}
+        about["instrument"] = {k: getattr(instrument, k) for k in ("pixel_size", "diffusion", "jitter")}
+        about["radius"] = optics.response.radius
+        surfaces = optics.plane.surfaces
+        hdus += [
+            _image("WAVELENGTHS", instrument.wavelengths),
+            _image("HEIGHT_CUBIC", surfaces.polynomial),
+            _image("WAVEFRONT", np.column_stack([optics.aberration.coefficients, optics.aberration.field_gradient])),
+            _image("PARAMETER_COVARIANCE", optics.covariance),
+            _image("RESPONSE", optics.response.polynomial),
+            _image("DESIGN", field.design),
+        ]
+        if surfaces.grid is not None:
+            hdus.append(_image("HEIGHT_SPLINE", surfaces.grid))
+        if instrument.dispersion is not None:
+            hdus.append(_image("DISPERSION", instrument.dispersion))
+    text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+    return [_image("ABOUT", text, "JSON, one character of UTF-8 a pixel"), *hdus]
+
+
+def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
+    """Return the fields of a model from the extensions of :func:`model_hdus`; ProductError where they are missing."""
+    found = {hdu.name: hdu.data for hdu in hdus}
+
+    def part(name: str) -> np.ndarray:
+        values = np.asarray(found[name])
+        return values.astype(values.dtype.newbyteorder("="))
+
+    try:
+        about = json.loads(bytes(part("ABOUT")))
+        camera = None
+        if "camera" in about:
+            known = about["camera"]
+            camera = Camera(
+                known["name"],
+                tuple(about["ccds"]),
+                tuple(known["rafts"]),
+                np.array(known["raft_index"]),
+                part("CENTERS"),
+                known["pixels"],
+                known["pixel_size"],
+            )
+        mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
+        places = _places(mosaic, part("POSITION"), part("STAR_CCD"))
+        pca = None
+        if "PCA" in found:
+            pca = ResidualImages(
+                mosaic,
+                part("PCA"),
+                _places(mosaic, part("PCA_POSITION"), part("PCA_CCD")),
+                part("PCA_COEFFICIENT"),
+                part("PCA_NOISE"),
+                tuple(_unpacked(row) for row in part("PCA_COVARIANCE")),
+            )
+        optics = None
+        if "telescope" in about and camera is not None:
+            optics = _optics(about, part, found, camera)
+        return {
+            "field": ShapeField(
+                mosaic,
+                ShapeData(places, part("SHAPE"), part("NOISE")),
+                part("RESIDUAL"),
+                tuple(_unpacked(row) for row in part("COVARIANCE")),
+                optics,
+                part("DESIGN") if optics is not None else None,
+            ),
+            "used": part("USED").astype(bool),
+            "leave_one_out": PsfShapes(*part("LEFT_OUT").T),
+            "chi2": about["chi2"],
+            "evidence": np.nan if about["evidence"] is None else about["evidence"],
+            "warnings": tuple(about["warnings"]),
+            "weight_fwhm": about["weight_fwhm"],
+            "pixel_scale": about["pixel_scale"],
+            "stamp_size": about["stamp_size"],
+            "mean_star": part("MEAN") if "MEAN" in found else None,
+            "pca": pca,
+        }
+    except KeyError as error:
+        raise ProductError(f"no focal-plane PSF model ({error.args[0]} is missing)", file=path) from None
+
+
+def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camera: Camera) -> OpticsPart:
+    instrument = Instrument.of(
+        _telescope(about["telescope"]),
+        part("WAVELENGTHS"),
+        Atmosphere.from_site("cerro_pachon", seed=0, **about["atmosphere"]),
+        **about["instrument"],
+        weight_fwhm=about["weight_fwhm"],
+        dispersion=part("DISPERSION") if "DISPERSION" in found else None,
+        stamp_size=about["stamp_size"],
+    )
+    cubic = part("HEIGHT_CUBIC")
+    grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in found else None
+    surfaces = CcdSurfaces(camera.half_size, cubic, np.zeros((len(cubic), 2, 4)), grid)
+    wavefront, telescope = part("WAVEFRONT"), instrument.telescope
+    return OpticsPart(
+        instrument,
+        FocalPlane(camera, surfaces, np.ones(len(camera), dtype=bool)),
+        ResidualWavefront(
+            wavefront[:, 0], telescope.pupil_diameter, telescope.pupil_obscuration, wavefront[:, 1:].copy()
+        ),
+        about["seeing"],
+        HeightPrior.broad(camera),
+        part("PARAMETER_COVARIANCE"),
+        ExposureResponse(part("RESPONSE"), about["radius"]),
+    )
+
+
+def _telescope(text: str) -> Telescope:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "telescope.yaml"
+        path.write_text(text, encoding="utf-8")
+        return read_telescope(path)
+
+
+def _places(mosaic: Mosaic, xy: np.ndarray, ccd: np.ndarray) -> Places:
+    return mosaic.at(xy, ccd.astype(np.int64))
+
+
+def _packed(covariance: Covariance) -> np.ndarray:
+    parts = [[covariance.constant], covariance.amplitude, covariance.matrix.ravel(), covariance.ccd]
+    return np.concatenate([*parts, [covariance.nugget]])
+
+
+def _unpacked(row: np.ndarray) -> Covariance:
+    n = (len(row) - 5) // 5
+    matrix = row[1 + n : 1 + 5 * n].reshape(n, 2, 2)
+    return Covariance(float(row[0]), row[1 : 1 + n], matrix, row[1 + 5 * n : 4 + 5 * n], float(row[-1]))
+
+
+def _image(name: str, values: np.ndarray, comment: str | None = None) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.ascontiguousarray(values), name=name)
+    if comment:
+        hdu.header["COMMENT"] = comment
+    return hdu

@@ -1,0 +1,384 @@
+r"""Joint fit of heights, alignment, seeing and the covariance of turbulence to the stars of one exposure.
+
+Shapes y (e1, e2, ln size) of the stars are those of the optics at the height of the CCD, a Gaussian random field and
+noise. About the last solution the optics are linear in the parameters, and the most probable change minimises
+
+.. math:: \sum_k (r_k - A_k \delta)^T (K_k + N_k)^{-1} (r_k - A_k \delta) + (\beta + \delta)^T P^{-1} (\beta + \delta),
+
+which is Gauss-Newton with the prior covariance P. Blocks of neighbouring stars are taken as independent, so that work
+grows in proportion to the number of stars. Covariances of turbulence are fitted to the same residuals, with the
+uncertain parameters marginalised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from ...core.progress import Reporter
+from ...core.threads import one_blas_thread
+from ...models.camera.focal_plane import FocalPlane
+from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
+from .covariance import Covariance, Places
+from .heights import HeightPrior, legendre
+from .kriging import on_threads
+from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
+from .response import LARGEST_HEIGHT, NOLL, ExposureResponse, HeightResponse, Instrument, wavefront
+
+#: Names of the shape parameters.
+SHAPES = ("e1", "e2", "ln size")
+#: Number of parameters of an exposure: Noll terms on the axis and along x and y, and the Fried parameter.
+N_EXPOSURE = 3 * len(NOLL) + 1
+# Standard deviation of the wavefront coefficients of an aligned telescope [m].
+_NO_WAVEFRONT = 1e-15
+#: Standard deviation of the logarithm of the Fried parameter.
+_SEEING = 0.3
+# Standard deviations of what turbulence adds to the shapes of all stars alike. The mean size is the seeing, which
+# is fitted.
+_MEAN = (0.02, 0.02, 0.01)
+# Stars of a block of the linear fit.
+_BLOCK = 1500
+# Steps of Gauss-Newton and of the covariances, before the optics are evaluated again about the alignment found.
+_STEPS = 3
+# Most times that a step is halved.
+_HALVINGS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeData:
+    """Measured shapes of the stars of one exposure.
+
+    Attributes
+    ----------
+    places : Places
+        Positions and CCDs.
+    values : ndarray, shape [n, 3]
+        e1, e2 and the logarithm of the size [rad].
+    noise : ndarray, shape [n, 3]
+        Variances of their noise.
+    """
+
+    places: Places
+    values: np.ndarray
+    noise: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsFit:
+    """Optics of one exposure.
+
+    Attributes
+    ----------
+    heights : ndarray, shape [n_height]
+        Height parameters (:class:`.HeightPrior`).
+    exposure : ndarray, shape [25]
+        Wavefront coefficients [m] on the axis, along x and along y, and ln(r0 / r0 assumed).
+    covariance : ndarray, shape [n_height + 25, n_height + 25]
+        Covariance of all of these.
+    plane : FocalPlane
+        The heights.
+    aberration : ResidualWavefront
+        The residual wavefront.
+    """
+
+    heights: np.ndarray
+    exposure: np.ndarray
+    covariance: np.ndarray
+    plane: FocalPlane
+    aberration: ResidualWavefront
+
+    @property
+    def seeing(self) -> float:
+        """Logarithm of the Fried parameter over the assumed one."""
+        return float(self.exposure[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Quadratic approximation of an exposure's likelihood about parameters: ``matrix @ change = vector``."""
+
+    matrix: np.ndarray
+    vector: np.ndarray
+
+
+def exposure_sigma(alignment_rms: float) -> np.ndarray:
+    """Return the prior standard deviations of the parameters of an exposure, those of :class:`.ResidualWavefront`."""
+    degree = np.array([int((np.sqrt(8 * j - 7) - 1) / 2) for j in NOLL], dtype=float)
+    variance = degree ** (-11.0 / 3.0)
+    sigma = alignment_rms * np.sqrt(variance / variance.sum())
+    along = np.sqrt(2.0 * LINEAR_FRACTION) * sigma
+    return np.concatenate([np.sqrt(1.0 - LINEAR_FRACTION) * sigma, along, along, [_SEEING]])
+
+
+class ExposureFit:
+    """Gauss-Newton fit of one exposure; :meth:`run` does all of it."""
+
+    def __init__(
+        self,
+        data: ShapeData,
+        instrument: Instrument,
+        prior: HeightPrior,
+        alignment_rms: float,
+        threads: int | None,
+        reporter: Reporter,
+    ) -> None:
+        self.data, self.instrument, self.prior = data, instrument, prior
+        self.threads, self.reporter = threads, reporter
+        self.sigma = exposure_sigma(alignment_rms)
+        # A wavefront that is not to change keeps its place among the parameters.
+        self.sigma = np.maximum(self.sigma, _NO_WAVEFRONT)
+        self.fields = instrument.fields(data.places.xy, threads)
+        self.flat = FocalPlane.flat(prior.camera)
+        self.common = prior.common_terms(data.places)
+        self.own = legendre(data.places.uv)
+        self.blocks = blocks_of(data.places.xy, _BLOCK)
+        self.heights = np.zeros(prior.n_parameter)
+        self.exposure = np.zeros(N_EXPOSURE)
+        self.covariances: list[Covariance] = []
+        self.at_bounds: tuple[str, ...] = ()
+        self.covariance: np.ndarray | None = None
+        self._log_determinant = 0.0
+        self._response: ExposureResponse | None = None
+
+    @property
+    def response(self) -> ExposureResponse:
+        """Derivatives with respect to the parameters of the exposure."""
+        assert self._response is not None
+        return self._response
+
+    def derivatives(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return slopes with height [n, 3], and columns of the exposure's parameters [n, 25, 3], at the stars."""
+        _, slopes, columns = self._columns()
+        return slopes, columns
+
+    def linearise(self, exposure: np.ndarray | None = None) -> None:
+        """Evaluate the optics about parameters of the exposure."""
+        if exposure is not None:
+            self.exposure = exposure.copy()
+        aberration = wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius, None)
+        seeing = float(self.exposure[-1])
+        with self.reporter.stage("optics at the stars", total=5 * len(self.data)) as stage:
+            self.optics = HeightResponse.of(
+                self.instrument, self.fields, self.flat, aberration, seeing, self.threads, stage.advance
+            )
+        if self._response is None:
+            with self.reporter.stage("response to alignment and seeing"):
+                self._response = ExposureResponse.of(
+                    self.instrument, self.fields, self.flat, aberration, seeing, self.threads
+                )
+        self._base = self.exposure.copy()
+
+    def use_optics(self, optics: HeightResponse, response: ExposureResponse) -> None:
+        """Take responses that were computed before, about no aberration and the assumed seeing."""
+        self.optics, self._response = optics, response
+        self._base = np.zeros(N_EXPOSURE)
+
+    def solve_exposure(self) -> NormalEquations:
+        """Take one step in the parameters of the exposure alone, and return the normal equations about the result."""
+        n = self.prior.n_parameter
+        normal = self.normal_equations()
+        matrix = normal.matrix[n:, n:] + np.diag(self.sigma**-2)
+        scale = 1.0 / np.sqrt(np.diagonal(matrix))
+        right = scale * (normal.vector[n:] - self.sigma**-2 * self.exposure)
+        change = scale * np.linalg.solve(matrix * scale[:, None] * scale, right)
+        self.exposure = self.exposure + change
+        # The model is linear in them.
+        return NormalEquations(normal.matrix, normal.vector - normal.matrix[:, n:] @ change)
+
+    @property
+    def _radius(self) -> float:
+        return float(np.hypot(*self.fields.T).max()) or self.instrument.telescope.field_radius
+
+    def _residuals(self) -> np.ndarray:
+        """Return the shapes less those of the optics at the parameters, shape [n, 3]."""
+        return self._columns()[0]
+
+    def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return residuals, slopes with height [n, 3] and columns of the exposure [n, 25, 3] at the parameters."""
+        assert self._response is not None
+        heights = np.clip(self.prior.heights(self.heights, self.data.places), -LARGEST_HEIGHT, LARGEST_HEIGHT)
+        columns = self._response.columns(self.fields, heights)
+        shapes = self.optics.at(heights) + np.einsum("npf,p->nf", columns, self.exposure - self._base)
+        return self.data.values - shapes, self.optics.slope(heights), columns
+
+    def fit_covariances(self, max_iterations: int = 15) -> None:
+        """Fit the covariances of turbulence to what the optics leave, with their uncertainty (one step of EM)."""
+        residuals, slopes, columns = self._columns()
+
+        def fit(shape: int) -> CovarianceFit:
+            def spread(index: np.ndarray) -> np.ndarray:
+                used, terms = self._terms(index)
+                design = terms * slopes[index, shape, None]
+                design[:, -N_EXPOSURE:] = columns[index, :, shape]
+                assert self.covariance is not None
+                return design @ self.covariance[np.ix_(used, used)] @ design.T
+
+            return fit_covariance(
+                self.data.places,
+                residuals[:, shape],
+                self.data.noise[:, shape],
+                spread=spread if self.covariance is not None else None,
+                start=self.covariances[shape] if self.covariances else None,
+                constant=_MEAN[shape] ** 2,
+                max_iterations=max_iterations,
+            )
+
+        with self.reporter.stage("covariance of turbulence"):
+            found: list[CovarianceFit] = on_threads(fit, range(3), self.threads)
+        self.covariances = [f.covariance for f in found]
+        self.at_bounds = tuple(f"{n} of {SHAPES[i]}" for i, f in enumerate(found) for n in f.at_bounds)
+
+    def _terms(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parameters that act on some stars, and their terms in the height, zero for the exposure's own."""
+        prior, here = self.prior, self.data.places[index]
+        ccds, width = np.unique(here.ccd), self.own.shape[1]
+        every = np.arange(prior.n_parameter + N_EXPOSURE)
+        used = np.concatenate(
+            [every[: prior.n_common], *(every[prior.columns_of(c)] for c in ccds), every[prior.n_parameter :]]
+        )
+        terms = np.zeros((len(index), len(used)))
+        terms[:, : prior.n_common] = self.common[index]
+        for i, ccd in enumerate(ccds):
+            rows = here.ccd == ccd
+            first = prior.n_common + i * width
+            terms[rows, first : first + width] = self.own[index][rows]
+        return used, terms
+
+    def normal_equations(self) -> NormalEquations:
+        """Return the normal equations of a change of all parameters, without the prior of the heights."""
+        residuals, slopes, columns = self._columns()
+        size = self.prior.n_parameter + N_EXPOSURE
+        matrix, vector = np.zeros((size, size)), np.zeros(size)
+
+        def contribution(index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            here = self.data.places[index]
+            used, terms = self._terms(index)
+            part, right = np.zeros((len(used), len(used))), np.zeros(len(used))
+            for shape, covariance in enumerate(self.covariances):
+                design = terms * slopes[index, shape, None]
+                design[:, -N_EXPOSURE:] = columns[index, :, shape]
+                total = covariance.between(here, here)
+                total[np.diag_indices(len(index))] += self.data.noise[index, shape] + covariance.nugget
+                root = scipy.linalg.cholesky(total, lower=True, overwrite_a=True, check_finite=False)
+                both = np.column_stack([design, residuals[index, shape]])
+                white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
+                part += white[:, :-1].T @ white[:, :-1]
+                right += white[:, :-1].T @ white[:, -1]
+            return used, part, right
+
+        for used, part, right in on_threads(contribution, self.blocks, self.threads):
+            matrix[np.ix_(used, used)] += part
+            vector[used] += right
+        return NormalEquations(matrix, vector)
+
+    def solve(self, steps: int = 2) -> None:
+        """Take Gauss-Newton steps, halved where the fit would get worse, and keep the covariance of the parameters."""
+        n_height = self.prior.n_parameter
+        precision = self._precision()
+        # Heights of CCDs without stars stay where they are.
+        every = np.arange(len(precision))
+        ccds = np.unique(self.data.places.ccd)
+        own = [every[self.prior.columns_of(c)] for c in ccds]
+        active = np.concatenate([every[: self.prior.n_common], *own, every[n_height:]])
+        within = np.ix_(active, active)
+        now = np.concatenate([self.heights, self.exposure])
+        before = self._objective(now, precision)
+        for _ in range(steps):
+            normal = self.normal_equations()
+            right = (normal.vector - precision @ now)[active]
+            matrix = (normal.matrix + precision)[within]
+            # Parameters of metres and of pure numbers side by side: scale the matrix to a unit diagonal.
+            scale = 1.0 / np.sqrt(np.diagonal(matrix))
+            with one_blas_thread():
+                root = scipy.linalg.cholesky(matrix * scale[:, None] * scale, lower=True, overwrite_a=True)
+                step = np.zeros_like(now)
+                step[active] = scale * scipy.linalg.cho_solve((root, True), scale * right)
+            for halved in range(_HALVINGS):
+                trial = now + 0.5**halved * step
+                after = self._objective(trial, precision)
+                if after <= before:
+                    now, before = trial, after
+                    break
+            self.heights, self.exposure = now[:n_height], now[n_height:]
+        self._log_determinant = 2.0 * float(np.log(np.diagonal(root)).sum() - np.log(scale).sum())
+        with one_blas_thread():
+            lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
+        self.covariance = np.zeros_like(precision)
+        self.covariance[within] = (np.tril(lower) + np.tril(lower, -1).T) * scale[:, None] * scale
+        silent = np.setdiff1d(np.arange(len(self.prior.camera)), ccds)
+        for ccd in silent:
+            columns = self.prior.columns_of(ccd)
+            self.covariance[columns, columns] = self.prior.ccd[ccd]
+        own_terms = [precision[c, c] for c in (self.prior.columns_of(ccd) for ccd in silent)]
+        self._log_determinant += float(sum(np.linalg.slogdet(block)[1] for block in own_terms))
+
+    def _objective(self, parameters: np.ndarray, precision: np.ndarray) -> float:
+        """Return what the fit minimises."""
+        n = self.prior.n_parameter
+        kept = self.heights, self.exposure
+        self.heights, self.exposure = parameters[:n], parameters[n:]
+        residuals = self._residuals()
+        self.heights, self.exposure = kept
+
+        def of_block(index: np.ndarray) -> float:
+            here = self.data.places[index]
+            total = 0.0
+            for shape, covariance in enumerate(self.covariances):
+                matrix = covariance.between(here, here)
+                matrix[np.diag_indices(len(index))] += self.data.noise[index, shape] + covariance.nugget
+                root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+                white = scipy.linalg.solve_triangular(root, residuals[index, shape], lower=True, check_finite=False)
+                total += float(white @ white)
+            return total
+
+        return sum(on_threads(of_block, self.blocks, self.threads)) + float(parameters @ precision @ parameters)
+
+    def _precision(self) -> np.ndarray:
+        n_height = self.prior.n_parameter
+        precision = np.zeros((n_height + N_EXPOSURE,) * 2)
+        self.prior.add_to(precision)
+        own = range(n_height, len(precision))
+        precision[own, own] += self.sigma**-2
+        return precision
+
+    def log_evidence(self) -> float:
+        """Return the logarithm of the likelihood of the stars, all parameters of the optics marginalised (Laplace)."""
+        residuals, _, _ = self._columns()
+        now = np.concatenate([self.heights, self.exposure])
+        precision = self._precision()
+        scale = 1.0 / np.sqrt(np.diagonal(precision))
+        _, log_prior = np.linalg.slogdet(precision * scale[:, None] * scale)
+        log_prior -= 2.0 * float(np.log(scale).sum())
+        total = 0.5 * (log_prior - self._log_determinant - float(now @ precision @ now))
+        for shape, covariance in enumerate(self.covariances):
+            values, noise = residuals[:, shape], self.data.noise[:, shape]
+            total += log_likelihood(covariance, self.data.places, values, noise, self.blocks)
+        return total
+
+    def run(self) -> OpticsFit:
+        """Fit everything."""
+        self.linearise()
+        with self.reporter.stage("heights, alignment and turbulence"):
+            self.fit_covariances(20)
+            for _ in range(_STEPS):
+                self.solve()
+                self.fit_covariances()
+        if self.sigma[0] > _NO_WAVEFRONT:
+            self.linearise()
+        with self.reporter.stage("heights, alignment and turbulence, again"):
+            self.solve(1)
+            self.fit_covariances()
+            self.solve()
+        assert self.covariance is not None
+        return OpticsFit(
+            self.heights,
+            self.exposure,
+            self.covariance,
+            self.prior.focal_plane(self.heights),
+            wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius),
+        )

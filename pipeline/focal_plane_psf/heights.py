@@ -1,0 +1,208 @@
+"""Heights of the CCDs as linear parameters with a prior: the whole focal plane, rafts, and each CCD's own shape.
+
+The height at a place is the sum of a quadratic over the focal plane (five terms; its mean belongs to the focus of an
+exposure), a piston of each raft, and products of Legendre polynomials in u and v of each CCD up to a total degree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from astropy.table import Table
+from numpy.polynomial.legendre import legvander
+
+from ...models.camera.camera import Camera
+from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.height_budget import HeightBudget, load_budget
+from .covariance import Places
+
+#: Largest total degree within a CCD: of a potato chip of 1 to 2 cycles 6 leaves 0.2 um rms.
+DEGREE = 6
+# Focal planes of a budget that are drawn to find the covariance of its terms.
+_DRAWS = 8
+# Nodes along the side of a CCD at which drawn heights are projected and fitted heights are tabulated.
+_NODES = 20
+# Variance of a coefficient without a budget term [m^2], to keep the prior invertible: 1 nm.
+_LEAST = 1e-18
+
+
+@dataclass(frozen=True, eq=False)
+class HeightPrior:
+    """Prior of the height parameters, of mean `mean`.
+
+    Parameters are ordered: five of the focal plane, one of each raft, then those of each CCD.
+
+    Attributes
+    ----------
+    camera : Camera
+        The camera.
+    global_covariance : ndarray, shape [5, 5]
+        Covariance of the coefficients [m] of x, y, x^2, xy, y^2, in units of the radius of the focal plane.
+    raft : float
+        Variance of the raft pistons [m^2].
+    ccd : ndarray, shape [n_ccd, n_term, n_term]
+        Covariance of the coefficients of each CCD [m^2].
+    mean : FocalPlane or None
+        Heights about which the prior stands; None for zero.
+    """
+
+    camera: Camera
+    global_covariance: np.ndarray
+    raft: float
+    ccd: np.ndarray
+    mean: FocalPlane | None = None
+
+    @classmethod
+    def from_budget(
+        cls, camera: Camera, budget: str | HeightBudget = "simulated", mean: FocalPlane | None = None
+    ) -> HeightPrior:
+        """Return the prior with the covariance of focal planes drawn from a budget of heights."""
+        budget = load_budget(budget) if isinstance(budget, str) else budget
+        # Seeds far from those that people choose, so that no run is fitted with its own heights.
+        seeds = range(2**31, 2**31 + _DRAWS)
+        ccd = np.zeros((len(powers()), len(powers())))
+        for term in ("ccd", "tilt", "potato_chip"):
+            drawn = [project(FocalPlane.from_budget(camera, seed=s, terms=(term,), budget=budget)) for s in seeds]
+            rows = np.concatenate(drawn)
+            ccd += rows.T @ rows / len(rows)
+        # The quadratic's coefficients are normal but for a scale; many more draws are needed than of CCDs.
+        planes = [
+            _global_terms(FocalPlane.from_budget(camera, seed=s, terms=("global",), budget=budget))
+            for s in range(2**31, 2**31 + 16 * _DRAWS)
+        ]
+        rows = np.array(planes)
+        diagonal = np.diag(np.maximum((rows**2).mean(axis=0), _LEAST))
+        own = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
+        return cls(camera, diagonal, max(budget.raft_height**2 / 12.0, _LEAST), own, mean)
+
+    @classmethod
+    def broad(cls, camera: Camera, size: float = 10e-6, mean: FocalPlane | None = None) -> HeightPrior:
+        """Return a prior that hardly holds heights [m]: independent coefficients that fall as the degree rises."""
+        degree = np.array([i + j for i, j in powers()])
+        ccd = np.diag((size / (1.0 + degree) ** 2) ** 2)
+        return cls(camera, size**2 * np.eye(5), size**2, np.broadcast_to(ccd, (len(camera), *ccd.shape)), mean)
+
+    @classmethod
+    def known(cls, plane: FocalPlane, covariance: np.ndarray | None = None) -> HeightPrior:
+        """Return the prior of known heights, with the covariance of each CCD's coefficients [n_ccd, n_term, n_term]."""
+        n, k = len(plane.camera), len(powers())
+        own = np.zeros((n, k, k)) if covariance is None else covariance
+        return cls(plane.camera, _LEAST * np.eye(5), _LEAST, own + _LEAST * np.eye(k), plane)
+
+    @cached_property
+    def precision(self) -> np.ndarray:
+        """Inverse of the covariance of each CCD's coefficients [1/m^2], shape [n_ccd, n_term, n_term]."""
+        return np.linalg.inv(self.ccd)
+
+    @property
+    def n_common(self) -> int:
+        """Number of parameters of the focal plane and the rafts."""
+        return 5 + len(self.camera.raft_names)
+
+    @property
+    def n_parameter(self) -> int:
+        """Number of parameters."""
+        return self.n_common + len(self.camera) * len(powers())
+
+    def columns_of(self, ccd: int) -> slice:
+        """Return the columns of a CCD's own parameters."""
+        first = self.n_common + ccd * len(powers())
+        return slice(first, first + len(powers()))
+
+    def add_to(self, normal: np.ndarray) -> None:
+        """Add the precision of the prior to a normal matrix whose first columns are the height parameters."""
+        normal[:5, :5] += np.linalg.inv(self.global_covariance)
+        for i in range(5, self.n_common):
+            normal[i, i] += 1.0 / self.raft
+        for ccd in range(len(self.camera)):
+            columns = self.columns_of(ccd)
+            normal[columns, columns] += self.precision[ccd]
+
+    def common_terms(self, places: Places) -> np.ndarray:
+        """Return the terms of the focal plane and the rafts at places, shape [n, n_common]."""
+        rafts = (self.camera.raft_index[places.ccd][:, None] == np.arange(len(self.camera.raft_names))).astype(float)
+        return np.concatenate([_quadratic(self.camera, places.xy), rafts], axis=1)
+
+    def covariance(self, places: Places) -> np.ndarray:
+        """Return the prior covariance of the heights at places [m^2], shape [n, n]."""
+        common, own = self.common_terms(places), legendre(places.uv)
+        total = common[:, :5] @ self.global_covariance @ common[:, :5].T
+        total += self.raft * (common[:, 5:] @ common[:, 5:].T)
+        for ccd in np.unique(places.ccd):
+            rows = np.flatnonzero(places.ccd == ccd)
+            total[np.ix_(rows, rows)] += own[rows] @ self.ccd[ccd] @ own[rows].T
+        return total
+
+    def per_ccd(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance of each CCD's height in its own terms, of a covariance of all parameters.
+
+        Quadratics over the focal plane and pistons of rafts are polynomials of a CCD too. Covariances between CCDs are
+        left out.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(DEGREE + 1)
+        v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
+        uv = np.stack([u, v], axis=1)
+        terms = legendre(uv)
+        projection = terms.T * (np.outer(weights, weights).ravel() / 4.0)
+        result = np.empty((len(self.camera), terms.shape[1], terms.shape[1]))
+        for ccd, center in enumerate(self.camera.centers):
+            places = Places(center + self.camera.half_size * uv, np.full(len(uv), ccd), uv)
+            change = np.concatenate([projection @ self.common_terms(places), np.eye(terms.shape[1])], axis=1)
+            columns = np.r_[: self.n_common, self.columns_of(ccd)]
+            result[ccd] = change @ covariance[np.ix_(columns, columns)] @ change.T
+        return result
+
+    def heights(self, parameters: np.ndarray, places: Places) -> np.ndarray:
+        """Return the heights at places [m], shape [n], mean of the prior included."""
+        own = parameters[self.n_common :].reshape(len(self.camera), -1)
+        change = self.common_terms(places) @ parameters[: self.n_common]
+        change += np.einsum("nk,nk->n", legendre(places.uv), own[places.ccd])
+        return change if self.mean is None else change + self.mean.height(*places.xy.T)
+
+    def focal_plane(self, parameters: np.ndarray) -> FocalPlane:
+        """Return the heights as a focal plane."""
+        camera = self.camera
+        axis = np.linspace(-1.0, 1.0, _NODES + 1) * (1.0 - 1e-9)
+        v, u = np.meshgrid(axis, axis, indexing="ij")
+        uv = np.stack([u.ravel(), v.ravel()], axis=1)
+        ccd = np.repeat(np.arange(len(camera)), len(uv))
+        tiled = np.tile(uv, (len(camera), 1))
+        places = Places(camera.centers[ccd] + camera.half_size * tiled, ccd, tiled)
+        x, y = places.xy.T
+        return FocalPlane.from_heights(Table({"x": x, "y": y, "z": self.heights(parameters, places)}), camera)
+
+
+def powers() -> list[tuple[int, int]]:
+    """Return the degrees in u and v of the terms of a CCD, by total degree."""
+    return [(total - j, j) for total in range(DEGREE + 1) for j in range(total + 1)]
+
+
+def legendre(uv: np.ndarray) -> np.ndarray:
+    """Return the terms of a CCD at places [n, 2] in halves of its side, each of unit rms over it: [n, n_term]."""
+    along = [legvander(uv[:, axis], DEGREE) * np.sqrt(2.0 * np.arange(DEGREE + 1) + 1.0) for axis in range(2)]
+    return np.stack([along[0][:, i] * along[1][:, j] for i, j in powers()], axis=1)
+
+
+def project(plane: FocalPlane) -> np.ndarray:
+    """Return the coefficients of each CCD that fit its heights best [m], shape [n_ccd, n_term]."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
+    terms = legendre(np.stack([u, v], axis=1)) * (np.outer(weights, weights).ravel()[:, None] / 4.0)
+    half = plane.camera.half_size
+    x = plane.camera.centers[:, :1] + half * u * (1.0 - 1e-12)
+    y = plane.camera.centers[:, 1:] + half * v * (1.0 - 1e-12)
+    return plane.height(x, y) @ terms
+
+
+def _quadratic(camera: Camera, xy: np.ndarray) -> np.ndarray:
+    x, y = (xy / np.hypot(*camera.centers.T).max()).T
+    return np.stack([x, y, x * x, x * y, y * y], axis=1)
+
+
+def _global_terms(plane: FocalPlane) -> np.ndarray:
+    """Return the five coefficients of a quadratic over the focal plane [m], its mean left out."""
+    camera = plane.camera
+    design = np.column_stack([np.ones(len(camera)), _quadratic(camera, camera.centers)])
+    return np.linalg.lstsq(design, plane.height(*camera.centers.T), rcond=None)[0][1:]

@@ -1,0 +1,82 @@
+r"""Prediction of a shape parameter at places without stars, from the stars about each CCD (simple kriging).
+
+For the places of one CCD the nearest stars of any CCD are taken, all at once: with K their covariance, noise included,
+and k the covariance with a place, the prediction is :math:`k^T K^{-1} y` and its variance
+:math:`C(0) - k^T K^{-1} k`. The mean is free, since the covariance holds a large constant. The work grows in
+proportion to the number of CCDs, and the memory is that of one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from ...core.threads import one_blas_thread, thread_count
+from .covariance import Covariance, Places
+
+#: Stars that a prediction is made from.
+NEIGHBOURS = 700
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Stars near one CCD, and their weights.
+
+    Attributes
+    ----------
+    stars : ndarray of int, shape [m]
+        Indices of the stars.
+    root : ndarray, shape [m, m]
+        Lower Cholesky factor of their covariance.
+    alpha : ndarray, shape [m]
+        Inverse covariance times the values.
+    """
+
+    stars: np.ndarray
+    root: np.ndarray
+    alpha: np.ndarray
+
+    def predict(self, between: np.ndarray) -> np.ndarray:
+        """Return predictions at places, of the covariance [m, n] between stars and places: shape [n]."""
+        return between.T @ self.alpha
+
+    def weights(self, between: np.ndarray) -> np.ndarray:
+        """Return the weights of the stars in the predictions, shape [m, n]."""
+        return scipy.linalg.cho_solve((self.root, True), between, check_finite=False)
+
+
+def neighbours_of(places: Places, center: np.ndarray, count: int = NEIGHBOURS) -> np.ndarray:
+    """Return the indices of the stars nearest to a point, in rising order."""
+    if len(places) <= count:
+        return np.arange(len(places))
+    squares = ((places.xy - center) ** 2).sum(axis=1)
+    return np.sort(np.argpartition(squares, count - 1)[:count])
+
+
+def neighbourhood(
+    covariance: Covariance, places: Places, values: np.ndarray, noise: np.ndarray, stars: np.ndarray
+) -> Neighbourhood:
+    """Solve for the weights of stars of given indices; `noise` [n] are variances of all stars."""
+    near = places[stars]
+    matrix = covariance.between(near, near)
+    matrix[np.diag_indices(len(stars))] += noise[stars] + covariance.nugget
+    root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+    return Neighbourhood(stars, root, scipy.linalg.cho_solve((root, True), values[stars], check_finite=False))
+
+
+def leave_one_out(near: Neighbourhood) -> tuple[np.ndarray, np.ndarray]:
+    """Return value minus prediction of the other stars, and the variance of that, each of shape [m] (Dubrule 1983)."""
+    lower = scipy.linalg.lapack.dpotri(near.root, lower=1)[0]
+    own = np.diagonal(lower)
+    return near.alpha / own, 1.0 / own
+
+
+def on_threads(job: Callable[..., Any], items: Iterable[object], threads: int | None) -> list[Any]:
+    """Return results of a job for each item, in order: on all threads, with BLAS on one in each."""
+    with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
+        return list(pool.map(job, items))

@@ -1,0 +1,372 @@
+"""One model of the PSF over the whole focal plane of an exposure: optics, CCD heights and turbulence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError
+from ...core.products import read_fits, write_fits
+from ...core.progress import Reporter
+from ...core.units import metres, positive_angle
+from ...core.version import CREATOR
+from ...models.camera.camera import Camera
+from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.height_budget import HeightBudget
+from ...models.telescope import Telescope
+from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ..experiment import Experiment
+from .covariance import Covariance, Places
+from .field import ShapeField
+from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of, places_of
+from .file import model_fields, model_hdus
+from .fit import SHAPES, ShapeData
+from .images import ResidualImages, deformed
+from .mosaic import Mosaic, PsfShapes
+from .response import Instrument
+from .stars import FocalPlaneStars, stars_of
+from .static_heights import StaticHeights
+
+# Images that are deformed at a time.
+_BATCH = 512
+# Brightest stars, from which the principal components of the residual stamps are made.
+_PCA_STARS = 2000
+# Reduced chi-squares beyond which the stated noise is called wrong.
+_CHI2 = (0.7, 1.4)
+
+
+@dataclass(frozen=True, eq=False)
+class FocalPlanePsf:
+    """The PSF of one exposure over the whole focal plane.
+
+    Made by :meth:`fit`; shapes of the PSF are e1, e2 and the weighted rms size.
+
+    Attributes
+    ----------
+    field : ShapeField
+        Shapes over the focal plane: the stars that the model was fitted to, covariances and optics.
+    used : ndarray of bool
+        Stars given to :meth:`fit` that the model was fitted to.
+    leave_one_out : PsfShapes
+        Prediction at each star given to :meth:`fit` from all others; NaN where a star was not used.
+    chi2 : dict of str to float
+        Reduced chi-square of these predictions, noise of the stars included, by shape.
+    evidence : float
+        Logarithm of the likelihood with the telescope over that without; NaN without a telescope.
+    warnings : tuple of str
+        Remarks on the fit.
+    weight_fwhm, pixel_scale : float
+        Weight of the moments, and pixel of the stamps [rad].
+    stamp_size : int
+        Pixels on a side of an image.
+    mean_star : ndarray, shape [ny, nx], or None
+        Mean of the stamps, of unit sum; None without stamps.
+    pca : ResidualImages or None
+        Principal components of what the stamps differ from the model by.
+    """
+
+    field: ShapeField
+    used: np.ndarray
+    leave_one_out: PsfShapes
+    chi2: dict[str, float]
+    evidence: float
+    warnings: tuple[str, ...]
+    weight_fwhm: float
+    pixel_scale: float | None
+    stamp_size: int
+    mean_star: np.ndarray | None = None
+    pca: ResidualImages | None = None
+
+    @classmethod
+    def fit(
+        cls,
+        stars: Any,
+        telescope: Telescope | None = None,
+        focal_plane: FocalPlane | StaticHeights | None = None,
+        *,
+        camera: str | Camera | None = None,
+        wavelengths: ArrayLike | None = None,
+        atmosphere: Atmosphere | None = None,
+        pixel_size: ArrayLike = 10e-6,
+        diffusion: ArrayLike = 4e-6,
+        jitter: ArrayLike = 0.0,
+        weight_fwhm: ArrayLike | None = None,
+        dispersion: ArrayLike | None = None,
+        budget: str | HeightBudget | None = "simulated",
+        alignment_rms: ArrayLike = 0.2e-6,
+        stamp_size: int = 31,
+        components: int = 3,
+        threads: int | None = None,
+        reporter: Reporter | None = None,
+    ) -> FocalPlanePsf:
+        """Fit the model to the stars of one exposure.
+
+        Parameters
+        ----------
+        stars : FocalPlaneStars, table, mapping or path
+            The stars (:class:`~pachon.FocalPlaneStars`); or a table, the path of one, or the folder of a run.
+        telescope : Telescope, optional
+            Telescope as it is believed to be. Without it the model is turbulence, with a step, a slope and ripples of
+            each CCD, and principal components.
+        focal_plane : FocalPlane or StaticHeights, optional
+            Heights that are known, or learnt from other exposures (:func:`~pachon.fit_static_heights`). By default they
+            are unknown.
+        camera : str or Camera, optional
+            By default the telescope's. Without one positions must be lengths on one detector plane.
+        wavelengths : array_like or Quantity, optional
+            Wavelengths [m]; by default five over the telescope's band.
+        atmosphere : Atmosphere, optional
+            Its Fried parameter, from which the fit starts, and its outer scale; by default Cerro Pachon's.
+        pixel_size, diffusion : float or Quantity
+            Pixel and rms charge diffusion [m].
+        jitter : float or Quantity
+            Pointing, rms along each axis [rad].
+        weight_fwhm : float or Quantity, optional
+            Weight of the moments [rad]; by default that of the stars.
+        dispersion : array_like, shape [n_wave, 2], optional
+            Shift of each wavelength by the air [rad].
+        budget : str, HeightBudget or None
+            Prior of unknown heights: "simulated", "specification", a budget of one's own, or None, which hardly holds
+            them.
+        alignment_rms : float or Quantity
+            Prior rms of the residual wavefront of the exposure [m]: annular Zernike terms 4 to 11, each constant and
+            linear over the field. 0 for an aligned telescope.
+        stamp_size : int
+            Pixels on a side of drawn images; that of the stamps where there are stamps.
+        components : int
+            Most principal components of the residual stamps.
+        threads : int, optional
+            Number of threads; all processors by default. No byte depends on it.
+        reporter : Reporter, optional
+            Progress display; silent by default.
+
+        Raises
+        ------
+        DomainError
+            If there are fewer than 30 usable stars, a star lies outside the field of the telescope, or an argument is
+            outside its range.
+        """
+        reporter = Reporter(quiet=True) if reporter is None else reporter
+        given = stars_of(stars)
+        weight = given.weight_fwhm if weight_fwhm is None else positive_angle(weight_fwhm, "weight_fwhm")
+        mosaic = mosaic_of(given, telescope, focal_plane, camera)
+        used = given.usable
+        if used.sum() < LEAST_STARS:
+            raise DomainError(
+                f"{used.sum()} of {len(given)} stars have position, shape and noise: expected {LEAST_STARS} or more"
+            )
+        chosen = given.chosen(used)
+        data = ShapeData(places_of(mosaic, chosen), chosen.values, chosen.noise**2)
+        stamp_size = stamp_size if given.stamps is None else given.stamps.shape[1]
+        instrument = prior = None
+        if telescope is not None:
+            instrument = Instrument.of(
+                telescope,
+                wavelengths,
+                atmosphere,
+                pixel_size=pixel_size,
+                diffusion=diffusion,
+                jitter=jitter,
+                weight_fwhm=weight,
+                dispersion=dispersion,
+                stamp_size=stamp_size,
+            )
+            prior = height_prior(mosaic, focal_plane, budget)
+        rms = float(metres(alignment_rms, "alignment_rms"))
+        if not rms >= 0.0:
+            raise DomainError(f"alignment_rms = {rms!r}: expected a length from 0")
+        fitted = fit_field(mosaic, data, instrument, prior, rms, threads, reporter)
+        field = fitted.field
+        with reporter.stage("stars against the others"):
+            good = field.agreeing(threads)
+            if not good.all():
+                # Covariances are hardly changed by a few stars; all else is solved again without them.
+                field = field.with_stars(good)
+                used[np.flatnonzero(used)[~good]] = False
+            left, variance = field.left_out(threads)
+        predicted = np.full((len(given), 3), np.nan)
+        predicted[used] = field.data.values - left
+        chi2 = {name: float(v) for name, v in zip(SHAPES, np.nanmean(left**2 / variance, axis=0), strict=True)}
+        model = cls(
+            field,
+            used,
+            PsfShapes.of_values(predicted),
+            chi2,
+            fitted.evidence,
+            _remarks(field, chi2, fitted),
+            weight,
+            given.pixel_scale,
+            stamp_size,
+        )
+        return model._with_stamps(given, components, threads, reporter)
+
+    @classmethod
+    def fit_run(
+        cls,
+        experiment: Experiment,
+        products: Sequence[Any],
+        threads: int | None = None,
+        reporter: Reporter | None = None,
+    ) -> FocalPlanePsf:
+        """Fit the model to the products of a run, with its telescope but without its heights.
+
+        The budget of the heights is known, their draw is not; so is the size of the residual of the active optics.
+        """
+        config = experiment.config
+        focal = config.focal_plane
+        return cls.fit(
+            FocalPlaneStars.from_products(products, experiment.weight_fwhm),
+            experiment.telescope,
+            FocalPlane.flat(experiment.camera) if focal.budget == "flat" else None,
+            camera=experiment.camera,
+            wavelengths=experiment.wavelengths,
+            atmosphere=experiment.atmosphere,
+            pixel_size=experiment.pixel_size,
+            diffusion=experiment.diffusion,
+            jitter=experiment.jitter,
+            dispersion=experiment.dispersion,
+            budget=experiment.focal_plane.budget,
+            alignment_rms=config.active_optics.residual_um * 1e-6,
+            threads=threads,
+            reporter=reporter,
+        )
+
+    @property
+    def mosaic(self) -> Mosaic:
+        """The CCDs."""
+        return self.field.mosaic
+
+    @property
+    def covariances(self) -> tuple[Covariance, ...]:
+        """Covariances of what turbulence adds to e1, e2 and ln size."""
+        return self.field.covariances
+
+    @property
+    def heights(self) -> FocalPlane | None:
+        """Fitted heights of the CCDs; None without a telescope."""
+        return None if self.field.optics is None else self.field.optics.plane
+
+    def shapes(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> PsfShapes:
+        """Return the shapes of the PSF.
+
+        Parameters
+        ----------
+        ccd : str or sequence of str
+            CCD of all positions, or of each.
+        x, y : array_like or Quantity
+            Positions on the detector [m], or in pixels of the CCD (``astropy.units.pix``).
+        """
+        return PsfShapes.of_values(self.field.predict(self.field.mosaic.places(ccd, x, y), threads=threads)[0])
+
+    def uncertainty(
+        self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
+    ) -> PsfShapes:
+        """Return standard deviations of e1, e2 and the size [rad]; arguments as for :meth:`shapes`."""
+        values, variance = self.field.predict(self.field.mosaic.places(ccd, x, y), variance=True, threads=threads)
+        assert variance is not None
+        sigma = np.sqrt(np.maximum(variance, 0.0))
+        return PsfShapes(sigma[:, 0], sigma[:, 1], np.exp(values[:, 2]) * sigma[:, 2])
+
+    def draw(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> np.ndarray:
+        """Return images of the PSF, centred and of unit sum, shape [n, ny, nx]; arguments as for :meth:`shapes`.
+
+        Principal components of the residual stamps are added to the image of the optics under the mean of turbulence
+        (without a telescope, to the mean star). The sum is convolved with the Gaussian, of positive or negative width,
+        that gives it the predicted shape.
+        """
+        places = self.field.mosaic.places(ccd, x, y)
+        values, _ = self.field.predict(places, threads=threads)
+        return self._images(places, values, threads)
+
+    def draw_uncertainty(
+        self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
+    ) -> np.ndarray:
+        """Return the standard deviation of each pixel of :meth:`draw`, shape [n, ny, nx]."""
+        places = self.field.mosaic.places(ccd, x, y)
+        values, variance = self.field.predict(places, variance=True, threads=threads)
+        assert variance is not None
+        total = np.zeros((len(places), self.stamp_size, self.stamp_size))
+        for shape in range(3):
+            step = np.zeros((len(places), 3))
+            step[:, shape] = np.sqrt(np.maximum(variance[:, shape], 0.0))
+            ends = [self._images(places, values + sign * step, threads) for sign in (1.0, -1.0)]
+            total += (0.5 * (ends[0] - ends[1])) ** 2
+        return np.sqrt(total)
+
+    def write(self, path: str | Path) -> None:
+        """Write the model as a FITS file, telescope included."""
+        write_fits(Path(path), model_hdus(self), None, [CREATOR])
+
+    @classmethod
+    def read(cls, path: str | Path) -> FocalPlanePsf:
+        """Read a model; ProductError if the file is missing, damaged or of another kind."""
+        return cls(**model_fields(read_fits(Path(path)), Path(path)))
+
+    def _images(self, places: Places, values: np.ndarray, threads: int | None) -> np.ndarray:
+        """Return images of given shapes e1, e2 and ln size [n, 3]."""
+        optics, mean = self.field.optics, self.mean_star
+        scale = self.pixel_scale if optics is None else optics.pixel_scale
+        if scale is None or (optics is None and mean is None):
+            raise DomainError("draw: expected a telescope, or stars with stamps")
+        images = np.empty((len(places), self.stamp_size, self.stamp_size))
+        for first in range(0, len(places), _BATCH):
+            part = slice(first, first + _BATCH)
+            here = places[part]
+            base = np.asarray(mean) if optics is None else optics.images(here, threads)
+            if self.pca is not None:
+                base = base + self.pca.at(here, threads)
+            images[part] = deformed(
+                np.broadcast_to(base, (len(here), *images.shape[1:])), values[part], scale, self.weight_fwhm
+            )
+        return images
+
+    def _with_stamps(
+        self, given: FocalPlaneStars, components: int, threads: int | None, reporter: Reporter
+    ) -> FocalPlanePsf:
+        """Return the model with the mean star and the principal components of the residual stamps."""
+        if given.stamps is None or given.pixel_scale is None:
+            return self
+        finite = np.flatnonzero(np.isfinite(given.stamps[self.used]).all(axis=(1, 2)))
+        brightest = np.argsort(self.field.data.noise[finite, 0], kind="stable")[:_PCA_STARS]
+        finite = np.sort(finite[brightest])
+        stamps = given.stamps[self.used][finite].astype(np.float64)
+        places, noise = self.field.data.places[finite], self.field.data.noise[finite]
+        weight = 1.0 / np.maximum(noise[:, 0], np.percentile(noise[:, 0], 10))
+        mean = np.einsum("n,nyx->yx", weight / weight.sum(), stamps)
+        model = replace(self, mean_star=mean, pixel_scale=given.pixel_scale)
+        if components < 1:
+            return model
+        with reporter.stage("residual stamps"):
+            plain = model._images(places, self.field.data.values[finite], threads)
+            pca = ResidualImages.fit(stamps - plain, places, weight, self.field.mosaic, components, threads)
+        return replace(model, pca=pca)
+
+
+def _remarks(field: ShapeField, chi2: dict[str, float], fitted: FittedField) -> tuple[str, ...]:
+    """Return remarks on a fit, a line each."""
+    remarks = []
+    if fitted.at_bounds:
+        remarks.append(f"hyperparameters at their bounds: {', '.join(fitted.at_bounds)}")
+    for name, value in chi2.items():
+        if not _CHI2[0] < value < _CHI2[1]:
+            remarks.append(
+                f"reduced chi-square of {name} at the stars is {value:.2f}: the noise of the stars is not as stated"
+            )
+    if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:
+        remarks.append(
+            f"the stars are less likely with this telescope than without any (ln ratio {fitted.evidence:.0f}):"
+            " it is not the one that they were taken with"
+        )
+    ccds = np.unique(field.data.places.ccd)
+    empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds]
+    if empty:
+        shown = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
+        remarks.append(f"{len(empty)} CCDs without stars, predicted from the others: {shown}")
+    if len(ccds) == 1:
+        remarks.append("all stars are on one CCD: elsewhere the prediction is their mean")
+    return tuple(remarks)

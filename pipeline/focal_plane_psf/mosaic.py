@@ -1,0 +1,119 @@
+"""CCDs of a focal plane by name, where positions of stars and predictions belong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError, unknown_name
+from ...core.units import metres
+from ...models.camera.camera import Camera
+from .covariance import Places
+
+
+@dataclass(frozen=True, eq=False)
+class Mosaic:
+    """Names, centres and size of the CCDs.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the CCDs.
+    centers : ndarray, shape [n_ccd, 2]
+        Their centres on the detector [m].
+    half_size : float
+        Half the side of a CCD [m].
+    camera : Camera or None
+        The camera, if known: it converts pixels to positions on the detector.
+    """
+
+    names: tuple[str, ...]
+    centers: np.ndarray
+    half_size: float
+    camera: Camera | None = None
+
+    @classmethod
+    def of_camera(cls, camera: Camera) -> Mosaic:
+        """Return the CCDs of a camera."""
+        return cls(camera.ccd_names, camera.centers, camera.half_size, camera)
+
+    @classmethod
+    def of_stars(cls, names: Sequence[str], xy: np.ndarray) -> Mosaic:
+        """Return CCDs about the stars [n, 2] of each name: as large as the largest extent of stars on one of them."""
+        different = tuple(sorted(set(names)))
+        labels = np.asarray(names)
+        low, high = (np.array([f(xy[labels == n], axis=0) for n in different]) for f in (np.min, np.max))
+        half = 0.5 * float(np.max(high - low))
+        return cls(different, 0.5 * (low + high), half if half > 0.0 else 1.0)
+
+    def index(self, names: str | Sequence[str]) -> np.ndarray:
+        """Return the numbers of CCDs of given names; UnknownNameError for another name."""
+        listed = [names] if isinstance(names, str) else list(names)
+        numbers = {name: i for i, name in enumerate(self.names)}
+        for name in listed:
+            if str(name) not in numbers:
+                raise unknown_name("CCD", str(name), self.names)
+        return np.array([numbers[str(name)] for name in listed], dtype=np.int64)
+
+    def places(self, ccd: str | Sequence[str], x: Any, y: Any) -> Places:
+        """Return places of given coordinates.
+
+        Parameters
+        ----------
+        ccd : str or sequence of str
+            CCD of all, or of each.
+        x, y : array_like or Quantity
+            Position on the detector: lengths [m]; or pixels of the CCD (``astropy.units.pix``), the centre of the first
+            one at (0, 0).
+        """
+        numbers = self.index(ccd)
+        px, py = (self._metres(value, axis, numbers) for axis, value in enumerate((x, y)))
+        px, py, numbers = np.broadcast_arrays(np.atleast_1d(px), np.atleast_1d(py), numbers)
+        xy = np.stack([px.ravel(), py.ravel()], axis=1)
+        if not np.isfinite(xy).all():
+            raise DomainError(f"x, y: {np.count_nonzero(~np.isfinite(xy).all(axis=1))} positions are not finite")
+        return self.at(xy, numbers.ravel())
+
+    def at(self, xy: np.ndarray, ccd: np.ndarray) -> Places:
+        """Return the places at positions on the detector [m] on CCDs of given numbers."""
+        return Places(xy, ccd, (xy - self.centers[ccd]) / self.half_size)
+
+    def _metres(self, value: Any, axis: int, ccd: np.ndarray) -> np.ndarray:
+        if not (isinstance(value, u.Quantity) and value.unit == u.pix):
+            return metres(value, "xy"[axis])
+        if self.camera is None:
+            raise DomainError(f"{'xy'[axis]} in pixels: expected a camera, or positions on the detector in metres")
+        middle = 0.5 * (self.camera.pixels - 1)
+        offset = (np.asarray(value.value, dtype=np.float64) - middle) * self.camera.pixel_size
+        return self.centers[ccd, axis] + offset
+
+
+@dataclass(frozen=True, eq=False)
+class PsfShapes:
+    """Shapes of the PSF at places, one array element each.
+
+    Attributes
+    ----------
+    e1, e2 : ndarray
+        Ellipticity (a - b)/(a + b), along x and along the diagonal.
+    size : ndarray
+        Weighted rms size [rad], as :func:`~pachon.measure_shapes` defines it.
+    """
+
+    e1: np.ndarray
+    e2: np.ndarray
+    size: np.ndarray
+
+    @classmethod
+    def of_values(cls, values: ArrayLike) -> PsfShapes:
+        """Return the shapes of e1, e2 and ln size [n, 3]."""
+        e1, e2, log_size = np.asarray(values, dtype=np.float64).T
+        return cls(e1, e2, np.exp(log_size))
+
+    def __len__(self) -> int:
+        return len(self.e1)

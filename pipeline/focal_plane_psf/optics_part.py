@@ -1,0 +1,99 @@
+"""Optical part of a focal-plane model: long-exposure PSFs at fitted heights and alignment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...models.camera.focal_plane import FocalPlane
+from ...wavefront.aberration import ResidualWavefront
+from ...wavefront.psf.engine import center_focal_length
+from .covariance import Places
+from .fit import N_EXPOSURE
+from .heights import HeightPrior, legendre
+from .response import ExposureResponse, Instrument
+
+# Difference in height for the derivative of the shapes [m].
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsPart:
+    """Optics of one exposure, fitted.
+
+    Attributes
+    ----------
+    instrument : Instrument
+        Telescope, wavelengths, atmosphere and detector.
+    plane : FocalPlane
+        Fitted heights.
+    aberration : ResidualWavefront
+        Fitted residual wavefront.
+    seeing : float
+        Logarithm of the Fried parameter over the assumed one.
+    prior : HeightPrior
+        Parametrisation of the heights.
+    covariance : ndarray, shape [n_ccd, n, n]
+        Covariance of the parameters that act on each CCD: those of the focal plane and the rafts, its own, and those of
+        the exposure.
+    response : ExposureResponse
+        Derivatives with respect to the parameters of the exposure.
+    """
+
+    instrument: Instrument
+    plane: FocalPlane
+    aberration: ResidualWavefront
+    seeing: float
+    prior: HeightPrior
+    covariance: np.ndarray
+    response: ExposureResponse
+
+    @property
+    def pixel_scale(self) -> float:
+        """Angle of a pixel of the images [rad]."""
+        instrument = self.instrument
+        return instrument.pixel_size / center_focal_length(instrument.telescope, instrument.wavelengths)
+
+    def shapes(
+        self, places: Places, threads: int | None = None, progress: Callable[[int], None] | None = None
+    ) -> np.ndarray:
+        """Return e1, e2 and ln size at places, shape [n, 3]."""
+        fields = self.instrument.fields(places.xy, threads)
+        return self.instrument.shapes(fields, self.plane, self.aberration, self.seeing, threads, progress)
+
+    def images(self, places: Places, threads: int | None = None) -> np.ndarray:
+        """Return the PSFs of unit sum at places, shape [n, ny, nx]."""
+        fields = self.instrument.fields(places.xy, threads)
+        return self.instrument.images(fields, self.plane, self.aberration, self.seeing, threads)[0]
+
+    def design(self, places: Places, threads: int | None = None) -> np.ndarray:
+        """Return the derivatives of the shapes with respect to the parameters of the CCD, shape [n, n_parameter, 3]."""
+        fields = self.instrument.fields(places.xy, threads)
+        heights = self.plane.height(*places.xy.T)
+        ends = [self._lifted(places, fields, sign * _STEP, threads) for sign in (1.0, -1.0)]
+        slopes = (ends[0] - ends[1]) / (2.0 * _STEP)
+        return self.design_of(places, slopes, self.response.columns(fields, heights))
+
+    def design_of(self, places: Places, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the same from derivatives [n, 3] with respect to height and columns [n, 25, 3] of the exposure."""
+        terms = np.concatenate([self.prior.common_terms(places), legendre(places.uv)], axis=1)
+        return np.concatenate([terms[:, :, None] * slopes[:, None], columns], axis=1)
+
+    def _lifted(self, places: Places, fields: np.ndarray, step: float, threads: int | None) -> np.ndarray:
+        surfaces = self.plane.surfaces
+        polynomial = surfaces.polynomial.copy()
+        polynomial[:, 0] += step
+        moved = FocalPlane(
+            self.plane.camera,
+            type(surfaces)(surfaces.half_size, polynomial, surfaces.waves, surfaces.grid),
+            self.plane.measured,
+        )
+        return self.instrument.shapes(fields, moved, self.aberration, self.seeing, threads)
+
+
+def columns_acting_on(prior: HeightPrior, ccd: int) -> np.ndarray:
+    """Return the columns of all parameters that act on a CCD."""
+    own = prior.columns_of(ccd)
+    return np.r_[: prior.n_common, own, prior.n_parameter : prior.n_parameter + N_EXPOSURE]

@@ -1,0 +1,285 @@
+r"""Shapes of the long-exposure PSF of a telescope, as functions of CCD height, residual wavefront and seeing.
+
+The shape of the PSF of the optics under the mean of all turbulence changes with the height of the CCD, with the
+residual aberration of the exposure and with the Fried parameter. Heights enter through a polynomial between Chebyshev
+nodes, whose derivative is exact: five nodes over +-25 um reproduce e of the engine to 1e-5 at any height. The other
+parameters are linear about the last solution, with derivatives that are functions of field and height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
+
+from ...core.units import ARCSEC, metres, positive_angle, radians
+from ...models.camera.ccd_surfaces import CcdSurfaces
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...wavefront.aberration import ResidualWavefront
+from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.chief_rays import fields_at
+from ...wavefront.psf.psf import make_psfs
+from ..measure.shapes import measure_shapes
+
+#: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.
+NOLL = tuple(range(4, 12))
+#: Height range of the polynomial [m].
+LARGEST_HEIGHT = 25e-6
+_NODES = 5
+# Steps of the differences: wavefront [m] and logarithm of the Fried parameter.
+_WAVEFRONT_STEP, _SEEING_STEP = 0.05e-6, 0.05
+# Stars at which derivatives are computed, and the degree of their dependence on the field.
+_SAMPLES, _FIELD_DEGREE = 300, 6
+# Heights [m] between which these derivatives are linear.
+_LEVELS = (-8e-6, 8e-6)
+_BATCH = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """All that decides the long-exposure PSF of a star at a place and height.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        The telescope.
+    wavelengths : ndarray, shape [n_wave]
+        Wavelengths [m].
+    atmosphere : Atmosphere
+        Fried parameter and outer scale.
+    pixel_size, diffusion : float
+        Pixel of the stamps, and rms charge diffusion [m].
+    jitter : float
+        Pointing, rms along each axis [rad].
+    weight_fwhm : float
+        Weight of the moments [rad].
+    dispersion : ndarray, shape [n_wave, 2], or None
+        Shift of each wavelength by the air [rad].
+    stamp_size : int
+        Pixels on a side of a stamp.
+    """
+
+    telescope: Telescope
+    wavelengths: np.ndarray
+    atmosphere: Atmosphere
+    pixel_size: float
+    diffusion: float
+    jitter: float
+    weight_fwhm: float
+    dispersion: np.ndarray | None
+    stamp_size: int
+
+    @classmethod
+    def of(
+        cls,
+        telescope: Telescope,
+        wavelengths: ArrayLike | None = None,
+        atmosphere: Atmosphere | None = None,
+        *,
+        pixel_size: ArrayLike = 10e-6,
+        diffusion: ArrayLike = 4e-6,
+        jitter: ArrayLike = 0.0,
+        weight_fwhm: ArrayLike = 0.7 * ARCSEC,
+        dispersion: ArrayLike | None = None,
+        stamp_size: int = 31,
+    ) -> Instrument:
+        """Return an instrument of numbers in SI or quantities, by default of five wavelengths over the band."""
+        if wavelengths is None:
+            low, high = telescope.band or telescope.wavelength_range
+            wavelengths = np.linspace(low, high, 5)
+        return cls(
+            telescope,
+            np.atleast_1d(metres(wavelengths, "wavelengths")),
+            Atmosphere.from_site("cerro_pachon", seed=0) if atmosphere is None else atmosphere,
+            float(metres(pixel_size, "pixel_size")),
+            float(metres(diffusion, "diffusion")),
+            float(radians(jitter, "jitter")),
+            positive_angle(weight_fwhm, "weight_fwhm"),
+            None if dispersion is None else radians(dispersion, "dispersion"),
+            stamp_size,
+        )
+
+    def fields(self, xy: np.ndarray, threads: int | None = None) -> np.ndarray:
+        """Return the field angles of positions on the detector [rad], shape [n, 2]."""
+        return fields_at(self.telescope, xy, self.wavelengths[len(self.wavelengths) // 2], threads=threads)
+
+    def images(
+        self,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float = 0.0,
+        threads: int | None = None,
+    ) -> tuple[np.ndarray, float]:
+        """Return the PSFs of stars at field angles, of unit sum [n, ny, nx], and the angle of a pixel [rad]."""
+        atmosphere = self.atmosphere
+        if seeing:
+            atmosphere = replace(atmosphere, r0=atmosphere.r0 * float(np.exp(seeing)))
+        psfs = make_psfs(
+            self.telescope,
+            fields,
+            self.wavelengths,
+            focal_plane=plane,
+            atmosphere=atmosphere,
+            aberration=aberration,
+            engine="long_exposure",
+            stamp_size=self.stamp_size,
+            pixel_size=self.pixel_size,
+            diffusion=self.diffusion,
+            jitter=self.jitter,
+            dispersion=self.dispersion,
+            threads=threads,
+        )
+        return psfs.image, psfs.pixel_scale
+
+    def shapes(
+        self,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float = 0.0,
+        threads: int | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> np.ndarray:
+        """Return e1, e2 and the logarithm of the size [rad] of PSFs at field angles, shape [n, 3]."""
+        found = np.empty((len(fields), 3))
+        for first in range(0, len(fields), _BATCH):
+            part = slice(first, first + _BATCH)
+            images, scale = self.images(fields[part], plane, aberration, seeing, threads)
+            shapes = measure_shapes(images, scale, self.weight_fwhm)
+            found[part] = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
+            if progress is not None:
+                progress(len(images))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class HeightResponse:
+    """Shapes of stars as polynomials of the height of the CCD: coefficients [n_node, n, 3] of Chebyshev terms."""
+
+    coefficients: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        instrument: Instrument,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float = 0.0,
+        threads: int | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> HeightResponse:
+        """Evaluate the engine at the nodes; `plane` gives the camera alone."""
+        nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+        values = np.stack(
+            [
+                instrument.shapes(fields, level_plane(plane, LARGEST_HEIGHT * n), aberration, seeing, threads, progress)
+                for n in nodes
+            ]
+        )
+        inverse = np.linalg.inv(chebyshev.chebvander(nodes, _NODES - 1))
+        return cls(np.einsum("kn,nsf->ksf", inverse, values))
+
+    def at(self, heights: np.ndarray) -> np.ndarray:
+        """Return the shapes at heights [m], shape [n, 3]."""
+        terms = chebyshev.chebvander(heights / LARGEST_HEIGHT, _NODES - 1)
+        return np.einsum("sk,ksf->sf", terms, self.coefficients)
+
+    def slope(self, heights: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the shapes with respect to the height [1/m], shape [n, 3]."""
+        terms = chebyshev.chebvander(heights / LARGEST_HEIGHT, _NODES - 2)
+        change = chebyshev.chebder(self.coefficients, axis=0) / LARGEST_HEIGHT
+        return np.einsum("sk,ksf->sf", terms, change)
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureResponse:
+    """Derivatives of the shapes with respect to the parameters of an exposure.
+
+    Parameters: coefficients [m] of the Noll terms on the axis, their slopes along x and y of the field [m per field
+    radius], and the logarithm of the Fried parameter.
+    """
+
+    polynomial: np.ndarray  #: [n_term + 1, level, field term, 3]
+    radius: float  #: of the field [rad]
+
+    @classmethod
+    def of(
+        cls,
+        instrument: Instrument,
+        fields: np.ndarray,
+        plane: FocalPlane,
+        aberration: ResidualWavefront | None,
+        seeing: float,
+        threads: int | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> ExposureResponse:
+        """Compute central differences at some of the stars, and fit them over the field."""
+        radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
+        chosen = fields[np.unique(np.linspace(0, len(fields) - 1, min(_SAMPLES, len(fields))).astype(int))]
+        degree = min(_FIELD_DEGREE, max(0, int((np.sqrt(8 * len(chosen) / 3 + 1) - 3) / 2)))
+        terms = field_terms(chosen / radius, degree)
+        found = []
+        for parameter in range(len(NOLL) + 1):
+            levels = []
+            for level in _LEVELS:
+                flat, ends = level_plane(plane, level), []
+                for sign in (1.0, -1.0):
+                    changed, air = aberration, seeing
+                    if parameter < len(NOLL):
+                        step = np.zeros((3, len(NOLL)))
+                        step[0, parameter] = sign * _WAVEFRONT_STEP
+                        changed = wavefront(instrument.telescope, step, radius, aberration)
+                    else:
+                        air = seeing + sign * _SEEING_STEP
+                    ends.append(instrument.shapes(chosen, flat, changed, air, threads, progress))
+                width = 2.0 * (_WAVEFRONT_STEP if parameter < len(NOLL) else _SEEING_STEP)
+                change = (ends[0] - ends[1]) / width
+                levels.append(np.linalg.lstsq(terms, change, rcond=None)[0])
+            found.append(levels)
+        return cls(np.array(found), radius)
+
+    def columns(self, fields: np.ndarray, heights: np.ndarray) -> np.ndarray:
+        """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""
+        low, high = _LEVELS
+        upper = ((heights - low) / (high - low))[:, None, None]
+        degree = round((np.sqrt(8 * self.polynomial.shape[2] + 1) - 3) / 2)
+        terms = field_terms(fields / self.radius, degree)
+        at_level = np.einsum("nt,pltf->lnpf", terms, self.polynomial)
+        own = at_level[0] + upper * (at_level[1] - at_level[0])
+        waves = own[:, :-1]
+        along = fields / self.radius
+        return np.concatenate(
+            [waves, along[:, 0, None, None] * waves, along[:, 1, None, None] * waves, own[:, -1:]], axis=1
+        )
+
+
+def wavefront(
+    telescope: Telescope, coefficients: np.ndarray, radius: float, base: ResidualWavefront | None = None
+) -> ResidualWavefront:
+    """Return a residual wavefront of coefficients [3, n_term] (on the axis, along x, along y), added to another."""
+    values = np.zeros((3, NOLL[-1] - 3))
+    values[:, np.array(NOLL) - 4] = coefficients
+    constant, gradient = values[0], values[1:].T / radius
+    if base is not None:
+        constant, gradient = constant + base.coefficients, gradient + base.field_gradient
+    return ResidualWavefront(constant, telescope.pupil_diameter, telescope.pupil_obscuration, gradient)
+
+
+def field_terms(slopes: np.ndarray, degree: int) -> np.ndarray:
+    """Return products of Legendre polynomials over the field up to a total degree, shape [n, n_term]."""
+    x, y = (np.polynomial.legendre.legvander(slopes[:, axis], degree) for axis in range(2))
+    return np.stack([x[:, i] * y[:, t - i] for t in range(degree + 1) for i in range(t + 1)], axis=1)
+
+
+def level_plane(plane: FocalPlane, height: float) -> FocalPlane:
+    """Return a focal plane of the same camera, all of whose CCDs lie at one height [m]."""
+    polynomial = np.zeros((len(plane.camera), 10))
+    polynomial[:, 0] = height
+    surfaces = CcdSurfaces(plane.camera.half_size, polynomial, np.zeros((len(plane.camera), 2, 4)))
+    return FocalPlane(plane.camera, surfaces, np.zeros(len(plane.camera), dtype=bool))

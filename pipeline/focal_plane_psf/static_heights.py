@@ -1,0 +1,265 @@
+r"""Heights of the CCDs from many exposures, each with turbulence, alignment and seeing of its own.
+
+Every exposure gives the quadratic approximation of its likelihood in the height parameters, its own parameters
+marginalised; these add up,
+
+.. math:: \left(P^{-1} + \sum_v F_v\right) \delta = \sum_v g_v - P^{-1} \beta ,
+
+so that exposures are independent jobs, and memory does not grow with their number. Gauss-Newton steps are repeated
+about the new heights; the optics of an exposure are evaluated once, and are polynomials of the heights from then on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from astropy.io import fits
+
+from ...core.errors import DomainError, ProductError
+from ...core.products import read_fits, write_fits
+from ...core.progress import Reporter
+from ...models.camera.camera import Camera, load_camera
+from ...models.camera.ccd_surfaces import CcdSurfaces
+from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.height_budget import HeightBudget
+from ...models.telescope import Telescope
+from .fit import ExposureFit, ShapeData
+from .heights import HeightPrior
+from .mosaic import Mosaic
+from .response import ExposureResponse, HeightResponse, Instrument
+from .stars import stars_of
+
+#: Gauss-Newton steps about the heights of all exposures.
+STEPS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class StaticHeights:
+    """Heights learnt from exposures.
+
+    Attributes
+    ----------
+    focal_plane : FocalPlane
+        The heights.
+    covariance : ndarray, shape [n_ccd, n_term, n_term]
+        Covariance of the coefficients of each CCD [m^2].
+    exposures : int
+        Number of exposures.
+    """
+
+    focal_plane: FocalPlane
+    covariance: np.ndarray
+    exposures: int
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        return self.focal_plane.camera
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviation of the height of each CCD, rms over its area [m], shape [n_ccd]."""
+        return np.sqrt(np.einsum("cii->c", self.covariance))
+
+    def prior(self) -> HeightPrior:
+        """Return the prior that these heights are for another exposure."""
+        return HeightPrior.known(self.focal_plane, self.covariance)
+
+    def write(self, path: str | Path) -> None:
+        """Write a FITS file."""
+        surfaces = self.focal_plane.surfaces
+        hdus = [
+            _float64("POLYNOMIAL", surfaces.polynomial, "[m] cubic of each CCD"),
+            _float64("GRID", surfaces.grid if surfaces.grid is not None else np.zeros((0, 0, 0)), "[m] B-splines"),
+            _float64("COVARIANCE", self.covariance, "[m2] of the Legendre coefficients of each CCD"),
+        ]
+        cards = [
+            ("CAMERA", self.camera.name, "name of the camera"),
+            ("NEXPOSE", self.exposures, "number of exposures"),
+        ]
+        write_fits(Path(path), hdus, None, cards)
+
+    @classmethod
+    def read(cls, path: str | Path, camera: str | Camera | None = None) -> StaticHeights:
+        """Read heights, of a camera that is not bundled with `camera`; ProductError if the file is no such product."""
+        hdus = read_fits(Path(path))
+        try:
+            known = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
+            grid = _array(hdus["GRID"])
+            surfaces = CcdSurfaces(
+                known.half_size,
+                _array(hdus["POLYNOMIAL"]),
+                np.zeros((len(known), 2, 4)),
+                grid if grid.size else None,
+            )
+            plane = FocalPlane(known, surfaces, np.ones(len(known), dtype=bool))
+            return cls(plane, _array(hdus["COVARIANCE"]), int(hdus[0].header["NEXPOSE"]))
+        except KeyError as error:
+            raise ProductError(f"no product with heights ({' '.join(str(error).split())})", file=path) from None
+
+
+def fit_static_heights(
+    exposures: Sequence[Any],
+    telescope: Telescope,
+    *,
+    camera: str | Camera | None = None,
+    instrument: Instrument | None = None,
+    budget: str | HeightBudget | None = "simulated",
+    alignment_rms: float = 0.2e-6,
+    folder: str | Path | None = None,
+    steps: int = STEPS,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+    map_jobs: Callable[..., Any] = map,
+) -> StaticHeights:
+    """Fit the heights of all CCDs to the stars of several exposures.
+
+    Parameters
+    ----------
+    exposures : sequence
+        Stars of each, as :meth:`.FocalPlanePsf.fit` takes them; paths keep the memory at that of one exposure.
+    telescope : Telescope
+        The telescope.
+    camera : str or Camera, optional
+        By default the telescope's.
+    instrument : Instrument, optional
+        Wavelengths, atmosphere and detector; by default those of :meth:`.FocalPlanePsf.fit`.
+    budget : str, HeightBudget or None
+        Prior of the heights; None for one that hardly holds them.
+    alignment_rms : float
+        Prior rms of the residual wavefront of each exposure [m].
+    folder : str or path, optional
+        Folder in which the result of each exposure is kept, so that a fit that was stopped goes on.
+    steps : int
+        Gauss-Newton steps.
+    map_jobs : callable
+        ``map`` of an executor over processes or of a Dask client's futures; by default one exposure after the other.
+
+    Returns
+    -------
+    StaticHeights
+        The mean height, and the plane of the focal plane, are degenerate with the focus of each exposure: they are
+        those of the mean of all exposures, within the prior.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    if not len(exposures):
+        raise DomainError("exposures: expected one or more")
+    known = telescope.camera if camera is None else camera
+    if known is None:
+        raise DomainError(f"camera: {telescope.name} names none, expected one with the heights of its CCDs")
+    cam = load_camera(known)
+    prior = HeightPrior.broad(cam) if budget is None else HeightPrior.from_budget(cam, budget)
+    instrument = Instrument.of(telescope) if instrument is None else instrument
+    heights = np.zeros(prior.n_parameter)
+    precision = np.zeros((prior.n_parameter, prior.n_parameter))
+    prior.add_to(precision)
+    covariance = None
+    for step in range(max(1, steps)):
+        job = _Job(instrument, prior, alignment_rms, heights, step, None if folder is None else Path(folder), threads)
+        matrix, vector = precision.copy(), -precision @ heights
+        with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
+            for part, right in map_jobs(job, list(enumerate(exposures))):
+                matrix += part
+                vector += right
+                stage.advance(1)
+        scale = 1.0 / np.sqrt(np.diagonal(matrix))
+        root = scipy.linalg.cholesky(matrix * scale[:, None] * scale, lower=True, overwrite_a=True)
+        heights = heights + scale * scipy.linalg.cho_solve((root, True), scale * vector)
+        covariance = root, scale
+    assert covariance is not None
+    root, scale = covariance
+    lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
+    full = (np.tril(lower) + np.tril(lower, -1).T) * scale[:, None] * scale
+    return StaticHeights(prior.focal_plane(heights), prior.per_ccd(full), len(exposures))
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Normal equations of one exposure about heights, its own parameters marginalised."""
+
+    instrument: Instrument
+    prior: HeightPrior
+    alignment_rms: float
+    heights: np.ndarray
+    step: int
+    folder: Path | None
+    threads: int | None
+
+    def __call__(self, numbered: tuple[int, Any]) -> tuple[np.ndarray, np.ndarray]:
+        number, exposure = numbered
+        stars = stars_of(exposure)
+        stars = stars.chosen(stars.usable)
+        mosaic = Mosaic.of_camera(self.prior.camera)
+        places = mosaic.places(stars.ccd, stars.x, stars.y)
+        data = ShapeData(places, stars.values, stars.noise**2)
+        key = self._key(data)
+        path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{self.step}.npz"
+        if path is not None and path.exists():
+            try:
+                kept = np.load(path)
+                if str(kept["key"]) == key:
+                    return kept["matrix"], kept["vector"]
+            except (OSError, ValueError, KeyError):
+                pass
+        fit = ExposureFit(data, self.instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
+        fit.use_optics(*_optics(fit, self.threads))
+        fit.heights = self.heights.copy()
+        # Parameters of the exposure follow the heights before its covariances are fitted.
+        fit.fit_covariances(30)
+        fit.solve_exposure()
+        fit.fit_covariances(10)
+        normal = fit.solve_exposure()
+        n = self.prior.n_parameter
+        own = normal.matrix[n:, n:] + np.diag(fit.sigma**-2)
+        size = 1.0 / np.sqrt(np.diagonal(own))
+        between = scipy.linalg.cho_solve(
+            scipy.linalg.cho_factor(own * size[:, None] * size), (normal.matrix[n:, :n] * size[:, None])
+        )
+        cross = normal.matrix[:n, n:] * size
+        matrix = normal.matrix[:n, :n] - cross @ between
+        right = size * (normal.vector[n:] - fit.sigma**-2 * fit.exposure)
+        vector = normal.vector[:n] - between.T @ right
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = path.with_name(path.name + ".part.npz")
+            np.savez(part, matrix=matrix, vector=vector, key=key)
+            part.replace(path)
+        return matrix, vector
+
+    def _key(self, data: ShapeData) -> str:
+        state = hashlib.sha256()
+        for array in (data.values, data.noise, data.places.xy, data.places.ccd, self.heights):
+            state.update(np.ascontiguousarray(array).tobytes())
+        state.update(repr((self.alignment_rms, self.instrument.telescope.name)).encode())
+        return state.hexdigest()
+
+
+_LAST: dict[str, tuple[HeightResponse, ExposureResponse]] = {}
+
+
+def _optics(fit: ExposureFit, threads: int | None) -> tuple[HeightResponse, ExposureResponse]:
+    """Return the responses at the stars of an exposure, those of the last call where these stand at the same places."""
+    key = hashlib.sha256(fit.fields.tobytes() + fit.instrument.telescope.name.encode()).hexdigest()
+    if key not in _LAST:
+        fit.linearise()
+        _LAST.clear()
+        _LAST[key] = fit.optics, fit.response
+    return _LAST[key]
+
+
+def _float64(name: str, values: np.ndarray, comment: str) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(values, dtype=np.float64), name=name)
+    hdu.header["COMMENT"] = comment
+    return hdu
+
+
+def _array(hdu: fits.ImageHDU) -> np.ndarray:
+    if hdu.data is None:
+        return np.zeros((0, 0, 0))
+    return np.asarray(hdu.data, dtype=np.float64)
