@@ -82,6 +82,7 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
         instrument, air = optics.instrument, optics.instrument.atmosphere
         about["telescope"] = telescope_to_yaml(instrument.telescope)
         about["seeing"] = optics.seeing
+        about["degree"] = optics.prior.degree
         about["atmosphere"] = {"r0": air.r0, "outer_scale": air.outer_scale}
         about["instrument"] = {k: getattr(instrument, k) for k in ("pixel_size", "diffusion", "jitter")}
         about["radius"] = optics.response.radius
@@ -184,7 +185,7 @@ def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camer
             wavefront[:, 0], telescope.pupil_diameter, telescope.pupil_obscuration, wavefront[:, 1:].copy()
         ),
         about["seeing"],
-        HeightPrior.broad(camera),
+        HeightPrior.broad(camera, degree=about["degree"]),
         part("PARAMETER_COVARIANCE"),
         ExposureResponse(part("RESPONSE"), about["radius"]),
     )

@@ -22,7 +22,7 @@ from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from .covariance import Covariance, Places
-from .heights import HeightPrior, legendre
+from .heights import HeightPrior
 from .kriging import on_threads
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
 from .response import LARGEST_HEIGHT, NOLL, ExposureResponse, HeightResponse, Instrument, wavefront
@@ -39,7 +39,7 @@ _SEEING = 0.3
 # is fitted.
 _MEAN = (0.02, 0.02, 0.01)
 # Stars of a block of the linear fit.
-_BLOCK = 1500
+_BLOCK = 750
 # Steps of Gauss-Newton and of the covariances, before the optics are evaluated again about the alignment found.
 _STEPS = 3
 # Most times that a step is halved.
@@ -135,7 +135,7 @@ class ExposureFit:
         self.fields = instrument.fields(data.places.xy, threads)
         self.flat = FocalPlane.flat(prior.camera)
         self.common = prior.common_terms(data.places)
-        self.own = legendre(data.places.uv)
+        self.own = prior.own_terms(data.places)
         self.blocks = blocks_of(data.places.xy, _BLOCK)
         self.heights = np.zeros(prior.n_parameter)
         self.exposure = np.zeros(N_EXPOSURE)

@@ -18,8 +18,8 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget, load_budget
 from .covariance import Places
 
-#: Largest total degree within a CCD: of a potato chip of 1 to 2 cycles 6 leaves 0.2 um rms.
-DEGREE = 6
+#: Largest total degree within a CCD, for one exposure and for many: of a potato chip of 1 to 2 cycles 6 leaves 0.3 um.
+DEGREE, STATIC_DEGREE = 4, 6
 # Focal planes of a budget that are drawn to find the covariance of its terms.
 _DRAWS = 8
 # Nodes along the side of a CCD at which drawn heights are projected and fitted heights are tabulated.
@@ -55,16 +55,16 @@ class HeightPrior:
     mean: FocalPlane | None = None
 
     @classmethod
-    def from_budget(
-        cls, camera: Camera, budget: str | HeightBudget = "simulated", mean: FocalPlane | None = None
-    ) -> HeightPrior:
+    def from_budget(cls, camera: Camera, budget: str | HeightBudget = "simulated", degree: int = DEGREE) -> HeightPrior:
         """Return the prior with the covariance of focal planes drawn from a budget of heights."""
         budget = load_budget(budget) if isinstance(budget, str) else budget
         # Seeds far from those that people choose, so that no run is fitted with its own heights.
         seeds = range(2**31, 2**31 + _DRAWS)
-        ccd = np.zeros((len(powers()), len(powers())))
+        ccd = np.zeros((len(powers(degree)), len(powers(degree))))
         for term in ("ccd", "tilt", "potato_chip"):
-            drawn = [project(FocalPlane.from_budget(camera, seed=s, terms=(term,), budget=budget)) for s in seeds]
+            drawn = [
+                project(FocalPlane.from_budget(camera, seed=s, terms=(term,), budget=budget), degree) for s in seeds
+            ]
             rows = np.concatenate(drawn)
             ccd += rows.T @ rows / len(rows)
         # The quadratic's coefficients are normal but for a scale; many more draws are needed than of CCDs.
@@ -75,26 +75,35 @@ class HeightPrior:
         rows = np.array(planes)
         diagonal = np.diag(np.maximum((rows**2).mean(axis=0), _LEAST))
         own = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
-        return cls(camera, diagonal, max(budget.raft_height**2 / 12.0, _LEAST), own, mean)
+        return cls(camera, diagonal, max(budget.raft_height**2 / 12.0, _LEAST), own)
 
     @classmethod
-    def broad(cls, camera: Camera, size: float = 10e-6, mean: FocalPlane | None = None) -> HeightPrior:
+    def broad(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:
         """Return a prior that hardly holds heights [m]: independent coefficients that fall as the degree rises."""
-        degree = np.array([i + j for i, j in powers()])
-        ccd = np.diag((size / (1.0 + degree) ** 2) ** 2)
-        return cls(camera, size**2 * np.eye(5), size**2, np.broadcast_to(ccd, (len(camera), *ccd.shape)), mean)
+        total = np.array([i + j for i, j in powers(degree)])
+        ccd = np.diag((size / (1.0 + total) ** 2) ** 2)
+        return cls(camera, size**2 * np.eye(5), size**2, np.broadcast_to(ccd, (len(camera), *ccd.shape)))
 
     @classmethod
     def known(cls, plane: FocalPlane, covariance: np.ndarray | None = None) -> HeightPrior:
         """Return the prior of known heights, with the covariance of each CCD's coefficients [n_ccd, n_term, n_term]."""
-        n, k = len(plane.camera), len(powers())
-        own = np.zeros((n, k, k)) if covariance is None else covariance
+        k = len(powers(DEGREE)) if covariance is None else covariance.shape[1]
+        own = np.zeros((len(plane.camera), k, k)) if covariance is None else covariance
         return cls(plane.camera, _LEAST * np.eye(5), _LEAST, own + _LEAST * np.eye(k), plane)
 
     @cached_property
     def precision(self) -> np.ndarray:
         """Inverse of the covariance of each CCD's coefficients [1/m^2], shape [n_ccd, n_term, n_term]."""
         return np.linalg.inv(self.ccd)
+
+    @property
+    def degree(self) -> int:
+        """Largest total degree of the terms of a CCD."""
+        return round((np.sqrt(8 * self.ccd.shape[1] + 1) - 3) / 2)
+
+    def own_terms(self, places: Places) -> np.ndarray:
+        """Return the terms of each place's own CCD, shape [n, n_term]."""
+        return legendre(places.uv, self.degree)
 
     @property
     def n_common(self) -> int:
@@ -104,12 +113,12 @@ class HeightPrior:
     @property
     def n_parameter(self) -> int:
         """Number of parameters."""
-        return self.n_common + len(self.camera) * len(powers())
+        return self.n_common + len(self.camera) * self.ccd.shape[1]
 
     def columns_of(self, ccd: int) -> slice:
         """Return the columns of a CCD's own parameters."""
-        first = self.n_common + ccd * len(powers())
-        return slice(first, first + len(powers()))
+        first = self.n_common + ccd * self.ccd.shape[1]
+        return slice(first, first + self.ccd.shape[1])
 
     def add_to(self, normal: np.ndarray) -> None:
         """Add the precision of the prior to a normal matrix whose first columns are the height parameters."""
@@ -127,7 +136,7 @@ class HeightPrior:
 
     def covariance(self, places: Places) -> np.ndarray:
         """Return the prior covariance of the heights at places [m^2], shape [n, n]."""
-        common, own = self.common_terms(places), legendre(places.uv)
+        common, own = self.common_terms(places), self.own_terms(places)
         total = common[:, :5] @ self.global_covariance @ common[:, :5].T
         total += self.raft * (common[:, 5:] @ common[:, 5:].T)
         for ccd in np.unique(places.ccd):
@@ -141,10 +150,10 @@ class HeightPrior:
         Quadratics over the focal plane and pistons of rafts are polynomials of a CCD too. Covariances between CCDs are
         left out.
         """
-        nodes, weights = np.polynomial.legendre.leggauss(DEGREE + 1)
+        nodes, weights = np.polynomial.legendre.leggauss(self.degree + 1)
         v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
         uv = np.stack([u, v], axis=1)
-        terms = legendre(uv)
+        terms = legendre(uv, self.degree)
         projection = terms.T * (np.outer(weights, weights).ravel() / 4.0)
         result = np.empty((len(self.camera), terms.shape[1], terms.shape[1]))
         for ccd, center in enumerate(self.camera.centers):
@@ -158,7 +167,7 @@ class HeightPrior:
         """Return the heights at places [m], shape [n], mean of the prior included."""
         own = parameters[self.n_common :].reshape(len(self.camera), -1)
         change = self.common_terms(places) @ parameters[: self.n_common]
-        change += np.einsum("nk,nk->n", legendre(places.uv), own[places.ccd])
+        change += np.einsum("nk,nk->n", self.own_terms(places), own[places.ccd])
         return change if self.mean is None else change + self.mean.height(*places.xy.T)
 
     def focal_plane(self, parameters: np.ndarray) -> FocalPlane:
@@ -174,22 +183,22 @@ class HeightPrior:
         return FocalPlane.from_heights(Table({"x": x, "y": y, "z": self.heights(parameters, places)}), camera)
 
 
-def powers() -> list[tuple[int, int]]:
+def powers(degree: int) -> list[tuple[int, int]]:
     """Return the degrees in u and v of the terms of a CCD, by total degree."""
-    return [(total - j, j) for total in range(DEGREE + 1) for j in range(total + 1)]
+    return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
 
 
-def legendre(uv: np.ndarray) -> np.ndarray:
+def legendre(uv: np.ndarray, degree: int) -> np.ndarray:
     """Return the terms of a CCD at places [n, 2] in halves of its side, each of unit rms over it: [n, n_term]."""
-    along = [legvander(uv[:, axis], DEGREE) * np.sqrt(2.0 * np.arange(DEGREE + 1) + 1.0) for axis in range(2)]
-    return np.stack([along[0][:, i] * along[1][:, j] for i, j in powers()], axis=1)
+    along = [legvander(uv[:, axis], degree) * np.sqrt(2.0 * np.arange(degree + 1) + 1.0) for axis in range(2)]
+    return np.stack([along[0][:, i] * along[1][:, j] for i, j in powers(degree)], axis=1)
 
 
-def project(plane: FocalPlane) -> np.ndarray:
+def project(plane: FocalPlane, degree: int) -> np.ndarray:
     """Return the coefficients of each CCD that fit its heights best [m], shape [n_ccd, n_term]."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
-    terms = legendre(np.stack([u, v], axis=1)) * (np.outer(weights, weights).ravel()[:, None] / 4.0)
+    terms = legendre(np.stack([u, v], axis=1), degree) * (np.outer(weights, weights).ravel()[:, None] / 4.0)
     half = plane.camera.half_size
     x = plane.camera.centers[:, :1] + half * u * (1.0 - 1e-12)
     y = plane.camera.centers[:, 1:] + half * v * (1.0 - 1e-12)

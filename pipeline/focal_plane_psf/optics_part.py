@@ -12,7 +12,7 @@ from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.psf.engine import center_focal_length
 from .covariance import Places
 from .fit import N_EXPOSURE
-from .heights import HeightPrior, legendre
+from .heights import HeightPrior
 from .response import ExposureResponse, Instrument
 
 # Difference in height for the derivative of the shapes [m].
@@ -78,7 +78,7 @@ class OpticsPart:
 
     def design_of(self, places: Places, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the same from derivatives [n, 3] with respect to height and columns [n, 25, 3] of the exposure."""
-        terms = np.concatenate([self.prior.common_terms(places), legendre(places.uv)], axis=1)
+        terms = np.concatenate([self.prior.common_terms(places), self.prior.own_terms(places)], axis=1)
         return np.concatenate([terms[:, :, None] * slopes[:, None], columns], axis=1)
 
     def _lifted(self, places: Places, fields: np.ndarray, step: float, threads: int | None) -> np.ndarray:

@@ -30,7 +30,7 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
 from .fit import ExposureFit, ShapeData
-from .heights import HeightPrior
+from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
 from .response import ExposureResponse, HeightResponse, Instrument
 from .stars import stars_of
@@ -154,7 +154,11 @@ def fit_static_heights(
     if known is None:
         raise DomainError(f"camera: {telescope.name} names none, expected one with the heights of its CCDs")
     cam = load_camera(known)
-    prior = HeightPrior.broad(cam) if budget is None else HeightPrior.from_budget(cam, budget)
+    degree = STATIC_DEGREE
+    if budget is None:
+        prior = HeightPrior.broad(cam, degree=degree)
+    else:
+        prior = HeightPrior.from_budget(cam, budget, degree)
     instrument = Instrument.of(telescope) if instrument is None else instrument
     heights = np.zeros(prior.n_parameter)
     precision = np.zeros((prior.n_parameter, prior.n_parameter))
