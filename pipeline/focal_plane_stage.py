@@ -1,0 +1,94 @@
+"""Second stage of a run: a PSF model of the whole focal plane in place of the CCDs' own models.
+
+It reads measured shapes alone, never what a model says, so that it can be repeated: after a run was stopped, or with
+more CCDs, it leaves what one uninterrupted run leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from ..core.errors import ConfigError
+from ..core.progress import Reporter
+from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
+from .config import Configuration
+from .experiment import Experiment
+from .focal_plane_psf.model import FocalPlanePsf
+
+#: Name of the focal-plane model in the folder of a run.
+FOCAL_PLANE_PSF_NAME = "focal_plane_psf.fits"
+_StarsKind = TypeVar("_StarsKind", bound=Stars)
+
+
+def apply_focal_plane_model(
+    experiment: Experiment,
+    products: Sequence[CcdProduct],
+    *,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> tuple[list[CcdProduct], FocalPlanePsf]:
+    """Fit one model to the used stars of all CCDs, and return the products with its shapes, and the model.
+
+    Ellipticities and sizes of the CCDs' own models are kept beside, those fitted without a star are replaced; products
+    that have a focal-plane model already get the new one. Images and PSF models of the CCDs stay as they are.
+
+    Raises
+    ------
+    DomainError
+        If there are too few stars.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    model = FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
+    left_out, first, applied = model.leave_one_out, 0, []
+    total = sum(len(p.observed) + len(p.holdout) for p in products)
+    with reporter.stage("focal-plane PSF model on the CCDs", total=total) as stage:
+        for product in products:
+            observed, used = _with_model(product.name, product.observed, model), product.observed.used
+            own = slice(first, first + int(used.sum()))
+            e1, e2 = np.full((2, len(used)), np.nan)
+            e1[used], e2[used] = left_out.e1[own], left_out.e2[own]
+            observed = replace(observed, leave_one_out_e1=e1, leave_one_out_e2=e2)
+            holdout = _with_model(product.name, product.holdout, model)
+            applied.append(replace(product, observed=observed, holdout=holdout))
+            first = own.stop
+            stage.advance(len(observed) + len(holdout))
+    return applied, model
+
+
+def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf) -> None:
+    """Write the model into the folder of a run, and its shapes into the products of the CCDs."""
+    for product in products:
+        write_focal_plane_columns(folder, product)
+    model.write(folder / FOCAL_PLANE_PSF_NAME)
+
+
+def refuse_focal_plane_model(config: Configuration, why: str) -> None:
+    """Raise ConfigError if the PSF is to be modelled over the whole focal plane; `why` says what it is not for."""
+    if config.reconstruction.model == "focal_plane":
+        raise ConfigError(f"reconstruction.model = focal_plane: expected ccd, {why}")
+
+
+def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf) -> _StarsKind:
+    """Return stars of a CCD with the shapes that the model has there, and those of the CCD's own model."""
+    own, shapes, sigma = (
+        of_ccd_model(stars),
+        model.shapes(name, stars.x, stars.y),
+        model.uncertainty(name, stars.x, stars.y),
+    )
+    return replace(
+        stars,
+        model_e1=shapes.e1,
+        model_e2=shapes.e2,
+        model_size=shapes.size,
+        ccd_e1=own.model_e1,
+        ccd_e2=own.model_e2,
+        ccd_size=own.model_size,
+        sigma_e1=sigma.e1,
+        sigma_e2=sigma.e2,
+        sigma_size=sigma.size,
+    )
