@@ -32,10 +32,26 @@ def apply_focal_plane_model(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> tuple[list[CcdProduct], FocalPlanePsf]:
-    """Fit one model to the used stars of all CCDs, and return the products with its shapes, and the model.
+    """Fit one model to the used stars of all CCDs, and put its shapes into the products.
 
-    Ellipticities and sizes of the CCDs' own models are kept beside, those fitted without a star are replaced; products
-    that have a focal-plane model already get the new one. Images and PSF models of the CCDs stay as they are.
+    Parameters
+    ----------
+    experiment : Experiment
+        Telescope, camera and atmosphere of the products.
+    products : sequence of CcdProduct
+        Products with the stamps of their observed stars. Those that have a focal-plane model already get the new one.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Returns
+    -------
+    products : list of CcdProduct
+        Products whose ``model_``, ``leave_one_out_`` and ``sigma_`` are of the focal-plane model; ``ccd_`` has the
+        shapes of the CCD's own model. All else is as it was.
+    model : FocalPlanePsf
+        The model.
 
     Raises
     ------
@@ -48,12 +64,13 @@ def apply_focal_plane_model(
     total = sum(len(p.observed) + len(p.holdout) for p in products)
     with reporter.stage("focal-plane PSF model on the CCDs", total=total) as stage:
         for product in products:
-            observed, used = _with_model(product.name, product.observed, model), product.observed.used
+            observed = _with_model(product.name, product.observed, model, threads)
+            holdout = _with_model(product.name, product.holdout, model, threads)
+            used = observed.used
             own = slice(first, first + int(used.sum()))
             e1, e2 = np.full((2, len(used)), np.nan)
             e1[used], e2[used] = left_out.e1[own], left_out.e2[own]
             observed = replace(observed, leave_one_out_e1=e1, leave_one_out_e2=e2)
-            holdout = _with_model(product.name, product.holdout, model)
             applied.append(replace(product, observed=observed, holdout=holdout))
             first = own.stop
             stage.advance(len(observed) + len(holdout))
@@ -73,13 +90,11 @@ def refuse_focal_plane_model(config: Configuration, why: str) -> None:
         raise ConfigError(f"reconstruction.model = focal_plane: expected ccd, {why}")
 
 
-def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf) -> _StarsKind:
+def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf, threads: int | None) -> _StarsKind:
     """Return stars of a CCD with the shapes that the model has there, and those of the CCD's own model."""
-    own, shapes, sigma = (
-        of_ccd_model(stars),
-        model.shapes(name, stars.x, stars.y),
-        model.uncertainty(name, stars.x, stars.y),
-    )
+    own = of_ccd_model(stars)
+    shapes = model.shapes(name, stars.x, stars.y, threads=threads)
+    sigma = model.uncertainty(name, stars.x, stars.y, threads=threads)
     return replace(
         stars,
         model_e1=shapes.e1,

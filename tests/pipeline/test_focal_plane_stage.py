@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
+from pachon.core.errors import ConfigError, ProductError, UnknownNameError
 from pachon.core.progress import Reporter
 from pachon.pipeline import focal_plane_stage
 from pachon.pipeline import run as run_module
@@ -17,7 +17,6 @@ from pachon.pipeline.ccd_product import CCD_KINDS, KINDS, of_ccd_model, read_pro
 from pachon.pipeline.config import to_yaml
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
-from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
 from pachon.pipeline.focal_plane_stage import FOCAL_PLANE_PSF_NAME, apply_focal_plane_model
 from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.pipeline.measure.summary import correlations, run_metrics, separation_bins
@@ -33,92 +32,28 @@ OF_MODEL = {"MODEL_E1", "MODEL_E2", "MODELSZ", "RES_E1", "RES_E2", "LOO_E1", "LO
 ADDED = ["CCD_E1", "CCD_E2", "CCD_SIZE", "SIG_E1", "SIG_E2", "SIG_SIZE"]
 
 
-class Shapes:
-    """Shapes of a plane over the detector, as a focal-plane model returns them."""
-
-    def __init__(self, values):
-        self.e1, self.e2, self.size = values[:, 0], values[:, 1], np.exp(values[:, 2])
-
-
-class Plane:
-    """Stand-in for a focal-plane model: a plane through the shapes of the stars, and their scatter."""
-
-    warnings = ("the plane is <flat>",)
-    fits = 0
-
-    @classmethod
-    def fit_run(cls, experiment, products, threads=None, reporter=None):
-        cls.fits += 1
-        stars = FocalPlaneStars.from_products(products)
-        if len(stars) < 30:
-            raise DomainError(f"{len(stars)} stars: expected at least 30")
-        model = cls()
-        terms = cls.terms(stars.x, stars.y)
-        model.planes = np.linalg.lstsq(terms, stars.values, rcond=None)[0]
-        left = stars.values - terms @ model.planes
-        model.scatter = left.std(axis=0)
-        inside = np.diag(terms @ np.linalg.pinv(terms))
-        model.leave_one_out = Shapes(stars.values - left / (1.0 - inside[:, None]))
-        model.chi2 = {"e1": 0.5, "e2": 1.5, "size": 2.5}
-        return model
-
-    @staticmethod
-    def terms(x, y):
-        return np.stack([np.ones(len(x)), x, y], axis=1)
-
-    def shapes(self, ccd, x, y):
-        return Shapes(self.terms(x, y) @ self.planes)
-
-    def uncertainty(self, ccd, x, y):
-        found = self.shapes(ccd, x, y)
-        found.e1, found.e2 = (np.full(len(x), s) for s in self.scatter[:2])
-        found.size = found.size * self.scatter[2]
-        return found
-
-    def write(self, path):
-        np.savetxt(path, self.planes)
-
-
-@pytest.fixture
-def plane(monkeypatch):
-    """A plane in place of the focal-plane model, for what does not depend on which model it is."""
-    monkeypatch.setattr(focal_plane_stage, "FocalPlanePsf", Plane)
-    monkeypatch.setattr(Plane, "fits", 0)
-
-
-@pytest.fixture(scope="session")
-def small(tiny):
-    """Two CCDs of twenty stars each, the mean over all turbulence: ``small(ccds=("R22_S11",))``."""
-
-    def make(**options):
-        mine = {"ccds": CCDS, "stars__observed": 20, "psf__engine": "long_exposure", "psf__n_pupil": 300}
-        return tiny(**(mine | {"reconstruction__model": "focal_plane"} | options))
-
-    return make
-
-
 @pytest.fixture
 def no_report(monkeypatch):
     monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
 
 
 @pytest.fixture(scope="module")
-def whole_run(small, tmp_path_factory):
+def whole_run(focal_plane_config, tmp_path_factory):
     """The folder of a finished run with the real model; its report has no pictures."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_module, "draw_pictures", lambda *_: [])
-        run(small(), folder, threads=1)
+        run(focal_plane_config(), folder, threads=1)
     return folder
 
 
 @pytest.fixture(scope="module")
-def ccd_run(small, tmp_path_factory):
+def ccd_run(focal_plane_config, tmp_path_factory):
     """The same run with the models of single CCDs alone."""
     folder = tmp_path_factory.mktemp("single") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_module, "draw_pictures", lambda *_: [])
-        run(small(reconstruction__model="ccd"), folder, threads=1)
+        run(focal_plane_config(reconstruction__model="ccd"), folder, threads=1)
     return folder
 
 
@@ -200,19 +135,21 @@ def test_default_runs_have_no_more_columns(finished_run):
 
 
 @pytest.mark.long
-def test_a_finished_run_resumed_and_one_on_two_threads_have_the_same_bytes(whole_run, small, tmp_path, no_report):
+def test_a_finished_run_resumed_and_one_on_two_threads_have_the_same_bytes(
+    whole_run, focal_plane_config, tmp_path, no_report
+):
     shutil.copytree(whole_run, tmp_path / "copy")
-    assert run(small(), tmp_path / "copy", resume=True).computed == ()
+    assert run(focal_plane_config(), tmp_path / "copy", resume=True).computed == ()
     assert contents(tmp_path / "copy") == contents(whole_run)
-    run(small(), tmp_path / "again", threads=2)
+    run(focal_plane_config(), tmp_path / "again", threads=2)
     assert contents(tmp_path / "again") == contents(whole_run)
 
 
 @pytest.mark.long
 def test_a_run_stopped_while_products_are_rewritten_goes_on_to_the_same_bytes(
-    small, tmp_path, plane, no_report, monkeypatch
+    focal_plane_config, tmp_path, plane_model, no_report, monkeypatch
 ):
-    run(small(), tmp_path / "at_once")
+    run(focal_plane_config(), tmp_path / "at_once")
     real, out = focal_plane_stage.write_focal_plane_columns, tmp_path / "out"
 
     def stopped(folder, product):
@@ -222,42 +159,42 @@ def test_a_run_stopped_while_products_are_rewritten_goes_on_to_the_same_bytes(
 
     monkeypatch.setattr(focal_plane_stage, "write_focal_plane_columns", stopped)
     with pytest.raises(KeyboardInterrupt):
-        run(small(), out)
+        run(focal_plane_config(), out)
     states = [fits.getheader(out / f"ccd_{name}.fits")["PSFMODEL"] for name in CCDS]
     assert states == ["focal_plane", "ccd"]
     with pytest.raises(ProductError, match="CCD R22_S12: has no focal-plane model yet, which pachon run --resume adds"):
         diagnose(out, strict=True)
     monkeypatch.setattr(focal_plane_stage, "write_focal_plane_columns", real)
-    result = run(small(), out, resume=True)
+    result = run(focal_plane_config(), out, resume=True)
     assert (result.kept, result.computed) == (CCDS, ())
     assert contents(out) == contents(tmp_path / "at_once")
 
 
 @pytest.mark.long
-def test_a_run_that_grows_models_all_ccds_again(small, tmp_path, plane, no_report):
+def test_a_run_that_grows_models_all_ccds_again(focal_plane_config, tmp_path, plane_model, no_report):
     options = {"stars__observed": 32}
-    run(small(ccds=CCDS[:1], **options), tmp_path / "grows")
+    run(focal_plane_config(ccds=CCDS[:1], **options), tmp_path / "grows")
     alone = tables(tmp_path / "grows", CCDS[0], "STARS")[0]
-    assert run(small(**options), tmp_path / "grows", resume=True).kept == CCDS[:1]
+    assert run(focal_plane_config(**options), tmp_path / "grows", resume=True).kept == CCDS[:1]
     assert not np.array_equal(tables(tmp_path / "grows", CCDS[0], "STARS")[0]["MODEL_E1"], alone["MODEL_E1"])
-    run(small(**options), tmp_path / "at_once")
+    run(focal_plane_config(**options), tmp_path / "at_once")
     assert contents(tmp_path / "grows") == contents(tmp_path / "at_once")
 
 
 @pytest.mark.long
-def test_a_product_of_another_model_is_not_kept(ccd_run, small, tmp_path, plane, no_report):
+def test_a_product_of_another_model_is_not_kept(ccd_run, focal_plane_config, tmp_path, plane_model, no_report):
     shutil.copytree(ccd_run, tmp_path / "out")
     with pytest.raises(ProductError, match=r'reconstruction\.model: "ccd" -> "focal_plane"'):
-        run(small(), tmp_path / "out", resume=True)
+        run(focal_plane_config(), tmp_path / "out", resume=True)
 
 
 @pytest.mark.long
-def test_stars_that_are_not_used_have_no_prediction_without_them(products, small, plane):
+def test_stars_that_are_not_used_have_no_prediction_without_them(products, focal_plane_config, plane_model):
     first = products[0]
     used = first.observed.used.copy()
     used[[0, 7]] = False
     changed = [replace(first, observed=replace(first.observed, used=used)), products[1]]
-    applied, model = apply_focal_plane_model(Experiment.from_config(small()), changed)
+    applied, model = apply_focal_plane_model(Experiment.from_config(focal_plane_config()), changed)
     expected = model.leave_one_out.e1
     assert len(expected) == 38
     np.testing.assert_array_equal(np.isnan(applied[0].observed.leave_one_out_e2), ~used)
@@ -265,7 +202,7 @@ def test_stars_that_are_not_used_have_no_prediction_without_them(products, small
     np.testing.assert_array_equal(found, expected)
     assert np.isfinite(applied[0].observed.model_e1).all()
     # Applied to what has a model already: the CCDs' own stay what they were.
-    again, _ = apply_focal_plane_model(Experiment.from_config(small()), applied)
+    again, _ = apply_focal_plane_model(Experiment.from_config(focal_plane_config()), applied)
     for one, other, before in zip(again, applied, changed, strict=True):
         for key in ("model_e1", "model_size", "ccd_e1", "ccd_e2", "ccd_size", "sigma_e1"):
             np.testing.assert_array_equal(getattr(one.holdout, key), getattr(other.holdout, key))
@@ -273,8 +210,8 @@ def test_stars_that_are_not_used_have_no_prediction_without_them(products, small
 
 
 @pytest.mark.long
-def test_metrics_are_of_both_models(products, small, plane):
-    applied, model = apply_focal_plane_model(Experiment.from_config(small()), products)
+def test_metrics_are_of_both_models(products, focal_plane_config, plane_model):
+    applied, model = apply_focal_plane_model(Experiment.from_config(focal_plane_config()), products)
     assert applied[0].kinds == (*KINDS, *CCD_KINDS)
     correlated = correlations(applied)
     assert set(correlated) == {"truth", "observed", "residual", "away", *CCD_KINDS}
@@ -300,7 +237,7 @@ def test_metrics_are_of_both_models(products, small, plane):
 
 
 @pytest.mark.long
-def test_the_report_has_both_residuals_and_the_warnings(small, tmp_path, plane, monkeypatch, capsys):
+def test_the_report_has_both_residuals_and_the_warnings(focal_plane_config, tmp_path, plane_model, monkeypatch, capsys):
     drawn = {}
 
     def keep(name):
@@ -316,7 +253,7 @@ def test_the_report_has_both_residuals_and_the_warnings(small, tmp_path, plane, 
         monkeypatch.setattr(report_module, name, lambda *_, **__: b"")
     for name in ("correlation_plot", "models_plot"):
         monkeypatch.setattr(report_module, name, keep(name))
-    result = run(small(), tmp_path / "out", reporter=Reporter())
+    result = run(focal_plane_config(), tmp_path / "out", reporter=Reporter())
     assert "the plane is <flat>\n" in capsys.readouterr().err
     assert list(drawn["correlation_plot"][0]) == ["truth", "observed", "residual", "away"]
     assert set(CCD_KINDS) < set(drawn["models_plot"][0])
@@ -355,15 +292,15 @@ def test_diagnostics_have_both_models(whole_run, ccd_run, tmp_path, capsys):
     assert "CCD's own model, at holdout positions" in capsys.readouterr().out
 
 
-def test_optics_alone_are_refused(small):
+def test_optics_alone_are_refused(focal_plane_config):
     with pytest.raises(ConfigError, match=r"^reconstruction.model = focal_plane: expected atmosphere.enabled = true"):
-        small(atmosphere__enabled=False, psf__engine="fast")
+        focal_plane_config(atmosphere__enabled=False, psf__engine="fast")
 
 
 @pytest.mark.long
-def test_too_few_stars_are_one_line(small, tmp_path, capsys):
+def test_too_few_stars_are_one_line(focal_plane_config, tmp_path, capsys):
     path = tmp_path / "small.yaml"
-    path.write_text(to_yaml(small(ccds=CCDS[:1])))
+    path.write_text(to_yaml(focal_plane_config(ccds=CCDS[:1])))
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("pachon: error: ")
@@ -373,9 +310,9 @@ def test_too_few_stars_are_one_line(small, tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_who_wants_no_progress_reads_the_warnings(small, tmp_path, plane, no_report, capsys):
+def test_who_wants_no_progress_reads_the_warnings(focal_plane_config, tmp_path, plane_model, no_report, capsys):
     path = tmp_path / "small.yaml"
-    path.write_text(to_yaml(small()))
+    path.write_text(to_yaml(focal_plane_config()))
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr().err == "pachon: the plane is <flat>\n"
     shutil.rmtree(tmp_path / "out")
