@@ -73,6 +73,12 @@ def draw_pictures(
     components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
     errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
+    at_stars = (
+        "Residuals at the stars hold the noise of each star, some of which the model has followed"
+        if whole
+        else "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
+        "whatever the error of the model is"
+    )
     pictures = [
         Picture(
             "Focal plane",
@@ -137,8 +143,7 @@ def draw_pictures(
             "Correlation of the ellipticity",
             correlation_plot({kind: correlated[kind] for kind in CORRELATED}),
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
-            f"{errors}, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
-            "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
+            f"{errors}, cut off where they would pass zero. {at_stars}; "
             "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
             "along it, and an ellipticity common to the field does not average out of ξ-.",
             "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
@@ -160,8 +165,9 @@ def draw_pictures(
                 "Residuals of both models",
                 models_plot(correlated),
                 "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "
-                "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative. Residuals of "
-                "models of single CCDs sum to zero over the stars of each.",
+                "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative. Residuals at the "
+                "stars sum to zero over each CCD where it has a model of its own, so their correlation between CCDs "
+                "cancels whatever the error of that model is.",
             )
         )
     # Single pixels and shapelets look the same whatever the stars are.

@@ -55,7 +55,7 @@ MODELS_CAPTION = (
 )
 
 
-def models_rows(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
+def models_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Return rows of the focal-plane model beside the CCDs' own models, in the columns of :data:`MODELS_COLUMNS`.
 
     There are none in a run without a focal-plane model.
@@ -63,7 +63,7 @@ def models_rows(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
     metrics = summary["all"]
     if "rms_residual_away_ccd" not in metrics:
         return []
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (f"rms e residual, {name}", *(_percent(metrics[f"rms_residual_{key}{end}"]) for end in ("", "_ccd")))
         for key, name in (("at_stars", "at the stars"), ("away", "at holdout positions (noise-free)"))
     ]
