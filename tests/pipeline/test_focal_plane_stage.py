@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError, ProductError, UnknownNameError
+from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
 from pachon.core.progress import Reporter
 from pachon.pipeline import focal_plane_stage
 from pachon.pipeline import run as run_module
@@ -179,6 +179,42 @@ def test_a_run_that_grows_models_all_ccds_again(focal_plane_config, tmp_path, pl
     assert not np.array_equal(tables(tmp_path / "grows", CCDS[0], "STARS")[0]["MODEL_E1"], alone["MODEL_E1"])
     run(focal_plane_config(**options), tmp_path / "at_once")
     assert contents(tmp_path / "grows") == contents(tmp_path / "at_once")
+
+
+@pytest.mark.long
+def test_ccds_computed_apart_make_the_run_of_one_machine(focal_plane_config, tmp_path, plane_model, no_report):
+    run(focal_plane_config(), tmp_path / "at_once")
+    together = tmp_path / "together"
+    together.mkdir()
+    for name in CCDS:
+        # Each alone has too few stars, and leaves its product nevertheless.
+        with pytest.raises(DomainError, match="20 stars: expected at least 30"):
+            run(focal_plane_config(ccds=(name,)), tmp_path / name)
+        for file in (f"ccd_{name}.fits", "config.yaml"):
+            shutil.copy(tmp_path / name / file, together)
+    assert run(focal_plane_config(), together, resume=True).computed == ()
+    assert contents(together) == contents(tmp_path / "at_once")
+
+
+@pytest.mark.long
+def test_a_ccd_that_cannot_be_modelled_is_left_out(focal_plane_config, tmp_path, plane_model, no_report, monkeypatch):
+    real, config = run_module.model_ccd, focal_plane_config(stars__observed=32)
+
+    def fails(experiment, exposure):
+        if exposure.name == CCDS[0]:
+            raise DomainError("too few stars")
+        return real(experiment, exposure)
+
+    monkeypatch.setattr(run_module, "model_ccd", fails)
+    result = run(config, tmp_path / "out")
+    assert result.not_modelled == {CCDS[0]: "too few stars"}
+    monkeypatch.setattr(run_module, "model_ccd", real)
+    run(focal_plane_config(stars__observed=32, ccds=CCDS[1:]), tmp_path / "alone")
+    name = f"ccd_{CCDS[1]}.fits"
+    assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+    assert run(config, tmp_path / "out", resume=True).computed == CCDS[:1]
+    run(config, tmp_path / "at_once")
+    assert contents(tmp_path / "out") == contents(tmp_path / "at_once")
 
 
 @pytest.mark.long
