@@ -140,6 +140,7 @@ def focal_plane_config(tiny):
         mine = {
             "ccds": ("R22_S11", "R22_S12"),
             "stars__observed": 20,
+            "wavelengths_nm": [620.0],
             "psf__engine": "long_exposure",
             "psf__n_pupil": 300,
         }
