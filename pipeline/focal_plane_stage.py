@@ -19,6 +19,7 @@ from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_colu
 from .config import Configuration
 from .experiment import Experiment
 from .focal_plane_psf.model import FocalPlanePsf
+from .focal_plane_psf.stars import FocalPlaneStars
 
 #: Name of the focal-plane model in the folder of a run.
 FOCAL_PLANE_PSF_NAME = "focal_plane_psf.fits"
@@ -59,7 +60,12 @@ def apply_focal_plane_model(
         If there are too few stars.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    model = FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
+    if experiment.atmosphere_only:
+        # No telescope to fit: the stars are those of an ideal one.
+        stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
+        model = FocalPlanePsf.fit(stars, camera=experiment.camera, threads=threads, reporter=reporter)
+    else:
+        model = FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
     left_out, first, applied = model.leave_one_out, 0, []
     total = sum(len(p.observed) + len(p.holdout) for p in products)
     with reporter.stage("focal-plane PSF model on the CCDs", total=total) as stage:

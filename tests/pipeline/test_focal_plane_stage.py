@@ -243,6 +243,14 @@ def test_stars_that_are_not_used_have_no_prediction_without_them(products, focal
 
 
 @pytest.mark.long
+def test_stars_of_an_ideal_telescope_have_no_telescope_to_fit(products, focal_plane_config):
+    experiment = replace(Experiment.from_config(focal_plane_config()), atmosphere_only=True)
+    applied, model = apply_focal_plane_model(experiment, products, threads=1)
+    assert model.heights is None
+    assert applied[0].of_focal_plane
+
+
+@pytest.mark.long
 def test_metrics_are_of_both_models(products, focal_plane_config, plane_model):
     applied, model = apply_focal_plane_model(Experiment.from_config(focal_plane_config()), products)
     assert applied[0].kinds == (*KINDS, *CCD_KINDS)
