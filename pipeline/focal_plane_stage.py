@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..core.errors import ConfigError
+from ..core.products import Stamp, read_fits, write_hdus
 from ..core.progress import Reporter
 from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
 from .config import Configuration
@@ -83,11 +84,16 @@ def apply_focal_plane_model(
     return applied, model
 
 
-def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf) -> None:
-    """Write the model into the folder of a run, and its shapes into the products of the CCDs."""
+def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf, stamp: Stamp) -> None:
+    """Write the model into the folder of a run, with the stamp of the run, and its shapes into the CCDs' products."""
     for product in products:
         write_focal_plane_columns(folder, product)
-    model.write(folder / FOCAL_PLANE_PSF_NAME)
+    path = folder / FOCAL_PLANE_PSF_NAME
+    model.write(path)
+    hdus = read_fits(path)
+    for keyword, value, comment in stamp.cards():
+        hdus[0].header[keyword] = (value, comment)
+    write_hdus(path, hdus)
 
 
 def refuse_focal_plane_model(config: Configuration, why: str) -> None:

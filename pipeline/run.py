@@ -132,7 +132,7 @@ def run(
     if experiment.config.reconstruction.model == "focal_plane":
         products, model = apply_focal_plane_model(experiment, products, threads=threads, reporter=reporter)
         with reporter.stage("products with the focal-plane PSF model"):
-            write_focal_plane_model(folder, products, model)
+            write_focal_plane_model(folder, products, model, stamp)
         warnings, chi2 = model.warnings, {f"chi2_left_out_{name.split()[-1]}": v for name, v in model.chi2.items()}
         for warning in warnings:
             reporter.line(warning)

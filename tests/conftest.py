@@ -4,6 +4,7 @@ import yaml
 
 import pachon
 from pachon.core.errors import DomainError
+from pachon.core.products import image_hdu, write_fits
 from pachon.pipeline import focal_plane_stage
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
@@ -121,7 +122,7 @@ class Plane:
         return found
 
     def write(self, path):
-        np.savetxt(path, self.planes)
+        write_fits(path, [image_hdu("PLANES", self.planes, "of e1, e2, ln size")], None, [])
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from pachon.pipeline.report import report as report_module
 from pachon.pipeline.report.diagnostics import diagnose
 from pachon.pipeline.report.tables import headline, models_rows
 from pachon.pipeline.run import run
+from pachon.pipeline.run_folder import stamp_of
 
 CCDS = ("R22_S11", "R22_S12")
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -72,10 +73,12 @@ def tables(folder, name, *extensions):
 
 
 @pytest.mark.long
-def test_a_run_with_a_focal_plane_model_leaves_one_file_more(whole_run, ccd_run):
+def test_a_run_with_a_focal_plane_model_leaves_one_file_more(whole_run, ccd_run, focal_plane_config):
     names = {p.name for p in ccd_run.iterdir()}
     assert {p.name for p in whole_run.iterdir()} == names | {FOCAL_PLANE_PSF_NAME}
     assert FOCAL_PLANE_PSF_NAME == "focal_plane_psf.fits"
+    header = fits.getheader(whole_run / FOCAL_PLANE_PSF_NAME)
+    assert stamp_of(Experiment.from_config(focal_plane_config())).matches(header)
 
 
 @pytest.mark.long
