@@ -60,6 +60,8 @@ def run_command(
     if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
             print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)
+        for warning in result.summary.get("warnings", ()):
+            print(f"pachon: {warning}", file=sys.stderr)
     if as_json:
         print_json(result.summary)
     elif not quiet:
@@ -67,7 +69,15 @@ def run_command(
 
 
 def _show_run(result: Any, seconds: float) -> None:
-    from ..pipeline.report.tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
+    from ..pipeline.report.tables import (
+        MODELS_CAPTION,
+        MODELS_COLUMNS,
+        PER_CCD_CAPTION,
+        PER_CCD_COLUMNS,
+        headline,
+        models_rows,
+        per_ccd,
+    )
 
     console = wide_console()
     headlines = plain_table(show_header=False)
@@ -79,6 +89,10 @@ def _show_run(result: Any, seconds: float) -> None:
         Rows(headings, rows, PER_CCD_CAPTION, left=sum(not unit for _, unit in PER_CCD_COLUMNS)).show()
         console.print()
     console.print(headlines)
+    models = models_rows(result.summary)
+    if models:
+        console.print()
+        Rows(MODELS_COLUMNS, models, MODELS_CAPTION).show()
     console.print(f"\n{len(result.computed)} CCDs computed, {len(result.kept)} kept, {seconds:.0f} s")
     if result.not_modelled:
         console.print(f"left out, not to be modelled: {', '.join(result.not_modelled)}", style="bold")

@@ -60,11 +60,15 @@ def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tup
     parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
     for keyword, value, comment in [*(stamp.cards() if stamp else []), parts, *cards]:
         primary.header[keyword] = (value, comment)
+    write_hdus(path, fits.HDUList([primary, *hdus]))
+
+
+def write_hdus(path: Path, hdus: fits.HDUList) -> None:
+    """Write all parts of a FITS product, as :func:`read_fits` returns them, with checksums."""
     buffer = io.BytesIO()
-    everything = fits.HDUList([primary, *hdus])
-    for hdu in everything:
+    for hdu in hdus:
         hdu.add_checksum(when=_WHEN)
-    everything.writeto(buffer, checksum=False)
+    hdus.writeto(buffer, checksum=False)
     write_bytes(path, buffer.getvalue())
 
 

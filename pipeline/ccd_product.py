@@ -6,7 +6,7 @@ same input.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,7 +14,7 @@ import numpy as np
 from astropy.io import fits
 
 from ..core.errors import ProductError, unknown_name
-from ..core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from ..core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits, write_hdus
 from ..core.units import ARCSEC
 from .psf_model.model import PsfModel
 
@@ -28,6 +28,10 @@ _MM, _DEG, _SEC, _NONE = _Unit("mm", 1e-3), _Unit("deg", np.pi / 180.0), _Unit("
 _MODEL, _NOISE_FREE_MODEL = "PSF", "TRUEPSF"
 #: Ellipticities of a CCD, see :meth:`CcdProduct.ellipticity`.
 KINDS = ("truth", "observed", "residual", "left_out", "away")
+#: Residuals of the CCD's own model, where a model of the whole focal plane has taken its place.
+CCD_KINDS = ("residual_ccd", "away_ccd")
+#: FITS card that says which model the columns MODEL_E1 and so on are of; only in runs with a focal-plane model.
+MODEL_CARD = "PSFMODEL"
 _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "x": ("X", _MM, "detector x"),
     "y": ("Y", _MM, "detector y"),
@@ -48,12 +52,28 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "model_size": ("MODELSZ", _SEC, "weighted rms size of the model there"),
     "leave_one_out_e1": ("LOO_E1", _NONE, "of the model fitted without the star"),
     "leave_one_out_e2": ("LOO_E2", _NONE, "of the model fitted without the star"),
+    "ccd_e1": ("CCD_E1", _NONE, "ellipticity of the CCD's own model there"),
+    "ccd_e2": ("CCD_E2", _NONE, "ellipticity of the CCD's own model there"),
+    "ccd_size": ("CCD_SIZE", _SEC, "weighted rms size of the CCD's own model"),
+    "sigma_e1": ("SIG_E1", _NONE, "predicted uncertainty of MODEL_E1"),
+    "sigma_e2": ("SIG_E2", _NONE, "predicted uncertainty of MODEL_E2"),
+    "sigma_size": ("SIG_SIZE", _SEC, "predicted uncertainty of MODELSZ"),
 }
+# What a focal-plane model changes in a table, and what keeps the values that stood there before.
+_REPLACED = frozenset(
+    ["MODEL_E1", "MODEL_E2", "MODELSZ", "LOO_E1", "LOO_E2", "SIG_E1", "SIG_E2", "SIG_SIZE", "RES_E1", "RES_E2"]
+)
+_OWN = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
 
 
 @dataclass(frozen=True)
 class Stars:
-    """Positions and shapes, one array element a star."""
+    """Positions and shapes, one array element a star.
+
+    Where the model is one of the whole focal plane, ``ccd_`` has the ellipticity and size [rad] of the CCD's own model,
+    and ``sigma_`` the uncertainty (standard deviation) that the focal-plane model predicts of its own; else all are
+    None.
+    """
 
     x: np.ndarray  #: detector position [m]
     y: np.ndarray
@@ -66,6 +86,12 @@ class Stars:
     model_e1: np.ndarray  #: ellipticity of the model at the position of the star
     model_e2: np.ndarray
     model_size: np.ndarray  #: weighted rms size of the model there [rad]
+    ccd_e1: np.ndarray | None = field(default=None, kw_only=True)
+    ccd_e2: np.ndarray | None = field(default=None, kw_only=True)
+    ccd_size: np.ndarray | None = field(default=None, kw_only=True)
+    sigma_e1: np.ndarray | None = field(default=None, kw_only=True)
+    sigma_e2: np.ndarray | None = field(default=None, kw_only=True)
+    sigma_size: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def residual_e1(self) -> np.ndarray:
@@ -79,6 +105,30 @@ class Stars:
 
     def __len__(self) -> int:
         return len(self.x)
+
+
+_StarsKind = TypeVar("_StarsKind", bound=Stars)
+
+
+def of_ccd_model(stars: _StarsKind) -> _StarsKind:
+    """Return stars whose model is the CCD's own: as they are, unless a focal-plane model has taken its place.
+
+    Ellipticities of the model fitted without the star stay those of the focal-plane model.
+    """
+    if stars.ccd_e1 is None or stars.ccd_e2 is None or stars.ccd_size is None:
+        return stars
+    return replace(
+        stars,
+        model_e1=stars.ccd_e1,
+        model_e2=stars.ccd_e2,
+        model_size=stars.ccd_size,
+        ccd_e1=None,
+        ccd_e2=None,
+        ccd_size=None,
+        sigma_e1=None,
+        sigma_e2=None,
+        sigma_size=None,
+    )
 
 
 @dataclass(frozen=True)
@@ -117,10 +167,22 @@ class CcdProduct:
     model: PsfModel  #: fitted to the observed stars
     noise_free_model: PsfModel  #: fitted to the noise-free PSFs
 
+    @property
+    def of_focal_plane(self) -> bool:
+        """Whether ellipticities and sizes of the model are those of a model of the whole focal plane."""
+        return self.observed.ccd_e1 is not None
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of ellipticity: :data:`KINDS`, and :data:`CCD_KINDS` with a focal-plane model."""
+        return KINDS + CCD_KINDS if self.of_focal_plane else KINDS
+
     def stars(self, kind: str) -> HoldoutStars | ObservedStars:
         """Return the stars that a kind of ellipticity belongs to; kinds are those of :meth:`ellipticity`."""
-        if kind not in KINDS:
-            raise unknown_name("kind", kind, KINDS)
+        if kind not in self.kinds:
+            raise unknown_name("kind", kind, self.kinds)
+        if kind in CCD_KINDS:
+            return of_ccd_model(self.holdout) if kind == "away_ccd" else of_ccd_model(self.observed)
         return self.holdout if kind in ("truth", "away") else self.observed
 
     def ellipticity(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +190,8 @@ class CcdProduct:
 
         Kinds: of the noise-free PSFs (``truth``) and of the stars (``observed``); observed - model at the stars
         (``residual``) and with the model fitted without the star (``left_out``); truth - model at holdout positions
-        (``away``). Another one raises UnknownNameError.
+        (``away``); with a focal-plane model, ``residual_ccd`` and ``away_ccd`` of the CCD's own model. Another one
+        raises UnknownNameError.
         """
         stars = self.stars(kind)
         if kind in ("truth", "observed"):
@@ -136,9 +199,6 @@ class CcdProduct:
         if kind == "left_out":
             return stars.e1 - self.observed.leave_one_out_e1, stars.e2 - self.observed.leave_one_out_e2
         return stars.residual_e1, stars.residual_e2
-
-
-_StarsKind = TypeVar("_StarsKind", bound=Stars)
 
 
 def product_path(folder: Path, ccd: str) -> Path:
@@ -166,6 +226,25 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
         *product.noise_free_model.to_hdus(_NOISE_FREE_MODEL),
     ]
     write_fits(product_path(folder, product.name), hdus, stamp, header)
+
+
+def write_focal_plane_columns(folder: Path, product: CcdProduct) -> None:
+    """Put the focal-plane model of a product into the tables of its file; all else there keeps its bytes.
+
+    The values of the CCD's own model are those in the file, so that any number of times leaves the same bytes.
+    """
+    path = product_path(folder, product.name)
+    hdus = read_fits(path)
+    for name, stars in (("STARS", product.observed), ("TRUTH", product.holdout)):
+        before, table = hdus[name], _table(stars)
+        known = before.columns.names
+        for key, (_, unit, description) in table.items():
+            source = key if key in known else _OWN.get(key, key)
+            if key not in _REPLACED:
+                table[key] = (column(before, source), unit, description)
+        hdus[name] = table_hdu(name, table)
+    hdus[0].header[MODEL_CARD] = "focal_plane"
+    write_hdus(path, hdus)
 
 
 def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool = True) -> CcdProduct:
@@ -201,9 +280,9 @@ def _image(hdu: fits.ImageHDU) -> np.ndarray:
 def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
     table = {}
     for key, (name, unit, description) in _COLUMNS.items():
-        if not hasattr(stars, key):
+        values = getattr(stars, key, None)
+        if values is None:
             continue
-        values = getattr(stars, key)
         table[name] = (values / unit.size if values.dtype.kind == "f" else values, unit.name, description)
     table["RES_E1"] = (stars.residual_e1, "", "measured minus model")
     table["RES_E2"] = (stars.residual_e2, "", "measured minus model")
@@ -212,8 +291,10 @@ def _table(stars: Stars) -> dict[str, tuple[np.ndarray, str, str]]:
 
 def _stars(kind: type[_StarsKind], hdu: fits.BinTableHDU) -> _StarsKind:
     values = {}
-    for field in fields(kind):
-        name, unit, _ = _COLUMNS[field.name]
+    for each in fields(kind):
+        name, unit, _ = _COLUMNS[each.name]
+        if each.default is None and name not in hdu.columns.names:
+            continue
         data = column(hdu, name)
-        values[field.name] = data * unit.size if data.dtype.kind == "f" else data
+        values[each.name] = data * unit.size if data.dtype.kind == "f" else data
     return kind(**values)

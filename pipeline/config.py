@@ -142,6 +142,9 @@ class PsfConfig(Section):
 class ReconstructionConfig(Section):
     """How the PSF is measured and modelled."""
 
+    model: Literal["ccd", "focal_plane"] = Field(
+        "ccd", description="ccd (each CCD by itself), focal_plane (one more model, of the shapes on all CCDs together)"
+    )
     flag_stars: Switch = Field(
         False, description="leave out stars with neighbours, cosmic rays and saturated cores, as far as they are seen"
     )

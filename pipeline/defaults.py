@@ -138,6 +138,8 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     if given(config.psf.stamp) % 2 == 0:
         raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
     fit, stars = config.reconstruction, config.stars
+    if fit.model == "focal_plane" and not config.atmosphere.enabled:
+        raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
     if fit.basis == "pixels" and fit.components is not None:
         raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
     if fit.interpolation == "gp" and fit.weights != "equal":

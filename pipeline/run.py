@@ -20,9 +20,10 @@ from ..core.products import write_ecsv
 from ..core.progress import Reporter
 from ..core.threads import thread_count
 from ..core.version import VERSION
-from .ccd_product import product_path, read_product, write_product
+from .ccd_product import MODEL_CARD, product_path, read_product, write_product
 from .config import Configuration
 from .experiment import Experiment
+from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .measure.summary import correlations, run_metrics
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
@@ -122,13 +123,27 @@ def run(
     if not names:
         name, reason = next(iter(failed.items()))
         raise DomainError(f"none of {len(failed)} CCDs can be modelled; CCD {name}: {reason}")
-    with reporter.stage("correlations"):
+    with reporter.stage("products"):
         stamp = stamp_of(experiment)
         # Plots and metrics need no noise-free PSF again, and 189 CCDs of 800 are half a gigabyte.
         products = [read_product(product_path(folder, name), stamp, holdout_images=False) for name in names]
+    chi2: dict[str, float] = {}
+    warnings: tuple[str, ...] | None = None
+    if experiment.config.reconstruction.model == "focal_plane":
+        products, model = apply_focal_plane_model(experiment, products, threads=threads, reporter=reporter)
+        with reporter.stage("products with the focal-plane PSF model"):
+            write_focal_plane_model(folder, products, model, stamp)
+        warnings, chi2 = model.warnings, {f"chi2_left_out_{name.split()[-1]}": v for name, v in model.chi2.items()}
+        for warning in warnings:
+            reporter.line(warning)
+    with reporter.stage("correlations"):
         correlated = correlations(products)
         origin = {**stamp.meta(), "configuration": experiment.config.as_dict()}
-        summary = {**origin, **run_metrics(products, correlated), "not_modelled": failed}
+        metrics = run_metrics(products, correlated)
+        metrics["all"] |= chi2
+        summary = {**origin, **metrics, "not_modelled": failed}
+        if warnings is not None:
+            summary["warnings"] = list(warnings)
         write_json(folder / SUMMARY_NAME, summary)
     with reporter.stage("focal plane"):
         _write_focal_plane(experiment, folder)
@@ -151,6 +166,8 @@ def _write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> N
         ("ATMOSPH", config.atmosphere.enabled, "whether there is an atmosphere"),
         ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
     ]
+    if config.reconstruction.model == "focal_plane":
+        cards.append((MODEL_CARD, "ccd", "model of the columns MODEL_E1 and so on"))
     write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), cards)
 
 

@@ -3,8 +3,12 @@ import pytest
 import yaml
 
 import pachon
+from pachon.core.errors import DomainError
+from pachon.core.products import image_hdu, write_fits
+from pachon.pipeline import focal_plane_stage
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
 from pachon.pipeline.run import run
 
 # A run small enough for tests: far too few stars and steps for figures that mean anything, every stage real.
@@ -73,6 +77,77 @@ def settings_file(tmp_path):
     path = tmp_path / "small.yaml"
     path.write_text(yaml.safe_dump(SETTINGS))
     return path
+
+
+class Shapes:
+    """Shapes of a plane over the detector, as a focal-plane model returns them."""
+
+    def __init__(self, values):
+        self.e1, self.e2, self.size = values[:, 0], values[:, 1], np.exp(values[:, 2])
+
+
+class Plane:
+    """Stand-in for a focal-plane model: a plane through the shapes of the stars, and their scatter."""
+
+    warnings = ("the plane is <flat>",)
+    fits = 0
+
+    @classmethod
+    def fit_run(cls, experiment, products, threads=None, reporter=None):
+        cls.fits += 1
+        stars = FocalPlaneStars.from_products(products)
+        if len(stars) < 30:
+            raise DomainError(f"{len(stars)} stars: expected at least 30")
+        model = cls()
+        terms = cls.terms(stars.x, stars.y)
+        model.planes = np.linalg.lstsq(terms, stars.values, rcond=None)[0]
+        left = stars.values - terms @ model.planes
+        model.scatter = left.std(axis=0)
+        inside = np.diag(terms @ np.linalg.pinv(terms))
+        model.leave_one_out = Shapes(stars.values - left / (1.0 - inside[:, None]))
+        model.chi2 = {"e1": 0.5, "e2": 1.5, "size": 2.5}
+        return model
+
+    @staticmethod
+    def terms(x, y):
+        return np.stack([np.ones(len(x)), x, y], axis=1)
+
+    def shapes(self, ccd, x, y, *, threads=None):
+        return Shapes(self.terms(x, y) @ self.planes)
+
+    def uncertainty(self, ccd, x, y, *, threads=None):
+        found = self.shapes(ccd, x, y)
+        found.e1, found.e2 = (np.full(len(x), s) for s in self.scatter[:2])
+        found.size = found.size * self.scatter[2]
+        return found
+
+    def write(self, path):
+        write_fits(path, [image_hdu("PLANES", self.planes, "of e1, e2, ln size")], None, [])
+
+
+@pytest.fixture
+def plane_model(monkeypatch):
+    """A plane in place of the focal-plane model, for what does not depend on which model it is."""
+    monkeypatch.setattr(focal_plane_stage, "FocalPlanePsf", Plane)
+    monkeypatch.setattr(Plane, "fits", 0)
+    return Plane
+
+
+@pytest.fixture(scope="session")
+def focal_plane_config(tiny):
+    """Two CCDs of twenty stars each, the mean over all turbulence: ``focal_plane_config(ccds=("R22_S11",))``."""
+
+    def make(**options):
+        mine = {
+            "ccds": ("R22_S11", "R22_S12"),
+            "stars__observed": 20,
+            "wavelengths_nm": [620.0],
+            "psf__engine": "long_exposure",
+            "psf__n_pupil": 300,
+        }
+        return tiny(**(mine | {"reconstruction__model": "focal_plane"} | options))
+
+    return make
 
 
 def pytest_collection_modifyitems(items):

@@ -8,30 +8,41 @@ from typing import Any
 import numpy as np
 
 from ...core.units import ARCMIN, ARCSEC
-from ..ccd_product import CcdProduct, Stars
+from ..ccd_product import CCD_KINDS, CcdProduct, Stars
 from .correlation import SEPARATION_RANGES, Correlation, shear_correlation
 
 #: Ellipticities that are correlated; ``truth`` and ``away`` (noise-free - model) are of the holdout positions.
 CORRELATED = ("truth", "observed", "residual", "away")
+#: Shape parameters of which a focal-plane model predicts its uncertainty.
+_PREDICTED = ("e1", "e2", "size")
 #: Pairs are counted from here on [arcmin].
 SHORTEST_ARCMIN = 0.5
 _BINS_PER_DECADE = 6
 
 
-def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] = CORRELATED) -> dict[str, Correlation]:
+def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] | None = None) -> dict[str, Correlation]:
     """Correlate ellipticities and residuals, of :data:`~.KINDS`, over all CCDs (Jee & Tyson 2011, Fig. 14).
+
+    By default those of :data:`CORRELATED` and, beside a focal-plane model, the residuals of the CCDs' own models.
 
     Residuals at the stars of an unweighted fit with a constant term sum to zero over each CCD, so their correlation
     between CCDs cancels for any error of the model; those at holdout positions apply to galaxies. Errors are by
     jackknife over the CCDs where there are two or more.
     """
     bins = separation_bins(products)
+    if kinds is None:
+        kinds = CORRELATED + CCD_KINDS if of_focal_plane(products) else CORRELATED
     result = {}
     for kind in kinds:
         stars = [p.stars(kind) for p in products]
         x, y = (np.concatenate([getattr(s, key) for s in stars]) for key in ("field_x", "field_y"))
         result[kind] = shear_correlation(x, y, *ellipticities(products, kind), patch=patches(stars), **bins)
     return result
+
+
+def of_focal_plane(products: Sequence[CcdProduct]) -> bool:
+    """Return whether the model of all products is one of the whole focal plane."""
+    return all(p.of_focal_plane for p in products)
 
 
 def ellipticities(products: Sequence[CcdProduct], kind: str) -> np.ndarray:
@@ -75,7 +86,8 @@ def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
     """Return the metrics of a run: of each CCD, of all together, and the correlations.
 
     ``xi_plus_..._short`` is the mean of xi+ over pairs closer than 10 arcmin, ``xi_plus_..._long`` over those from 10
-    to 180 arcmin.
+    to 180 arcmin. Beside a focal-plane model, keys that end in ``_ccd`` are of the CCDs' own models, and ``chi2_away_``
+    is the mean square of noise-free - model over its predicted uncertainty.
     """
     fwhm = np.concatenate([p.holdout.fwhm for p in products]) / ARCSEC
     together = {
@@ -101,14 +113,27 @@ def run_metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlatio
 def _common_metrics(products: Sequence[CcdProduct]) -> dict[str, Any]:
     """Return the metrics of which a run has the same as each of its CCDs."""
     residuals = {"at_stars": "residual", "left_out": "left_out", "away": "away"}
+    chi2 = {}
+    if of_focal_plane(products):
+        residuals |= {"at_stars_ccd": "residual_ccd", "away_ccd": "away_ccd"}
+        chi2 = {f"chi2_away_{key}": _chi2_away(products, key) for key in _PREDICTED}
     return {
         "truth_psfs": sum(len(p.holdout) for p in products),
         "stars": sum(len(p.observed) for p in products),
         "stars_used": sum(int(p.observed.used.sum()) for p in products),
         **{f"mean_e_{k}": finite_mean(np.hypot(*ellipticities(products, k))) for k in ("truth", "observed")},
         **{f"rms_residual_{name}": rms(ellipticities(products, kind)) for name, kind in residuals.items()},
+        **chi2,
         "truth_variance_in_components": min(p.noise_free_model.explained for p in products),
     }
+
+
+def _chi2_away(products: Sequence[CcdProduct], key: str) -> float:
+    """Return the mean square of noise-free - model over the predicted uncertainty, at holdout positions."""
+    true, model, sigma = (
+        np.concatenate([getattr(p.holdout, f"{start}{key}") for p in products]) for start in ("", "model_", "sigma_")
+    )
+    return finite_mean(((true - model) / sigma) ** 2)
 
 
 def finite_mean(values: np.ndarray) -> float:

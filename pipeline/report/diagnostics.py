@@ -19,12 +19,20 @@ from astropy.table import Table
 from ...core.errors import PachonError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Stamp, described_table, write_ecsv
-from ..ccd_product import KINDS, CcdProduct, Stars, product_path, read_product
+from ..ccd_product import CCD_KINDS, KINDS, CcdProduct, Stars, product_path, read_product
 from ..config import load_configuration
 from ..experiment import Experiment
 from ..measure.correlation import Correlation
 from ..measure.rho_statistics import RhoStatistics, rho_statistics, trace_of_moments
-from ..measure.summary import correlations, ellipticities, finite_mean, patches, rms, separation_bins
+from ..measure.summary import (
+    correlations,
+    ellipticities,
+    finite_mean,
+    of_focal_plane,
+    patches,
+    rms,
+    separation_bins,
+)
 from ..run_folder import CONFIG_NAME, SUMMARY_NAME, stamp_of
 from .focal_plane_plots import residual_plot
 from .statistics_plots import correlation_plot, rho_plot
@@ -32,12 +40,14 @@ from .statistics_plots import correlation_plot, rho_plot
 #: Residuals: at the stars, of stars left out, away from them.
 RESIDUALS = ("residual", "left_out", "away")
 #: Those of them whose size is known too.
-SIZED = ("residual", "away")
+SIZED = ("residual", "away", *CCD_KINDS)
 FOLDER_NAME = "diagnostics"
 _MEANINGS = {
     "residual": "observed - model, at the stars",
     "left_out": "observed - model fitted without the star",
     "away": "noise-free - model, at holdout positions",
+    "residual_ccd": "observed - the CCD's own model, at the stars",
+    "away_ccd": "noise-free - the CCD's own model, at holdout positions",
 }
 
 
@@ -50,7 +60,8 @@ class Diagnostics:
     missing: dict[str, str]  #: reason by CCD without a readable product
     table: Table  #: means and rms of the residuals, a row for each CCD
     overall: dict[str, Any]  #: the same over all CCDs, and metrics of the correlations; keys end in their unit
-    #: Of each of :data:`~.KINDS`, with errors by jackknife over the CCDs where there are two or more.
+    #: Of each of :data:`~.KINDS`, with errors by jackknife over the CCDs where there are two or more; with a
+    #: focal-plane model also of :data:`~.CCD_KINDS`, as in the table.
     correlations: dict[str, Correlation]
     rho: dict[str, RhoStatistics]  #: at the stars (``residual``), and at holdout positions (``away``)
 
@@ -91,16 +102,17 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     products, missing = [], {}
     for name in names:
         try:
-            products.append(_product(folder, name, stamp))
+            products.append(_product(folder, name, stamp, config.reconstruction.model))
         except ProductError as error:
             missing[name] = str(error)
             # Damage happens to single files; a folder without any that can be read has another reason.
             if strict or len(missing) == len(names):
                 raise
-    columns = _ccd_columns(products)
-    correlated = correlations(products, KINDS)
-    rho = {kind: _rho(products, kind) for kind in SIZED}
-    overall = _overall(products, correlated)
+    residuals = RESIDUALS + CCD_KINDS if of_focal_plane(products) else RESIDUALS
+    columns = _ccd_columns(products, residuals)
+    correlated = correlations(products, products[0].kinds)
+    rho = {kind: _rho(products, kind) for kind in ("residual", "away")}
+    overall = _overall(products, residuals, correlated)
 
     out = folder / FOLDER_NAME if out is None else out
     make_folder(out)
@@ -113,7 +125,7 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     }
     pictures = {
         "residuals.png": residual_plot(experiment.camera, {name: values for name, (values, _, _) in columns.items()}),
-        "correlations.png": correlation_plot(correlated),
+        "correlations.png": correlation_plot({kind: correlated[kind] for kind in KINDS}),
         "rho.png": rho_plot(rho),
     }
     for name, (what, content) in tables.items():
@@ -126,11 +138,14 @@ def diagnose(folder: Path, out: Path | None = None, *, strict: bool = False) -> 
     return result
 
 
-def _product(folder: Path, name: str, stamp: Stamp) -> CcdProduct:
+def _product(folder: Path, name: str, stamp: Stamp, model: str) -> CcdProduct:
     """Return the product of a CCD, or raise the reason for its absence from the summary of the run."""
     path = product_path(folder, name)
     if path.exists():
-        return read_product(path, stamp, holdout_images=False)
+        product = read_product(path, stamp, holdout_images=False)
+        if model == "focal_plane" and not product.of_focal_plane:
+            raise ProductError(f"CCD {name}: has no focal-plane model yet, which pachon run --resume adds")
+        return product
     reason = "has no product yet"
     with suppress(OSError, ValueError, KeyError):
         reason = json.loads((folder / SUMMARY_NAME).read_text())["not_modelled"][name]
@@ -161,7 +176,7 @@ def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:
     return metrics
 
 
-def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, str, str]]:
+def _ccd_columns(products: Sequence[CcdProduct], residuals: Sequence[str]) -> dict[str, tuple[np.ndarray, str, str]]:
     columns: dict[str, tuple[np.ndarray, str, str]] = {
         "ccd": (np.array([p.name for p in products]), "", "name of the CCD"),
         "x_mm": (np.array([round(p.center[0] * 1e3, 6) for p in products]), "mm", "centre on the detector"),
@@ -170,7 +185,7 @@ def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, 
         "stars_used": (np.array([int(p.observed.used.sum()) for p in products]), "", "stars in the fit"),
         "truth_psfs": (np.array([len(p.holdout) for p in products]), "", "places where the PSF is known"),
     }
-    for kind in RESIDUALS:
+    for kind in residuals:
         rows = [_moments([p], kind) for p in products]
         for key in rows[0]:
             what = key.partition("_")[0]
@@ -180,13 +195,15 @@ def _ccd_columns(products: Sequence[CcdProduct]) -> dict[str, tuple[np.ndarray, 
     return columns
 
 
-def _overall(products: Sequence[CcdProduct], correlated: Mapping[str, Correlation]) -> dict[str, Any]:
+def _overall(
+    products: Sequence[CcdProduct], residuals: Sequence[str], correlated: Mapping[str, Correlation]
+) -> dict[str, Any]:
     metrics: dict[str, Any] = {
         "ccds": len(products),
         "stars": sum(len(p.observed) for p in products),
         "truth_psfs": sum(len(p.holdout) for p in products),
     }
-    for kind in RESIDUALS:
+    for kind in residuals:
         metrics |= _moments(products, kind)
     for kind, correlation in correlated.items():
         r = correlation.r_arcmin

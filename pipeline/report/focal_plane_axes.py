@@ -19,6 +19,8 @@ from ...models.camera.camera import Camera
 
 #: Colour of each quantity in every plot; blue and red for observed and residual as in Jee & Tyson 2011.
 TRUTH, OBSERVED, RESIDUAL, AWAY, LEFT_OUT = GREY, BLUE, RED, ORANGE, PURPLE
+#: Residuals of the CCDs' own models, beside those of a focal-plane model.
+CCD_MODEL = GREY
 RESIDUAL_TITLES = {
     "residual": "at the stars: observed - model",
     "left_out": "at stars left out: observed - model",

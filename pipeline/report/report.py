@@ -12,11 +12,20 @@ from ..config import ReconstructionConfig, to_yaml
 from ..defaults import noise_free_components
 from ..experiment import Experiment
 from ..measure.correlation import Correlation
+from ..measure.summary import CORRELATED, of_focal_plane
 from .focal_plane_plots import close_up_plot, heights_plot, whiskers_plot
 from .page import Picture, render
 from .psf_plots import eigen_psf_plot, spectrum_plot, stamps_plot
-from .statistics_plots import correlation_plot, scatter_plot
-from .tables import PER_CCD_CAPTION, PER_CCD_COLUMNS, headline, per_ccd
+from .statistics_plots import correlation_plot, models_plot, scatter_plot
+from .tables import (
+    MODELS_CAPTION,
+    MODELS_COLUMNS,
+    PER_CCD_CAPTION,
+    PER_CCD_COLUMNS,
+    headline,
+    models_rows,
+    per_ccd,
+)
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
 _CLOSE_UPS = 3
@@ -34,6 +43,9 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
         caption=PER_CCD_CAPTION,
         columns=PER_CCD_COLUMNS,
         ccds=per_ccd(summary),
+        models=models_rows(summary),
+        models_caption=MODELS_CAPTION,
+        models_columns=MODELS_COLUMNS,
         pictures=pictures,
         configuration=to_yaml(experiment.config),
         model=_model_words(experiment.config.reconstruction),
@@ -46,7 +58,8 @@ def _model_words(fit: ReconstructionConfig) -> str:
     basis = described[fit.basis] if fit.components is None else f"{fit.components} {described[fit.basis]}"
     process = "a Gaussian process over " if fit.interpolation == "gp" else ""
     weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
-    return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}"
+    whole = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
+    return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}{whole}"
 
 
 def draw_pictures(
@@ -56,10 +69,16 @@ def draw_pictures(
     config, plane = experiment.config, experiment.focal_plane
     radius = experiment.field_radius_on_detector
     close = closest_middle_farthest(products)
-    optics = not config.atmosphere.enabled
+    optics, whole = not config.atmosphere.enabled, of_focal_plane(products)
     components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
     errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
+    at_stars = (
+        "Residuals at the stars hold the noise of each star, some of which the model has followed"
+        if whole
+        else "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
+        "whatever the error of the model is"
+    )
     pictures = [
         Picture(
             "Focal plane",
@@ -122,10 +141,9 @@ def draw_pictures(
         ),
         Picture(
             "Correlation of the ellipticity",
-            correlation_plot(correlated),
+            correlation_plot({kind: correlated[kind] for kind in CORRELATED}),
             "ξ+ and ξ- by TreeCorr; filled symbols are positive, open ones negative. Error bars are "
-            f"{errors}, cut off where they would pass zero. Residuals at the stars of a CCD sum to "
-            "zero by construction, so their correlation between CCDs cancels whatever the error of the model is; "
+            f"{errors}, cut off where they would pass zero. {at_stars}; "
             "triangles, away from the stars, apply to galaxies. Where the CCDs lie in a row, long pairs all point "
             "along it, and an ellipticity common to the field does not average out of ξ-.",
             "Fig. 14: ξ+ of about 3e-5 before, about 1e-8 after the correction (189 CCDs, at the stars only), below "
@@ -137,9 +155,21 @@ def draw_pictures(
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
             "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
             "only that noise is left. A bright star can show more: mean and components are fitted without weights, "
-            "so the noise of the faint stars is in the model.",
+            "so the noise of the faint stars is in the model."
+            + (" The model here is the CCD's own: that of the focal plane has shapes only." if whole else ""),
         ),
     ]
+    if whole:
+        pictures.append(
+            Picture(
+                "Residuals of both models",
+                models_plot(correlated),
+                "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "
+                "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative. Residuals at the "
+                "stars sum to zero over each CCD where it has a model of its own, so their correlation between CCDs "
+                "cancels whatever the error of that model is.",
+            )
+        )
     # Single pixels and shapelets look the same whatever the stars are.
     return [p for p in pictures if config.reconstruction.basis == "pca" or p.title != OBSERVED_COMPONENTS]
 

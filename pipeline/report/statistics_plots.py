@@ -12,7 +12,7 @@ from ..ccd_product import CcdProduct
 from ..measure.correlation import Correlation
 from ..measure.rho_statistics import RhoStatistics
 from ..measure.summary import ellipticities
-from .focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
+from .focal_plane_axes import AWAY, CCD_MODEL, LEFT_OUT, OBSERVED, RESIDUAL, RESIDUAL_TITLES, TRUTH
 
 _LABELS = {
     "truth": (TRUTH, "o", "noise-free PSFs, at holdout positions"),
@@ -94,6 +94,24 @@ def correlation_plot(correlated: dict[str, Correlation]) -> bytes:
         hollow = panels[0].plot([], [], "o", color="0.4", markersize=4.5, markerfacecolor="white")[0]
         handles, labels = [*handles, filled, hollow], [*labels, "positive", "negative"]
         figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        return png_bytes(figure)
+
+
+def models_plot(correlated: Mapping[str, Correlation]) -> bytes:
+    """Draw xi+ of the residuals of a focal-plane model beside those of the CCDs' own models."""
+    with styled():
+        figure = new_figure(11.5, 5.0)
+        panels = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axes, kind in zip(panels, ("residual", "away"), strict=True):
+            color, marker, _ = _LABELS[kind]
+            draw_correlation(axes, correlated[kind], "plus", color, marker, "model of the focal plane")
+            draw_correlation(axes, correlated[f"{kind}_ccd"], "plus", CCD_MODEL, "s", "models CCD by CCD")
+            log_axes(axes, RESIDUAL_TITLES[kind])
+            axes.set_xlabel("separation [arcmin]")
+            axes.legend(loc="best")
+        panels[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
+        low, high = panels[0].get_ylim()
+        panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
         return png_bytes(figure)
 
 

@@ -36,11 +36,46 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     low, high = SEPARATION_RANGES["long"]
     for kind in CORRELATED:
-        near, far = (
-            f"{_power(metrics[f'xi_plus_{kind}_{name}'])} ± {_power(metrics[f'error_xi_plus_{kind}_{name}'])}"
-            for name in ("short", "long")
-        )
+        near, far = (_xi_plus(metrics, kind, name) for name in ("short", "long"))
         rows.append((f"ξ+ of {_NAMES[kind]}, below {low:g}' / {low:g}' to {high:g}'", f"{near} / {far}"))
+    return rows
+
+
+def _xi_plus(metrics: dict[str, Any], kind: str, name: str) -> str:
+    """Return a mean xi+ with its error."""
+    return f"{_power(metrics[f'xi_plus_{kind}_{name}'])} ± {_power(metrics[f'error_xi_plus_{kind}_{name}'])}"
+
+
+MODELS_COLUMNS = ("", "focal plane", "CCD by CCD")
+MODELS_CAPTION = (
+    "One model of the whole focal plane, which fills the products, beside the models of the single CCDs. rms of one "
+    "component of the residual; mean ξ+ of the residuals; reduced chi-square: mean square of the difference over the "
+    "uncertainty that the model predicts, of noise-free - model at holdout positions, and of observed - model fitted "
+    "without the star, noise of the star included."
+)
+
+
+def models_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return rows of the focal-plane model beside the CCDs' own models, in the columns of :data:`MODELS_COLUMNS`.
+
+    There are none in a run without a focal-plane model.
+    """
+    metrics = summary["all"]
+    if "rms_residual_away_ccd" not in metrics:
+        return []
+    rows: list[tuple[str, ...]] = [
+        (f"rms e residual, {name}", *(_percent(metrics[f"rms_residual_{key}{end}"]) for end in ("", "_ccd")))
+        for key, name in (("at_stars", "at the stars"), ("away", "at holdout positions (noise-free)"))
+    ]
+    for kind in ("residual", "away"):
+        for name, (low, high) in SEPARATION_RANGES.items():
+            words = f"{low:g}' to {high:g}'" if low > 0.0 else f"below {high:g}'"
+            both = (_xi_plus(metrics, f"{kind}{end}", name) for end in ("", "_ccd"))
+            rows.append((f"ξ+ of {_NAMES[kind]}, {words}", *both))
+    for key, name in (("left_out", "leave-one-out"), ("away", "at holdout positions")):
+        chi2 = {k.rpartition("_")[2]: v for k, v in metrics.items() if k.startswith(f"chi2_{key}_")}
+        values = ", ".join(f"{v:.2f}" for v in chi2.values())
+        rows.append((f"reduced chi-square, {name}: {', '.join(chi2)}", values, "-"))
     return rows
 
 
@@ -97,6 +132,8 @@ def diagnostics_rows(overall: dict[str, Any]) -> list[tuple[str, ...]]:
         return _power(overall.get(key, math.nan))
 
     names = {"residual": _NAMES["residual"], "left_out": "the same, star left out of the fit", "away": _NAMES["away"]}
+    if "rms_e_away_ccd" in overall:
+        names |= {"residual_ccd": "CCD's own model, at the stars", "away_ccd": "CCD's own model, at holdout positions"}
     return [
         (
             name,

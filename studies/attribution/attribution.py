@@ -21,11 +21,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.progress import Reporter
-from ...pipeline.ccd_product import KINDS, CcdProduct
+from ...pipeline.ccd_product import CCD_KINDS, CcdProduct
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
+from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
-from ...pipeline.measure.summary import correlations, run_metrics
+from ...pipeline.measure.summary import correlations, of_focal_plane, run_metrics
 from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
@@ -33,6 +34,7 @@ from ...pipeline.simulate.ccd_model import model_ccd
 from .causes import CAUSES, FULL, NOISE, OPTICS, checked_causes
 
 _RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
+_RMS_CCD = ("rms_residual_at_stars_ccd", "rms_residual_away_ccd")
 _XI = ("truth", "observed", "residual", "away")
 
 
@@ -42,7 +44,8 @@ class Attribution:
 
     Metrics are rms of e and of its residuals, median FWHM, and the mean xi+ of noise-free PSFs, observed stars and
     residuals, over short and long separations. ``change_`` and a key is the effect of the cause, the full case less
-    this one; ``error_`` and a key of xi+ its jackknife error over the CCDs.
+    this one; ``error_`` and a key of xi+ its jackknife error over the CCDs. With a focal-plane model there are those of
+    the CCDs' own models too, with ``_ccd`` in their keys.
     """
 
     metrics: dict[str, dict[str, float]]  #: by case
@@ -73,7 +76,7 @@ def attribute(
             products, noiseless = _products(experiment, case, NOISE in chosen and case == FULL, threads, reporter)
             for name, found in ((case, products), (NOISE, noiseless)):
                 if found:
-                    correlated[name] = correlations(found, KINDS)
+                    correlated[name] = correlations(found, found[0].kinds)
                     metrics[name] = _metrics(found, correlated[name])
     order = (FULL, *chosen)
     for name in chosen:
@@ -95,18 +98,33 @@ def _products(
 ) -> tuple[list[CcdProduct], list[CcdProduct]]:
     """Return the products of all CCDs, and of the same stars without noise."""
     noisy_or_not = (True, False) if noiseless else (True,)
+    whole = experiment.config.reconstruction.model == "focal_plane"
 
     def model(exposure: CcdExposure) -> list[CcdProduct]:
-        return [_without_images(model_ccd(experiment, exposure, noisy=noisy)) for noisy in noisy_or_not]
+        # A focal-plane model takes the noise of the stars from their stamps.
+        return [_without_images(model_ccd(experiment, exposure, noisy=noisy), whole) for noisy in noisy_or_not]
 
     title = "everything on" if case == FULL else f"{case} off"
     models = simulate_ccds(experiment, model, title=title, threads=threads, reporter=reporter).results.values()
-    return [m[0] for m in models], [m[1] for m in models if noiseless]
+    noisy, noise_free = [m[0] for m in models], [m[1] for m in models if noiseless]
+    if whole:
+        noisy = _of_focal_plane(experiment, noisy, threads, reporter)
+        noise_free = _of_focal_plane(experiment, noise_free, threads, reporter) if noiseless else []
+    return noisy, noise_free
 
 
-def _without_images(product: CcdProduct) -> CcdProduct:
-    """Return a product without its stamps: half a gigabyte for 189 CCDs."""
-    return replace(product, holdout_images=product.holdout_images[:0], observed_images=product.observed_images[:0])
+def _of_focal_plane(
+    experiment: Experiment, products: list[CcdProduct], threads: int | None, reporter: Reporter
+) -> list[CcdProduct]:
+    """Return products with the focal-plane model of all of them, without any stamps."""
+    applied, _ = apply_focal_plane_model(experiment, products, threads=threads, reporter=reporter)
+    return [_without_images(product, keep_stars=False) for product in applied]
+
+
+def _without_images(product: CcdProduct, keep_stars: bool) -> CcdProduct:
+    """Return a product without its stamps, half a gigabyte for 189 CCDs, but for those of the stars where asked."""
+    stars = product.observed_images if keep_stars else product.observed_images[:0]
+    return replace(product, holdout_images=product.holdout_images[:0], observed_images=stars)
 
 
 def _metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation]) -> dict[str, float]:
@@ -114,7 +132,9 @@ def _metrics(products: Sequence[CcdProduct], correlated: dict[str, Correlation])
     e = np.concatenate([[p.holdout.e1, p.holdout.e2] for p in products], axis=1)
     metrics = {"rms_e_truth": float(np.sqrt(np.nanmean(e**2)))}
     metrics |= {key: float(together[key]) for key in _RMS if key != "rms_e_truth"}
-    for kind in _XI:
+    if of_focal_plane(products):
+        metrics |= {key: float(together[key]) for key in _RMS_CCD}
+    for kind in (k for k in (*_XI, *CCD_KINDS) if k in correlated):
         for name in SEPARATION_RANGES:
             metrics[f"xi_plus_{kind}_{name}"] = correlated[kind].mean_xi_plus(name)
     return metrics
@@ -131,7 +151,7 @@ def changes(
     The stars are the same in both, so that errors in common cancel.
     """
     found = {f"change_{key}": full[key] - case[key] for key in case}
-    for kind in _XI:
+    for kind in (k for k in (*_XI, *CCD_KINDS) if k in with_all):
         for name in SEPARATION_RANGES:
             one, other = with_all[kind], without[kind]
             error = np.nan

@@ -48,6 +48,8 @@ def _nothing_left(config: Configuration) -> str | None:
 def _no_atmosphere(config: Configuration) -> str | None:
     if not config.atmosphere.enabled:
         return "atmosphere.enabled = false"
+    if config.reconstruction.model == "focal_plane":
+        return "reconstruction.model = focal_plane, which needs it"
     return "psf.engine = long_exposure, which needs it" if config.psf.engine == "long_exposure" else None
 
 

@@ -50,7 +50,8 @@ def _meaning(key: str) -> str:
             return words + _meaning(key.removeprefix(start))
     if key.startswith("xi_plus_"):
         low, high = SEPARATION_RANGES[key.rpartition("_")[2]]
-        return f"mean xi+ of {key.split('_')[2]}, {low:g} to {high:g} arcmin"
+        kind = key.removeprefix("xi_plus_").rpartition("_")[0].replace("_ccd", " of the CCDs' own models")
+        return f"mean xi+ of {kind}, {low:g} to {high:g} arcmin"
     return "median FWHM" if key == "fwhm_arcsec" else key.replace("_", " ") + ", one component"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.units import ARCSEC
+from ...pipeline.focal_plane_stage import refuse_focal_plane_model
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.measure.summary import ccd_metrics
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_positions
@@ -63,6 +64,7 @@ def reconstruction(scene: Scene) -> dict[str, float]:
 
     With noise, rounding could change the number of photons in a pixel, and with it all random numbers that follow.
     """
+    refuse_focal_plane_model(scene.camera_experiment.config, "a baseline takes the model of one CCD")
     name = scene.plan.ccds[0]
     exposure = expose_ccd(scene.camera_experiment, name, threads=scene.threads)
     found = ccd_metrics(model_ccd(scene.camera_experiment, exposure, noisy=False))

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from ...core.units import ARCSEC
 from ...design.images.encircled_energy import energy_curve
+from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.correlation import SEPARATION_RANGES
 from ...pipeline.measure.summary import correlations, run_metrics
 from ...pipeline.psf_model.polynomial import design_matrix
@@ -108,7 +109,9 @@ def reconstruction(scene: Scene) -> dict[str, float]:
     experiment = scene.camera_experiment
     simulated = simulate_ccds(experiment, partial(model_ccd, experiment), threads=scene.threads)
     products = list(simulated.results.values())
-    found = correlations(products)
+    if experiment.config.reconstruction.model == "focal_plane":
+        products, _ = apply_focal_plane_model(experiment, products, threads=scene.threads)
+    found = correlations(products, ("residual", "away"))
     together = run_metrics(products, found)["all"]
     metrics = {
         f"xi_{kind}_{name}": found[kind].mean_xi_plus(name)

@@ -18,6 +18,7 @@ from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
+from ...pipeline.focal_plane_stage import refuse_focal_plane_model
 from ...pipeline.memory import check_memory
 from .plan import NOISE_FREE, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
@@ -76,8 +77,9 @@ class Study:
 def study_experiment(config: Configuration, plan: Plan) -> Experiment:
     """Return the experiment of a plan, with as many observed stars as the largest case needs.
 
-    Stars with defects are a ConfigError: the study adds its own noise.
+    Stars with defects are a ConfigError, since the study adds its own noise, and so is a focal-plane model.
     """
+    refuse_focal_plane_model(config, "a study compares models of single CCDs")
     for key in ("neighbours", "cosmic_rays", "saturated"):
         if (value := getattr(config.stars, key)) > 0.0:
             raise ConfigError(f"stars.{key} = {value:g}: expected 0, the stars of a study have noise but no defects")

@@ -11,7 +11,7 @@ from astropy.io import fits
 from pachon.core import files as products
 from pachon.core.errors import ProductError
 from pachon.core.files import json_text, write_bytes
-from pachon.core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from pachon.core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits, write_hdus
 
 STAMP = Stamp("ab" * 32, 7, "1.2.3")
 
@@ -54,6 +54,17 @@ def test_the_same_content_gives_the_same_bytes_and_standard_checksums(tmp_path):
     # astropy's own check of CHECKSUM and DATASUM warns where one is wrong, and warnings are errors here.
     with fits.open(tmp_path / "a.fits", checksum=True) as hdus:
         assert all("DATASUM" in hdu.header for hdu in hdus)
+
+
+def test_a_product_written_again_keeps_its_bytes_and_a_changed_one_its_checksums(tmp_path):
+    path = tmp_path / "a.fits"
+    write_example(path)
+    write_hdus(tmp_path / "again.fits", read_fits(path))
+    assert (tmp_path / "again.fits").read_bytes() == path.read_bytes()
+    hdus = read_fits(path)
+    hdus[0].header["CCD"] = "R22_S12"
+    write_hdus(path, hdus)
+    assert read_fits(path)[0].header["CCD"] == "R22_S12"
 
 
 @pytest.mark.parametrize("where", [100, 3000, -2000])

@@ -8,9 +8,10 @@ from scipy.special import j0
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, UnknownNameError
 from pachon.core.units import ARCSEC
-from pachon.pipeline.ccd_product import KINDS
+from pachon.pipeline.ccd_product import CCD_KINDS, KINDS
 from pachon.pipeline.config import load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
 from pachon.pipeline.measure.correlation import SEPARATION_RANGES, shear_correlation
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.measure.summary import correlations
@@ -180,6 +181,7 @@ def test_causes_that_are_off_are_no_causes(tiny):
         ({"psf__diffusion_pixels": 0.0}, "diffusion", "psf.diffusion_pixels = 0"),
         ({}, "active_optics", "active_optics.residual_um = 0"),
         ({"atmosphere__ground_lift_m": 200.0}, "ground_layer", "no layer is on the ground"),
+        ({"reconstruction__model": "focal_plane"}, "atmosphere", "reconstruction.model = focal_plane, which needs it"),
         ({"psf__engine": "long_exposure"}, "ground_layer", "no star is imaged through turbulence"),
         ({"atmosphere__enabled": False}, OPTICS, "nothing would be left"),
     ):
@@ -239,3 +241,29 @@ def test_bad_input_is_one_line(settings_file, tmp_path, capsys, arguments, parts
     for part in parts:
         assert part in err
     assert not (tmp_path / "out").exists()
+
+
+def test_cases_have_the_focal_plane_model_that_a_run_has(focal_plane_config, plane_model, tmp_path):
+    config = focal_plane_config()
+    result = attribute(config, ("tilt", NOISE), threads=1)
+    assert plane_model.fits == 3
+    for case, options, noisy in ((FULL, {}, True), ("tilt", {"focal_plane__tilt": False}, True), (NOISE, {}, False)):
+        experiment = Experiment.from_config(with_options(config, **options))
+        products = [model_ccd(experiment, expose_ccd(experiment, name, threads=1), noisy=noisy) for name in config.ccds]
+        applied, _ = apply_focal_plane_model(experiment, products)
+        expected = correlations(applied, (*KINDS, *CCD_KINDS))
+        assert tuple(result.correlations[case]) == tuple(expected)
+        for kind, found in result.correlations[case].items():
+            assert found.xi_plus.tobytes() == expected[kind].xi_plus.tobytes()
+        metrics = result.metrics[case]
+        for end, of in (("", applied), ("_ccd", products)):
+            away = np.concatenate([p.ellipticity("away") for p in of], axis=1)
+            assert metrics[f"rms_residual_away{end}"] == np.sqrt(np.mean(away**2))
+    tilt, full = result.metrics["tilt"], result.metrics[FULL]
+    key = "xi_plus_away_ccd_short"
+    assert tilt[f"change_{key}"] == full[key] - tilt[key]
+    assert "atmosphere" not in checked_causes(config)
+    write_attribution(result, tmp_path, config)
+    table = Table.read(tmp_path / "attribution.ecsv")
+    assert table[key].description == "mean xi+ of away of the CCDs' own models, 0 to 10 arcmin"
+    assert table["xi_plus_away_short"].description == "mean xi+ of away, 0 to 10 arcmin"

@@ -19,11 +19,14 @@ from pachon.core.errors import ConfigError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.io.prescription import DATA, load_telescope, save_telescope
 from pachon.models.shapes.shape import EvenAsphere
+from pachon.pipeline.config import Configuration, with_options
+from pachon.pipeline.experiment import Experiment
 from pachon.studies.baseline.baseline import bundled_baselines, check_baseline, make_baseline
 from pachon.studies.baseline.file import baseline_text, read_baseline, rounded, write_baseline
 from pachon.studies.metrics import camera as camera_metrics
 from pachon.studies.metrics.camera import CAMERA
 from pachon.studies.metrics.optics import OPTICS
+from pachon.studies.metrics.scene import Scene
 from pachon.testing import assert_matches_baseline
 
 #: All of them need a finished study, of seconds.
@@ -234,6 +237,12 @@ def test_a_telescope_that_loses_a_figure_is_out(project):
 
 
 # --- files -------------------------------------------------------------------------------------------------------
+
+
+def test_a_focal_plane_model_has_no_baseline():
+    experiment = Experiment.from_config(with_options(Configuration(), reconstruction__model="focal_plane"))
+    with pytest.raises(ConfigError, match=r"^reconstruction\.model = focal_plane: expected ccd, a baseline takes"):
+        CAMERA["reconstruction"].compute(Scene(experiment.telescope, experiment))
 
 
 def test_one_figure_stands_on_one_line_in_order(project):

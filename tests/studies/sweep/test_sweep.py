@@ -17,7 +17,12 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.camera import CAMERAS, lsst_camera
-from pachon.models.io.prescription import DATA
+from pachon.models.io.prescription import DATA, load_telescope
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd
+from pachon.pipeline.simulate.ccd_model import model_ccd
+from pachon.studies.metrics.scene import Scene
 from pachon.studies.metrics.stars import STARS
 from pachon.studies.sweep.file import load_sweep, read_sweep
 from pachon.studies.sweep.point import point_experiment
@@ -336,3 +341,19 @@ def test_motions_are_those_of_the_points_own_camera(folder, monkeypatch):
     assert configuration("A.rx_urad").focal_plane.moved["A"].rx_urad == 5
     with pytest.raises(PachonError, match="R22_S11"):
         configuration("R22_S11.dz_um")
+
+
+def test_reconstruction_is_that_of_the_configuration(focal_plane_config, plane_model):
+    config = focal_plane_config()
+    scene = Scene(load_telescope(config.telescope), Experiment.from_config(config), threads=1)
+    found = STARS["reconstruction"].compute(scene)
+    assert plane_model.fits == 1
+    alone = Scene(scene.telescope, Experiment.from_config(focal_plane_config(reconstruction__model="ccd")), threads=1)
+    others = STARS["reconstruction"].compute(alone)
+    assert list(found) == list(others)
+    assert plane_model.fits == 1
+    assert all(found[key] != others[key] for key in ("rms_residual_away", "rms_residual_at_stars"))
+    products = [model_ccd(scene.experiment, expose_ccd(scene.experiment, name, threads=1)) for name in config.ccds]
+    applied, _ = apply_focal_plane_model(scene.experiment, products)
+    away = np.concatenate([p.ellipticity("away") for p in applied], axis=1)
+    assert found["rms_residual_away"] == np.sqrt(np.mean(away**2))
