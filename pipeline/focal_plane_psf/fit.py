@@ -162,7 +162,8 @@ class ExposureFit:
             self.exposure = exposure.copy()
         aberration = wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius, None)
         seeing = float(self.exposure[-1])
-        with self.reporter.stage("optics at the stars", total=5 * len(self.data)) as stage:
+        again = ", again" if self._response is not None else ""
+        with self.reporter.stage(f"optics at the stars{again}", total=5 * len(self.data)) as stage:
             self.optics = HeightResponse.of(
                 self.instrument, self.fields, self.flat, aberration, seeing, self.threads, stage.advance
             )
@@ -206,7 +207,7 @@ class ExposureFit:
         shapes = self.optics.at(heights) + np.einsum("npf,p->nf", columns, self.exposure - self._base)
         return self.data.values - shapes, self.optics.slope(heights), columns
 
-    def fit_covariances(self, max_iterations: int = 15) -> None:
+    def fit_covariances(self, max_iterations: int = 8) -> None:
         """Fit the covariances of turbulence to what the optics leave, with their uncertainty (one step of EM)."""
         residuals, slopes, columns = self._columns()
 
@@ -228,8 +229,7 @@ class ExposureFit:
                 max_iterations=max_iterations,
             )
 
-        with self.reporter.stage("covariance of turbulence"):
-            found: list[CovarianceFit] = on_threads(fit, range(3), self.threads)
+        found: list[CovarianceFit] = on_threads(fit, range(3), self.threads)
         self.covariances = [f.covariance for f in found]
         self.at_bounds = tuple(f"{n} of {SHAPES[i]}" for i, f in enumerate(found) for n in f.at_bounds)
 
@@ -364,16 +364,16 @@ class ExposureFit:
         """Fit everything."""
         self.linearise()
         with self.reporter.stage("heights, alignment and turbulence"):
-            self.fit_covariances(20)
+            self.fit_covariances(15)
             for _ in range(_STEPS):
-                self.solve()
+                self.solve(1)
                 self.fit_covariances()
         if self.sigma[0] > _NO_WAVEFRONT:
             self.linearise()
         with self.reporter.stage("heights, alignment and turbulence, again"):
             self.solve(1)
             self.fit_covariances()
-            self.solve()
+            self.solve(1)
         assert self.covariance is not None
         return OpticsFit(
             self.heights,

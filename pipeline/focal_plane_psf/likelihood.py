@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from .covariance import COMPONENTS, Covariance, Places, ccd_terms
 
 #: Largest number of stars in a block.
-BLOCK = 500
+BLOCK = 300
 # Logarithmic bounds of amplitudes over the variance of the values, and of lengths over the extent of the field.
 _AMPLITUDES, _LENGTHS, _SHEAR = (-14.0, 2.0), (-6.5, 1.0), (-10.0, 10.0)
 # Lengths from which the fit starts, over the extent of the field: 3 and 16 arcmin over 3.5 degrees.

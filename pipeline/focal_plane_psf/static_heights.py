@@ -155,10 +155,7 @@ def fit_static_heights(
         raise DomainError(f"camera: {telescope.name} names none, expected one with the heights of its CCDs")
     cam = load_camera(known)
     degree = STATIC_DEGREE
-    if budget is None:
-        prior = HeightPrior.broad(cam, degree=degree)
-    else:
-        prior = HeightPrior.from_budget(cam, budget, degree)
+    prior = HeightPrior.broad(cam, degree=degree) if budget is None else HeightPrior.from_budget(cam, budget, degree)
     instrument = Instrument.of(telescope) if instrument is None else instrument
     heights = np.zeros(prior.n_parameter)
     precision = np.zeros((prior.n_parameter, prior.n_parameter))
