@@ -105,8 +105,7 @@ def refuse_focal_plane_model(config: Configuration, why: str) -> None:
 def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf, threads: int | None) -> _StarsKind:
     """Return stars of a CCD with the shapes that the model has there, and those of the CCD's own model."""
     own = of_ccd_model(stars)
-    shapes = model.shapes(name, stars.x, stars.y, threads=threads)
-    sigma = model.uncertainty(name, stars.x, stars.y, threads=threads)
+    shapes, sigma = model.predict(name, stars.x, stars.y, threads=threads)
     return replace(
         stars,
         model_e1=shapes.e1,

@@ -121,6 +121,9 @@ class Plane:
         found.size = found.size * self.scatter[2]
         return found
 
+    def predict(self, ccd, x, y, *, threads=None):
+        return self.shapes(ccd, x, y), self.uncertainty(ccd, x, y)
+
     def write(self, path):
         write_fits(path, [image_hdu("PLANES", self.planes, "of e1, e2, ln size")], None, [])
 

@@ -57,7 +57,7 @@ class ShapeField:
         values = np.zeros((len(places), 3))
         if self.optics is not None:
             values += self.optics.shapes(places, threads)
-        design = self.optics.design(places, threads) if variance and self.optics is not None else None
+        design = self.optics.design(places, values, threads) if variance and self.optics is not None else None
         ccds = np.unique(places.ccd)
 
         def job(ccd: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -101,6 +101,7 @@ class FocalPlanePsf:
         alignment_rms: ArrayLike = 0.2e-6,
         stamp_size: int = 31,
         components: int = 3,
+        ccds: Sequence[str] | None = None,
         threads: int | None = None,
         reporter: Reporter | None = None,
     ) -> FocalPlanePsf:
@@ -140,6 +141,8 @@ class FocalPlanePsf:
             Pixels on a side of drawn images; that of the stamps where there are stamps.
         components : int
             Most principal components of the residual stamps.
+        ccds : sequence of str, optional
+            CCDs that should have stars: there is a remark on those that have none. By default all of the camera.
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
         reporter : Reporter, optional
@@ -198,7 +201,7 @@ class FocalPlanePsf:
             PsfShapes.of_values(predicted),
             chi2,
             fitted.evidence,
-            _remarks(field, chi2, fitted),
+            _remarks(field, chi2, fitted, mosaic.names if ccds is None else ccds),
             weight,
             given.pixel_scale,
             stamp_size,
@@ -222,7 +225,7 @@ class FocalPlanePsf:
         return cls.fit(
             FocalPlaneStars.from_products(products, experiment.weight_fwhm),
             experiment.telescope,
-            FocalPlane.flat(experiment.camera) if focal.budget == "flat" else None,
+            FocalPlane.flat(experiment.camera) if focal.budget == "flat" and not focal.moved else None,
             camera=experiment.camera,
             wavelengths=experiment.wavelengths,
             atmosphere=experiment.atmosphere,
@@ -232,6 +235,7 @@ class FocalPlanePsf:
             dispersion=experiment.dispersion,
             budget=experiment.focal_plane.budget,
             alignment_rms=config.active_optics.residual_um * 1e-6,
+            ccds=[product.name for product in products],
             threads=threads,
             reporter=reporter,
         )
@@ -263,14 +267,20 @@ class FocalPlanePsf:
         """
         return PsfShapes.of_values(self.field.predict(self.field.mosaic.places(ccd, x, y), threads=threads)[0])
 
+    def predict(
+        self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
+    ) -> tuple[PsfShapes, PsfShapes]:
+        """Return the shapes of :meth:`shapes` and their standard deviations of :meth:`uncertainty`, in one pass."""
+        places = self.mosaic.places(ccd, x, y)
+        values, variance = self.field.predict(places, variance=True, threads=threads)
+        sigma = np.sqrt(np.maximum(np.zeros_like(values) if variance is None else variance, 0.0))
+        return PsfShapes.of_values(values), PsfShapes(sigma[:, 0], sigma[:, 1], np.exp(values[:, 2]) * sigma[:, 2])
+
     def uncertainty(
         self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
     ) -> PsfShapes:
         """Return standard deviations of e1, e2 and the size [rad]; arguments as for :meth:`shapes`."""
-        values, variance = self.field.predict(self.field.mosaic.places(ccd, x, y), variance=True, threads=threads)
-        assert variance is not None
-        sigma = np.sqrt(np.maximum(variance, 0.0))
-        return PsfShapes(sigma[:, 0], sigma[:, 1], np.exp(values[:, 2]) * sigma[:, 2])
+        return self.predict(ccd, x, y, threads=threads)[1]
 
     def draw(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> np.ndarray:
         """Return images of the PSF, centred and of unit sum, shape [n, ny, nx]; arguments as for :meth:`shapes`.
@@ -347,7 +357,9 @@ class FocalPlanePsf:
         return replace(model, pca=pca)
 
 
-def _remarks(field: ShapeField, chi2: dict[str, float], fitted: FittedField) -> tuple[str, ...]:
+def _remarks(
+    field: ShapeField, chi2: dict[str, float], fitted: FittedField, expected: Sequence[str]
+) -> tuple[str, ...]:
     """Return remarks on a fit, a line each."""
     remarks = []
     if fitted.at_bounds:
@@ -363,7 +375,7 @@ def _remarks(field: ShapeField, chi2: dict[str, float], fitted: FittedField) -> 
             " it is not the one that they were taken with"
         )
     ccds = np.unique(field.data.places.ccd)
-    empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds]
+    empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds and n in expected]
     if empty:
         shown = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
         remarks.append(f"{len(empty)} CCDs without stars, predicted from the others: {shown}")

@@ -68,12 +68,15 @@ class OpticsPart:
         fields = self.instrument.fields(places.xy, threads)
         return self.instrument.images(fields, self.plane, self.aberration, self.seeing, threads)[0]
 
-    def design(self, places: Places, threads: int | None = None) -> np.ndarray:
-        """Return the derivatives of the shapes with respect to the parameters of the CCD, shape [n, n_parameter, 3]."""
+    def design(self, places: Places, shapes: np.ndarray, threads: int | None = None) -> np.ndarray:
+        """Return the derivatives of the shapes with respect to the parameters of the CCD, shape [n, n_parameter, 3].
+
+        `shapes` [n, 3] are those of :meth:`shapes` at the places.
+        """
         fields = self.instrument.fields(places.xy, threads)
         heights = self.plane.height(*places.xy.T)
-        ends = [self._lifted(places, fields, sign * _STEP, threads) for sign in (1.0, -1.0)]
-        slopes = (ends[0] - ends[1]) / (2.0 * _STEP)
+        # One-sided: these derivatives serve for the uncertainty alone.
+        slopes = (self._lifted(fields, threads) - shapes) / _STEP
         return self.design_of(places, slopes, self.response.columns(fields, heights))
 
     def design_of(self, places: Places, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -81,10 +84,10 @@ class OpticsPart:
         terms = np.concatenate([self.prior.common_terms(places), self.prior.own_terms(places)], axis=1)
         return np.concatenate([terms[:, :, None] * slopes[:, None], columns], axis=1)
 
-    def _lifted(self, places: Places, fields: np.ndarray, step: float, threads: int | None) -> np.ndarray:
+    def _lifted(self, fields: np.ndarray, threads: int | None) -> np.ndarray:
         surfaces = self.plane.surfaces
         polynomial = surfaces.polynomial.copy()
-        polynomial[:, 0] += step
+        polynomial[:, 0] += _STEP
         moved = FocalPlane(
             self.plane.camera,
             type(surfaces)(surfaces.half_size, polynomial, surfaces.waves, surfaces.grid),
