@@ -15,6 +15,9 @@ from ...core.units import metres
 from ...models.camera.camera import Camera
 from .covariance import Places
 
+# Distance outside the rim of a CCD, in halves of its side, at which a position still counts as on it.
+_RIM = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
@@ -77,7 +80,15 @@ class Mosaic:
         xy = np.stack([px.ravel(), py.ravel()], axis=1)
         if not np.isfinite(xy).all():
             raise DomainError(f"x, y: {np.count_nonzero(~np.isfinite(xy).all(axis=1))} positions are not finite")
-        return self.at(xy, numbers.ravel())
+        places = self.at(xy, numbers.ravel())
+        off = np.flatnonzero((np.abs(places.uv) > 1.0 + _RIM).any(axis=1))
+        if self.camera is not None and off.size:
+            first = off[0]
+            raise DomainError(
+                f"{off.size} positions are not on the CCD that they name, the first of them"
+                f" {self.names[places.ccd[first]]} at x, y = {1e3 * xy[first, 0]:.3f}, {1e3 * xy[first, 1]:.3f} mm"
+            )
+        return places
 
     def at(self, xy: np.ndarray, ccd: np.ndarray) -> Places:
         """Return the places at positions on the detector [m] on CCDs of given numbers."""

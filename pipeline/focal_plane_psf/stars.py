@@ -156,7 +156,9 @@ class FocalPlaneStars:
                 if place.suffix.lower() in (".fits", ".fit")
                 else Table.read(place, format="ascii.ecsv")
             )
-        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        except OSError as error:
+            raise ProductError(f"cannot be read ({error.strerror or error})", file=place) from None
+        except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ProductError(
                 f"cannot be read as a table of stars ({' '.join(str(error).split())})", file=place
             ) from None

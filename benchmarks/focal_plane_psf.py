@@ -1,0 +1,167 @@
+"""The focal-plane PSF model beside the CCDs' own polynomials and Piff's Gaussian process over the whole field.
+
+Run: python benchmarks/focal_plane_psf.py RUN [--heights STATIC.fits] [--no-piff]
+
+RUN is the folder of `pachon run --all`: its observed stars and its noise-free PSFs at holdout positions. Errors are
+those of e1, e2 and ln size at the holdout positions:
+
+- the models of the CCDs in the products (the paper's cubic by default), and linear polynomials of all pixels with
+  softened weights, the best of docs/psf_study.md;
+- Piff's GPInterp (treegp) over the whole field, on the same measured shapes with the same noise: isotropic and
+  anisotropic von Karman kernels, hyperparameters by Piff's two-point function;
+- pachon without telescope, and with the telescope but without heights; with those of other exposures if they are given.
+
+With the times of the fits, which run one after the other on all threads.
+"""
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+import treecorr
+from astropy.io import fits
+
+import pachon
+from pachon.core.units import ARCMIN
+from pachon.pipeline.ccd_product import read_product
+from pachon.pipeline.config import configuration_of
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
+from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.pipeline.psf_model.checks import snr_weights
+from pachon.pipeline.psf_model.model import PsfModel
+from pachon.pipeline.run_folder import SUMMARY_NAME
+
+
+def piff_gp(stars: FocalPlaneStars, x: np.ndarray, y: np.ndarray, kernel: str, optimizer: str) -> np.ndarray:
+    """Return e1, e2 and ln size at places by Piff's Gaussian process over the field."""
+    import piff
+
+    def star(u: float, v: float) -> piff.Star:
+        return piff.Star.makeTarget(u=u, v=v, x=u, y=v, stamp_size=8, scale=1.0)
+
+    # Piff's own units: arcmin of the field.
+    per_metre = 1.0 / 3.0e-3
+    fitted = [
+        piff.Star(star(u, v).data, piff.StarFit(params=p, params_var=n**2))
+        for u, v, p, n in zip(stars.x * per_metre, stars.y * per_metre, stars.values, stars.noise, strict=True)
+    ]
+    gp = piff.GPInterp(kernel=kernel, optimizer=optimizer, normalize=True, max_sep=60.0, nbins=21)
+    fitted = gp.initialize(fitted)
+    gp.solve(fitted)
+    at = gp.interpolateList([star(u, v) for u, v in zip(x * per_metre, y * per_metre, strict=True)])
+    return np.array([s.fit.params for s in at])
+
+
+def linear(products, experiment) -> np.ndarray:
+    """Return e1, e2 and ln size at holdout positions by linear polynomials of all pixels."""
+    result = []
+    for product in products:
+        stars = product.observed
+        used, xy = stars.used, np.stack([stars.x, stars.y], axis=1)
+        weights = snr_weights("softened", stars.snr[used])
+        stamps = product.observed_images[used]
+        model = PsfModel.fit(stamps, xy[used], basis="pixels", order=1, weights=weights)
+        images = model.at(np.stack([product.holdout.x, product.holdout.y], axis=1))
+        shapes = measure_shapes(images, product.pixel_scale, experiment.weight_fwhm)
+        result.append(np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1))
+    return np.concatenate(result)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--heights", type=Path, help="heights learnt from other exposures, of StaticHeights.write")
+    parser.add_argument("--no-piff", action="store_true")
+    options = parser.parse_args()
+    import json
+
+    summary = json.loads((options.run / SUMMARY_NAME).read_text())
+    experiment = Experiment.from_config(configuration_of(summary["configuration"], str(options.run)))
+    products = [read_product(path, holdout_images=False) for path in sorted(options.run.glob("ccd_*.fits"))]
+    stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
+    holdout = {
+        key: np.concatenate([getattr(p.holdout, key) for p in products]) for key in ("x", "y", "e1", "e2", "size")
+    }
+    field = np.concatenate([np.stack([p.holdout.field_x, p.holdout.field_y]) for p in products], axis=1)
+    names = [p.name for p in products for _ in range(len(p.holdout))]
+    patch = np.repeat(np.arange(len(products)), [len(p.holdout) for p in products])
+    truth = np.stack([holdout["e1"], holdout["e2"], np.log(holdout["size"])], axis=1)
+    print(f"pachon {pachon.__version__}, {len(products)} CCDs, {len(stars)} stars, {len(names)} holdout positions")
+    print(
+        f"{'':44s} {'e1':>8s} {'e2':>8s} {'ln size':>8s}  chi2 e1, e2, ln size     xi+ 5.5', 10'-20', 30'-180'      fit"
+    )
+
+    def show(label: str, values: np.ndarray, seconds: float = np.nan, sigma: np.ndarray | None = None) -> None:
+        left = truth - values
+        good = np.isfinite(left).all(axis=1)
+        rms = np.sqrt((left[good] ** 2).mean(axis=0))
+        chi2 = "" if sigma is None else " ".join(f"{v:5.2f}" for v in ((left / sigma)[good] ** 2).mean(axis=0))
+        xi = []
+        catalogue = treecorr.Catalog(
+            x=field[0][good], y=field[1][good], g1=left[good, 0], g2=left[good, 1], patch=patch[good]
+        )
+        for low, high in ((4.5, 6.5), (10.0, 20.0), (30.0, 180.0)):
+            pairs = treecorr.GGCorrelation(
+                min_sep=low * ARCMIN, max_sep=high * ARCMIN, nbins=1, var_method="jackknife", num_threads=2
+            )
+            pairs.process(catalogue)
+            xi.append(f"{pairs.xip[0]:8.1e}+-{np.sqrt(pairs.varxip[0]):.0e}")
+        print(
+            f"{label:44s} "
+            + " ".join(f"{1e3 * v:7.3f}m" for v in rms)
+            + f"  {chi2:24s} {' '.join(xi)} {seconds:7.1f} s"
+        )
+
+    own = "ccd" if fits.getheader(next(options.run.glob("ccd_*.fits"))).get("PSFMODEL", "ccd") == "ccd" else "focal"
+    prefix = "model" if own == "ccd" else "ccd"
+    parts = [np.stack([getattr(p.holdout, f"{prefix}_{k}") for k in ("e1", "e2", "size")], axis=1) for p in products]
+    values = np.concatenate(parts)
+    show("each CCD, as in the run", np.column_stack([values[:, :2], np.log(values[:, 2])]))
+    start = time.perf_counter()
+    show("each CCD, linear, all pixels, softened", linear(products, experiment), time.perf_counter() - start)
+    if not options.no_piff:
+        import piff
+
+        print(f"Piff {piff.__version__}")
+        for kernel, optimizer in (
+            ("1.e-5 * VonKarman(20.)", "isotropic"),
+            ("1.e-5 * AnisotropicVonKarman(invLam=np.array([[1./400., 0.], [0., 1./400.]]))", "anisotropic"),
+        ):
+            start = time.perf_counter()
+            found = piff_gp(stars, holdout["x"], holdout["y"], kernel, optimizer)
+            show(f"Piff GPInterp, {optimizer}", found, time.perf_counter() - start)
+    common = {"camera": experiment.camera, "components": 0}
+    optics = common | {
+        "wavelengths": experiment.wavelengths,
+        "atmosphere": experiment.atmosphere,
+        "pixel_size": experiment.pixel_size,
+        "diffusion": experiment.diffusion,
+        "jitter": experiment.jitter,
+        "dispersion": experiment.dispersion,
+        "budget": experiment.focal_plane.budget,
+    }
+    cases = [
+        ("without telescope", None, None, common),
+        ("telescope, heights unknown", experiment.telescope, None, optics),
+    ]
+    if options.heights:
+        known = pachon.StaticHeights.read(options.heights)
+        cases.append((f"heights from {known.exposures} exposures", experiment.telescope, known, optics))
+    cases.append(("heights as drawn (the limit)", experiment.telescope, experiment.focal_plane, optics))
+    for label, telescope, plane, more in cases:
+        start = time.perf_counter()
+        model = pachon.FocalPlanePsf.fit(stars, telescope, plane, **more)
+        seconds = time.perf_counter() - start
+        shapes, sigma = model.predict(names, holdout["x"], holdout["y"])
+        found = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
+        show(f"pachon, {label}", found, seconds, np.stack([sigma.e1, sigma.e2, sigma.size / shapes.size], axis=1))
+        for remark in model.warnings:
+            print(f"    {remark}")
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.1f} GiB")
+
+
+if __name__ == "__main__":
+    main()
