@@ -105,7 +105,7 @@ def main() -> None:
         )
         for low, high in ((4.5, 6.5), (10.0, 20.0), (30.0, 180.0)):
             pairs = treecorr.GGCorrelation(
-                min_sep=low * ARCMIN, max_sep=high * ARCMIN, nbins=1, var_method="jackknife", num_threads=2
+                min_sep=low * ARCMIN, max_sep=high * ARCMIN, nbins=1, var_method="jackknife", cross_patch_weight="match"
             )
             pairs.process(catalogue)
             xi.append(f"{pairs.xip[0]:8.1e}+-{np.sqrt(pairs.varxip[0]):.0e}")
