@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import pytest
 
+import pachon
 from pachon.models.io.prescription import DATA
 from pachon.pipeline.psf_model.model import PsfModel
 
@@ -17,7 +18,7 @@ BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
 LENSES = Path(__file__).parents[1] / "data" / "zmx"
 GLASSES = DATA / "glasses.agf"
 #: Pages whose examples need files of the reader's own, and run with files of ours in other tests.
-WITH_FILES = {"psf_models.md", "zemax.md", "perturbations.md"}
+WITH_FILES = {"psf_models.md", "zemax.md", "perturbations.md", "focal_plane_psf.md"}
 EXAMPLES = [name for name, text in PAGES.items() if BLOCK.search(text) and name not in WITH_FILES]
 
 
@@ -45,6 +46,15 @@ def test_the_zemax_page_runs_on_a_lens(tmp_path, monkeypatch):
     for block in BLOCK.findall(PAGES["zemax.md"]):
         exec(compile(block, "zemax.md", "exec"), {})
     assert (tmp_path / "again.zmx").stat().st_size > 500
+
+
+@pytest.mark.long
+def test_the_page_of_the_focal_plane_model_runs_on_a_run(tmp_path, monkeypatch, capsys, focal_plane_config):
+    monkeypatch.chdir(tmp_path)
+    pachon.run(focal_plane_config(reconstruction__model="ccd"), tmp_path / "my_run")
+    exec(compile(BLOCK.findall(PAGES["focal_plane_psf.md"])[0], "focal_plane_psf.md", "exec"), {})
+    assert "ln size" in capsys.readouterr().out
+    assert (tmp_path / "focal_plane_psf.fits").stat().st_size > 10000
 
 
 @pytest.mark.parametrize("name", PAGES)
