@@ -8,7 +8,7 @@ from pachon.pipeline.focal_plane_psf.response import Instrument
 from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def one_thread_of_linear_algebra():
     """As in the product, which runs blocks of stars side by side: threads within small matrices only wait."""
     with one_blas_thread():
@@ -39,7 +39,7 @@ class Exposure:
     The first stars of each CCD have noise and are to be fitted; the others are holdout positions.
     """
 
-    def __init__(self, telescope, camera, plane, *, stars=40, holdout=15, noise=2e-3, turbulence=0.01, seed=0, at=1):
+    def __init__(self, telescope, camera, plane, *, stars=40, holdout=15, noise=1e-3, turbulence=0.004, seed=0, at=1):
         places = np.random.default_rng(at)
         rng = np.random.default_rng(seed)
         self.camera, self.plane = camera, plane
@@ -56,8 +56,9 @@ class Exposure:
         # Streaks of 100 by 15 mm along a wind at 30 degrees: the exponential of a length, by Cholesky.
         along = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]]) / np.array([[0.1], [0.015]])
         difference = (self.xy[:, None] - self.xy) @ along.T
-        root = np.linalg.cholesky(np.exp(-np.hypot(*difference.T)) + 1e-10 * np.eye(len(self.xy)))
-        self.truth = optics + turbulence * root @ rng.standard_normal((len(self.xy), 3))
+        self.covariance = turbulence**2 * (np.exp(-np.hypot(*difference.T)) + 1e-10 * np.eye(len(self.xy)))
+        self.optics = optics
+        self.truth = optics + np.linalg.cholesky(self.covariance) @ rng.standard_normal((len(self.xy), 3))
         self.noise = np.full(self.truth.shape, noise)
         self.values = self.truth + self.noise * rng.standard_normal(self.truth.shape)
 
