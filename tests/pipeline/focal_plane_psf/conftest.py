@@ -72,7 +72,7 @@ class Exposure:
 
 @pytest.fixture(scope="session")
 def exposure_of(lsst_r, part):
-    """``exposure_of(plane, **options)``: an :class:`Exposure` of the r-band telescope on the camera of a focal plane."""
+    """``exposure_of(plane, **options)``: an :class:`Exposure` of the r-band telescope."""
 
     def of(plane, **options):
         return Exposure(lsst_r, plane.camera, plane, **options)

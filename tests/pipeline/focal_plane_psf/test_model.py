@@ -204,17 +204,28 @@ def test_no_byte_depends_on_the_threads(aligned, exposure, few, lsst_r, waveleng
         assert values(one).tobytes() == values(other).tobytes()
 
 
-@pytest.mark.long
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="BLAS has one thread on one processor")
-@pytest.mark.xfail(reason="parts of a fit with a telescope are left to all threads of BLAS: see core/threads.py")
-def test_no_byte_depends_on_the_threads_of_blas(aligned, exposure, few, lsst_r, wavelengths):
+@pytest.fixture(scope="module")
+def of_two_threads_of_blas(exposure, few, lsst_r, wavelengths):
+    """As `aligned`, which has one of them."""
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("BLAS has one thread on one processor")
     with threadpool_limits(2, user_api="blas"):
-        two = FocalPlanePsf.fit(
+        return FocalPlanePsf.fit(
             exposure.stars(few), lsst_r, camera=exposure.camera, wavelengths=wavelengths, alignment_rms=0.0, threads=1
         )
-    assert two.evidence == aligned.evidence
+
+
+@pytest.mark.long
+def test_no_prediction_depends_on_the_threads_of_blas(of_two_threads_of_blas, aligned):
+    two = of_two_threads_of_blas
     assert two.chi2 == aligned.chi2
     assert values(two.leave_one_out).tobytes() == values(aligned.leave_one_out).tobytes()
+    assert values(two.shapes(*ELSEWHERE)).tobytes() == values(aligned.shapes(*ELSEWHERE)).tobytes()
+
+
+@pytest.mark.xfail(reason="log_evidence and log_likelihood run outside one_blas_thread: the evidence differs by 2e-5")
+def test_no_evidence_depends_on_the_threads_of_blas(of_two_threads_of_blas, aligned):
+    assert of_two_threads_of_blas.evidence == aligned.evidence
 
 
 @pytest.mark.long
@@ -324,7 +335,7 @@ def test_ccds_without_stars_are_predicted_and_remarked(exposure):
     where = ("R23_S02", *exposure.xy[h].T)
     left, sigma = values(model.shapes(*where)) - exposure.truth[h], model.uncertainty(*where)
     assert np.isfinite(left).all()
-    # Fifteen places of one CCD err together: within 3 sigma of one.
+    # Fifteen places of one CCD err together: within 4 sigma of one.
     assert (np.abs(left[:, 0]) < 4.0 * sigma.e1).all()
     assert (np.abs(left[:, 1]) < 4.0 * sigma.e2).all()
     other = model.uncertainty(PLANTED, *exposure.camera.centers[exposure.camera.ccd_index(PLANTED)])

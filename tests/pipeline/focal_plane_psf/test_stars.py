@@ -223,7 +223,7 @@ def test_columns_of_different_lengths_give_one_clear_line(bad):
 def test_no_stars_and_only_nan_stars_give_one_clear_line():
     nothing = {k: v[:0] for k, v in COLUMNS.items()}
     for bad in (nothing, COLUMNS | {"e1": np.full(N, np.nan)}):
-        with pytest.raises(DomainError, match="^0 of") as raised:
+        with pytest.raises(DomainError, match=r"^0 of ") as raised:
             FocalPlanePsf.fit(bad, camera="lsst")
         assert "\n" not in str(raised.value)
 
