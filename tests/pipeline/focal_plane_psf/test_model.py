@@ -223,6 +223,7 @@ def test_no_prediction_depends_on_the_threads_of_blas(of_two_threads_of_blas, al
     assert values(two.shapes(*ELSEWHERE)).tobytes() == values(aligned.shapes(*ELSEWHERE)).tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.xfail(reason="log_evidence and log_likelihood run outside one_blas_thread: the evidence differs by 2e-5")
 def test_no_evidence_depends_on_the_threads_of_blas(of_two_threads_of_blas, aligned):
     assert of_two_threads_of_blas.evidence == aligned.evidence
@@ -289,11 +290,13 @@ def test_positions_in_pixels_and_lengths_are_the_same(blind, exposure):
         np.testing.assert_allclose(values(there), values(metres), atol=1e-12)
 
 
+@pytest.mark.long
 def test_without_a_telescope_or_stamps_there_are_no_images(blind):
     with pytest.raises(DomainError, match=r"^draw: [^\n]*$"):
         blind.draw(*ELSEWHERE)
 
 
+@pytest.mark.long
 def test_few_stars_and_unknown_ccds_give_one_clear_line(blind, exposure):
     which = np.flatnonzero(exposure.first)[:29]
     with pytest.raises(DomainError, match=r"^29 of 29 stars [^\n]*30[^\n]*$"):
