@@ -9,6 +9,7 @@ from astropy import units as u
 
 from ...core.errors import DomainError
 from ...core.progress import Reporter
+from ...core.threads import one_blas_thread
 from ...models.camera.camera import Camera, load_camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
@@ -75,10 +76,11 @@ def fit_field(
         )
     fit = ExposureFit(data, instrument, prior, alignment_rms, threads, reporter)
     solution = fit.run()
-    evidence = fit.log_evidence() - sum(
-        log_likelihood(s.covariance, data.places, data.values[:, i], data.noise[:, i], fit.blocks)
-        for i, s in enumerate(statistics)
-    )
+    with one_blas_thread():
+        evidence = fit.log_evidence() - sum(
+            log_likelihood(s.covariance, data.places, data.values[:, i], data.noise[:, i], fit.blocks)
+            for i, s in enumerate(statistics)
+        )
     slopes, columns = fit.derivatives()
     blocks = np.stack(
         [solution.covariance[np.ix_(c, c)] for c in (columns_acting_on(prior, i) for i in range(len(mosaic.names)))]

@@ -73,9 +73,9 @@ class HeightPrior:
             for s in range(2**31, 2**31 + 16 * _DRAWS)
         ]
         rows = np.array(planes)
-        diagonal = np.diag(np.maximum((rows**2).mean(axis=0), _LEAST))
+        quadratic = rows.T @ rows / len(rows) + _LEAST * np.eye(5)
         own = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
-        return cls(camera, diagonal, max(budget.raft_height**2 / 12.0, _LEAST), own)
+        return cls(camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), own)
 
     @classmethod
     def broad(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:

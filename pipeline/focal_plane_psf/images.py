@@ -4,7 +4,7 @@ A change of second moments is a convolution with a narrow Gaussian, of positive 
 
 .. math:: \tilde I(k) \to \tilde I(k) \, e^{-k^T S k / 2},
 
-which is what turbulence does to the image of the optics to lowest order. S is found by Newton's method, so that the
+which is what turbulence does to the image of the optics to lowest order. S is found by Broyden's method, so that the
 image has the predicted e1, e2 and size.
 """
 
@@ -23,7 +23,9 @@ from .mosaic import Mosaic
 # The three deformations, as coefficients of kx^2, ky^2 and kx ky: along x, along x = y, and round.
 _SHAPES = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 2.0], [1.0, 1.0, 0.0]])
 _STEP = 0.02
-_ITERATIONS = 3
+_ITERATIONS = 7
+# Square of a step of the amounts below which it says nothing of the Jacobian.
+_SMALLEST = 1e-14
 # Pixels of zeros about a stamp while it is convolved.
 _ROOM = 8
 
@@ -56,9 +58,14 @@ def deformed(images: np.ndarray, values: np.ndarray, pixel_scale: float, weight_
         ends = [measured(image(amounts + sign * step, shift))[0] for sign in (1.0, -1.0)]
         jacobian[:, :, shape] = (ends[0] - ends[1]) / (2.0 * _STEP)
     for _ in range(_ITERATIONS):
-        amounts = amounts + np.linalg.solve(jacobian, (values - now)[:, :, None])[:, :, 0]
-        shift = shift + centre
+        step = np.linalg.solve(jacobian, (values - now)[:, :, None])[:, :, 0]
+        amounts, shift, before = amounts + step, shift + centre, now
         now, centre = measured(image(amounts, shift))
+        # Broyden's update of the Jacobian, where there was a step.
+        square = (step**2).sum(axis=1)
+        missed = now - before - np.einsum("nfs,ns->nf", jacobian, step)
+        moved = square > _SMALLEST
+        jacobian[moved] += missed[moved, :, None] * (step / np.maximum(square, _SMALLEST)[:, None])[moved, None]
     result = image(amounts, shift)
     return result / result.sum(axis=(1, 2), keepdims=True)
 

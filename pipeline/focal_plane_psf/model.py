@@ -36,6 +36,8 @@ from .static_heights import StaticHeights
 _BATCH = 512
 # Brightest stars, from which the principal components of the residual stamps are made.
 _PCA_STARS = 2000
+# Variance that is added to the noise of a star, over the stated one, from which the stated noise is called wrong.
+_EXTRA_NOISE = 1.0
 # Reduced chi-squares beyond which the stated noise is called wrong.
 _CHI2 = (0.7, 1.4)
 
@@ -369,6 +371,10 @@ def _remarks(
             remarks.append(
                 f"reduced chi-square of {name} at the stars is {value:.2f}: the noise of the stars is not as stated"
             )
+    for covariance, noise, name in zip(field.covariances, field.data.noise.T, SHAPES, strict=True):
+        if covariance.nugget > _EXTRA_NOISE * np.median(noise):
+            ratio = np.sqrt(1.0 + covariance.nugget / np.median(noise))
+            remarks.append(f"the stars scatter {ratio:.1f} times as much in {name} as the stated noise")
     if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:
         remarks.append(
             f"the stars are less likely with this telescope than without any (ln ratio {fitted.evidence:.0f}):"

@@ -2,12 +2,13 @@ r"""Shapes of the long-exposure PSF of a telescope, as functions of CCD height, 
 
 The shape of the PSF of the optics under the mean of all turbulence changes with the height of the CCD, with the
 residual aberration of the exposure and with the Fried parameter. Heights enter through a polynomial between Chebyshev
-nodes, whose derivative is exact: five nodes over +-25 um reproduce e of the engine to 1e-5 at any height. The other
-parameters are linear about the last solution, with derivatives that are functions of field and height.
+nodes, whose derivative is exact: five nodes over +-25 um reproduce the shapes of the engine to 5e-5 at any height.
+The other parameters are linear about the last solution, with derivatives that are functions of field and height.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,9 +16,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
+from ...core.errors import DomainError
 from ...core.units import ARCSEC, metres, positive_angle, radians
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
+from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
@@ -103,6 +106,17 @@ class Instrument:
             stamp_size,
         )
 
+    @property
+    def key(self) -> str:
+        """SHA-256 of all that decides the PSF."""
+        air = self.atmosphere
+        numbers = (air.r0, air.outer_scale, self.pixel_size, self.diffusion, self.jitter, self.weight_fwhm)
+        arrays = (self.wavelengths, np.zeros(0) if self.dispersion is None else self.dispersion)
+        text = (
+            telescope_to_yaml(self.telescope) + repr((*numbers, self.stamp_size)) + repr([a.tolist() for a in arrays])
+        )
+        return hashlib.sha256(text.encode()).hexdigest()
+
     def fields(self, xy: np.ndarray, threads: int | None = None) -> np.ndarray:
         """Return the field angles of positions on the detector [rad], shape [n, 2]."""
         return fields_at(self.telescope, xy, self.wavelengths[len(self.wavelengths) // 2], threads=threads)
@@ -182,6 +196,12 @@ class HeightResponse:
                 for n in nodes
             ]
         )
+        lost = int((~np.isfinite(values).all(axis=(0, 2))).sum())
+        if lost:
+            raise DomainError(
+                f"{instrument.telescope.name}: the PSF at {lost} of {len(fields)} stars has no shape within"
+                f" {1e6 * LARGEST_HEIGHT:g} um of the focal plane: expected the telescope that they were taken with"
+            )
         inverse = np.linalg.inv(chebyshev.chebvander(nodes, _NODES - 1))
         return cls(np.einsum("kn,nsf->ksf", inverse, values))
 

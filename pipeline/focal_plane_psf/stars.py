@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.io.registry import IORegistryError
 from astropy.table import Table
 
 from ...core.errors import DomainError, ProductError
@@ -122,7 +123,9 @@ class FocalPlaneStars:
         if "e1" in columns:
             size = _quantity(columns, "size", u.rad)
             with np.errstate(divide="ignore", invalid="ignore"):
-                values = np.stack([_quantity(columns, "e1"), _quantity(columns, "e2"), np.log(size)], axis=1)
+                values = _stacked(
+                    {"e1": _quantity(columns, "e1"), "e2": _quantity(columns, "e2"), "size": np.log(size)}
+                )
         elif cube is not None:
             shapes = measure_shapes(cube, pixel_scale or 0.0, weight_fwhm)
             values = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
@@ -135,8 +138,13 @@ class FocalPlaneStars:
             with np.errstate(divide="ignore"):
                 noise = per_snr / snr[:, None]
         else:
-            noise = np.stack([_quantity(columns, f"{n}_noise") for n in ("e1", "e2", "size")], axis=1)
+            noise = _stacked({f"{n}_noise": _quantity(columns, f"{n}_noise") for n in ("e1", "e2", "size")})
         stars = cls(tuple(names), x, y, values, noise, cube, pixel_scale, weight_fwhm, bool(in_pixels))
+        lengths = {"ccd": len(names), "x": len(x), "y": len(y), "shapes": len(values), "noise": len(noise)}
+        if len(set(lengths.values())) > 1:
+            raise DomainError(f"stars: columns of different lengths, {lengths}")
+        if "used" in columns and len(np.asarray(columns["used"])) != len(x):
+            raise DomainError(f"stars: column 'used' has {len(np.asarray(columns['used']))} values for {len(x)} stars")
         if "used" in columns:
             stars = stars.chosen(np.asarray(columns["used"], dtype=bool))
         return stars
@@ -158,7 +166,7 @@ class FocalPlaneStars:
             )
         except OSError as error:
             raise ProductError(f"cannot be read ({error.strerror or error})", file=place) from None
-        except (ValueError, KeyError, TypeError, IndexError) as error:
+        except (ValueError, KeyError, TypeError, IndexError, IORegistryError) as error:
             raise ProductError(
                 f"cannot be read as a table of stars ({' '.join(str(error).split())})", file=place
             ) from None
@@ -238,6 +246,14 @@ def stars_of(stars: Any) -> FocalPlaneStars:
     if isinstance(stars, (str, Path)):
         return FocalPlaneStars.read(stars)
     return FocalPlaneStars.from_table(stars)
+
+
+def _stacked(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Return columns of one length side by side."""
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise DomainError(f"stars: columns of different lengths, {lengths}")
+    return np.stack(list(columns.values()), axis=1)
 
 
 def _columns(table: Any) -> dict[str, Any]:

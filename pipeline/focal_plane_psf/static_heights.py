@@ -24,12 +24,13 @@ from astropy.io import fits
 from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
+from ...core.threads import one_blas_thread
 from ...models.camera.camera import Camera, load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
-from .fit import ExposureFit, ShapeData
+from .fit import ExposureFit, NormalEquations, ShapeData
 from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
 from .response import ExposureResponse, HeightResponse, Instrument
@@ -170,14 +171,16 @@ def fit_static_heights(
                 vector += right
                 stage.advance(1)
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
-        root = scipy.linalg.cholesky(matrix * scale[:, None] * scale, lower=True, overwrite_a=True)
-        heights = heights + scale * scipy.linalg.cho_solve((root, True), scale * vector)
+        with one_blas_thread():
+            root = scipy.linalg.cholesky(matrix * scale[:, None] * scale, lower=True, overwrite_a=True)
+            heights = heights + scale * scipy.linalg.cho_solve((root, True), scale * vector)
         covariance = root, scale
     assert covariance is not None
     root, scale = covariance
-    lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
-    full = (np.tril(lower) + np.tril(lower, -1).T) * scale[:, None] * scale
-    return StaticHeights(prior.focal_plane(heights), prior.per_ccd(full), len(exposures))
+    with one_blas_thread():
+        lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
+        full = (np.tril(lower) + np.tril(lower, -1).T) * scale[:, None] * scale
+        return StaticHeights(prior.focal_plane(heights), prior.per_ccd(full), len(exposures))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,16 +219,8 @@ class _Job:
         fit.solve_exposure()
         fit.fit_covariances(10)
         normal = fit.solve_exposure()
-        n = self.prior.n_parameter
-        own = normal.matrix[n:, n:] + np.diag(fit.sigma**-2)
-        size = 1.0 / np.sqrt(np.diagonal(own))
-        between = scipy.linalg.cho_solve(
-            scipy.linalg.cho_factor(own * size[:, None] * size), (normal.matrix[n:, :n] * size[:, None])
-        )
-        cross = normal.matrix[:n, n:] * size
-        matrix = normal.matrix[:n, :n] - cross @ between
-        right = size * (normal.vector[n:] - fit.sigma**-2 * fit.exposure)
-        vector = normal.vector[:n] - between.T @ right
+        with one_blas_thread():
+            matrix, vector = _marginalised(fit, normal, self.prior.n_parameter)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             part = path.with_name(path.name + ".part.npz")
@@ -237,8 +232,20 @@ class _Job:
         state = hashlib.sha256()
         for array in (data.values, data.noise, data.places.xy, data.places.ccd, self.heights):
             state.update(np.ascontiguousarray(array).tobytes())
-        state.update(repr((self.alignment_rms, self.instrument.telescope.name)).encode())
+        state.update(repr((self.alignment_rms, self.instrument.key)).encode())
         return state.hexdigest()
+
+
+def _marginalised(fit: ExposureFit, normal: NormalEquations, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal equations of the first n parameters, the others marginalised with their prior."""
+    own = normal.matrix[n:, n:] + np.diag(fit.sigma**-2)
+    size = 1.0 / np.sqrt(np.diagonal(own))
+    between = scipy.linalg.cho_solve(
+        scipy.linalg.cho_factor(own * size[:, None] * size), normal.matrix[n:, :n] * size[:, None]
+    )
+    cross = normal.matrix[:n, n:] * size
+    right = size * (normal.vector[n:] - fit.sigma**-2 * fit.exposure)
+    return normal.matrix[:n, :n] - cross @ between, normal.vector[:n] - between.T @ right
 
 
 _LAST: dict[str, tuple[HeightResponse, ExposureResponse]] = {}
@@ -246,7 +253,7 @@ _LAST: dict[str, tuple[HeightResponse, ExposureResponse]] = {}
 
 def _optics(fit: ExposureFit, threads: int | None) -> tuple[HeightResponse, ExposureResponse]:
     """Return the responses at the stars of an exposure, those of the last call where these stand at the same places."""
-    key = hashlib.sha256(fit.fields.tobytes() + fit.instrument.telescope.name.encode()).hexdigest()
+    key = hashlib.sha256(fit.fields.tobytes() + fit.instrument.key.encode()).hexdigest()
     if key not in _LAST:
         fit.linearise()
         _LAST.clear()

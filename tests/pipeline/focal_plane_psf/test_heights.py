@@ -69,16 +69,7 @@ def test_the_prior_of_rafts_and_ccds_has_the_covariance_of_drawn_focal_planes(pa
 
 @pytest.mark.parametrize(
     "whole",
-    [
-        True,
-        pytest.param(
-            False,
-            marks=pytest.mark.xfail(
-                reason="from_budget keeps only the diagonal of the quadratic's covariance: on a camera off the axis the"
-                " scaling to one peak to valley couples x with x^2, and the variance at its rim is twice too large"
-            ),
-        ),
-    ],
+    [True, False],
 )
 @pytest.mark.long
 def test_the_prior_of_the_whole_plane_has_the_covariance_of_drawn_ones(part, whole):

@@ -29,12 +29,9 @@ BASE = np.stack([moffat(0.01, -0.02), moffat(-0.03, 0.01, center=(0.3, -0.4)), m
 
 
 CHANGE = np.array([[0.03, -0.02, 0.04], [-0.02, 0.03, -0.03], [0.05, 0.05, 0.08]])
-LARGE = pytest.mark.xfail(
-    reason="three steps with the derivative at the first image: 3e-4 is left of a change of 0.03, 6e-3 of one of 0.08"
-)
 
 
-@pytest.mark.parametrize("factor", [0.1, pytest.param(1.0, marks=LARGE)])
+@pytest.mark.parametrize("factor", [0.1, 1.0])
 def test_images_have_the_shapes_asked_for(factor):
     asked = values(BASE)[0] + factor * CHANGE
     found = deformed(BASE, asked, PIXEL, WEIGHT)

@@ -200,10 +200,6 @@ def test_bad_tables_give_one_clear_line(bad, options, words):
         assert word in text
 
 
-@pytest.mark.xfail(
-    raises=(ValueError, IndexError, pytest.fail.Exception),
-    reason="from_table does not compare the lengths of the columns of a mapping: ValueError of NumPy, or nothing",
-)
 @pytest.mark.parametrize(
     "bad",
     [
@@ -232,10 +228,7 @@ def test_no_stars_and_only_nan_stars_give_one_clear_line():
     "name",
     [
         "notes.ecsv",
-        pytest.param(
-            "short.fits",
-            marks=pytest.mark.xfail(reason="a FITS file of another kind is astropy's IORegistryError of 60 lines"),
-        ),
+        "short.fits",
         "lacks.ecsv",
         "none.fits",
         "folder",

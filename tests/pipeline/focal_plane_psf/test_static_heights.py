@@ -89,9 +89,6 @@ def test_a_fit_that_was_stopped_goes_on(both, fit, monkeypatch):
 
 
 @pytest.mark.long
-@pytest.mark.xfail(
-    raises=AssertionError, reason="the heights of a step depend on the threads of BLAS, and their bytes are in the key"
-)
 def test_a_fit_goes_on_with_another_number_of_threads_of_blas(both, fit, monkeypatch):
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("BLAS has one thread on one processor")
@@ -120,7 +117,6 @@ def test_what_belongs_to_other_stars_or_is_damaged_is_computed_again(both, fit, 
         fit([0, 1], folder=folder)
 
 
-@pytest.mark.xfail(reason="the name of the telescope alone is in the key: a perturbed one finds the files of another")
 @pytest.mark.long
 def test_files_of_another_telescope_are_computed_again(both, fit, exposures, monkeypatch, lsst_r, wavelengths):
     def never(self):
@@ -132,7 +128,6 @@ def test_files_of_another_telescope_are_computed_again(both, fit, exposures, mon
         fit([0, 1], folder=both[1], instrument=moved)
 
 
-@pytest.mark.xfail(reason="_optics keeps the last responses by field angles and name of the telescope alone")
 @pytest.mark.long
 def test_optics_of_another_instrument_are_computed_again(fit, monkeypatch, lsst_r, wavelengths):
     def stop(self):
