@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 #: Names of the terms of each CCD.
 CCD_TERMS = ("step", "slope", "ripple")
@@ -96,6 +97,12 @@ class Covariance:
                 total += variance * term
         return total
 
+    def root(self, places: Places, noise: np.ndarray) -> np.ndarray:
+        """Return the lower Cholesky factor of the covariance of stars, nugget and noise variances [n] included."""
+        matrix = self.between(places, places)
+        matrix[np.diag_indices(len(places))] += noise + self.nugget
+        return scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+
     def at(self, places: Places) -> np.ndarray:
         """Return the variance at places, shape [n]."""
         slope = self.ccd[1] * (places.uv**2).sum(axis=1)
@@ -115,3 +122,9 @@ def _length(difference: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     u = matrix[0, 0] * difference[..., 0] + matrix[0, 1] * difference[..., 1]
     v = matrix[1, 1] * difference[..., 1]
     return np.sqrt(u * u + v * v)
+
+
+def inverse_of_root(root: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric matrix of given lower Cholesky factor."""
+    lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
+    return np.tril(lower) + np.tril(lower, -1).T

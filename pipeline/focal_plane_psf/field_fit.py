@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from astropy import units as u
 
 from ...core.errors import DomainError
 from ...core.progress import Reporter
@@ -14,7 +13,6 @@ from ...models.camera.camera import Camera, load_camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
-from .covariance import Places
 from .field import ShapeField
 from .fit import SHAPES, ExposureFit, ShapeData
 from .heights import HeightPrior
@@ -114,12 +112,6 @@ def mosaic_of(
     if not names:
         raise DomainError(f"0 of {len(stars)} stars have position, shape and noise: expected {LEAST_STARS} or more")
     return Mosaic.of_stars(names, np.stack([stars.x, stars.y], axis=1)[usable])
-
-
-def places_of(mosaic: Mosaic, stars: FocalPlaneStars) -> Places:
-    """Return the places of stars."""
-    x, y = (stars.x * u.pix, stars.y * u.pix) if stars.pixels else (stars.x, stars.y)
-    return mosaic.places(stars.ccd, x, y)
 
 
 def height_prior(

@@ -20,8 +20,9 @@ import scipy.linalg
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
+from ...models.zernike_polynomials import noll_to_nm
 from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
-from .covariance import Covariance, Places
+from .covariance import Covariance, Places, inverse_of_root
 from .heights import HeightPrior
 from .kriging import on_threads
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
@@ -108,11 +109,18 @@ class NormalEquations:
 
 def exposure_sigma(alignment_rms: float) -> np.ndarray:
     """Return the prior standard deviations of the parameters of an exposure, those of :class:`.ResidualWavefront`."""
-    degree = np.array([int((np.sqrt(8 * j - 7) - 1) / 2) for j in NOLL], dtype=float)
+    degree = np.array([float(noll_to_nm(j)[0]) for j in NOLL])
     variance = degree ** (-11.0 / 3.0)
     sigma = alignment_rms * np.sqrt(variance / variance.sum())
     along = np.sqrt(2.0 * LINEAR_FRACTION) * sigma
     return np.concatenate([np.sqrt(1.0 - LINEAR_FRACTION) * sigma, along, along, [_SEEING]])
+
+
+def _design(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return derivatives of one shape: terms in the height times slopes [n], and the exposure's own columns [n, 25]."""
+    design = terms * slopes[:, None]
+    design[:, -N_EXPOSURE:] = columns
+    return design
 
 
 class ExposureFit:
@@ -156,11 +164,9 @@ class ExposureFit:
         _, slopes, columns = self._columns()
         return slopes, columns
 
-    def linearise(self, exposure: np.ndarray | None = None) -> None:
-        """Evaluate the optics about parameters of the exposure."""
-        if exposure is not None:
-            self.exposure = exposure.copy()
-        aberration = wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius, None)
+    def linearise(self) -> None:
+        """Evaluate the optics about the parameters of the exposure."""
+        aberration = wavefront(self.instrument.telescope, self.exposure[:-1].reshape(3, -1), self._radius)
         seeing = float(self.exposure[-1])
         again = ", again" if self._response is not None else ""
         with self.reporter.stage(f"optics at the stars{again}", total=5 * len(self.data)) as stage:
@@ -195,10 +201,6 @@ class ExposureFit:
     def _radius(self) -> float:
         return float(np.hypot(*self.fields.T).max()) or self.instrument.telescope.field_radius
 
-    def _residuals(self) -> np.ndarray:
-        """Return the shapes less those of the optics at the parameters, shape [n, 3]."""
-        return self._columns()[0]
-
     def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return residuals, slopes with height [n, 3] and columns of the exposure [n, 25, 3] at the parameters."""
         assert self._response is not None
@@ -214,8 +216,7 @@ class ExposureFit:
         def fit(shape: int) -> CovarianceFit:
             def spread(index: np.ndarray) -> np.ndarray:
                 used, terms = self._terms(index)
-                design = terms * slopes[index, shape, None]
-                design[:, -N_EXPOSURE:] = columns[index, :, shape]
+                design = _design(terms, slopes[index, shape], columns[index, :, shape])
                 assert self.covariance is not None
                 return design @ self.covariance[np.ix_(used, used)] @ design.T
 
@@ -260,11 +261,8 @@ class ExposureFit:
             used, terms = self._terms(index)
             part, right = np.zeros((len(used), len(used))), np.zeros(len(used))
             for shape, covariance in enumerate(self.covariances):
-                design = terms * slopes[index, shape, None]
-                design[:, -N_EXPOSURE:] = columns[index, :, shape]
-                total = covariance.between(here, here)
-                total[np.diag_indices(len(index))] += self.data.noise[index, shape] + covariance.nugget
-                root = scipy.linalg.cholesky(total, lower=True, overwrite_a=True, check_finite=False)
+                design = _design(terms, slopes[index, shape], columns[index, :, shape])
+                root = covariance.root(here, self.data.noise[index, shape])
                 both = np.column_stack([design, residuals[index, shape]])
                 white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
                 part += white[:, :-1].T @ white[:, :-1]
@@ -307,9 +305,9 @@ class ExposureFit:
             self.heights, self.exposure = now[:n_height], now[n_height:]
         self._log_determinant = 2.0 * float(np.log(np.diagonal(root)).sum() - np.log(scale).sum())
         with one_blas_thread():
-            lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
+            inverse = inverse_of_root(root)
         self.covariance = np.zeros_like(precision)
-        self.covariance[within] = (np.tril(lower) + np.tril(lower, -1).T) * scale[:, None] * scale
+        self.covariance[within] = inverse * scale[:, None] * scale
         silent = np.setdiff1d(np.arange(len(self.prior.camera)), ccds)
         for ccd in silent:
             columns = self.prior.columns_of(ccd)
@@ -322,16 +320,14 @@ class ExposureFit:
         n = self.prior.n_parameter
         kept = self.heights, self.exposure
         self.heights, self.exposure = parameters[:n], parameters[n:]
-        residuals = self._residuals()
+        residuals, _, _ = self._columns()
         self.heights, self.exposure = kept
 
         def of_block(index: np.ndarray) -> float:
             here = self.data.places[index]
             total = 0.0
             for shape, covariance in enumerate(self.covariances):
-                matrix = covariance.between(here, here)
-                matrix[np.diag_indices(len(index))] += self.data.noise[index, shape] + covariance.nugget
-                root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+                root = covariance.root(here, self.data.noise[index, shape])
                 white = scipy.linalg.solve_triangular(root, residuals[index, shape], lower=True, check_finite=False)
                 total += float(white @ white)
             return total

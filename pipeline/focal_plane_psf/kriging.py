@@ -62,10 +62,7 @@ def neighbourhood(
     covariance: Covariance, places: Places, values: np.ndarray, noise: np.ndarray, stars: np.ndarray
 ) -> Neighbourhood:
     """Solve for the weights of stars of given indices; `noise` [n] are variances of all stars."""
-    near = places[stars]
-    matrix = covariance.between(near, near)
-    matrix[np.diag_indices(len(stars))] += noise[stars] + covariance.nugget
-    root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+    root = covariance.root(places[stars], noise[stars])
     return Neighbourhood(stars, root, scipy.linalg.cho_solve((root, True), values[stars], check_finite=False))
 
 

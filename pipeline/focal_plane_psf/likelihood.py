@@ -19,7 +19,7 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize
 
-from .covariance import COMPONENTS, Covariance, Places, ccd_terms
+from .covariance import CCD_TERMS, COMPONENTS, Covariance, Places, ccd_terms, inverse_of_root
 
 #: Largest number of stars in a block.
 BLOCK = 300
@@ -126,9 +126,9 @@ def fit_covariance(
         terms = ccd_terms(here, here) if with_ccds else ()
         difference = (here.xy[:, None] - here.xy) / extent
         prepared.append(_Block(difference, held, products, terms))
-    n_ccd = 3 if with_ccds else 0
+    n_ccd = len(CCD_TERMS) if with_ccds else 0
     names = [f"{what} {j + 1}" for j in range(COMPONENTS) for what in ("amplitude", "length", "length across", "shear")]
-    names += [("step", "slope", "ripple")[i] for i in range(n_ccd)] + ["nugget"]
+    names += [*CCD_TERMS[:n_ccd], "nugget"]
     bounds = [_AMPLITUDES, _LENGTHS, _LENGTHS, _SHEAR] * COMPONENTS + [_AMPLITUDES] * (n_ccd + 1)
     # Inverse lengths are fitted.
     bounds = [(-b[1], -b[0]) if "length" in n else b for n, b in zip(names, bounds, strict=True)]
@@ -167,10 +167,7 @@ def log_likelihood(
     """Return the logarithm of the likelihood of values in blocks, without the constant of 2 pi."""
     total = 0.0
     for index in blocks:
-        here = places[index]
-        matrix = covariance.between(here, here)
-        matrix[np.diag_indices(len(index))] += noise[index] + covariance.nugget
-        root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
+        root = covariance.root(places[index], noise[index])
         white = scipy.linalg.solve_triangular(root, values[index], lower=True, check_finite=False)
         total -= 0.5 * float(white @ white) + float(np.log(np.diagonal(root)).sum())
     return total
@@ -225,8 +222,7 @@ def _negative_log_likelihood(packed: np.ndarray, blocks: Sequence[_Block]) -> tu
         diagonal = np.diag_indices(len(matrix))
         matrix[diagonal] += variances[-1]
         root = scipy.linalg.cholesky(matrix, lower=True, overwrite_a=True, check_finite=False)
-        lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
-        inverse = np.tril(lower) + np.tril(lower, -1).T
+        inverse = inverse_of_root(root)
         solved = inverse @ block.products
         total += 0.5 * float(np.trace(solved)) + float(np.log(root[diagonal]).sum())
         weight = 0.5 * (inverse - solved @ inverse)

@@ -23,13 +23,13 @@ from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ..experiment import Experiment
 from .covariance import Covariance, Places
 from .field import ShapeField
-from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of, places_of
+from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
 from .file import model_fields, model_hdus
 from .fit import SHAPES, ShapeData
 from .images import ResidualImages, deformed
 from .mosaic import Mosaic, PsfShapes
 from .response import Instrument
-from .stars import FocalPlaneStars, stars_of
+from .stars import FocalPlaneStars, places_of, stars_of
 from .static_heights import StaticHeights
 
 # Images that are deformed at a time.

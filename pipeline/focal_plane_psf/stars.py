@@ -16,6 +16,8 @@ from ...core.errors import DomainError, ProductError
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, read_product
 from ..measure.shapes import measure_shapes
+from .covariance import Places
+from .mosaic import Mosaic
 
 #: Noise of e1, e2 and ln size times the S/N, of stars as wide as the weight, where no stamps are given.
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
@@ -237,6 +239,12 @@ def _mean_star(
     shapes = measure_shapes(np.concatenate([mean[None], changed]), pixel_scale, weight_fwhm)
     values = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)])
     return mean, (values[:, 1:] - values[:, :1]) / step
+
+
+def places_of(mosaic: Mosaic, stars: FocalPlaneStars) -> Places:
+    """Return the places of stars."""
+    x, y = (stars.x * u.pix, stars.y * u.pix) if stars.pixels else (stars.x, stars.y)
+    return mosaic.places(stars.ccd, x, y)
 
 
 def stars_of(stars: Any) -> FocalPlaneStars:

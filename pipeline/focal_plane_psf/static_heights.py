@@ -12,6 +12,7 @@ about the new heights; the optics of an exposure are evaluated once, and are pol
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ import scipy.linalg
 from astropy.io import fits
 
 from ...core.errors import DomainError, ProductError
+from ...core.files import write_bytes
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
@@ -30,11 +32,12 @@ from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
+from .covariance import inverse_of_root
 from .fit import ExposureFit, NormalEquations, ShapeData
 from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
 from .response import ExposureResponse, HeightResponse, Instrument
-from .stars import stars_of
+from .stars import places_of, stars_of
 
 #: Gauss-Newton steps about the heights of all exposures.
 STEPS = 3
@@ -178,8 +181,7 @@ def fit_static_heights(
     assert covariance is not None
     root, scale = covariance
     with one_blas_thread():
-        lower = scipy.linalg.lapack.dpotri(root, lower=1)[0]
-        full = (np.tril(lower) + np.tril(lower, -1).T) * scale[:, None] * scale
+        full = inverse_of_root(root) * scale[:, None] * scale
         return StaticHeights(prior.focal_plane(heights), prior.per_ccd(full), len(exposures))
 
 
@@ -199,8 +201,7 @@ class _Job:
         number, exposure = numbered
         stars = stars_of(exposure)
         stars = stars.chosen(stars.usable)
-        mosaic = Mosaic.of_camera(self.prior.camera)
-        places = mosaic.places(stars.ccd, stars.x, stars.y)
+        places = places_of(Mosaic.of_camera(self.prior.camera), stars)
         data = ShapeData(places, stars.values, stars.noise**2)
         key = self._key(data)
         path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{self.step}.npz"
@@ -212,7 +213,7 @@ class _Job:
             except (OSError, ValueError, KeyError):
                 pass
         fit = ExposureFit(data, self.instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
-        fit.use_optics(*_optics(fit, self.threads))
+        fit.use_optics(*_optics(fit))
         fit.heights = self.heights.copy()
         # Parameters of the exposure follow the heights before its covariances are fitted.
         fit.fit_covariances(30)
@@ -223,9 +224,9 @@ class _Job:
             matrix, vector = _marginalised(fit, normal, self.prior.n_parameter)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_name(path.name + ".part.npz")
-            np.savez(part, matrix=matrix, vector=vector, key=key)
-            part.replace(path)
+            content = io.BytesIO()
+            np.savez(content, matrix=matrix, vector=vector, key=key)
+            write_bytes(path, content.getvalue())
         return matrix, vector
 
     def _key(self, data: ShapeData) -> str:
@@ -251,7 +252,7 @@ def _marginalised(fit: ExposureFit, normal: NormalEquations, n: int) -> tuple[np
 _LAST: dict[str, tuple[HeightResponse, ExposureResponse]] = {}
 
 
-def _optics(fit: ExposureFit, threads: int | None) -> tuple[HeightResponse, ExposureResponse]:
+def _optics(fit: ExposureFit) -> tuple[HeightResponse, ExposureResponse]:
     """Return the responses at the stars of an exposure, those of the last call where these stand at the same places."""
     key = hashlib.sha256(fit.fields.tobytes() + fit.instrument.key.encode()).hexdigest()
     if key not in _LAST:
