@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .covariance import Covariance, Places
-from .fit import ShapeData
+from .fit import N_EXPOSURE, ShapeData, columns_acting_on
 from .kriging import Neighbourhood, leave_one_out, neighbourhood, neighbours_of, on_threads
 from .likelihood import blocks_of
 from .mosaic import Mosaic
@@ -95,13 +95,21 @@ class ShapeField:
         """Return the variance due to uncertain optics, less what the stars about a place correct of it."""
         assert self.optics is not None
         assert self.design is not None
-        own = self.design[stars, :, shape].copy()
-        prior = self.optics.prior
-        elsewhere = self.data.places.ccd[stars] != ccd
-        # Parameters of other CCDs are other parameters.
-        own[elsewhere, prior.n_common : prior.n_common + prior.ccd.shape[1]] = 0.0
-        left = design - weights.T @ own
-        return np.einsum("np,pq,nq->n", left, self.optics.covariance[ccd], left)
+        prior, at = self.optics.prior, self.data.places.ccd[stars]
+        ccds = np.union1d(at, ccd)
+        used, common, width = columns_acting_on(prior, ccds), prior.n_common, prior.ccd.shape[1]
+
+        def columns(of: int) -> np.ndarray:
+            first = common + int(np.searchsorted(ccds, of)) * width
+            return np.r_[:common, first : first + width, len(used) - N_EXPOSURE : len(used)]
+
+        left = np.zeros((len(design), len(used)))
+        left[:, columns(ccd)] = design
+        for other in np.unique(at):
+            rows = at == other
+            left[:, columns(other)] -= weights[rows].T @ self.design[stars[rows], :, shape]
+        covariance = self.optics.covariance[np.ix_(used, used)].astype(np.float64)
+        return np.asarray(((left @ covariance) * left).sum(axis=1))
 
     def left_out(self, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return shapes minus those predicted from all other stars, and their variances, each of shape [n, 3].

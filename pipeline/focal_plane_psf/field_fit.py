@@ -19,7 +19,7 @@ from .heights import HeightPrior
 from .kriging import on_threads
 from .likelihood import CovarianceFit, fit_covariance, log_likelihood
 from .mosaic import Mosaic
-from .optics_part import OpticsPart, columns_acting_on
+from .optics_part import OpticsPart
 from .response import Instrument
 from .stars import FocalPlaneStars
 from .static_heights import StaticHeights
@@ -80,10 +80,10 @@ def fit_field(
             for i, s in enumerate(statistics)
         )
     slopes, columns = fit.derivatives()
-    blocks = np.stack(
-        [solution.covariance[np.ix_(c, c)] for c in (columns_acting_on(prior, i) for i in range(len(mosaic.names)))]
+    covariance = solution.covariance.astype(np.float32)
+    optics = OpticsPart(
+        instrument, solution.plane, solution.aberration, solution.seeing, prior, covariance, fit.response
     )
-    optics = OpticsPart(instrument, solution.plane, solution.aberration, solution.seeing, prior, blocks, fit.response)
     residuals = data.values - optics.shapes(data.places, threads)
     design = optics.design_of(data.places, slopes, columns)
     field = ShapeField(mosaic, data, residuals, tuple(fit.covariances), optics, design)

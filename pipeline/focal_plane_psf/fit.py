@@ -13,6 +13,7 @@ uncertain parameters marginalised.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -107,6 +108,14 @@ class NormalEquations:
     vector: np.ndarray
 
 
+class BlockEquations(NamedTuple):
+    """What one block of stars adds to the normal equations."""
+
+    used: np.ndarray  #: parameters that act on its stars, [m]
+    matrix: np.ndarray  #: [m, m]
+    vector: np.ndarray  #: [m]
+
+
 def exposure_sigma(alignment_rms: float) -> np.ndarray:
     """Return the prior standard deviations of the parameters of an exposure, those of :class:`.ResidualWavefront`."""
     degree = np.array([float(noll_to_nm(j)[0]) for j in NOLL])
@@ -114,6 +123,13 @@ def exposure_sigma(alignment_rms: float) -> np.ndarray:
     sigma = alignment_rms * np.sqrt(variance / variance.sum())
     along = np.sqrt(2.0 * LINEAR_FRACTION) * sigma
     return np.concatenate([np.sqrt(1.0 - LINEAR_FRACTION) * sigma, along, along, [_SEEING]])
+
+
+def columns_acting_on(prior: HeightPrior, ccds: np.ndarray) -> np.ndarray:
+    """Return the columns of the parameters that act on some CCDs: the common ones, those of each, the exposure's."""
+    every = np.arange(prior.n_parameter + N_EXPOSURE)
+    own = [every[prior.columns_of(ccd)] for ccd in ccds]
+    return np.concatenate([every[: prior.n_common], *own, every[prior.n_parameter :]])
 
 
 def _design(terms: np.ndarray, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -178,24 +194,22 @@ class ExposureFit:
                 self._response = ExposureResponse.of(
                     self.instrument, self.fields, self.flat, aberration, seeing, self.threads
                 )
+            self._column_slopes = self._response.height_slopes(self.fields)
         self._base = self.exposure.copy()
 
-    def use_optics(self, optics: HeightResponse, response: ExposureResponse) -> None:
-        """Take responses that were computed before, about no aberration and the assumed seeing."""
-        self.optics, self._response = optics, response
-        self._base = np.zeros(N_EXPOSURE)
-
-    def solve_exposure(self) -> NormalEquations:
-        """Take one step in the parameters of the exposure alone, and return the normal equations about the result."""
-        n = self.prior.n_parameter
-        normal = self.normal_equations()
-        matrix = normal.matrix[n:, n:] + np.diag(self.sigma**-2)
+    def solve_exposure(self) -> list[BlockEquations]:
+        """Take one step in the parameters of the exposure alone; return the equations of blocks about the result."""
+        blocks = self.block_equations()
+        matrix, vector = np.diag(self.sigma**-2), -(self.sigma**-2) * self.exposure
+        # The parameters of the exposure act on every star, and are the last of every block.
+        for block in blocks:
+            matrix += block.matrix[-N_EXPOSURE:, -N_EXPOSURE:]
+            vector += block.vector[-N_EXPOSURE:]
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
-        right = scale * (normal.vector[n:] - self.sigma**-2 * self.exposure)
-        change = scale * np.linalg.solve(matrix * scale[:, None] * scale, right)
+        change = scale * np.linalg.solve(matrix * scale[:, None] * scale, scale * vector)
         self.exposure = self.exposure + change
         # The model is linear in them.
-        return NormalEquations(normal.matrix, normal.vector - normal.matrix[:, n:] @ change)
+        return [b._replace(vector=b.vector - b.matrix[:, -N_EXPOSURE:] @ change) for b in blocks]
 
     @property
     def _radius(self) -> float:
@@ -206,8 +220,10 @@ class ExposureFit:
         assert self._response is not None
         heights = np.clip(self.prior.heights(self.heights, self.data.places), -LARGEST_HEIGHT, LARGEST_HEIGHT)
         columns = self._response.columns(self.fields, heights)
-        shapes = self.optics.at(heights) + np.einsum("npf,p->nf", columns, self.exposure - self._base)
-        return self.data.values - shapes, self.optics.slope(heights), columns
+        change = self.exposure - self._base
+        shapes = self.optics.at(heights) + np.einsum("npf,p->nf", columns, change)
+        slopes = self.optics.slope(heights) + np.einsum("npf,p->nf", self._column_slopes, change)
+        return self.data.values - shapes, slopes, columns
 
     def fit_covariances(self, max_iterations: int = 8) -> None:
         """Fit the covariances of turbulence to what the optics leave, with their uncertainty (one step of EM)."""
@@ -238,10 +254,7 @@ class ExposureFit:
         """Return the parameters that act on some stars, and their terms in the height, zero for the exposure's own."""
         prior, here = self.prior, self.data.places[index]
         ccds, width = np.unique(here.ccd), self.own.shape[1]
-        every = np.arange(prior.n_parameter + N_EXPOSURE)
-        used = np.concatenate(
-            [every[: prior.n_common], *(every[prior.columns_of(c)] for c in ccds), every[prior.n_parameter :]]
-        )
+        used = columns_acting_on(prior, ccds)
         terms = np.zeros((len(index), len(used)))
         terms[:, : prior.n_common] = self.common[index]
         for i, ccd in enumerate(ccds):
@@ -250,28 +263,32 @@ class ExposureFit:
             terms[rows, first : first + width] = self.own[index][rows]
         return used, terms
 
-    def normal_equations(self) -> NormalEquations:
-        """Return the normal equations of a change of all parameters, without the prior of the heights."""
+    def block_equations(self) -> list[BlockEquations]:
+        """Return the normal equations of each block of stars in a change of the parameters, without priors."""
         residuals, slopes, columns = self._columns()
-        size = self.prior.n_parameter + N_EXPOSURE
-        matrix, vector = np.zeros((size, size)), np.zeros(size)
 
-        def contribution(index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def contribution(index: np.ndarray) -> BlockEquations:
             here = self.data.places[index]
             used, terms = self._terms(index)
-            part, right = np.zeros((len(used), len(used))), np.zeros(len(used))
+            matrix, vector = np.zeros((len(used), len(used))), np.zeros(len(used))
             for shape, covariance in enumerate(self.covariances):
                 design = _design(terms, slopes[index, shape], columns[index, :, shape])
                 root = covariance.root(here, self.data.noise[index, shape])
                 both = np.column_stack([design, residuals[index, shape]])
                 white = scipy.linalg.solve_triangular(root, both, lower=True, check_finite=False)
-                part += white[:, :-1].T @ white[:, :-1]
-                right += white[:, :-1].T @ white[:, -1]
-            return used, part, right
+                matrix += white[:, :-1].T @ white[:, :-1]
+                vector += white[:, :-1].T @ white[:, -1]
+            return BlockEquations(used, matrix, vector)
 
-        for used, part, right in on_threads(contribution, self.blocks, self.threads):
-            matrix[np.ix_(used, used)] += part
-            vector[used] += right
+        return on_threads(contribution, self.blocks, self.threads)
+
+    def normal_equations(self) -> NormalEquations:
+        """Return the normal equations of a change of all parameters, without priors."""
+        size = self.prior.n_parameter + N_EXPOSURE
+        matrix, vector = np.zeros((size, size)), np.zeros(size)
+        for block in self.block_equations():
+            matrix[np.ix_(block.used, block.used)] += block.matrix
+            vector[block.used] += block.vector
         return NormalEquations(matrix, vector)
 
     def solve(self, steps: int = 2) -> None:
@@ -279,10 +296,8 @@ class ExposureFit:
         n_height = self.prior.n_parameter
         precision = self._precision()
         # Heights of CCDs without stars stay where they are.
-        every = np.arange(len(precision))
         ccds = np.unique(self.data.places.ccd)
-        own = [every[self.prior.columns_of(c)] for c in ccds]
-        active = np.concatenate([every[: self.prior.n_common], *own, every[n_height:]])
+        active = columns_acting_on(self.prior, ccds)
         within = np.ix_(active, active)
         now = np.concatenate([self.heights, self.exposure])
         before = self._objective(now, precision)

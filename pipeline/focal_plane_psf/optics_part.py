@@ -11,7 +11,6 @@ from ...models.camera.focal_plane import FocalPlane
 from ...wavefront.aberration import ResidualWavefront
 from ...wavefront.psf.engine import center_focal_length
 from .covariance import Places
-from .fit import N_EXPOSURE
 from .heights import HeightPrior
 from .response import ExposureResponse, Instrument
 
@@ -35,9 +34,8 @@ class OpticsPart:
         Logarithm of the Fried parameter over the assumed one.
     prior : HeightPrior
         Parametrisation of the heights.
-    covariance : ndarray, shape [n_ccd, n, n]
-        Covariance of the parameters that act on each CCD: those of the focal plane and the rafts, its own, and those of
-        the exposure.
+    covariance : ndarray of float32, shape [n_parameter, n_parameter]
+        Covariance of the parameters of the heights and of the exposure.
     response : ExposureResponse
         Derivatives with respect to the parameters of the exposure.
     """
@@ -94,9 +92,3 @@ class OpticsPart:
             self.plane.measured,
         )
         return self.instrument.shapes(fields, moved, self.aberration, self.seeing, threads)
-
-
-def columns_acting_on(prior: HeightPrior, ccd: int) -> np.ndarray:
-    """Return the columns of all parameters that act on a CCD."""
-    own = prior.columns_of(ccd)
-    return np.r_[: prior.n_common, own, prior.n_parameter : prior.n_parameter + N_EXPOSURE]

@@ -267,13 +267,23 @@ class ExposureResponse:
     def columns(self, fields: np.ndarray, heights: np.ndarray) -> np.ndarray:
         """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""
         low, high = _LEVELS
-        upper = ((heights - low) / (high - low))[:, None, None]
+        first, second = self._at_levels(fields)
+        return self._with_field(fields, first + ((heights - low) / (high - low))[:, None, None] * (second - first))
+
+    def height_slopes(self, fields: np.ndarray) -> np.ndarray:
+        """Return the derivatives of :meth:`columns` with respect to the height [1/m], shape [n, n_parameter, 3]."""
+        first, second = self._at_levels(fields)
+        return self._with_field(fields, (second - first) / (_LEVELS[1] - _LEVELS[0]))
+
+    def _at_levels(self, fields: np.ndarray) -> np.ndarray:
+        """Return the derivatives at the two heights, parameters on the axis alone: [level, n, n_term + 1, 3]."""
         degree = round((np.sqrt(8 * self.polynomial.shape[2] + 1) - 3) / 2)
         terms = field_terms(fields / self.radius, degree)
-        at_level = np.einsum("nt,pltf->lnpf", terms, self.polynomial)
-        own = at_level[0] + upper * (at_level[1] - at_level[0])
-        waves = own[:, :-1]
-        along = fields / self.radius
+        return np.einsum("nt,pltf->lnpf", terms, self.polynomial)
+
+    def _with_field(self, fields: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Add the parameters along x and y of the field, whose derivatives are those on the axis times x and y."""
+        along, waves = fields / self.radius, own[:, :-1]
         return np.concatenate(
             [waves, along[:, 0, None, None] * waves, along[:, 1, None, None] * waves, own[:, -1:]], axis=1
         )

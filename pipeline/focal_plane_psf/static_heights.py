@@ -6,13 +6,12 @@ marginalised; these add up,
 .. math:: \left(P^{-1} + \sum_v F_v\right) \delta = \sum_v g_v - P^{-1} \beta ,
 
 so that exposures are independent jobs, and memory does not grow with their number. Gauss-Newton steps are repeated
-about the new heights; the optics of an exposure are evaluated once, and are polynomials of the heights from then on.
+about the new heights, and about the wavefront that each exposure had at the last step.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,6 @@ import scipy.linalg
 from astropy.io import fits
 
 from ...core.errors import DomainError, ProductError
-from ...core.files import write_bytes
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
@@ -33,10 +31,11 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope
 from .covariance import inverse_of_root
-from .fit import ExposureFit, NormalEquations, ShapeData
+from .fit import ExposureFit, ShapeData
+from .height_equations import ExposureState, HeightEquations
 from .heights import STATIC_DEGREE, HeightPrior
 from .mosaic import Mosaic
-from .response import ExposureResponse, HeightResponse, Instrument
+from .response import Instrument
 from .stars import places_of, stars_of
 
 #: Gauss-Newton steps about the heights of all exposures.
@@ -165,13 +164,15 @@ def fit_static_heights(
     precision = np.zeros((prior.n_parameter, prior.n_parameter))
     prior.add_to(precision)
     covariance = None
+    states: list[ExposureState | None] = [None] * len(exposures)
     for step in range(max(1, steps)):
-        job = _Job(instrument, prior, alignment_rms, heights, step, None if folder is None else Path(folder), threads)
+        job = _Job(instrument, prior, alignment_rms, heights, None if folder is None else Path(folder), threads)
         matrix, vector = precision.copy(), -precision @ heights
         with reporter.stage(f"heights, step {step + 1} of {steps}", total=len(exposures)) as stage:
-            for part, right in map_jobs(job, list(enumerate(exposures))):
-                matrix += part
-                vector += right
+            jobs = [(step, i, exposure, states[i]) for i, exposure in enumerate(exposures)]
+            for number, part in enumerate(map_jobs(job, jobs)):
+                part.add_to(matrix, vector)
+                states[number] = part.state
                 stage.advance(1)
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
         with one_blas_thread():
@@ -193,73 +194,44 @@ class _Job:
     prior: HeightPrior
     alignment_rms: float
     heights: np.ndarray
-    step: int
     folder: Path | None
     threads: int | None
 
-    def __call__(self, numbered: tuple[int, Any]) -> tuple[np.ndarray, np.ndarray]:
-        number, exposure = numbered
+    def __call__(self, numbered: tuple[int, int, Any, ExposureState | None]) -> HeightEquations:
+        step, number, exposure, state = numbered
         stars = stars_of(exposure)
         stars = stars.chosen(stars.usable)
         places = places_of(Mosaic.of_camera(self.prior.camera), stars)
         data = ShapeData(places, stars.values, stars.noise**2)
-        key = self._key(data)
-        path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{self.step}.npz"
-        if path is not None and path.exists():
-            try:
-                kept = np.load(path)
-                if str(kept["key"]) == key:
-                    return kept["matrix"], kept["vector"]
-            except (OSError, ValueError, KeyError):
-                pass
+        key = self._key(data, state)
+        path = None if self.folder is None else self.folder / f"exposure_{number:05d}_step_{step}.npz"
+        kept = None if path is None else HeightEquations.read(path, key)
+        if kept is not None:
+            return kept
         fit = ExposureFit(data, self.instrument, self.prior, self.alignment_rms, self.threads, Reporter(quiet=True))
-        fit.use_optics(*_optics(fit))
         fit.heights = self.heights.copy()
-        # Parameters of the exposure follow the heights before its covariances are fitted.
-        fit.fit_covariances(30)
-        fit.solve_exposure()
-        fit.fit_covariances(10)
-        normal = fit.solve_exposure()
-        with one_blas_thread():
-            matrix, vector = _marginalised(fit, normal, self.prior.n_parameter)
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            content = io.BytesIO()
-            np.savez(content, matrix=matrix, vector=vector, key=key)
-            write_bytes(path, content.getvalue())
-        return matrix, vector
-
-    def _key(self, data: ShapeData) -> str:
-        state = hashlib.sha256()
-        for array in (data.values, data.noise, data.places.xy, data.places.ccd, self.heights):
-            state.update(np.ascontiguousarray(array).tobytes())
-        state.update(repr((self.alignment_rms, self.instrument.key)).encode())
-        return state.hexdigest()
-
-
-def _marginalised(fit: ExposureFit, normal: NormalEquations, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normal equations of the first n parameters, the others marginalised with their prior."""
-    own = normal.matrix[n:, n:] + np.diag(fit.sigma**-2)
-    size = 1.0 / np.sqrt(np.diagonal(own))
-    between = scipy.linalg.cho_solve(
-        scipy.linalg.cho_factor(own * size[:, None] * size), normal.matrix[n:, :n] * size[:, None]
-    )
-    cross = normal.matrix[:n, n:] * size
-    right = size * (normal.vector[n:] - fit.sigma**-2 * fit.exposure)
-    return normal.matrix[:n, :n] - cross @ between, normal.vector[:n] - between.T @ right
-
-
-_LAST: dict[str, tuple[HeightResponse, ExposureResponse]] = {}
-
-
-def _optics(fit: ExposureFit) -> tuple[HeightResponse, ExposureResponse]:
-    """Return the responses at the stars of an exposure, those of the last call where these stand at the same places."""
-    key = hashlib.sha256(fit.fields.tobytes() + fit.instrument.key.encode()).hexdigest()
-    if key not in _LAST:
+        if state is not None:
+            fit.exposure, fit.covariances = state
         fit.linearise()
-        _LAST.clear()
-        _LAST[key] = fit.optics, fit.response
-    return _LAST[key]
+        # Parameters of the exposure follow the heights before its covariances are fitted.
+        fit.fit_covariances(30 if state is None else 8)
+        fit.solve_exposure()
+        fit.fit_covariances(10 if state is None else 4)
+        blocks = fit.solve_exposure()
+        with one_blas_thread():
+            part = HeightEquations.of(fit, blocks)
+        if path is not None:
+            part.write(path, key)
+        return part
+
+    def _key(self, data: ShapeData, state: ExposureState | None) -> str:
+        digest = hashlib.sha256()
+        for array in (data.values, data.noise, data.places.xy, data.places.ccd, self.heights):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(repr((self.alignment_rms, self.instrument.key)).encode())
+        if state is not None:
+            digest.update(state.exposure.tobytes())
+        return digest.hexdigest()
 
 
 def _float64(name: str, values: np.ndarray, comment: str) -> fits.ImageHDU:

@@ -1,0 +1,97 @@
+"""Normal equations of the heights from one exposure, its own parameters marginalised; kept in a file."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from ...core.files import write_bytes
+from ...core.threads import one_blas_thread
+from .covariance import Covariance
+from .fit import N_EXPOSURE, BlockEquations, ExposureFit
+
+
+class ExposureState(NamedTuple):
+    """Parameters of an exposure, and the covariances of its turbulence."""
+
+    exposure: np.ndarray
+    covariances: list[Covariance]
+
+
+class HeightEquations(NamedTuple):
+    """Normal equations of the heights: a sum over blocks of stars, less what the exposure's own parameters explain."""
+
+    blocks: list[BlockEquations]
+    factor: np.ndarray  #: [n_height, n_exposure]: ``factor @ factor.T`` is to be subtracted
+    vector: np.ndarray  #: [n_height]
+    state: ExposureState
+
+    @classmethod
+    def of(cls, fit: ExposureFit, blocks: list[BlockEquations]) -> HeightEquations:
+        """Marginalise the parameters of an exposure, with their prior, in the equations of its blocks."""
+        n = fit.prior.n_parameter
+        cross, vector = np.zeros((n, N_EXPOSURE)), np.zeros(n)
+        own, right = np.diag(fit.sigma**-2), -(fit.sigma**-2) * fit.exposure
+        heights = []
+        for block in blocks:
+            used, m = block.used[:-N_EXPOSURE], len(block.used) - N_EXPOSURE
+            heights.append(BlockEquations(used, block.matrix[:m, :m], block.vector[:m]))
+            cross[used] += block.matrix[:m, m:]
+            vector[used] += block.vector[:m]
+            own += block.matrix[m:, m:]
+            right += block.vector[m:]
+        # Parameters of metres and of pure numbers side by side.
+        scale = 1.0 / np.sqrt(np.diagonal(own))
+        root = scipy.linalg.cholesky(own * scale[:, None] * scale, lower=True)
+        factor = scipy.linalg.solve_triangular(root, (cross * scale).T, lower=True).T
+        vector -= factor @ scipy.linalg.solve_triangular(root, scale * right, lower=True)
+        return cls(heights, factor, vector, ExposureState(fit.exposure, fit.covariances))
+
+    def add_to(self, matrix: np.ndarray, vector: np.ndarray) -> None:
+        """Add to the normal equations of all exposures."""
+        for block in self.blocks:
+            matrix[np.ix_(block.used, block.used)] += block.matrix
+        with one_blas_thread():
+            matrix -= self.factor @ self.factor.T
+        vector += self.vector
+
+    def write(self, path: Path, key: str) -> None:
+        """Write a file, with a key of all that the equations were made of."""
+        arrays: dict[str, np.ndarray] = {"factor": self.factor, "vector": self.vector, "exposure": self.state.exposure}
+        for i, block in enumerate(self.blocks):
+            arrays[f"block_used_{i}"] = block.used
+            arrays[f"block_matrix_{i}"] = block.matrix[np.tril_indices(len(block.used))]
+        for i, covariance in enumerate(self.state.covariances):
+            for name, value in vars(covariance).items():
+                arrays[f"{name}_{i}"] = np.asarray(value)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = io.BytesIO()
+        np.savez(content, key=key, **arrays)
+        write_bytes(path, content.getvalue())
+
+    @classmethod
+    def read(cls, path: Path, key: str) -> HeightEquations | None:
+        """Return the equations of a file, or None where there is no whole file with this key."""
+        if not path.exists():
+            return None
+        try:
+            kept = np.load(path)
+            if str(kept["key"]) != key:
+                return None
+            blocks, covariances = [], []
+            for i in range(sum(name.startswith("block_used_") for name in kept.files)):
+                used = kept[f"block_used_{i}"]
+                lower = np.zeros((len(used), len(used)))
+                lower[np.tril_indices(len(used))] = kept[f"block_matrix_{i}"]
+                # The right side of a block is in the vector of all.
+                blocks.append(BlockEquations(used, lower + np.tril(lower, -1).T, np.zeros(0)))
+            for i in range(sum(name.startswith("constant_") for name in kept.files)):
+                values = {name: kept[f"{name}_{i}"] for name in Covariance.__dataclass_fields__}
+                covariances.append(Covariance(**{k: v if v.ndim else float(v) for k, v in values.items()}))
+            return cls(blocks, kept["factor"], kept["vector"], ExposureState(kept["exposure"], covariances))
+        except (OSError, ValueError, KeyError):
+            return None
