@@ -62,11 +62,13 @@ from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
+from .models.camera.sensor_heights import CornerSensor as CornerSensor
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums
 from .models.first_order import first_order as first_order
 from .models.first_order import seidel_sums as seidel_sums
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
+from .models.io.heights.zernike_table import corner_sensors as corner_sensors
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
 from .models.io.site_file import load_site as load_site

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, unknown_name
 from ...core.units import metres, radians
+from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 from .camera import Camera, load_camera
 from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
@@ -30,7 +31,7 @@ _MESH_MARGIN = 1e-7
 class FocalPlane:
     """Height of the CCD surfaces over the nominal focal plane.
 
-    Made by `from_budget`, `flat`, `from_heights` or `from_mesh`.
+    Made by `from_budget`, `flat`, `as_measured`, `from_heights` or `from_mesh`.
 
     Parameters
     ----------
@@ -103,6 +104,26 @@ class FocalPlane:
         n = len(camera)
         surfaces = CcdSurfaces(camera.half_size, np.zeros((n, 10)), np.zeros((n, 2, 4)))
         return cls(camera, surfaces, np.zeros(n, dtype=bool))
+
+    @classmethod
+    def as_measured(cls, name: str = "lsstcam") -> FocalPlane:
+        """Return the focal plane of a camera as built.
+
+        Parameters
+        ----------
+        name : str
+            "lsstcam": cold metrology of Rubin's LSSTCam (Document-37242), circular Zernikes to Noll index 28 of each
+            CCD, from imSim (LSST DESC, BSD-3-Clause). Outside the measured part of a CCD, usually 0.2 to 0.6 mm at its
+            rims, the heights go on along their tangents.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such camera.
+        """
+        heights = bundled_heights(name)
+        camera = load_camera(AS_MEASURED[name][0])
+        return cls(camera, *heights.on(camera))
 
     @classmethod
     def from_heights(cls, table: Any, camera: str | Camera = "lsst") -> FocalPlane:
