@@ -1,5 +1,6 @@
 from .core.errors import ConfigError as ConfigError
 from .core.errors import DomainError as DomainError
+from .core.errors import HeightWarning as HeightWarning
 from .core.errors import PachonError as PachonError
 from .core.errors import PrescriptionError as PrescriptionError
 from .core.errors import PrescriptionWarning as PrescriptionWarning

@@ -4,27 +4,23 @@ Columns: DET_NAME; ORIGIN_X, ORIGIN_Y and R_OUTER, the circle of Noll's circular
 the measured rectangle, outside which the polynomials do not hold; ZK, coefficients of index 0, 1, 2..., of which the
 first means nothing. Each column has a unit of length.
 
-The frame of a file is the entry ``frame`` of its metadata (the card FRAME in FITS). ``telescope`` is pachon's. ``CCS``
-is the coordinate system of Rubin's camera: its x is our y, its y our x, and its z runs against ours.
+A table without a frame (:mod:`~.columns`) is in that of imSim's, CCS.
 """
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, cast
 
 import numpy as np
-from astropy import units as u
 from astropy.table import Table
 
 from ....core.errors import PrescriptionError, unknown_name
 from ...camera.sensor_heights import CornerSensor, SensorHeights
 from ...camera.zernike_surfaces import ZernikeSurfaces
+from .columns import frame_of, lengths
 
 COLUMNS = ("DET_NAME", "ORIGIN_X", "ORIGIN_Y", "MIN_X", "MAX_X", "MIN_Y", "MAX_Y", "R_OUTER", "ZK")
-Frame = Literal["telescope", "CCS"]
-FRAMES = ("telescope", "CCS")
 #: Cameras as built: the model of the camera, and the file of its heights.
 AS_MEASURED = {"lsstcam": ("lsst", "lsstcam_heights.ecsv")}
 _DATA = Path(__file__).parents[2] / "data"
@@ -43,7 +39,7 @@ def zernike_heights(table: Table, file: str | Path) -> SensorHeights:
         if name not in table.colnames:
             raise PrescriptionError(f"column {name} is missing: expected {', '.join(COLUMNS)}", file=file)
     names = tuple(str(name).strip() for name in table["DET_NAME"])
-    column = {name: _lengths(table, name, names, file) for name in COLUMNS[1:]}
+    column = {name: lengths(table, name, file, names) for name in COLUMNS[1:]}
     zernikes = column["ZK"]
     if zernikes.ndim != 2 or zernikes.shape[1] < 2:
         raise PrescriptionError(
@@ -71,14 +67,6 @@ def zernike_heights(table: Table, file: str | Path) -> SensorHeights:
         coefficients = -surfaces.coefficients.transpose(0, 2, 1).copy()
         surfaces = ZernikeSurfaces(radius, surfaces.origin, coefficients, limits)
     return SensorHeights(names, center, surfaces)
-
-
-def frame_of(metadata: Any, default: Frame, file: str | Path) -> Frame:
-    """Return the frame that the metadata of a table or the header of an image name; PrescriptionError if unknown."""
-    given = next((metadata[key] for key in ("frame", "FRAME") if key in metadata), default)
-    if given not in FRAMES:
-        raise PrescriptionError(f"frame = {given!r}: expected one of {', '.join(FRAMES)}", file=file, key="frame")
-    return cast(Frame, given)
 
 
 @cache
@@ -113,20 +101,3 @@ def corner_sensors(name: str = "lsstcam") -> tuple[CornerSensor, ...]:
             surface = heights.surfaces.chosen(np.array([i]))
             sensors.append(CornerSensor(sensor, kind, (float(x), float(y)), (float(half_x), float(half_y)), surface))
     return tuple(sensors)
-
-
-def _lengths(table: Table, name: str, sensors: tuple[str, ...], file: str | Path) -> np.ndarray:
-    """Return a column in metres."""
-    column = table[name]
-    try:
-        values = np.asarray(np.ma.filled(u.Quantity(np.ma.getdata(column), column.unit).to_value(u.m), np.nan))
-        values = np.where(np.ma.getmaskarray(column), np.nan, values).astype(np.float64)
-    except (TypeError, ValueError, u.UnitConversionError):
-        raise PrescriptionError(
-            f"column {name} in {column.unit or 'no unit'}: expected numbers with a unit of length, such as mm",
-            file=file,
-        ) from None
-    for sensor, row in zip(sensors, values, strict=True):
-        if not np.isfinite(row).all():
-            raise PrescriptionError(f"{sensor}: {name} has a value that is not finite", file=file)
-    return values
