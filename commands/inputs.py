@@ -25,7 +25,7 @@ def configured_experiment(config: Path | None, **options: object) -> Experiment:
     base = Configuration() if config is None else load_configuration(config)
     settings = with_options(base, **options)
     try:
-        with _warnings_shown(HeightWarning):
+        with warnings_shown(HeightWarning):
             return Experiment.from_config(settings, None if config is None else config.parent)
     except PachonError as error:
         if config is None or settings is not base:
@@ -37,12 +37,12 @@ def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Pat
     """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each."""
     from ..models.io.prescription import load_telescope
 
-    with _warnings_shown(PrescriptionWarning):
+    with warnings_shown(PrescriptionWarning):
         return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues)
 
 
 @contextmanager
-def _warnings_shown(kind: type[Warning]) -> Iterator[None]:
+def warnings_shown(kind: type[Warning]) -> Iterator[None]:
     """Print the warnings of a kind on standard error, a line each, at the end of the ``with`` block."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", kind)

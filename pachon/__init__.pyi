@@ -63,6 +63,8 @@ from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
+from .models.camera.height_statistics import HeightStatistics as HeightStatistics
+from .models.camera.height_statistics import height_statistics as height_statistics
 from .models.camera.sensor_heights import CornerSensor as CornerSensor
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums

@@ -206,7 +206,11 @@ def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     plane = config.focal_plane
     if plane.heights is not None:
-        focal_plane = _measured(plane.heights, camera, given(config.ccds))
+        with error_context(key="focal_plane.heights"):
+            focal_plane = measured_focal_plane(plane.heights, camera)
+        for name in given(config.ccds):
+            if not focal_plane.measured[camera.ccd_index(name)]:
+                raise ConfigError(f"focal_plane.heights = {plane.heights}: no heights of {name}, one of ccds")
     elif plane.budget == "flat":
         focal_plane = FocalPlane.flat(camera)
     else:
@@ -219,21 +223,23 @@ def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     return focal_plane
 
 
-def _measured(name: str, camera: Camera, ccds: Sequence[str]) -> FocalPlane:
-    """Return measured heights; a ConfigError where a CCD to compute has none."""
+def measured_focal_plane(name: str, camera: Camera) -> FocalPlane:
+    """Return measured heights, of a camera as built or of a file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such camera as built, or it is another camera.
+    PachonError
+        If the file is no file of heights.
+    """
     if Path(name).suffix.lower() in HEIGHT_ENDINGS:
-        with error_context(key="focal_plane.heights"):
-            focal_plane = FocalPlane.from_file(name, camera)
-    elif name in AS_MEASURED:
-        focal_plane = FocalPlane.as_measured(name)
-    else:
-        expected = f"{', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}"
-        raise ConfigError(f"focal_plane.heights = {name}: expected {expected}")
+        return FocalPlane.from_file(name, camera)
+    if name not in AS_MEASURED:
+        raise ConfigError(f"{name}: expected {', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}")
+    focal_plane = FocalPlane.as_measured(name)
     if focal_plane.camera.name != camera.name:
-        raise ConfigError(f"focal_plane.heights = {name}: expected heights of the telescope's camera, {camera.name}")
-    missing = [ccd for ccd in ccds if not focal_plane.measured[camera.ccd_index(ccd)]]
-    if missing:
-        raise ConfigError(f"focal_plane.heights = {name}: no heights of {missing[0]}, one of ccds")
+        raise ConfigError(f"{name}: expected heights of the telescope's camera, {camera.name}")
     return focal_plane
 
 

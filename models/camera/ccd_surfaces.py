@@ -72,6 +72,10 @@ class CcdSurfaces:
             gx, gy = gx + along_x, gy + along_y
         return np.stack([gx, gy], axis=-1)
 
+    def measured_at(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return whether local positions [m] lie within the measured rectangle; all do where there are no Zernikes."""
+        return np.ones(dx.shape, dtype=bool) if self.zernikes is None else self.zernikes.inside(ccd, dx, dy)
+
     def curvature_bound(self) -> np.ndarray:
         """Return an upper bound on the largest second derivative in any direction [1/m], shape (n,)."""
         c = self.polynomial

@@ -298,6 +298,10 @@ class FocalPlane:
         """Return the slopes (dh/dx, dh/dy) of the CCD surface [rad], shape (..., 2); arguments as for `height`."""
         return self._on_ccds(self.surfaces.gradient, x, y, 2)
 
+    def measured_at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return whether (x, y) [m] lies on the measured part of a CCD, which for most heights is all of it."""
+        return self._on_ccds(self.surfaces.measured_at, x, y) == 1.0
+
     def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
         px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))

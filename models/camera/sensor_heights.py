@@ -79,8 +79,8 @@ class CornerSensor:
     def height(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the height [m] at positions on the focal plane [m], positive along +z; NaN off the measured sides."""
         dx, dy = np.broadcast_arrays(metres(x, "x") - self.center[0], metres(y, "y") - self.center[1])
-        (left, right), (bottom, top) = self.surface.limits[0]
-        inside = (dx >= left) & (dx <= right) & (dy >= bottom) & (dy <= top)
+        first = np.zeros(dx.shape, dtype=np.int64)
+        inside = self.surface.inside(first, dx, dy)
         out = np.full(dx.shape, np.nan)
-        out[inside] = self.surface.height(np.zeros(int(inside.sum()), dtype=np.int64), dx[inside], dy[inside])
+        out[inside] = self.surface.height(first[inside], dx[inside], dy[inside])
         return out

@@ -57,6 +57,12 @@ class ZernikeSurfaces:
         (x, slope_x), (y, slope_y) = self._powers(sensor, dx, 0), self._powers(sensor, dy, 1)
         return self._sum(sensor, slope_x, y), self._sum(sensor, x, slope_y)
 
+    def inside(self, sensor: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return whether positions about the centres [m] of sensors of given index lie within the limits."""
+        position = np.stack([dx, dy], axis=-1) - self.origin[sensor]
+        low, high = np.moveaxis(self.limits[sensor], -1, 0)
+        return np.all((position >= low) & (position <= high), axis=-1)
+
     def curvature_bound(self, half_size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return upper bounds of |d2h/dx2|, |d2h/dy2|, |d2h/dxdy| [1/m] on squares of given half size [m], each [n]."""
         # The tangent of a power at the rim nowhere exceeds the power itself, so the bound holds outside the limits too.

@@ -87,8 +87,10 @@ def test_a_sweep_reads_heights_beside_it_and_counts_them_by_content(tmp_path):
         for point in numbered_points(sweep, tmp_path)
     ]
     assert heights == pytest.approx([1e-6, 4e-6], abs=1e-18)
+    before = sweep.digest
+    assert load_sweep(path).digest == before
     points_file(tmp_path / "mine.ecsv", 2)
-    assert load_sweep(path).digest != sweep.digest
+    assert load_sweep(path).digest != before
 
 
 @pytest.mark.filterwarnings("ignore::pachon.HeightWarning")
