@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
-from ..core.errors import PachonError, PrescriptionWarning
+from ..core.errors import HeightWarning, PachonError, PrescriptionWarning
 
 if TYPE_CHECKING:
     from ..models.telescope import Telescope
@@ -24,7 +25,8 @@ def configured_experiment(config: Path | None, **options: object) -> Experiment:
     base = Configuration() if config is None else load_configuration(config)
     settings = with_options(base, **options)
     try:
-        return Experiment.from_config(settings, None if config is None else config.parent)
+        with warnings_shown(HeightWarning):
+            return Experiment.from_config(settings, None if config is None else config.parent)
     except PachonError as error:
         if config is None or settings is not base:
             raise  # an option may be at fault, not the file
@@ -35,9 +37,15 @@ def load_model(model: str, lenient: bool = False, glass_catalogues: Sequence[Pat
     """Return the telescope of that name or file; warnings of a lenient reader go to standard error, a line each."""
     from ..models.io.prescription import load_telescope
 
+    with warnings_shown(PrescriptionWarning):
+        return load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues)
+
+
+@contextmanager
+def warnings_shown(kind: type[Warning]) -> Iterator[None]:
+    """Print the warnings of a kind on standard error, a line each, at the end of the ``with`` block."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", PrescriptionWarning)
-        telescope = load_telescope(model, lenient=lenient, glass_catalogues=glass_catalogues)
+        warnings.simplefilter("always", kind)
+        yield
     for warning in caught:
         typer.echo(f"pachon: warning: {warning.message}", err=True)
-    return telescope

@@ -89,6 +89,10 @@ class PrescriptionWarning(UserWarning):
     """Part of a lens file that is not understood and left out."""
 
 
+class HeightWarning(UserWarning):
+    """Measured heights with gaps, without some CCDs, or of an unlikely size."""
+
+
 class ConfigError(PachonError):
     """Malformed configuration file or option."""
 

@@ -8,6 +8,7 @@ for polynomials and needs no recursion; for eps = 0 they are Noll's (1976, J. Op
 from __future__ import annotations
 
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 
@@ -134,6 +135,24 @@ def radial_series(m: int, count: int, obscuration: float = 0.0) -> np.ndarray:
         expanded = np.polynomial.Polynomial(series)(node)
         powers[: degree + 1, degree] = expanded.coef
     return powers @ _radial_coefficients(m, count, float(obscuration))
+
+
+def zernike_monomials(jmax: int) -> np.ndarray:
+    """Return the circular Zernikes 1 ... jmax as polynomials, element [j - 1, p, q] the coefficient of x^p y^q."""
+    degree = noll_to_nm(jmax)[0]
+    out = np.zeros((jmax, degree + 1, degree + 1))
+    for row in range(jmax):
+        n, signed = noll_to_nm(row + 1)
+        m = abs(signed)
+        i = (n - m) // 2
+        scale = np.sqrt(2.0) if m else 1.0
+        for k, coefficient in enumerate(radial_series(m, i + 1)[:, i]):
+            # (x^2 + y^2)^k times the real or imaginary part of (x + iy)^m
+            for a in range(k + 1):
+                for b in range(m + 1):
+                    part = (1j**b).imag if signed < 0 else (1j**b).real
+                    out[row, m - b + 2 * (k - a), b + 2 * a] += scale * coefficient * comb(k, a) * comb(m, b) * part
+    return out
 
 
 def _annulus(x: np.ndarray, y: np.ndarray, obscuration: float) -> tuple[np.ndarray, ...]:

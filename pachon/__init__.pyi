@@ -1,5 +1,6 @@
 from .core.errors import ConfigError as ConfigError
 from .core.errors import DomainError as DomainError
+from .core.errors import HeightWarning as HeightWarning
 from .core.errors import PachonError as PachonError
 from .core.errors import PrescriptionError as PrescriptionError
 from .core.errors import PrescriptionWarning as PrescriptionWarning
@@ -62,11 +63,15 @@ from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
+from .models.camera.height_statistics import HeightStatistics as HeightStatistics
+from .models.camera.height_statistics import height_statistics as height_statistics
+from .models.camera.sensor_heights import CornerSensor as CornerSensor
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums
 from .models.first_order import first_order as first_order
 from .models.first_order import seidel_sums as seidel_sums
 from .models.io.glass_catalogue import GlassCatalogue as GlassCatalogue
+from .models.io.heights.zernike_table import corner_sensors as corner_sensors
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
 from .models.io.site_file import load_site as load_site

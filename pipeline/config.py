@@ -71,9 +71,18 @@ class FocalPlaneConfig(Section):
     potato_chip_cycles: tuple[Positive, Positive] | None = Field(
         None, description="fewest and most cycles along a CCD in place of 1 and 2"
     )
+    heights: str | None = Field(
+        None, description="measured heights in place of a budget: lsstcam (as built), or path of an ECSV or FITS file"
+    )
     moved: dict[str, MotionConfig] = Field(
         default_factory=dict, description="rafts and CCDs moved besides: {R22: {dz_um: 5}, R21_S11: {rx_urad: 50}}"
     )
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Keys of the height budget whose values are not the default ones."""
+        before, now = FocalPlaneConfig().model_dump(by_alias=True), self.model_dump(by_alias=True)
+        return tuple(key for key in now if key not in ("heights", "moved") and now[key] != before[key])
 
     @property
     def sizes(self) -> dict[str, Any]:

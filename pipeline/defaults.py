@@ -11,8 +11,11 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.errors import ConfigError
+from ..core.schema import shown
 from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera, load_camera
+from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
+from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
 from ..models.io.site_file import load_site
 from ..models.site import Site
@@ -65,6 +68,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     camera = load_camera(telescope.camera)
     atmosphere = config.atmosphere
     site_name = _absolute(atmosphere.site, folder, ())
+    plane = config.focal_plane
+    if plane.heights is not None:
+        heights = _absolute(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
+        plane = plane.model_copy(update={"heights": heights})
     site = load_site(site_name)
     wavelengths = config.wavelengths_nm
     if wavelengths is None:
@@ -76,6 +83,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "telescope": name,
             "ccds": chosen_ccds(camera, DEFAULT_CCDS if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
+            "focal_plane": plane,
             "atmosphere": _filled(
                 atmosphere.model_copy(update={"site": site_name}),
                 {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
@@ -164,6 +172,14 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         raise ConfigError(
             "focal_plane.budget = flat: expected simulated or specification where sizes of its terms are given"
         )
+    plane = config.focal_plane
+    if plane.heights is not None and plane.changed:
+        key = plane.changed[0]
+        value = plane.model_dump(by_alias=True)[key]
+        raise ConfigError(
+            f"focal_plane.{key} = {shown(value)}: expected no budget with measured heights, "
+            f"focal_plane.heights = {plane.heights}"
+        )
     if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:
         raise ConfigError("psf.engine = long_exposure: expected atmosphere.enabled = true, whose mean it takes")
     if config.atmosphere.time_step_s > config.atmosphere.exposure_s:
@@ -192,8 +208,8 @@ def _band_of(name: str) -> BandName:
     return bands.get(ending, "r")
 
 
-def _absolute(name: str, folder: Path | None, bundled: Sequence[str]) -> str:
+def _absolute(name: str, folder: Path | None, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
     """Return a bundled name as it is, and the path of a file as an absolute one."""
-    if name in bundled or Path(name).suffix.lower() not in ENDINGS:
+    if name in bundled or Path(name).suffix.lower() not in endings:
         return name
     return str(((folder or Path()) / name).resolve())

@@ -9,15 +9,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigError, PachonError
+from ..core.errors import ConfigError, PachonError, error_context
 from ..core.progress import Reporter
 from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.height_budget import load_budget
+from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
+from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, bundled_names
 from ..models.site import Site
 from ..models.telescope import Telescope
@@ -185,13 +188,30 @@ class Experiment:
         content = self.config.as_dict()
         del content["ccds"]
         content["telescope"] = _name_or_content(given(self.config.telescope), bundled_names())
+        content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())
         return digest(content)
 
 
+def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
+    """Return the section of the focal plane for a hash: a file of heights by its content; no key where there is none.
+
+    So configurations without measured heights keep the hashes that they had before there were any.
+    """
+    name = section["heights"]
+    rest = {key: value for key, value in section.items() if key != "heights"}
+    return rest if name is None else rest | {"heights": _name_or_content(name, tuple(AS_MEASURED), HEIGHT_ENDINGS)}
+
+
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     plane = config.focal_plane
-    if plane.budget == "flat":
+    if plane.heights is not None:
+        with error_context(key="focal_plane.heights"):
+            focal_plane = measured_focal_plane(plane.heights, camera)
+        for name in given(config.ccds):
+            if not focal_plane.measured[camera.ccd_index(name)]:
+                raise ConfigError(f"focal_plane.heights = {plane.heights}: no heights of {name}, one of ccds")
+    elif plane.budget == "flat":
         focal_plane = FocalPlane.flat(camera)
     else:
         budget = replace(load_budget(plane.budget), **plane.sizes)
@@ -200,6 +220,26 @@ def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
         focal_plane = focal_plane.with_moved(
             name, dz=motion.dz_um * 1e-6, rx=motion.rx_urad * 1e-6, ry=motion.ry_urad * 1e-6
         )
+    return focal_plane
+
+
+def measured_focal_plane(name: str, camera: Camera) -> FocalPlane:
+    """Return measured heights, of a camera as built or of a file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such camera as built, or it is another camera.
+    PachonError
+        If the file is no file of heights.
+    """
+    if Path(name).suffix.lower() in HEIGHT_ENDINGS:
+        return FocalPlane.from_file(name, camera)
+    if name not in AS_MEASURED:
+        raise ConfigError(f"{name}: expected {', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}")
+    focal_plane = FocalPlane.as_measured(name)
+    if focal_plane.camera.name != camera.name:
+        raise ConfigError(f"{name}: expected heights of the telescope's camera, {camera.name}")
     return focal_plane
 
 
@@ -225,8 +265,8 @@ def _atmosphere(config: Configuration, site: Site) -> Atmosphere | None:
         raise ConfigError(f"atmosphere: {error}") from None
 
 
-def _name_or_content(name: str, bundled: Sequence[str]) -> str:
+def _name_or_content(name: str, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
     """Return a bundled name, or the hash of the file of that name."""
-    if name in bundled or Path(name).suffix.lower() not in ENDINGS:
+    if name in bundled or Path(name).suffix.lower() not in endings:
         return name
     return hashlib.sha256(Path(name).read_bytes()).hexdigest()

@@ -27,6 +27,7 @@ class Camera:
     centers: np.ndarray  #: centres of the CCDs (x, y) [m], [n_ccd, 2]
     pixels: int  #: pixels along a side of a CCD
     pixel_size: float  #: side of a pixel [m]
+    vendors: tuple[str, ...] = ()  #: maker of each CCD; empty where they are not told apart
 
     def __post_init__(self) -> None:
         for array in (self.raft_index, self.centers):
@@ -83,12 +84,17 @@ class Camera:
         return index
 
 
+#: Rafts of the LSST camera whose CCDs are of Imaging Technology Laboratory; the others are Teledyne e2v's.
+_ITL_RAFTS = {"R01", "R02", "R03", "R10", "R20", "R41", "R42", "R43"}
+
+
 @lru_cache(maxsize=1)
 def lsst_camera() -> Camera:
     """Return the LSST camera: 189 CCDs of 4096 x 4096 pixels of 10 um in 21 rafts of 3 x 3.
 
     Rafts stand on a 5 x 5 grid of 127.0 mm less its corners, CCDs on a grid of 42.25 mm. ``R<row><column>_S<row>
     <column>``: rows along +y, columns along +x, R22_S11 at the centre. Order: rafts row by row, then CCDs row by row.
+    Vendors are "itl" and "e2v". (The CCDs as built have 4072 x 4000 and 4096 x 4004 pixels.)
     """
     raft_pitch, ccd_pitch = 127.0e-3, 42.25e-3
     # A corner has both its row and its column at the rim; every other place has at least one that is not.
@@ -109,6 +115,7 @@ def lsst_camera() -> Camera:
         centers=np.array(centers),
         pixels=4096,
         pixel_size=10e-6,
+        vendors=tuple("itl" if name[:3] in _ITL_RAFTS else "e2v" for name in names),
     )
 
 

@@ -1,10 +1,11 @@
-"""Heights of CCD surfaces: a cubic polynomial, two cosine waves and, where measured, a B-spline for each CCD.
+"""Heights of CCD surfaces: a cubic polynomial, two cosine waves and, where measured, a B-spline or Zernikes.
 
 On CCD ``i``, with ``dx, dy`` the distance from its centre [m] and ``u, v = dx / a, dy / a`` (``a`` half its side)::
 
     h = sum_k polynomial[i, k] * (1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3)[k]
       + sum_w amplitude_w cos(kx_w dx + ky_w dy + phase_w)
       + sum_jk grid[i, j, k] B_j(v) B_k(u)
+      + zernikes of the CCD (:mod:`~.zernike_surfaces`)
 
 `B` are the uniform cubic B-splines whose ``m - 3`` cells cover the CCD evenly. Positive heights are displaced along +z
 of the telescope frame.
@@ -15,6 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
+from .zernike_surfaces import ZernikeSurfaces
 
 # Powers (of u, of v) of the ten terms.
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
@@ -28,6 +31,7 @@ class CcdSurfaces:
     polynomial: np.ndarray  #: coefficients [m] of 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, v^3, [n, 10]
     waves: np.ndarray  #: amplitude [m], kx [rad/m], ky [rad/m], phase [rad] of two waves, [n, 2, 4]
     grid: np.ndarray | None = None  #: B-spline coefficients [m], index order CCD, y, x, [n, m, m]
+    zernikes: ZernikeSurfaces | None = None  #: published Zernike coefficients, [n]
 
     def __post_init__(self) -> None:
         for array in (self.polynomial, self.waves, self.grid):
@@ -45,6 +49,8 @@ class CcdSurfaces:
             h = h + amplitude * np.cos(kx * dx + ky * dy + phase)
         if self.grid is not None:
             h = h + self._spline(ccd, u, v, 0, 0)
+        if self.zernikes is not None:
+            h = h + self.zernikes.height(ccd, dx, dy)
         return h
 
     def gradient(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
@@ -61,7 +67,14 @@ class CcdSurfaces:
             amplitude, kx, ky, phase = self.waves[ccd, w].T
             fall = -amplitude * np.sin(kx * dx + ky * dy + phase)
             gx, gy = gx + kx * fall, gy + ky * fall
+        if self.zernikes is not None:
+            along_x, along_y = self.zernikes.gradient(ccd, dx, dy)
+            gx, gy = gx + along_x, gy + along_y
         return np.stack([gx, gy], axis=-1)
+
+    def measured_at(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return whether local positions [m] lie within the measured rectangle; all do where there are no Zernikes."""
+        return np.ones(dx.shape, dtype=bool) if self.zernikes is None else self.zernikes.inside(ccd, dx, dy)
 
     def curvature_bound(self) -> np.ndarray:
         """Return an upper bound on the largest second derivative in any direction [1/m], shape (n,)."""
@@ -76,8 +89,12 @@ class CcdSurfaces:
             uu = uu + np.abs(np.diff(self.grid, 2, axis=2)).max(axis=(1, 2)) / cell**2
             vv = vv + np.abs(np.diff(self.grid, 2, axis=1)).max(axis=(1, 2)) / cell**2
             uv = uv + np.abs(np.diff(np.diff(self.grid, axis=1), axis=2)).max(axis=(1, 2)) / cell**2
+        uu, vv, uv = uu / self.half_size**2, vv / self.half_size**2, uv / self.half_size**2
+        if self.zernikes is not None:
+            along_x, along_y, across = self.zernikes.curvature_bound(self.half_size)
+            uu, vv, uv = uu + along_x, vv + along_y, uv + across
         # Spectral norm of a symmetric matrix: at most its larger diagonal element plus the off-diagonal one.
-        bound = (np.maximum(uu, vv) + uv) / self.half_size**2
+        bound = np.maximum(uu, vv) + uv
         amplitude, kx, ky = self.waves[:, :, 0], self.waves[:, :, 1], self.waves[:, :, 2]
         return bound + np.sum(np.abs(amplitude) * (kx**2 + ky**2), axis=1)
 

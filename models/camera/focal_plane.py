@@ -6,8 +6,10 @@ detector. Camera teams often use the opposite sign: change it before a table or 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,10 +19,12 @@ from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, unknown_name
 from ...core.units import metres, radians
+from ..io.heights.file import read_heights
+from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 from .camera import Camera, load_camera
 from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
-from .height_fit import fit_heights
+from .height_fit import fit_heights, table_column
 
 # Rims of tiles read back from a file land this far [m] outside by rounding (in a float32 STL 0.34 m are good to 15 nm).
 _MESH_MARGIN = 1e-7
@@ -30,7 +34,7 @@ _MESH_MARGIN = 1e-7
 class FocalPlane:
     """Height of the CCD surfaces over the nominal focal plane.
 
-    Made by `from_budget`, `flat`, `from_heights` or `from_mesh`.
+    Made by `from_budget`, `flat`, `as_measured`, `from_file`, `from_heights` or `from_mesh`.
 
     Parameters
     ----------
@@ -46,6 +50,8 @@ class FocalPlane:
         Height budget of the draw.
     seed : int, optional
         Seed of the draw.
+    residual : ndarray, shape (n_ccd,), optional
+        Rms of the measurements of a file about their fit [m]; NaN without points.
     """
 
     camera: Camera
@@ -54,6 +60,7 @@ class FocalPlane:
     terms: tuple[str, ...] = ()
     budget: HeightBudget | None = None
     seed: int | None = None
+    residual: np.ndarray | None = None
 
     @classmethod
     def from_budget(
@@ -105,6 +112,59 @@ class FocalPlane:
         return cls(camera, surfaces, np.zeros(n, dtype=bool))
 
     @classmethod
+    def as_measured(cls, name: str = "lsstcam") -> FocalPlane:
+        """Return the focal plane of a camera as built.
+
+        Parameters
+        ----------
+        name : str
+            "lsstcam": cold metrology of Rubin's LSSTCam (Document-37242), circular Zernikes to Noll index 28 of each
+            CCD, from imSim (LSST DESC, BSD-3-Clause). Outside the measured part of a CCD, usually 0.2 to 0.6 mm at its
+            rims, the heights go on along their tangents.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such camera.
+        """
+        heights = bundled_heights(name)
+        camera = load_camera(AS_MEASURED[name][0])
+        return cls(camera, *heights.on(camera))
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str], camera: str | Camera = "lsst") -> FocalPlane:
+        """Read measured heights from a file.
+
+        A :class:`~pachon.HeightWarning` names CCDs without heights, which lie at zero, CCDs with gaps, and heights of
+        an unlikely size.
+
+        Parameters
+        ----------
+        path : str or path
+            Table (.ecsv, .fits) with columns x, y, z of points, or with Zernike coefficients of each CCD as imSim has
+            them (DET_NAME, ORIGIN_X..., ZK); or FITS images, one extension a CCD. Units must be stated. The frame is
+            the entry ``frame`` of the metadata: ``telescope`` (ours, heights along +z) or ``CCS`` (Rubin's camera: x
+            and y swapped, z reversed), by default CCS for Zernike coefficients and ``telescope`` for all else.
+        camera : str or Camera
+            Camera, or its name.
+
+        Returns
+        -------
+        FocalPlane
+            `residual` is what the fit of points or pixels leaves; Zernike coefficients are taken as they are.
+
+        Raises
+        ------
+        PrescriptionError
+            If the file cannot be read, or lacks columns, units or a known frame.
+        DomainError
+            If none of it lies on a CCD, or a CCD has too few points.
+        """
+        camera = load_camera(camera)
+        heights = read_heights(Path(path), camera)
+        return cls(camera, heights.surfaces, heights.measured, residual=heights.residual)
+
+    @classmethod
     def from_heights(cls, table: Any, camera: str | Camera = "lsst") -> FocalPlane:
         """Fit measured heights.
 
@@ -128,7 +188,7 @@ class FocalPlane:
             or all on one line.
         """
         camera = load_camera(camera)
-        x, y, z = (_column(table, name) for name in "xyz")
+        x, y, z = (table_column(table, name) for name in "xyz")
         if not x.shape == y.shape == z.shape or x.ndim != 1:
             raise DomainError(f"heights: columns of shape {x.shape}, {y.shape}, {z.shape}: expected one length")
         surfaces, measured = fit_heights(camera, x, y, z)
@@ -238,6 +298,10 @@ class FocalPlane:
         """Return the slopes (dh/dx, dh/dy) of the CCD surface [rad], shape (..., 2); arguments as for `height`."""
         return self._on_ccds(self.surfaces.gradient, x, y, 2)
 
+    def measured_at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return whether (x, y) [m] lies on the measured part of a CCD, which for most heights is all of it."""
+        return self._on_ccds(self.surfaces.measured_at, x, y) == 1.0
+
     def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
         px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
@@ -322,24 +386,3 @@ def _cells(cells_per_ccd: int) -> int:
     if isinstance(cells_per_ccd, bool) or not isinstance(cells_per_ccd, (int, np.integer)) or cells_per_ccd < 1:
         raise DomainError(f"cells_per_ccd = {cells_per_ccd!r}: expected a whole number of one or more")
     return int(cells_per_ccd)
-
-
-def _column(table: Any, name: str) -> np.ndarray:
-    if isinstance(table, Mapping):
-        columns: Iterable[str] = table.keys()
-    elif isinstance(table, Table):
-        columns = table.colnames
-    else:
-        columns = getattr(getattr(table, "dtype", None), "names", None) or ()
-    if name not in columns:
-        raise DomainError(f"heights: column {name!r} is missing: expected columns x, y, z")
-    column = table[name]
-    if isinstance(table, Table) and getattr(column, "unit", None) is not None:
-        column = getattr(column, "quantity", column)
-    if np.ma.isMaskedArray(column) and np.ma.is_masked(column):
-        raise DomainError(f"heights: column {name!r} has masked rows: expected finite numbers")
-    values = metres(column, f"heights column {name!r}")
-    if not np.all(np.isfinite(values)):
-        row = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise DomainError(f"heights: column {name!r}, row {row} = {values.flat[row]}: expected finite numbers")
-    return values

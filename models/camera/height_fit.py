@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from astropy.table import Table
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from ...core.errors import DomainError
+from ...core.units import metres
 from .camera import Camera
 from .ccd_surfaces import POWERS, CcdSurfaces, spline_weights
 
@@ -56,6 +60,28 @@ def fit_heights(
         if grid is not None and bending is not None and last - first >= _SPLINE_POINTS:
             grid[i] = _fit_spline(u, v, rest, bending)
     return CcdSurfaces(camera.half_size, polynomial, np.zeros((len(camera), 2, 4)), grid), counts > 0
+
+
+def table_column(table: Any, name: str) -> np.ndarray:
+    """Return a column of a table, structured array or mapping in metres; DomainError if it is missing or not finite."""
+    if isinstance(table, Mapping):
+        columns: Iterable[str] = table.keys()
+    elif isinstance(table, Table):
+        columns = table.colnames
+    else:
+        columns = getattr(getattr(table, "dtype", None), "names", None) or ()
+    if name not in columns:
+        raise DomainError(f"heights: column {name!r} is missing: expected columns x, y, z")
+    column = table[name]
+    if isinstance(table, Table) and getattr(column, "unit", None) is not None:
+        column = getattr(column, "quantity", column)
+    if np.ma.isMaskedArray(column) and np.ma.is_masked(column):
+        raise DomainError(f"heights: column {name!r} has masked rows: expected finite numbers")
+    values = metres(column, f"heights column {name!r}")
+    if not np.all(np.isfinite(values)):
+        row = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise DomainError(f"heights: column {name!r}, row {row} = {values.flat[row]}: expected finite numbers")
+    return values
 
 
 def _fit_polynomial(u: np.ndarray, v: np.ndarray, z: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:

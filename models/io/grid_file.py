@@ -46,7 +46,7 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
     header, data = images[0]
     with error_context(file=path):
         x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
-        return GridSag(x, y, np.asarray(data, dtype=np.float64) * _unit(header, "BUNIT"))
+        return GridSag(x, y, np.asarray(data, dtype=np.float64) * length_unit(header, "BUNIT"))
 
 
 def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
@@ -77,12 +77,12 @@ def _axis(header: Any, number: int, size: int) -> np.ndarray:
         if isinstance(header[key], bool) or not isinstance(header[key], (int, float)) or not np.isfinite(header[key]):
             raise PrescriptionError(f"{key} = {header[key]!r}: expected a number")
     reference, value, step = (float(header[key]) for key in keys)
-    return (value + (np.arange(1, size + 1) - reference) * step) * _unit(header, f"CUNIT{number}")
+    return (value + (np.arange(1, size + 1) - reference) * step) * length_unit(header, f"CUNIT{number}")
 
 
-def _unit(header: Any, key: str) -> float:
-    """Return the length in metres of the unit that a card names."""
-    text = header.get(key, "m")
+def length_unit(header: Any, key: str, default: str = "m") -> float:
+    """Return the length in metres of the unit that a card names; PrescriptionError where it is none."""
+    text = header.get(key, default)
     try:
         return float(u.Unit(text).to(u.m))
     except (ValueError, TypeError, u.UnitConversionError):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,9 +86,5 @@ class OpticsPart:
         surfaces = self.plane.surfaces
         polynomial = surfaces.polynomial.copy()
         polynomial[:, 0] += _STEP
-        moved = FocalPlane(
-            self.plane.camera,
-            type(surfaces)(surfaces.half_size, polynomial, surfaces.waves, surfaces.grid),
-            self.plane.measured,
-        )
+        moved = replace(self.plane, surfaces=replace(surfaces, polynomial=polynomial))
         return self.instrument.shapes(fields, moved, self.aberration, self.seeing, threads)

@@ -62,11 +62,20 @@ def _model_words(fit: ReconstructionConfig) -> str:
     return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}{whole}"
 
 
+#: Where the heights come from, measured ones or a budget.
+_HEIGHTS = {
+    True: "They are measured ones.",
+    False: "Steps between CCDs and rafts, tilts and the ripple within a CCD (the potato chip) come from the height "
+    "budget, each term from its own random stream.",
+}
+
+
 def draw_pictures(
     experiment: Experiment, products: Sequence[CcdProduct], correlated: dict[str, Correlation]
 ) -> list[Picture]:
     """Return the pictures of a run in the order of the report."""
     config, plane = experiment.config, experiment.focal_plane
+    measured = config.focal_plane.heights is not None
     radius = experiment.field_radius_on_detector
     close = closest_middle_farthest(products)
     optics, whole = not config.atmosphere.enabled, of_focal_plane(products)
@@ -83,10 +92,11 @@ def draw_pictures(
         Picture(
             "Focal plane",
             heights_plot(plane, [p.name for p in products], radius),
-            "Height of every CCD surface over the nominal focal plane, positive towards the sky. Steps between CCDs "
-            "and rafts, tilts and the ripple within a CCD (the potato chip) come from the height budget, each term "
-            "from its own random stream. The same surface as a mesh: focal_plane.glb.",
-            "Fig. 7 shows one realisation of the same budget (Table 1), ±10 µm in all.",
+            f"Height of every CCD surface over the nominal focal plane, positive towards the sky. {_HEIGHTS[measured]} "
+            "The same surface as a mesh: focal_plane.glb.",
+            "Fig. 7 shows one realisation of "
+            + ("a budget" if measured else "the same budget")
+            + " (Table 1), ±10 µm in all.",
         ),
         Picture(
             "Whiskers over the field",

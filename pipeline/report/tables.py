@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from ...models.camera.height_statistics import HeightStatistics
 from ..measure.correlation import SEPARATION_RANGES
 from ..measure.summary import CORRELATED
 
@@ -201,3 +202,34 @@ def _percent(value: float) -> str:
 
 def _power(value: float) -> str:
     return f"{value:.1e}" if math.isfinite(value) else "-"
+
+
+HEIGHT_COLUMNS = (
+    "CCDs",
+    "number",
+    "mean [um]",
+    "rms",
+    "95 %",
+    "peak to valley",
+    "CCD means, rms",
+    "within a CCD, rms",
+    "95 %",
+    "tilt, rms",
+    "shape, rms",
+)
+HEIGHT_CAPTION = (
+    "Heights along +z, the direction of the light. 95 %: from the 2.5th to the 97.5th percentile, within a CCD the "
+    "median over the CCDs. Tilt and shape: of the best plane of each CCD, and about it. Parts without metrology are "
+    "left out."
+)
+
+
+def height_rows(statistics: dict[str, HeightStatistics]) -> list[tuple[str, ...]]:
+    """Return a row for each group of CCDs, in the columns of :data:`HEIGHT_COLUMNS`."""
+
+    def row(name: str, of: HeightStatistics) -> tuple[str, ...]:
+        heights = (of.mean, of.rms, of.width95, of.peak_to_valley, of.ccd_mean_rms)
+        within = (of.within_rms, of.within_width95, of.tilt_rms, of.shape_rms)
+        return name, str(of.n_ccd), *(f"{value * 1e6:.2f}" for value in (*heights, *within))
+
+    return [row(name, of) for name, of in statistics.items()]

@@ -22,7 +22,7 @@ import numpy as np
 
 from ...core.progress import Reporter
 from ...pipeline.ccd_product import CCD_KINDS, CcdProduct
-from ...pipeline.config import Configuration, with_options
+from ...pipeline.config import Configuration
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, jackknife_error
@@ -31,7 +31,7 @@ from ...pipeline.memory import check_memory
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
 from ...pipeline.simulate.ccd_model import model_ccd
-from .causes import CAUSES, FULL, NOISE, OPTICS, checked_causes
+from .causes import FULL, NOISE, OPTICS, checked_causes, without
 
 _RMS = ("rms_e_truth", "rms_residual_at_stars", "rms_residual_left_out", "rms_residual_away", "fwhm_arcsec")
 _RMS_CCD = ("rms_residual_at_stars_ccd", "rms_residual_away_ccd")
@@ -86,7 +86,7 @@ def attribute(
 
 def without_cause(full: Experiment, cause: str) -> Experiment:
     """Return the experiment with one cause off; defaults that were filled in stay: pixels, stamps, weight."""
-    experiment = Experiment.from_config(with_options(full.config, **CAUSES[cause].options))
+    experiment = Experiment.from_config(without(full.config, cause))
     if full.atmosphere is not None and experiment.atmosphere is not None:
         # The screens are the same, and slow to make.
         experiment = replace(experiment, atmosphere=full.atmosphere.at_altitudes(experiment.atmosphere.altitudes))

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...core.errors import ConfigError, unknown_name
 from ...models.io.site_file import load_site
-from ...pipeline.config import Configuration
+from ...pipeline.config import Configuration, with_options
 
 #: Name of the case with all causes, and of the two causes that are no options of the configuration.
 FULL, NOISE, OPTICS = "full", "noise", "optics"
@@ -30,10 +30,14 @@ def _flat(config: Configuration) -> str | None:
 
 
 def _no_heights(config: Configuration) -> str | None:
+    if config.focal_plane.heights is not None:
+        return None
     return _flat(config) or (None if config.focal_plane.terms else "all terms of focal_plane are off already")
 
 
 def _no_term(term: str, config: Configuration) -> str | None:
+    if config.focal_plane.heights is not None:
+        return f"focal_plane.heights = {config.focal_plane.heights}, which has no terms"
     return _flat(config) or (None if term in config.focal_plane.terms else f"focal_plane.{term} = false")
 
 
@@ -80,6 +84,14 @@ CAUSES: dict[str, Cause] = {
     "diffusion": Cause({"psf__diffusion_pixels": 0.0}, _no_diffusion),
     NOISE: Cause({}, lambda _: None),
 }
+
+
+def without(config: Configuration, cause: str) -> Configuration:
+    """Return the configuration with a cause switched off."""
+    if cause == "heights":
+        plane = config.focal_plane.model_copy(update={"heights": None})
+        config = config.model_copy(update={"focal_plane": plane})
+    return with_options(config, **CAUSES[cause].options)
 
 
 def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
-from ...pipeline.experiment import Experiment
+from ...pipeline.experiment import Experiment, hashed_heights
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
 from ..metrics.optics import OPTICS
@@ -253,6 +253,7 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
         # The telescope has a hash of its own, and paths differ between machines.
         del content["telescope"], content["ccds"]
         content["atmosphere"]["site"] = Path(content["atmosphere"]["site"]).name
+        content["focal_plane"] = hashed_heights(content["focal_plane"])
         hashed = digest(content)
     return {"pachon": VERSION, "model_sha256": prescription_hash(telescope), "configuration_sha256": hashed}
 

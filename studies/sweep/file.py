@@ -64,6 +64,10 @@ class Design(Section):
     )
 
 
+#: Sections and keys of a configuration that may name a file, besides the telescope.
+_FILES = (("atmosphere", "site"), ("focal_plane", "heights"))
+
+
 class SweepFile(Section):
     """Content of a sweep file."""
 
@@ -82,8 +86,10 @@ class SweepFile(Section):
         """SHA-256 of the sweep, including the contents of the files that it names."""
         named: list[Any] = [self.design.file]
         if isinstance(self.base, dict):
-            air = self.base.get("atmosphere")
-            named += [self.base.get("telescope"), air.get("site") if isinstance(air, dict) else None]
+            named.append(self.base.get("telescope"))
+            for section, key in _FILES:
+                content = self.base.get(section)
+                named.append(content.get(key) if isinstance(content, dict) else None)
         files = [path for path in named if isinstance(path, str) and Path(path).is_file()]
         contents = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files}
         return digest({"sweep": self.model_dump(mode="json"), "files": contents})
@@ -98,8 +104,9 @@ def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
     folder = path.parent
     content["design"] = _with_path(content.get("design", {}), "file", folder)
     base = _with_path(content.get("base", {}), "telescope", folder)
-    if isinstance(base, dict) and "atmosphere" in base:
-        base = {**base, "atmosphere": _with_path(base["atmosphere"], "site", folder)}
+    for section, key in _FILES:
+        if isinstance(base, dict) and section in base:
+            base = {**base, section: _with_path(base[section], key, folder)}
     content["base"] = base
     return read_sweep(content, str(path))
 

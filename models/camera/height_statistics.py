@@ -1,0 +1,101 @@
+"""Statistics of the heights of a focal plane, of all CCDs and of those of each vendor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.errors import DomainError
+from .focal_plane import FocalPlane
+
+# Cells along the side of a CCD, at whose centres heights are taken.
+_CELLS = 24
+# Ends of the interval that holds 95 % of the heights.
+_TAILS = (2.5, 97.5)
+
+
+@dataclass(frozen=True)
+class HeightStatistics:
+    """Heights of a group of CCDs, each point of their measured surface counted alike [m]."""
+
+    n_ccd: int  #: number of CCDs
+    mean: float  #: mean height
+    rms: float  #: rms about that mean
+    width95: float  #: width of the interval between 2.5 % and 97.5 % of the heights
+    peak_to_valley: float  #: highest less lowest
+    ccd_mean_rms: float  #: rms of the mean heights of the CCDs about their own mean
+    within_rms: float  #: rms about the mean of each CCD
+    within_width95: float  #: the same width of the heights of one CCD, median over the CCDs
+    tilt_rms: float  #: rms of the best plane of each CCD about its mean
+    shape_rms: float  #: rms about the best plane of each CCD
+
+
+def height_statistics(focal_plane: FocalPlane) -> dict[str, HeightStatistics]:
+    """Compute statistics of the CCDs with measured heights, of all of them where none is measured.
+
+    Parameters
+    ----------
+    focal_plane : FocalPlane
+        The heights. Parts of a CCD that were not measured are left out.
+
+    Returns
+    -------
+    dict of str to HeightStatistics
+        Of ``"all"`` and of each vendor of the camera.
+
+    Raises
+    ------
+    DomainError
+        If a CCD has fewer than three measured points on the grid.
+    """
+    camera, (x, y, heights) = focal_plane.camera, sampled_heights(focal_plane)
+    chosen = np.flatnonzero(focal_plane.measured if focal_plane.measured.any() else np.ones(len(camera), dtype=bool))
+    heights = heights[chosen]
+    planes = np.stack([_plane(x, y, row, camera.ccd_names[i]) for i, row in zip(chosen, heights, strict=True)])
+    groups = {"all": np.ones(len(chosen), dtype=bool)}
+    for vendor in dict.fromkeys(camera.vendors):
+        groups[vendor] = np.array([camera.vendors[i] == vendor for i in chosen])
+    return {name: _statistics(heights[of], planes[of]) for name, of in groups.items() if of.any()}
+
+
+def sampled_heights(focal_plane: FocalPlane) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a grid about the centre of a CCD, x and y [m], [n], and the heights of all there [m], [n_ccd, n].
+
+    They are NaN where a CCD was not measured.
+    """
+    camera = focal_plane.camera
+    axis = ((np.arange(_CELLS) + 0.5) / _CELLS - 0.5) * camera.ccd_size
+    y, x = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
+    at = camera.centers[:, :1] + x, camera.centers[:, 1:] + y
+    return x, y, np.where(focal_plane.measured_at(*at), focal_plane.height(*at), np.nan)
+
+
+def _plane(x: np.ndarray, y: np.ndarray, height: np.ndarray, name: str) -> np.ndarray:
+    """Return the best plane of one CCD, at all points."""
+    known = np.isfinite(height)
+    if known.sum() < 3:
+        raise DomainError(f"{name}: {known.sum()} measured points: expected 3 or more")
+    design = np.stack([np.ones_like(x), x, y], axis=1) / np.array([1.0, x.max(), y.max()])
+    return design @ np.linalg.lstsq(design[known], height[known], rcond=None)[0]
+
+
+def _statistics(heights: np.ndarray, planes: np.ndarray) -> HeightStatistics:
+    means = np.nanmean(heights, axis=1, keepdims=True)
+    within, tilt = heights - means, np.where(np.isfinite(heights), planes - means, np.nan)
+    return HeightStatistics(
+        n_ccd=len(heights),
+        mean=float(np.nanmean(heights)),
+        rms=float(np.nanstd(heights)),
+        width95=float(np.ptp(np.nanpercentile(heights, _TAILS))),
+        peak_to_valley=float(np.nanmax(heights) - np.nanmin(heights)),
+        ccd_mean_rms=float(np.std(means)),
+        within_rms=_rms(within),
+        within_width95=float(np.median(np.ptp(np.nanpercentile(within, _TAILS, axis=1), axis=0))),
+        tilt_rms=_rms(tilt),
+        shape_rms=_rms(heights - planes),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))

@@ -1,0 +1,170 @@
+"""Reading of measured heights: tables of points or of Zernike coefficients (ECSV, FITS), and FITS images.
+
+Points and pixels are fitted by :func:`~pachon.models.camera.height_fit.fit_heights`, each CCD by itself, so steps from
+CCD to CCD stay; Zernike coefficients are taken as they are.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from ....core.errors import HeightWarning, PrescriptionError, error_context
+from ...camera.camera import Camera
+from ...camera.ccd_surfaces import CcdSurfaces
+from ...camera.height_fit import fit_heights
+from .columns import frame_of, lengths
+from .images import image_points
+from .zernike_table import COLUMNS, zernike_heights
+
+#: Endings of files with heights.
+ENDINGS = (".ecsv", ".fits", ".fit")
+# Less of a CCD than this is a gap: rims without metrology are a few per cent.
+_COVERED = 0.9
+# Larger heights [m] than this are no heights of a focal plane, but another unit.
+_LARGEST = 0.2e-3
+# Cells a side into which a CCD is divided to find gaps, and points that a cell should have.
+_MOST_CELLS, _POINTS_PER_CELL = 16, 4
+_FITS_PROBLEMS = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredHeights:
+    """Height functions of the CCDs of a camera, and how well they were measured."""
+
+    surfaces: CcdSurfaces
+    measured: np.ndarray  #: which CCDs have heights, [n_ccd] bool
+    residual: np.ndarray  #: rms of the measurements about their fit [m], [n_ccd]; NaN without points
+
+
+def read_heights(path: str | Path, camera: Camera) -> MeasuredHeights:
+    """Read measured heights of a camera's CCDs.
+
+    A :class:`~pachon.HeightWarning` names CCDs without heights, with gaps, and with heights of an unlikely size.
+
+    Raises
+    ------
+    PrescriptionError
+        If the file cannot be read, has neither heights nor Zernike coefficients, units that are no lengths or an
+        unknown frame.
+    DomainError
+        If none of it lies on a CCD, or a CCD has too few points.
+    """
+    path = Path(path)
+    content = _content(path)
+    with error_context(file=path):
+        if isinstance(content, Table):
+            if any(name in content.colnames for name in ("DET_NAME", "ZK")):
+                surfaces, measured = zernike_heights(content, path).on(camera)
+                found = MeasuredHeights(surfaces, measured, np.full(len(camera), np.nan))
+                covered = _measured_fraction(found, camera)
+            else:
+                found, covered = _fitted(_table_points(content, path), camera)
+        else:
+            images = {name: xyz for name, xyz in content.items() if name in camera.ccd_names}
+            if not images:
+                some = ", ".join(list(content)[:3])
+                raise PrescriptionError(f"images {some}: expected names such as {camera.ccd_names[0]}", file=path)
+            _warn_of_others(path, [name for name in content if name not in images])
+            found, covered = _fitted(np.concatenate(list(images.values()), axis=1), camera)
+            _check_places(images, camera)
+    _warn(path, camera, found, covered)
+    return found
+
+
+def _content(path: Path) -> Table | dict[str, np.ndarray]:
+    """Return the table of a file, or the points of its images by name."""
+    if path.suffix.lower() not in ENDINGS:
+        raise PrescriptionError(f"expected a file of heights that ends in {', '.join(ENDINGS)}", file=path)
+    try:
+        if path.suffix.lower() == ".ecsv":
+            return Table.read(path, format="ascii.ecsv")
+        with fits.open(path, memmap=False) as hdus:
+            images = [hdu for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
+            if not images:
+                return Table.read(hdus)
+            return image_points(images, hdus[0].header, path)
+    except _FITS_PROBLEMS as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
+        raise PrescriptionError(f"cannot be read ({reason[:120]})", file=path) from None
+
+
+def _table_points(table: Table, path: Path) -> np.ndarray:
+    for name in "xyz":
+        if name not in table.colnames:
+            wanted = f"expected x, y, z, or {', '.join(COLUMNS)}"
+            raise PrescriptionError(f"columns {', '.join(table.colnames)}: {wanted}", file=path)
+    x, y, z = (lengths(table, name, path) for name in "xyz")
+    return np.stack([y, x, -z] if frame_of(table.meta, "telescope", path) == "CCS" else [x, y, z])
+
+
+def _fitted(points: np.ndarray, camera: Camera) -> tuple[MeasuredHeights, np.ndarray]:
+    """Return the heights fitted to points [3, n], and the fraction of each CCD that they cover."""
+    x, y, z = points
+    surfaces, measured = fit_heights(camera, x, y, z)
+    ccd = camera.ccd_at(x, y)
+    on = ccd >= 0
+    ccd, local, z = ccd[on], points[:2, on].T - camera.centers[ccd[on]], z[on]
+    count = np.bincount(ccd, minlength=len(camera))
+    square = (z - surfaces.height(ccd, *local.T)) ** 2
+    with np.errstate(invalid="ignore"):
+        residual = np.sqrt(np.bincount(ccd, square, minlength=len(camera)) / count)
+    cells = np.clip(np.sqrt(count / _POINTS_PER_CELL).astype(int), 1, _MOST_CELLS)
+    # Number of the cell of each point, and how many different ones a CCD has.
+    place = np.floor((local / camera.ccd_size + 0.5) * cells[ccd, None]).astype(int)
+    place = np.clip(place, 0, cells[ccd, None] - 1)
+    filled = np.unique(np.stack([ccd, place[:, 0], place[:, 1]]), axis=1)
+    covered = np.bincount(filled[0], minlength=len(camera)) / cells**2
+    return MeasuredHeights(surfaces, measured, residual), covered
+
+
+def _measured_fraction(found: MeasuredHeights, camera: Camera) -> np.ndarray:
+    """Return the fraction of each CCD within the measured rectangle of its Zernikes."""
+    zernikes = found.surfaces.zernikes
+    assert zernikes is not None
+    limits = np.clip(zernikes.limits + zernikes.origin[:, :, None], -camera.half_size, camera.half_size)
+    return np.prod(np.diff(limits, axis=2)[..., 0], axis=1) / camera.ccd_size**2
+
+
+def _check_places(images: dict[str, np.ndarray], camera: Camera) -> None:
+    """Raise where the pixels of an image lie on another CCD than its name says."""
+    for name, (x, y, _) in images.items():
+        wanted = camera.ccd_index(name)
+        elsewhere = (ccd := camera.ccd_at(x, y)) != wanted
+        if np.any(elsewhere & (ccd >= 0)):
+            other = camera.ccd_names[int(ccd[elsewhere & (ccd >= 0)][0])]
+            raise PrescriptionError(f"image {name}: has pixels on {other}; are coordinates and frame right?")
+
+
+def _warn_of_others(path: Path, names: Sequence[str]) -> None:
+    if names:
+        warnings.warn(f"{path}: left out, not on the camera: {_some(names)}", HeightWarning, stacklevel=4)
+
+
+def _warn(path: Path, camera: Camera, found: MeasuredHeights, covered: np.ndarray) -> None:
+    names = np.array(camera.ccd_names)
+    if not found.measured.all():
+        missing = list(names[~found.measured])
+        warnings.warn(f"{path}: no heights, taken as zero: {_some(missing)}", HeightWarning, stacklevel=4)
+    gaps = np.flatnonzero(found.measured & (covered < _COVERED))
+    if gaps.size:
+        parts = [f"{names[i]} ({100 * covered[i]:.0f} % measured)" for i in gaps]
+        warnings.warn(f"{path}: gaps, across which heights are continued: {_some(parts)}", HeightWarning, stacklevel=4)
+    axis = np.linspace(-0.9, 0.9, 5) * camera.half_size
+    ccd, y, x = (a.ravel() for a in np.meshgrid(np.arange(len(camera)), axis, axis, indexing="ij"))
+    largest = np.abs(found.surfaces.height(ccd, x, y)).reshape(len(camera), -1).max(axis=1)
+    if np.any(largest > _LARGEST):
+        parts = [f"{names[i]} ({1e3 * largest[i]:.3g} mm)" for i in np.flatnonzero(largest > _LARGEST)]
+        text = f"heights of more than {_LARGEST * 1e3:g} mm; is the unit right? {_some(parts)}"
+        warnings.warn(f"{path}: {text}", HeightWarning, stacklevel=4)
+
+
+def _some(names: Sequence[Any]) -> str:
+    return ", ".join(map(str, names[:12])) + (f" and {len(names) - 12} more" if len(names) > 12 else "")

@@ -1,0 +1,63 @@
+"""Images of heights in FITS files, one extension a CCD: EXTNAME is its name, BUNIT the unit of the heights.
+
+Pixels have the linear coordinates of FITS, ``x_i = CRVALi + sum_j CDi_j (p_j - CRPIXj)`` in CUNITi, or CDELTi in place
+of the matrix. Pixels that are not finite have no height. The frame is the card FRAME of the extension or of the primary
+header (:mod:`~.columns`), by default the telescope's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ....core.errors import PrescriptionError, error_context
+from ..grid_file import length_unit
+from .columns import frame_of
+
+
+def image_points(images: Sequence[Any], primary: Any, file: Path) -> dict[str, np.ndarray]:
+    """Return x, y and height [m] in the telescope frame, shape [3, n], of the pixels of each image, by its name.
+
+    Raises
+    ------
+    PrescriptionError
+        If an image has no name or one twice, no coordinates, or units that are no lengths.
+    """
+    points: dict[str, np.ndarray] = {}
+    for number, hdu in enumerate(images, start=1):
+        name = str(hdu.header.get("EXTNAME", "")).strip()
+        if not name or name in points:
+            raise PrescriptionError(f"image {number}: EXTNAME = {name!r}: expected the name of a CCD, once", file=file)
+        with error_context(file=file, place=name):
+            points[name] = _points(hdu.data, hdu.header)
+        if frame_of(hdu.header, frame_of(primary, "telescope", file), file) == "CCS":
+            x, y, z = points[name]
+            points[name] = np.stack([y, x, -z])
+    return points
+
+
+def _points(data: np.ndarray, header: Any) -> np.ndarray:
+    index = np.indices(data.shape)
+    offset = [1.0 + index[1] - _number(header, "CRPIX1"), 1.0 + index[0] - _number(header, "CRPIX2")]
+    unit = length_unit(header, "BUNIT", "no unit")
+    position = []
+    for i in (1, 2):
+        if any(f"CD{i}_{j}" in header for j in (1, 2)):
+            steps = [_number(header, f"CD{i}_{j}", 0.0) for j in (1, 2)]
+        else:
+            steps = [_number(header, f"CDELT{i}") if i == j else 0.0 for j in (1, 2)]
+        along = _number(header, f"CRVAL{i}") + steps[0] * offset[0] + steps[1] * offset[1]
+        position.append(along * length_unit(header, f"CUNIT{i}", "no unit"))
+    finite = np.isfinite(data)
+    return np.stack([position[0][finite], position[1][finite], unit * data[finite].astype(np.float64)])
+
+
+def _number(header: Any, key: str, default: float | None = None) -> float:
+    value = header.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        found = "is missing" if value is None else f"= {value!r}"
+        raise PrescriptionError(f"{key} {found}: expected a number, the coordinates of the pixels")
+    return float(value)

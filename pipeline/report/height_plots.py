@@ -1,0 +1,84 @@
+"""Plot of measured heights: the focal plane with the CCDs of each vendor, and the distributions of their heights."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
+from ...models.camera.camera import Camera
+from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.height_statistics import height_statistics, sampled_heights
+from .focal_plane_axes import draw_outlines, frame_axes
+
+_COLOURS = (RED, BLUE, ORANGE, PURPLE, GREY)
+# Pixels of the map along a side, and the percentile of |height| at the ends of its scale: a few corners go far beyond.
+_SAMPLES, _SCALE = 700, 99.0
+
+
+def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
+    """Draw heights as a map with the borders between vendors, and their distributions by vendor."""
+    camera = focal_plane.camera
+    groups = {v: np.array([w == v for w in camera.vendors]) for v in dict.fromkeys(camera.vendors)}
+    groups = groups or {"all": np.ones(len(camera), dtype=bool)}
+    heights = 1e6 * sampled_heights(focal_plane)[2]
+    colours = dict(zip(groups, _COLOURS, strict=False))
+    with styled():
+        figure = new_figure(11.6, 6.6)
+        panels: dict[str, Axes] = figure.subplot_mosaic([["map", "all"], ["map", "within"]], width_ratios=[1.75, 1.0])
+        axes, upper, lower = panels["map"], panels["all"], panels["within"]
+        _draw_map(axes, focal_plane, float(np.nanpercentile(np.abs(heights), _SCALE)))
+        if camera.vendors:
+            _draw_borders(axes, camera)
+        axes.set_title(title)
+        statistics = height_statistics(focal_plane)
+        edge = float(np.ceil(np.nanpercentile(np.abs(heights), 99.8)))
+        for name, of in groups.items():
+            row, colour = statistics[name], colours[name]
+            label = f"{name.upper()}: {row.n_ccd} CCDs, rms {row.rms * 1e6:.1f} µm"
+            bins = list(np.linspace(-edge, edge, 81))
+            upper.hist(heights[of].ravel(), bins, density=True, histtype="step", color=colour, lw=1.4, label=label)
+            within = np.ptp(np.nanpercentile(heights[of], (2.5, 97.5), axis=1), axis=0)
+            label = f"{name.upper()}: median {np.median(within):.1f} µm"
+            lower.hist(within, list(range(60)), histtype="step", color=colour, lw=1.4, label=label)
+        upper.set(xlabel="height [µm]", ylabel="density [1/µm]", xlim=(-edge, edge))
+        lower.set(xlabel="width of the middle 95 % of the heights of a CCD [µm]", ylabel="CCDs")
+        lower.set_xlim(0.0, 1.05 * max(np.ptp(np.nanpercentile(heights, (2.5, 97.5), axis=1), axis=0)))
+        for panel in (upper, lower):
+            panel.margins(y=0.25)
+            panel.autoscale(axis="y")
+            panel.legend(loc="upper right")
+        return figure
+
+
+def _draw_map(axes: Axes, focal_plane: FocalPlane, bound: float) -> None:
+    camera = focal_plane.camera
+    edge = 1.03 * float(np.abs(camera.centers).max() + camera.half_size)
+    axis = np.linspace(-edge, edge, _SAMPLES)
+    x, y = np.meshgrid(axis, axis)
+    extent = (-1e3 * edge, 1e3 * edge, -1e3 * edge, 1e3 * edge)
+    height = np.where(focal_plane.measured_at(x, y), 1e6 * focal_plane.height(x, y), np.nan)
+    on_ccd = np.where(focal_plane.ccd_at(x, y) >= 0, 0.8, np.nan)
+    axes.imshow(on_ccd, extent=extent, cmap="gray", vmin=0.0, vmax=1.0)
+    image = axes.imshow(height, extent=extent, cmap="RdBu_r", vmin=-bound, vmax=bound)
+    draw_outlines(axes, camera, range(len(camera)), "0.5", 0.3)
+    frame_axes(axes, extent)
+    bar = axes.figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, extend="both")
+    bar.set_label("height along +z, the direction of the light [µm]")
+
+
+def _draw_borders(axes: Axes, camera: Camera) -> None:
+    """Draw the borders between rafts of different vendors, and write the vendors' names."""
+    vendor = dict(zip(camera.raft_of, camera.vendors, strict=True))
+    centers = {raft: camera.centers[[r == raft for r in camera.raft_of]].mean(axis=0) * 1e3 for raft in vendor}
+    pitch = min(np.hypot(*(a - b)) for r, a in centers.items() for s, b in centers.items() if r != s)
+    lines = []
+    for raft, at in centers.items():
+        axes.annotate(f"{raft} {vendor[raft].upper()}", at, ha="center", va="center", fontsize=6.5, color="0.15")
+        for other, there in centers.items():
+            if vendor[raft] < vendor[other] and np.hypot(*(at - there)) < 1.01 * pitch:
+                middle, along = 0.5 * (at + there), 0.5 * (there - at)[::-1]
+                lines.append(np.stack([middle - along, middle + along]))
+    axes.add_collection(LineCollection(lines, colors="black", linewidths=2.0))

@@ -1,0 +1,64 @@
+"""``pachon camera``: tables, JSON and nothing else, pictures, one line for bad input."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from pachon import FocalPlane, height_statistics
+from pachon.commands.cli import main
+
+
+@pytest.mark.long
+def test_the_table_has_the_vendors_and_the_picture_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["camera"]) == 0
+    out = capsys.readouterr().out
+    lines = {line.split()[0]: line.split() for line in out.splitlines() if line.strip()}
+    expected = height_statistics(FocalPlane.as_measured())
+    for name in ("all", "itl", "e2v"):
+        assert int(lines[name][1]) == expected[name].n_ccd
+        assert float(lines[name][3]) == pytest.approx(expected[name].rms * 1e6, abs=0.005)
+    assert (tmp_path / "camera_lsstcam.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_json_of_a_file_has_the_residuals_and_no_picture(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    x, y = np.random.default_rng(1).uniform(-0.02, 0.02, (2, 300))
+    z = 2.0 + 50 * x
+    Table({"x": x, "y": y, "z": z}, units={"x": "m", "y": "m", "z": "um"}).write("mine.ecsv")
+    assert main(["camera", "mine.ecsv", "--json"]) == 0
+    captured = capsys.readouterr()
+    result = json.loads(captured.out)
+    assert "pachon: warning: mine.ecsv: no heights, taken as zero: R01_S00" in captured.err
+    assert result["statistics_m"]["all"]["n_ccd"] == 1
+    assert result["statistics_m"]["all"]["mean"] == pytest.approx(2e-6, abs=1e-9)
+    assert result["fit_residual_m"]["R22_S11"] < 1e-12
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mine.ecsv"]
+
+
+@pytest.mark.long
+def test_a_configuration_names_its_heights(tmp_path, capsys):
+    path = tmp_path / "run.yaml"
+    path.write_text("focal_plane: {heights: lsstcam, moved: {R22: {dz_um: 100}}}\n")
+    assert main(["camera", str(path), "--json"]) == 0
+    moved = json.loads(capsys.readouterr().out)["statistics_m"]["e2v"]["mean"]
+    built = height_statistics(FocalPlane.as_measured())["e2v"].mean
+    # Nine CCDs of 117, by 100 um, all of one measured area to some per cent.
+    assert moved - built == pytest.approx(100e-6 * 9 / 117, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["camera", "lsstcm"], "lsstcm: expected lsstcam, or a file ending in .ecsv, .fits, .fit"),
+        (["camera", "missing.fits"], "missing.fits: cannot be read (no such file)"),
+        (["camera", "--picture", "heights.gif"], "expected a name that ends in .png, .pdf or .svg"),
+    ],
+)
+def test_bad_input_is_one_line(capsys, arguments, part):
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("pachon: error: ")
+    assert part in line
