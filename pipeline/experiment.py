@@ -206,7 +206,7 @@ def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     plane = config.focal_plane
     if plane.heights is not None:
-        with error_context(key="focal_plane.heights"):
+        with error_context(key="focal_plane"):
             focal_plane = measured_focal_plane(plane.heights, camera)
         for name in given(config.ccds):
             if not focal_plane.measured[camera.ccd_index(name)]:
@@ -234,12 +234,14 @@ def measured_focal_plane(name: str, camera: Camera) -> FocalPlane:
         If the file is no file of heights.
     """
     if Path(name).suffix.lower() in HEIGHT_ENDINGS:
-        return FocalPlane.from_file(name, camera)
+        with error_context(key="heights"):
+            return FocalPlane.from_file(name, camera)
     if name not in AS_MEASURED:
-        raise ConfigError(f"{name}: expected {', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}")
+        expected = f"{', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}"
+        raise ConfigError(f"heights = {name}: expected {expected}", key="heights")
     focal_plane = FocalPlane.as_measured(name)
     if focal_plane.camera.name != camera.name:
-        raise ConfigError(f"{name}: expected heights of the telescope's camera, {camera.name}")
+        raise ConfigError(f"heights = {name}: expected heights of the telescope's camera, {camera.name}", key="heights")
     return focal_plane
 
 
