@@ -1,9 +1,9 @@
 """Images of heights in FITS files, one extension a CCD: EXTNAME is its name, BUNIT the unit of the heights.
 
 Pixels have the linear coordinates of FITS, ``x_i = CRVALi + sum_j CDi_j (p_j - CRPIXj)`` in CUNITi, or CDELTi in place
-of the matrix. Pixels that are not finite have no height. Larger images are averaged to at most 64 x 64 pixels, three for
-each coefficient of the fit along a side; a bowl of 5 um moves by 2 nm. The frame is the card FRAME of the extension or
-of the primary header (:mod:`~.columns`), by default the telescope's.
+of the matrix. Pixels that are not finite have no height. Larger images are averaged to at most 64 x 64 pixels, three
+for each coefficient of the fit along a side; a bowl of 5 um moves by 2 nm. The frame is the card FRAME of the extension
+or of the primary header (:mod:`~.columns`), by default the telescope's.
 """
 
 from __future__ import annotations
