@@ -138,6 +138,8 @@ from .studies.baseline.check import BaselineCheck as BaselineCheck
 from .studies.baseline.file import Baseline as Baseline
 from .studies.baseline.file import read_baseline as read_baseline
 from .studies.baseline.file import write_baseline as write_baseline
+from .studies.shimming.shim import Shims as Shims
+from .studies.shimming.shim import shim as shim
 from .studies.sweep.file import load_sweep as load_sweep
 from .studies.sweep.sweep import run_sweep as run_sweep
 from .studies.sweep.table import SweepTable as SweepTable

@@ -7,13 +7,14 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigError, PachonError, error_context
+from ..core.errors import ConfigError, PachonError, PrescriptionError, error_context
+from ..core.files import read_bytes
 from ..core.progress import Reporter
 from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
@@ -206,7 +207,7 @@ def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     plane = config.focal_plane
     if plane.heights is not None:
-        with error_context(key="focal_plane.heights"):
+        with error_context(key="focal_plane"):
             focal_plane = measured_focal_plane(plane.heights, camera)
         for name in given(config.ccds):
             if not focal_plane.measured[camera.ccd_index(name)]:
@@ -234,13 +235,23 @@ def measured_focal_plane(name: str, camera: Camera) -> FocalPlane:
         If the file is no file of heights.
     """
     if Path(name).suffix.lower() in HEIGHT_ENDINGS:
-        return FocalPlane.from_file(name, camera)
+        with error_context(key="heights"):
+            content = read_bytes(Path(name), PrescriptionError)
+            return _focal_plane_of_file(name, hashlib.sha256(content).hexdigest(), camera)
     if name not in AS_MEASURED:
-        raise ConfigError(f"{name}: expected {', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}")
+        expected = f"{', '.join(AS_MEASURED)}, or a file ending in {', '.join(HEIGHT_ENDINGS)}"
+        raise ConfigError(f"heights = {name}: expected {expected}", key="heights")
     focal_plane = FocalPlane.as_measured(name)
     if focal_plane.camera.name != camera.name:
-        raise ConfigError(f"{name}: expected heights of the telescope's camera, {camera.name}")
+        raise ConfigError(f"heights = {name}: expected heights of the telescope's camera, {camera.name}", key="heights")
     return focal_plane
+
+
+@lru_cache(maxsize=1)
+def _focal_plane_of_file(name: str, content: str, camera: Camera) -> FocalPlane:
+    """Return the heights of a file of a content; kept, since a fit takes seconds and the points of a sweep share it."""
+    del content
+    return FocalPlane.from_file(name, camera)
 
 
 def _atmosphere(config: Configuration, site: Site) -> Atmosphere | None:

@@ -52,8 +52,8 @@ def test_a_configuration_names_its_heights(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["camera", "lsstcm"], "lsstcm: expected lsstcam, or a file ending in .ecsv, .fits, .fit"),
-        (["camera", "missing.fits"], "missing.fits: cannot be read (no such file)"),
+        (["camera", "lsstcm"], "heights = lsstcm: expected lsstcam, or a file ending in .ecsv, .fits, .fit"),
+        (["camera", "missing.fits"], "heights: missing.fits: no such file"),
         (["camera", "--picture", "heights.gif"], "expected a name that ends in .png, .pdf or .svg"),
     ],
 )

@@ -117,11 +117,11 @@ def _fitted(points: np.ndarray, camera: Camera) -> tuple[MeasuredHeights, np.nda
     with np.errstate(invalid="ignore"):
         residual = np.sqrt(np.bincount(ccd, square, minlength=len(camera)) / count)
     cells = np.clip(np.sqrt(count / _POINTS_PER_CELL).astype(int), 1, _MOST_CELLS)
-    # Number of the cell of each point, and how many different ones a CCD has.
     place = np.floor((local / camera.ccd_size + 0.5) * cells[ccd, None]).astype(int)
     place = np.clip(place, 0, cells[ccd, None] - 1)
-    filled = np.unique(np.stack([ccd, place[:, 0], place[:, 1]]), axis=1)
-    covered = np.bincount(filled[0], minlength=len(camera)) / cells**2
+    filled = np.zeros((len(camera), _MOST_CELLS, _MOST_CELLS), dtype=bool)
+    filled[ccd, place[:, 0], place[:, 1]] = True
+    covered = filled.sum(axis=(1, 2)) / cells**2
     return MeasuredHeights(surfaces, measured, residual), covered
 
 

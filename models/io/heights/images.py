@@ -1,8 +1,9 @@
 """Images of heights in FITS files, one extension a CCD: EXTNAME is its name, BUNIT the unit of the heights.
 
 Pixels have the linear coordinates of FITS, ``x_i = CRVALi + sum_j CDi_j (p_j - CRPIXj)`` in CUNITi, or CDELTi in place
-of the matrix. Pixels that are not finite have no height. The frame is the card FRAME of the extension or of the primary
-header (:mod:`~.columns`), by default the telescope's.
+of the matrix. Pixels that are not finite have no height. Larger images are averaged to at most 64 x 64 pixels, three
+for each coefficient of the fit along a side; a bowl of 5 um moves by 2 nm. The frame is the card FRAME of the extension
+or of the primary header (:mod:`~.columns`), by default the telescope's.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ import numpy as np
 from ....core.errors import PrescriptionError, error_context
 from ..grid_file import length_unit
 from .columns import frame_of
+
+# Pixels along a side that a fit can use.
+_MOST_PIXELS = 64
 
 
 def image_points(images: Sequence[Any], primary: Any, file: Path) -> dict[str, np.ndarray]:
@@ -51,8 +55,21 @@ def _points(data: np.ndarray, header: Any) -> np.ndarray:
             steps = [_number(header, f"CDELT{i}") if i == j else 0.0 for j in (1, 2)]
         along = _number(header, f"CRVAL{i}") + steps[0] * offset[0] + steps[1] * offset[1]
         position.append(along * length_unit(header, f"CUNIT{i}", "no unit"))
+    values = np.stack([position[0], position[1], unit * data.astype(np.float64)])
     finite = np.isfinite(data)
-    return np.stack([position[0][finite], position[1][finite], unit * data[finite].astype(np.float64)])
+    return _averaged(np.where(finite, values, 0.0), finite)
+
+
+def _averaged(values: np.ndarray, finite: np.ndarray) -> np.ndarray:
+    """Return the means of x, y and height over blocks of pixels, shape [3, n], of blocks with finite pixels."""
+    starts = [np.arange(0, size, -(-size // _MOST_PIXELS)) for size in finite.shape]
+
+    def sums(array: np.ndarray) -> np.ndarray:
+        along_y = np.add.reduceat(array, starts[0], axis=-2)
+        return np.asarray(np.add.reduceat(along_y, starts[1], axis=-1))
+
+    count = sums(finite.astype(np.float64))
+    return np.asarray(sums(values)[:, count > 0] / count[count > 0])
 
 
 def _number(header: Any, key: str, default: float | None = None) -> float:

@@ -60,7 +60,7 @@ def test_the_camera_as_built_is_rougher_on_itl_ccds():
     plane = FocalPlane.as_measured("lsstcam")
     found = height_statistics(plane)
     assert (found["itl"].n_ccd, found["e2v"].n_ccd) == (72, 117)
-    # Random points of the measured rectangles, in place of a grid: 200 a CCD are good to some per cent, and so are rims,
+    # Random points of the measured rectangles in place of a grid: 200 a CCD are good to some per cent. So are the rims,
     # where heights are largest, of which the grid has whole cells or none.
     camera, limits = lsst_camera(), plane.surfaces.zernikes.limits
     rng = np.random.default_rng(1)

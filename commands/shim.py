@@ -1,0 +1,69 @@
+"""The command ``pachon shim``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Option
+
+from .inputs import configured_experiment
+from .interrupt import interruptible
+from .options import Ccds, Config, Json, Quiet, Raft, Threads, one_name_list
+from .tables import Rows, print_json
+
+app = typer.Typer()
+_CAPTION = (
+    "Mean over the area of the CCDs of the long-exposure PSF, at places that the fit did not use. Focused: moved as a "
+    "whole, which needs no shims. Plane: CCDs without heights, focused."
+)
+
+
+@app.command("shim")
+def shim_command(
+    config: Config = None,
+    ccds: Ccds = None,
+    raft: Raft = None,
+    heights: Annotated[
+        str | None, Option(help="Measured heights: lsstcam, or an ECSV or FITS file; those of the configuration.")
+    ] = None,
+    merit: Annotated[str, Option(help="fwhm (mean FWHM) or ellipticity (rms).")] = "fwhm",
+    parts: Annotated[str, Option(help="rafts or ccds.")] = "rafts",
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_shims"),
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Find by how much rafts or CCDs should move for the sharpest or roundest images, and what that gains.
+
+    Telescope, band, heights and seeing are those of the configuration; all CCDs are used unless some are named. Motions
+    (shims.ecsv), gains (shims.json), a plot, and the configuration with the shims go into one folder.
+
+    **Examples**
+
+    - `pachon shim --heights lsstcam`: rafts of LSSTCam as built, half a minute
+    - `pachon shim my_config.yaml --parts ccds --merit ellipticity`
+    - `pachon run pachon_shims/config.yaml`: the run with the shims
+    """
+    from ..core.files import make_folder
+    from ..studies.shimming.product import shim_metrics, write_shims
+    from ..studies.shimming.shim import STATES, shim
+
+    names = one_name_list(ccds=ccds, raft=raft) or ("all",)
+    experiment = configured_experiment(config, ccds=names, focal_plane__heights=heights, psf__engine="long_exposure")
+    make_folder(out)
+    with interruptible(quiet) as reporter:
+        shims = shim(experiment, merit=merit, parts=parts, threads=threads, reporter=reporter)
+    write_shims(shims, out, experiment)
+    if as_json:
+        print_json(shim_metrics(shims))
+        return
+    if not quiet:
+        reference = shims.checked["focused"].fwhm
+        rows = [
+            (state, f"{m.fwhm:.4f}", f"{1e3 * (m.fwhm - reference):+.2f}", f"{1e3 * m.rms_e:.2f}")
+            for state, m in ((state, shims.checked[state]) for state in STATES)
+        ]
+        Rows(("focal plane", "mean FWHM [arcsec]", "less focused [mas]", "rms e [1e-3]"), rows, _CAPTION).show()
+    print(f"shims: {out.resolve()}")

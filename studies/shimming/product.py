@@ -1,0 +1,78 @@
+"""Files of shims: motions, gains, plot, and the configuration of a run with them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.plotting import new_figure, png_bytes, styled
+from ...models.camera.focal_plane import FocalPlane
+from ...pipeline.experiment import Experiment
+from ...pipeline.report.focal_plane_axes import draw_outlines, frame_axes
+from ...pipeline.report.focal_plane_plots import draw_heights
+from ...pipeline.run_folder import stamp_of
+from ..product import write_products
+from .shim import Shims, shimmed_configuration
+
+
+def shim_metrics(shims: Shims) -> dict[str, Any]:
+    """Return motions and means as plain numbers; keys end in their unit."""
+    motions = {name: (m.dz * 1e6, m.rx * 1e6, m.ry * 1e6) for name, m in shims.motions.items()}
+    named = {name: dict(zip(("dz_um", "rx_urad", "ry_urad"), values, strict=True)) for name, values in motions.items()}
+
+    def states(of: Any) -> dict[str, dict[str, float]]:
+        return {state: {"mean_fwhm_arcsec": m.fwhm, "rms_e": m.rms_e} for state, m in of.items()}
+
+    focus = asdict(shims.focus)
+    return {
+        "merit": shims.merit,
+        "parts": shims.parts,
+        "focus": {"dz_um": focus["dz"] * 1e6, "rx_urad": focus["rx"] * 1e6, "ry_urad": focus["ry"] * 1e6},
+        "motions": named,
+        "at_fitted_places": states(shims.fitted),
+        "at_other_places": states(shims.checked),
+    }
+
+
+def write_shims(shims: Shims, folder: Path, experiment: Experiment) -> tuple[str, ...]:
+    """Write motions, gains, plot and the configuration with the shims; return the names of the files."""
+    motions = shims.motions.values()
+    columns = {
+        "part": (np.array(list(shims.motions)), "", "raft or CCD"),
+        "dz_um": (np.array([m.dz for m in motions]) * 1e6, "um", "piston along +z"),
+        "rx_urad": (np.array([m.rx for m in motions]) * 1e6, "urad", "rotation about x; lifts the side at larger y"),
+        "ry_urad": (np.array([m.ry for m in motions]) * 1e6, "urad", "rotation about y; lowers the side at larger x"),
+    }
+    return write_products(
+        folder,
+        {"shims.ecsv": ("motions beside the focus of the whole focal plane", columns)},
+        {"shims.png": shims_plot(shims)},
+        {"shims.json": shim_metrics(shims)},
+        stamp_of(experiment).meta(),
+        shimmed_configuration(experiment.config, shims),
+        "the run with the focus and the shims among its moved rafts and CCDs.",
+    )
+
+
+def shims_plot(shims: Shims) -> bytes:
+    """Draw the heights focused as a whole, the motions of the parts, and the heights with them, on one scale."""
+    camera = shims.focal_plane.camera
+    edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
+    limits = (-edge, edge, -edge, edge)
+    flat = FocalPlane.flat(camera)
+    for name, motion in shims.motions.items():
+        flat = flat.with_moved(name, dz=motion.dz, rx=motion.rx, ry=motion.ry)
+    planes = {"focused as a whole": shims.focused, f"motions of {shims.parts}": flat, "shimmed": shims.focal_plane}
+    bounds = 3e6 * float(np.std(shims.focused.height(*camera.centers.T))) or 1.0
+    with styled():
+        figure = new_figure(13.0, 4.6)
+        for i, (axes, (title, plane)) in enumerate(zip(figure.subplots(1, 3), planes.items(), strict=True)):
+            image = draw_heights(axes, plane, limits, 450, bounds=bounds)
+            draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
+            frame_axes(axes, limits, y_label=i == 0)
+            axes.set_title(title)
+        figure.colorbar(image, ax=list(figure.axes), fraction=0.02, pad=0.01, extend="both", label="height [µm]")
+        return png_bytes(figure)

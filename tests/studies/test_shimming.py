@@ -1,0 +1,139 @@
+"""Shims: motions that undo known motions, minima by brute force, the configuration with the shims."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pachon.commands.cli import main
+from pachon.core.errors import ConfigError
+from pachon.models.camera.focal_plane import FocalPlane
+from pachon.pipeline.config import Configuration, load_configuration, with_options
+from pachon.pipeline.experiment import Experiment
+from pachon.studies.shimming.curves import FocusCurves, Places, measured
+from pachon.studies.shimming.shim import STATES, Motion, moved_parts, shim, shimmed_configuration
+
+OPTIONS = {"ccds": ("R34",), "psf__engine": "long_exposure", "wavelengths_nm": (620.0,)}
+
+
+def experiment_of(**options):
+    return Experiment.from_config(with_options(Configuration(), **(OPTIONS | options)))
+
+
+@pytest.fixture(scope="module")
+def built():
+    return experiment_of(focal_plane__heights="lsstcam")
+
+
+@pytest.fixture(scope="module")
+def shims(built):
+    return shim(built, threads=1)
+
+
+@pytest.mark.long
+def test_curves_are_the_engine_at_any_height(built):
+    places = Places.gauss(built.focal_plane, ("R34_S11",), 3)
+    curves = FocusCurves.of(built, places, 40e-6)
+    heights = np.random.default_rng(1).uniform(-40e-6, 40e-6, len(places.ccd))
+    values, slopes = curves.at(heights)
+    camera = built.camera
+    for i in (0, 4, 8):
+        plane = FocalPlane.flat(camera).with_moved("R34", dz=heights[i])
+        direct = measured(built, plane, places)[:, i]
+        assert values[0, i] == pytest.approx(direct[0], abs=2e-4)
+        # One in a hundred of the ellipticities of some 1e-2 at these heights.
+        assert values[1:, i] == pytest.approx(direct[1:], abs=2e-4)
+    step = 1e-8
+    differences = (curves.at(heights + step)[0] - curves.at(heights - step)[0]) / (2 * step)
+    assert np.allclose(slopes, differences, rtol=1e-5, atol=1e-3)
+
+
+def test_means_over_gauss_nodes_are_those_over_the_area():
+    # A quadratic of four CCDs, in closed form.
+    plane = FocalPlane.flat()
+    names = ("R22_S11", "R22_S12")
+    places = Places.gauss(plane, names, 3)
+    assert places.mean(places.offset[:, 0] ** 2) == pytest.approx(20.48e-3**2 / 3, rel=1e-12)
+    assert places.mean(places.position[:, 0]) == pytest.approx(42.25e-3 / 2, rel=1e-12)
+
+
+@pytest.mark.long
+def test_known_motions_are_undone():
+    """Whatever a raft is moved by, its shims bring it to the same place: where it is sharpest."""
+    flat = experiment_of(focal_plane__budget="flat")
+    moved = replace(flat, focal_plane=flat.focal_plane.with_moved("R34", dz=7e-6, rx=4e-5, ry=-9e-5))
+    x, y = flat.camera.centers[[flat.camera.ccd_index(n) for n in flat.config.ccds]].T
+    for merit in ("fwhm", "ellipticity"):
+        one, other = (shim(e, merit=merit, threads=1).focal_plane.height(x, y) for e in (flat, moved))
+        # The curves of the two span different ranges. The minimum is flat: 0.1 um changes the mean width by 1e-6 of it.
+        assert np.allclose(one, other, rtol=0, atol=0.1e-6)
+
+
+@pytest.mark.long
+def test_a_shimmed_raft_is_sharpest(built, shims):
+    """Brute force: the engine finds larger mean widths after any further motion, by as much one way as the other."""
+    fit = Places.gauss(built.focal_plane, built.config.ccds, 3)
+
+    def width(**motion):
+        plane = moved_parts(shims.focal_plane, {"R34": Motion(**motion)})
+        return fit.mean(measured(built, plane, fit)[0])
+
+    best = width()
+    # From the curves, which hold to 1e-4 each and better in the mean.
+    assert shims.fitted["shimmed"].fwhm == pytest.approx(best, abs=2e-5)
+    for key, step in (("dz", 3e-6), ("rx", 6e-5), ("ry", 6e-5)):
+        plus, minus = width(**{key: step}), width(**{key: -step})
+        assert min(plus, minus) > best
+        # The derivative vanishes: the parabola through three points has its vertex within a tenth of the step.
+        assert abs(plus - minus) < 0.2 * (plus + minus - 2 * best)
+
+
+@pytest.mark.long
+def test_gains_are_in_order_and_checked_elsewhere(built, shims):
+    for states in (shims.fitted, shims.checked):
+        assert tuple(states) == STATES
+        assert states["as built"].fwhm > states["focused"].fwhm - 1e-6
+        assert states["focused"].fwhm > states["shimmed"].fwhm - 1e-5
+        assert states["shimmed"].fwhm > states["plane"].fwhm
+    ccds = shim(built, parts="ccds", threads=1)
+    assert len(ccds.motions) == 9
+    assert ccds.fitted["shimmed"].fwhm < shims.fitted["shimmed"].fwhm
+
+
+@pytest.mark.long
+def test_the_configuration_with_the_shims_is_the_shimmed_focal_plane(built, shims):
+    plain = with_options(built.config, focal_plane__moved={"R34": {"dz_um": 1.0}, "R22_S11": {"rx_urad": 5.0}})
+    config = shimmed_configuration(plain, shims)
+    plane = Experiment.from_config(config).focal_plane
+    expected = shims.focal_plane.with_moved("R34", dz=1e-6).with_moved("R22_S11", rx=5e-6)
+    x, y = np.random.default_rng(3).uniform(-0.3, 0.3, (2, 500))
+    assert np.allclose(plane.height(x, y), expected.height(x, y), rtol=0, atol=1e-13, equal_nan=True)
+
+
+@pytest.mark.long
+def test_the_command_writes_motions_gains_and_a_configuration(tmp_path, capsys):
+    out = tmp_path / "shims"
+    arguments = ["shim", "--heights", "lsstcam", "--ccds", "R22_S11", "--parts", "ccds", "-o", str(out)]
+    assert main([*arguments, "--json", "--threads", "1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert list(found["motions"]) == ["R22_S11"]
+    assert {p.name for p in out.iterdir()} == {"shims.ecsv", "shims.json", "shims.png", "config.yaml"}
+    first = {p.name: p.read_bytes() for p in out.iterdir()}
+    moved = load_configuration(out / "config.yaml").focal_plane.moved
+    assert "R22_S11" in moved
+    # Again with two threads: the same bytes.
+    assert main([*arguments, "--quiet", "--threads", "2"]) == 0
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == first
+
+
+def test_bad_arguments_are_one_line(capsys):
+    experiment = experiment_of(focal_plane__heights="lsstcam")
+    with pytest.raises(ConfigError, match="merit = 'size': expected one of fwhm, ellipticity"):
+        shim(experiment, merit="size")
+    with pytest.raises(ConfigError, match="parts = 'raft': expected one of rafts, ccds"):
+        shim(experiment, parts="raft")
+    with pytest.raises(ConfigError, match=r"psf\.engine = fast: expected long_exposure"):
+        shim(experiment_of(psf__engine="fast"))
+    assert main(["shim", "--heights", "nowhere"]) == 2
+    assert "focal_plane.heights = nowhere: expected lsstcam" in capsys.readouterr().err
