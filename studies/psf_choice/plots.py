@@ -21,8 +21,8 @@ _HOW = {
     "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
     "softened": (AWAY, "D", "softened weights"),
     "gp": ("#2a8a57", "^", "Gaussian process"),
-    "no_telescope": ("#b08a2e", "P", FOCAL_PLANE["no_telescope"]),
-    "focal_plane": ("#7a4fa3", "v", FOCAL_PLANE["focal_plane"]),
+    "no_telescope": ("0.5", "P", FOCAL_PLANE["no_telescope"]),
+    "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }
 _BASIS = {"pca": (OBSERVED, "o"), "pixels": (AWAY, "s"), "shapelets": (LEFT_OUT, "D")}
 _RMS = "rms of one component of e, no star"
