@@ -55,8 +55,10 @@ def fit_focal_plane(
 
 def _product(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> _Product:
     exposure, found = ccd.exposure, observed.observation
+    x, y = exposure.positions.observed.T
     stars = _Stars(
-        *exposure.positions.observed.T,
+        x,
+        y,
         found.shapes.e1,
         found.shapes.e2,
         found.shapes.size,

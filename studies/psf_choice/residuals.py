@@ -68,10 +68,10 @@ def measure_residuals(
         )
         for k, (at, shapes, exposed, chosen) in enumerate(jobs):
             found: Shapes | PsfShapes
-            if isinstance(model, FocalPlanePsf):
-                found = model.shapes(exposure.name, *at.T, threads=threads)
-            else:
+            if isinstance(model, PsfModel):
                 found = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
+            else:
+                found = model.shapes(exposure.name, *at.T, threads=threads)
             if not np.isfinite(found.e1).any():
                 raise DomainError(f"CCD {exposure.name}: the model has no shape anywhere")
             residuals[k].append(np.stack([shapes.e1 - found.e1, shapes.e2 - found.e2, shapes.size / found.size - 1.0]))

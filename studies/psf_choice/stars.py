@@ -72,7 +72,8 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     exposed, places, name = ccd.exposure.observed, ccd.exposure.positions, ccd.exposure.name
     n_stars = len(exposed.image)
     if snr_min == NOISE_FREE:
-        return ObservedCcd(ccd.noise_free, *np.full((2, n_stars), np.inf), np.zeros(n_stars))
+        unlimited = np.full(n_stars, np.inf)
+        return ObservedCcd(ccd.noise_free, unlimited, unlimited, np.zeros(n_stars))
     seed, light = experiment.config.seed, exposed.lit_fraction
     width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
     faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
