@@ -43,6 +43,10 @@ def study_command(
     orders: Annotated[str, Option(help="Orders of the polynomials.")] = "1,2,3,4,5,6",
     components: Annotated[str, Option(help="Components of the basis.")] = "5,10,20,40",
     snr: Annotated[str, Option(help="S/N of the faintest star.")] = "30,100,300",
+    focal_plane: Annotated[
+        bool,
+        Option("--focal-plane", help="Also fit the model of the whole focal plane, with and without the telescope."),
+    ] = False,
     draws: Annotated[int, Option(min=1, help="Draws of the noise.")] = 4,
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_study"),
     truth_stars: TruthStars = None,
@@ -56,10 +60,14 @@ def study_command(
     configuration, are fitted and compared with the noise-free PSFs at holdout positions. Some minutes. Table (ECSV),
     plots and all metrics (study.json) go into one folder.
 
+    With `--focal-plane`, or `reconstruction.model: focal_plane` in the configuration, the model of all CCDs together is
+    among them. The nine CCDs are far apart and without neighbours; `--ccds all`, or whole rafts, shows what it can do.
+
     **Examples**
 
     - `pachon study`: forty stars of S/N 30 and more on nine CCDs across the field
     - `pachon study my_config.yaml --ccds R22_S11,R24_S11 -o small_study --stars 20,40 --orders 1,2,3 --draws 2`
+    - `pachon study --focal-plane --ccds R21,R22,R23 --stars 40 --orders 1,3 --components 20 --snr 30 --draws 1`
     """
     from ..core.files import make_folder
     from ..studies.psf_choice.plan import make_plan
@@ -67,7 +75,8 @@ def study_command(
     from ..studies.psf_choice.study import STUDY_CCDS, study, study_experiment
 
     names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
-    resolved = configured_experiment(config, ccds=names, stars__truth=truth_stars).config
+    model = "focal_plane" if focal_plane else None
+    resolved = configured_experiment(config, ccds=names, stars__truth=truth_stars, reconstruction__model=model).config
     plan = make_plan(
         resolved,
         stars=_numbers(stars, "--stars", int),
@@ -90,10 +99,13 @@ def study_command(
 
 
 def _show(result: Study) -> None:
+    from ..studies.psf_choice.plan import FOCAL_PLANE
+
     plan, chosen, console = result.plan, result.recommended(), wide_console()
     cases = [plan.base, *([chosen] if chosen is not None else [])]
+    ways = ("equal", "softened", *(FOCAL_PLANE if plan.focal_plane else ()))
     for stars in plan.stars:
-        cases += [best for how in ("equal", "softened") if (best := result.best_order(stars, how))]
+        cases += [best for how in ways if (best := result.best_order(stars, how))]
     rows = []
     for case in dict.fromkeys(cases):
         if (found := result.metrics.get(case)) is not None:

@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from ..core.errors import ConfigError
 from ..core.products import Stamp, read_fits, write_hdus
 from ..core.progress import Reporter
 from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
-from .config import Configuration
 from .experiment import Experiment
 from .focal_plane_psf.model import FocalPlanePsf
 from .focal_plane_psf.stars import FocalPlaneStars
@@ -61,12 +59,10 @@ def apply_focal_plane_model(
         If there are too few stars.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    if experiment.atmosphere_only:
-        # No telescope to fit: the stars are those of an ideal one.
-        stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
-        model = FocalPlanePsf.fit(stars, camera=experiment.camera, threads=threads, reporter=reporter)
-    else:
-        model = FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
+    # Stars of an ideal telescope are no reason to fit one.
+    model = fit_focal_plane_model(
+        experiment, products, telescope=not experiment.atmosphere_only, threads=threads, reporter=reporter
+    )
     left_out, first, applied = model.leave_one_out, 0, []
     total = sum(len(p.observed) + len(p.holdout) for p in products)
     with reporter.stage("focal-plane PSF model on the CCDs", total=total) as stage:
@@ -84,6 +80,21 @@ def apply_focal_plane_model(
     return applied, model
 
 
+def fit_focal_plane_model(
+    experiment: Experiment,
+    products: Sequence[Any],
+    *,
+    telescope: bool = True,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> FocalPlanePsf:
+    """Fit one model to the used stars of all products, with the telescope of the experiment or without any."""
+    if telescope:
+        return FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
+    stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
+    return FocalPlanePsf.fit(stars, camera=experiment.camera, threads=threads, reporter=reporter)
+
+
 def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf, stamp: Stamp) -> None:
     """Write the model into the folder of a run, with the stamp of the run, and its shapes into the CCDs' products."""
     for product in products:
@@ -94,12 +105,6 @@ def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model:
     for keyword, value, comment in stamp.cards():
         hdus[0].header[keyword] = (value, comment)
     write_hdus(path, hdus)
-
-
-def refuse_focal_plane_model(config: Configuration, why: str) -> None:
-    """Raise ConfigError if the PSF is to be modelled over the whole focal plane; `why` says what it is not for."""
-    if config.reconstruction.model == "focal_plane":
-        raise ConfigError(f"reconstruction.model = focal_plane: expected ccd, {why}")
 
 
 def _with_model(name: str, stars: _StarsKind, model: FocalPlanePsf, threads: int | None) -> _StarsKind:

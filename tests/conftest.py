@@ -94,8 +94,11 @@ class Plane:
 
     @classmethod
     def fit_run(cls, experiment, products, threads=None, reporter=None):
+        return cls.fit(FocalPlaneStars.from_products(products))
+
+    @classmethod
+    def fit(cls, stars, **_):
         cls.fits += 1
-        stars = FocalPlaneStars.from_products(products)
         if len(stars) < 30:
             raise DomainError(f"{len(stars)} stars: expected at least 30")
         model = cls()
@@ -126,6 +129,12 @@ class Plane:
 
     def write(self, path):
         write_fits(path, [image_hdu("PLANES", self.planes, "of e1, e2, ln size")], None, [])
+
+
+@pytest.fixture(scope="session")
+def plane():
+    """The stand-in for a focal-plane model."""
+    return Plane
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.units import ARCSEC
-from ...pipeline.focal_plane_stage import refuse_focal_plane_model
+from ...pipeline.focal_plane_stage import apply_focal_plane_model
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.measure.summary import ccd_metrics
 from ...pipeline.simulate.ccd_exposure import expose_ccd, expose_positions
@@ -60,14 +60,20 @@ def psf(scene: Scene) -> dict[str, float]:
 
 @CAMERA.group("reconstruction", Metric("reconstruction", "", "model", 2e-6))
 def reconstruction(scene: Scene) -> dict[str, float]:
-    """Return the residuals of the PSF model of the plan's first CCD, from noise-free stars.
+    """Return the residuals of the PSF model on the plan's first CCD, from noise-free stars.
 
-    With noise, rounding could change the number of photons in a pixel, and with it all random numbers that follow.
+    A model of the whole focal plane is fitted to the stars of all CCDs of the plan. With noise, rounding could change
+    the number of photons in a pixel, and with it all random numbers that follow.
     """
-    refuse_focal_plane_model(scene.camera_experiment.config, "a baseline takes the model of one CCD")
-    name = scene.plan.ccds[0]
-    exposure = expose_ccd(scene.camera_experiment, name, threads=scene.threads)
-    found = ccd_metrics(model_ccd(scene.camera_experiment, exposure, noisy=False))
+    experiment, name = scene.camera_experiment, scene.plan.ccds[0]
+    together = experiment.config.reconstruction.model == "focal_plane"
+    products = [
+        model_ccd(experiment, expose_ccd(experiment, ccd, threads=scene.threads), noisy=False)
+        for ccd in (scene.plan.ccds if together else [name])
+    ]
+    if together:
+        products, _ = apply_focal_plane_model(experiment, products, threads=scene.threads)
+    found = ccd_metrics(products[0])
     return {
         f"reconstruction {name} {key.replace('_', ' ')}": float(found[key])
         for key in ("mean_e_truth", "rms_residual_at_stars", "rms_residual_away")

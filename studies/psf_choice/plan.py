@@ -13,22 +13,23 @@ from ...pipeline.psf_model.basis import BASES
 from ...pipeline.psf_model.fit import COMPONENTS
 from ...pipeline.psf_model.polynomial import term_count
 
-#: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper), and a Gaussian process
-#: for each component in place of polynomials.
-INTERPOLATIONS = ("equal", "snr", "softened", "gp")
+#: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
+POLYNOMIALS = ("equal", "snr", "softened")
+#: Models of the shapes on all CCDs together in place of one of each CCD, without the telescope and with it, in words.
+FOCAL_PLANE = {"no_telescope": "focal plane, no telescope", "focal_plane": "focal plane"}
 #: Signal-to-noise ratio, or stars without noise.
 NOISE_FREE = math.inf
 
 
 @dataclass(frozen=True)
 class Case:
-    """Parameters of a PSF model of a CCD."""
+    """Parameters of a PSF model."""
 
     stars: int  #: stars of a CCD
     snr: float = 30.0  #: S/N of the faintest star; :data:`NOISE_FREE` for stars without noise
-    basis: str = "pca"  #: one of :data:`~pachon.pipeline.psf_model.basis.BASES`
-    interpolation: str = "equal"  #: one of :data:`INTERPOLATIONS`
-    order: int = 3  #: of the polynomials; 0 with a Gaussian process
+    basis: str = "pca"  #: one of :data:`~pachon.pipeline.psf_model.basis.BASES`; moments of a focal-plane model
+    interpolation: str = "equal"  #: one of :data:`POLYNOMIALS` or :data:`FOCAL_PLANE`; gp for a Gaussian process
+    order: int = 3  #: of the polynomials; 0 without them
     components: int = 20  #: of the basis; 0 for pixels, which are all used
 
     @property
@@ -38,18 +39,22 @@ class Case:
 
     def settled(self) -> Case:
         """Return the case as it is fitted: parameters without effect have one value."""
+        if self.interpolation in FOCAL_PLANE:
+            return replace(self, basis="moments", order=0, components=3)
         components = self.components
         if self.basis == "pca":
             components = min(components, self.stars - 1)
         elif self.basis == "pixels":
             components = 0
-        order = 0 if self.interpolation == "gp" else self.order
+        order = self.order if self.interpolation in POLYNOMIALS else 0
         interpolation = self.interpolation
-        if self.snr == NOISE_FREE and interpolation != "gp":
+        if self.snr == NOISE_FREE and interpolation in POLYNOMIALS:
             interpolation = "equal"
         return replace(self, components=components, order=order, interpolation=interpolation)
 
     def __str__(self) -> str:
+        if self.interpolation in FOCAL_PLANE:
+            return FOCAL_PLANE[self.interpolation]
         how = "Gaussian process" if self.interpolation == "gp" else f"order {self.order}, {self.interpolation} weights"
         what = self.basis if self.basis == "pixels" else f"{self.components} components of {self.basis}"
         return f"{what}, {how}"
@@ -65,6 +70,12 @@ class Plan:
     components: tuple[int, ...]
     snrs: tuple[float, ...]
     draws: int = 4  #: of the noise
+    focal_plane: bool = False  #: whether there are models of the whole focal plane
+
+    @property
+    def without_polynomials(self) -> tuple[str, ...]:
+        """Interpolations that have no order: a Gaussian process, and models of the whole focal plane."""
+        return ("gp", *FOCAL_PLANE) if self.focal_plane else ("gp",)
 
     def cases(self) -> tuple[Case, ...]:
         """Return the cases of the study, each once.
@@ -73,7 +84,7 @@ class Plan:
         each other have a plane: stars and order, order and components.
         """
         base = self.base
-        polynomials = INTERPOLATIONS[:-1]
+        polynomials, others = POLYNOMIALS, self.without_polynomials
         found: list[Case] = []
 
         def sweep(**axes: Sequence[object]) -> None:
@@ -88,9 +99,9 @@ class Plan:
         sweep(basis=BASES, stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=polynomials)
         sweep(basis=BASES, order=self.orders, interpolation=polynomials)
         sweep(basis=BASES, components=self.components, interpolation=polynomials)
-        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=("gp",))
-        sweep(components=self.components, interpolation=("gp",))
-        sweep(snr=self.snrs, interpolation=("gp",))
+        sweep(stars=self.stars, snr=(base.snr, NOISE_FREE), interpolation=others)
+        sweep(components=self.components, interpolation=others)
+        sweep(snr=self.snrs, interpolation=others)
         return tuple(dict.fromkeys(found))
 
 
@@ -103,7 +114,11 @@ def make_plan(
     snrs: Iterable[float] = (30.0, 100.0, 300.0),
     draws: int = 4,
 ) -> Plan:
-    """Return a plan around the observed stars, S/N and reconstruction of a configuration."""
+    """Return a plan around the observed stars, S/N and reconstruction of a configuration.
+
+    Its base is the configuration's model of a CCD. Models of the whole focal plane are added if the configuration has
+    one.
+    """
     fit = config.reconstruction
     base = Case(
         config.stars.observed,
@@ -129,4 +144,5 @@ def make_plan(
         tuple(int(n) for n in values("components", tuple(components), base.components or COMPONENTS, 1)),
         values("snr", tuple(snrs), base.snr, 1.0),
         draws,
+        fit.model == "focal_plane",
     )

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from ...core.plotting import new_figure, png_bytes, styled
 from ...pipeline.psf_model.basis import BASES
 from ...pipeline.report.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
-from .plan import INTERPOLATIONS, NOISE_FREE, Case
+from .plan import FOCAL_PLANE, NOISE_FREE, POLYNOMIALS, Case
 from .study import Study
 
 _HOW = {
@@ -21,6 +21,8 @@ _HOW = {
     "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
     "softened": (AWAY, "D", "softened weights"),
     "gp": ("#2a8a57", "^", "Gaussian process"),
+    "no_telescope": ("0.5", "P", FOCAL_PLANE["no_telescope"]),
+    "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }
 _BASIS = {"pca": (OBSERVED, "o"), "pixels": (AWAY, "s"), "shapelets": (LEFT_OUT, "D")}
 _RMS = "rms of one component of e, no star"
@@ -36,7 +38,7 @@ def stars_plot(result: Study) -> bytes:
     with styled():
         figure = new_figure(13.0, 4.8)
         panels = figure.subplots(1, 3, sharex=True, sharey=True)
-        for axes, how in zip(panels, INTERPOLATIONS[:-1], strict=True):
+        for axes, how in zip(panels, POLYNOMIALS, strict=True):
             for order, color in zip(plan.orders, colors, strict=True):
                 cases = [(n, replace(plan.base, stars=n, order=order, interpolation=how)) for n in plan.stars]
                 _line(axes, result, cases, "rms_e_away", color, "o", f"order {order}")
@@ -68,9 +70,11 @@ def choices_plot(result: Study) -> bytes:
             (panels[1, 0], "rms_e_away", _RMS),
             (panels[1, 1], "rms_size_away", "rms of the relative size, no star"),
         ):
-            for how, (color, marker, label) in _HOW.items():
+            for how in (*POLYNOMIALS, *plan.without_polynomials):
+                color, marker, label = _HOW[how]
                 best = [(n, c) for n in plan.stars if (c := result.best_order(n, how))]
-                _line(axes, result, best, key, color, marker, f"{label}, best order" if how != "gp" else label)
+                text = f"{label}, best order" if how in POLYNOMIALS else label
+                _line(axes, result, best, key, color, marker, text)
             paper = [(n, replace(base, stars=n)) for n in plan.stars]
             _line(axes, result, paper, key, TRUTH, "x", f"{_HOW[base.interpolation][2]}, order {base.order}")
             _log(axes, plan.stars, "stars of a CCD", "interpolation" + (": size" if "size" in key else ": e"))
@@ -123,12 +127,13 @@ def _snrs(axes: Axes, result: Study) -> None:
 def _against(axes: Axes, result: Study, key: str, values: Sequence[float]) -> None:
     """Draw the residual against one property of the cases, for each interpolation at the base's and the best order."""
     base = result.plan.base
-    for how, (color, marker, label) in _HOW.items():
-        orders = dict.fromkeys((base.order,) if how == "gp" else (base.order, _best_order(result, how)))
+    for how in (*POLYNOMIALS, *result.plan.without_polynomials):
+        color, marker, label = _HOW[how]
+        orders = dict.fromkeys((base.order, _best_order(result, how)) if how in POLYNOMIALS else (base.order,))
         for order, line in zip(orders, ("-", (0, (4, 2))), strict=False):
             way = replace(base, order=order, interpolation=how)
             cases = [(v, replace(way, **{key: v})) for v in values]  # type: ignore[arg-type]
-            text = label if how == "gp" else f"{label}, order {order}"
+            text = f"{label}, order {order}" if how in POLYNOMIALS else label
             _line(axes, result, cases, "rms_e_away", color, marker, text, line)
 
 
@@ -152,6 +157,8 @@ def _shared(axes: Axes, result: Study, key: str, label: str, title: str) -> None
     ways: dict[str, tuple[Case, Any]] = {f"order {base.order}, {_HOW[base.interpolation][2]}": (base, "-")}
     if other is not None:
         ways[f"order {other.order}, softened weights"] = (other, (0, (4, 2)))
+    if plan.focal_plane:
+        ways[FOCAL_PLANE["focal_plane"]] = (replace(base, interpolation="focal_plane"), _QUIET)
     for name, (way, line) in ways.items():
         cases = [(n, replace(way, stars=n)) for n in plan.stars]
         for kind, color, marker, where in (("at_stars", RESIDUAL, "D", "at the stars"), ("away", AWAY, "^", "no star")):

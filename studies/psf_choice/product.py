@@ -13,7 +13,7 @@ from ...pipeline.config import Configuration
 from ...pipeline.measure.correlation import SEPARATION_RANGES
 from ...pipeline.run_folder import stamp_of
 from ..product import write_products
-from .plan import INTERPOLATIONS
+from .plan import FOCAL_PLANE, POLYNOMIALS, Case
 from .plots import choices_plot, stars_plot
 from .study import Study, study_experiment
 
@@ -33,19 +33,24 @@ def write_study(result: Study, folder: Path, config: Configuration) -> tuple[str
 
 
 def study_summary(result: Study) -> dict[str, Any]:
-    """Return the base, the recommended case, and the best order for each number of stars."""
+    """Return the base, the recommended case, those of the focal plane, and the best order for each number of stars."""
     plan, chosen = result.plan, result.recommended()
     orders = {
-        how: {str(n): best.order for n in plan.stars if (best := result.best_order(n, how))}
-        for how in INTERPOLATIONS[:-1]
+        how: {str(n): best.order for n in plan.stars if (best := result.best_order(n, how))} for how in POLYNOMIALS
     }
+    together = [best for how in FOCAL_PLANE if (best := result.best_order(plan.base.stars, how))]
     return {
-        "base": {**vars(plan.base), "figures": result.metrics.get(plan.base)},
-        "recommended": None if chosen is None else {**vars(chosen), "figures": result.metrics[chosen]},
+        "base": _described(result, plan.base),
+        "recommended": None if chosen is None else _described(result, chosen),
+        **({"focal_plane": [_described(result, case) for case in together]} if plan.focal_plane else {}),
         "best_order": orders,
         "fitted": len(result.metrics),
         "not_fitted": {f"{case.stars} stars, S/N {case.snr:g}, {case}": why for case, why in result.problems.items()},
     }
+
+
+def _described(result: Study, case: Case) -> dict[str, Any]:
+    return {**vars(case), "figures": result.metrics.get(case)}
 
 
 def study_columns(result: Study) -> Columns:

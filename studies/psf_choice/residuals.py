@@ -12,11 +12,13 @@ from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ...core.units import ARCMIN
 from ...pipeline.experiment import Experiment
+from ...pipeline.focal_plane_psf.model import FocalPlanePsf
+from ...pipeline.focal_plane_psf.mosaic import PsfShapes
 from ...pipeline.measure.correlation import SEPARATION_RANGES, jackknife_error, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from ...pipeline.psf_model.model import PsfModel
 from ...pipeline.psf_model.polynomial import Extent, design_matrix
-from .plan import Case
+from .plan import POLYNOMIALS, Case
 from .stars import ObservedCcd, SimulatedCcd, used_stars
 
 #: Residuals: observed - model at the stars, and noise-free PSF - model at the holdout positions.
@@ -43,14 +45,16 @@ def measure_residuals(
     case: Case,
     ccds: Sequence[SimulatedCcd],
     observed: Sequence[ObservedCcd],
-    models: Sequence[PsfModel],
+    models: Sequence[PsfModel | FocalPlanePsf],
+    threads: int | None = None,
 ) -> Residuals:
-    """Measure the residuals of the models of all CCDs."""
+    """Measure the residuals of the models of all CCDs, one for each."""
     residuals: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     fields: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     law = np.full((len(ccds), 2), np.nan)
-    for i, (ccd, stars, whole) in enumerate(zip(ccds, observed, models, strict=True)):
-        model = whole.truncated(min(case.components, whole.n_components)) if case.basis == "pca" else whole
+    for i, (ccd, stars, model) in enumerate(zip(ccds, observed, models, strict=True)):
+        if isinstance(model, PsfModel) and case.basis == "pca":
+            model = model.truncated(min(case.components, model.n_components))
         used = used_stars(case, stars)
         exposure, places = ccd.exposure, ccd.exposure.positions
         jobs = (
@@ -63,12 +67,16 @@ def measure_residuals(
             (places.holdout, ccd.holdout, exposure.holdout, np.ones(len(places.holdout), dtype=bool)),
         )
         for k, (at, shapes, exposed, chosen) in enumerate(jobs):
-            found = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
-            if not found.usable.any():
+            found: Shapes | PsfShapes
+            if isinstance(model, PsfModel):
+                found = measure_shapes(model.at(at), exposed.pixel_scale, experiment.weight_fwhm)
+            else:
+                found = model.shapes(exposure.name, *at.T, threads=threads)
+            if not np.isfinite(found.e1).any():
                 raise DomainError(f"CCD {exposure.name}: the model has no shape anywhere")
             residuals[k].append(np.stack([shapes.e1 - found.e1, shapes.e2 - found.e2, shapes.size / found.size - 1.0]))
             fields[k].append(exposed.fields[chosen])
-        if case.interpolation != "gp":
+        if isinstance(model, PsfModel) and case.interpolation in POLYNOMIALS:
             law[i] = noise_law(
                 places.observed[used], places.holdout, stars.variance[used], model.weights, case.order, model.extent
             )

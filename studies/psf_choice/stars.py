@@ -38,9 +38,10 @@ class SimulatedCcd:
 
 @dataclass(frozen=True)
 class ObservedCcd:
-    """Stars of a CCD with noise: the observation, and S/N and variance of one component of e of each star."""
+    """Stars of a CCD with noise: the observation, and electrons, S/N and variance of one component of e of each."""
 
     observation: Observation
+    electrons: np.ndarray
     snr: np.ndarray
     variance: np.ndarray
 
@@ -71,7 +72,8 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     exposed, places, name = ccd.exposure.observed, ccd.exposure.positions, ccd.exposure.name
     n_stars = len(exposed.image)
     if snr_min == NOISE_FREE:
-        return ObservedCcd(ccd.noise_free, np.full(n_stars, np.inf), np.zeros(n_stars))
+        unlimited = np.full(n_stars, np.inf)
+        return ObservedCcd(ccd.noise_free, unlimited, unlimited, np.zeros(n_stars))
     seed, light = experiment.config.seed, exposed.lit_fraction
     width = effective_fwhm(ccd.exposure.holdout.image, ccd.exposure.holdout.pixel_scale)
     faint = limiting_magnitude(snr_min, places.band, places.exposure, width) + 2.5 * np.log10(light.min())
@@ -90,12 +92,13 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     )
     sky = sky_electrons_per_pixel(places.band, places.exposure, exposed.pixel_scale)
     rng = stream(seed, "study", "noise", name, draw)
-    images = observe_stamps(exposed.image, stars.electrons * light, sky, instrument_noise(places.exposure), rng)
+    electrons = stars.electrons * light
+    images = observe_stamps(exposed.image, electrons, sky, instrument_noise(places.exposure), rng)
     found = _look_at(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
     # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.
     noise = np.stack([found.shapes.e1 - ccd.noise_free.shapes.e1, found.shapes.e2 - ccd.noise_free.shapes.e2])
-    return ObservedCcd(found, snr, np.mean((noise * snr)[:, found.used] ** 2) / snr**2)
+    return ObservedCcd(found, electrons, snr, np.mean((noise * snr)[:, found.used] ** 2) / snr**2)
 
 
 def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:

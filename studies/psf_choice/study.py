@@ -8,6 +8,7 @@ the one at the holdout positions applies to galaxies.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
@@ -18,11 +19,13 @@ from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...pipeline.config import Configuration, with_options
 from ...pipeline.experiment import Experiment
-from ...pipeline.focal_plane_stage import refuse_focal_plane_model
+from ...pipeline.focal_plane_psf.model import FocalPlanePsf
 from ...pipeline.memory import check_memory
-from .plan import NOISE_FREE, Case, Plan
+from ...pipeline.psf_model.model import PsfModel
+from .focal_plane import fit_focal_plane
+from .plan import FOCAL_PLANE, NOISE_FREE, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
-from .stars import fit, observe, simulate
+from .stars import ObservedCcd, SimulatedCcd, fit, observe, simulate
 
 #: One in each raft along two lines through the centre of the field, from the centre to the edge.
 STUDY_CCDS = tuple(f"R{raft}_S11" for raft in ("02", "11", "13", "20", "22", "24", "31", "33", "42"))
@@ -52,7 +55,8 @@ class Study:
 
         Cases are as good as the best one if their :attr:`holdout_square` exceeds its own by no more than the standard
         error of the excess over the CCDs (rule of one standard error, Breiman et al. 1984). The simplest case has the
-        fewest free parameters.
+        fewest free parameters on a CCD. Models of the whole focal plane are last, that with the telescope after the
+        other: priors hold their parameters, which CCDs share, so that these cannot be counted beside free ones.
         """
         base = self.plan.base
         usable = [c for c, f in self.metrics.items() if (c.stars, c.snr) == (base.stars, base.snr) and not f["lost"]]
@@ -65,7 +69,7 @@ class Study:
             error = excess.std(ddof=1) / np.sqrt(len(excess)) if len(excess) > 1 else 0.0
             if excess.mean() <= error:
                 as_good.append(case)
-        return min(as_good, key=_free_parameters)
+        return min(as_good, key=_complexity)
 
     def best_order(self, stars: int, interpolation: str) -> Case | None:
         """Return the case of the base's basis, components and S/N with the least :attr:`holdout_square`."""
@@ -77,9 +81,8 @@ class Study:
 def study_experiment(config: Configuration, plan: Plan) -> Experiment:
     """Return the experiment of a plan, with as many observed stars as the largest case needs.
 
-    Stars with defects are a ConfigError, since the study adds its own noise, and so is a focal-plane model.
+    Stars with defects are a ConfigError, since the study adds its own noise.
     """
-    refuse_focal_plane_model(config, "a study compares models of single CCDs")
     for key in ("neighbours", "cosmic_rays", "saturated"):
         if (value := getattr(config.stars, key)) > 0.0:
             raise ConfigError(f"stars.{key} = {value:g}: expected 0, the stars of a study have noise but no defects")
@@ -106,9 +109,10 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
                 for _, group in groupby(sorted(wanted, key=_fit_key), key=_fit_key):
                     together = list(group)
                     try:
-                        models = [fit(together[-1], *pair) for pair in zip(ccds, observed, strict=True)]
+                        models = _models(together[-1], experiment, ccds, observed, threads)
                         for case in together:
-                            samples[case].append(measure_residuals(experiment, case, ccds, observed, models))
+                            found = measure_residuals(experiment, case, ccds, observed, models, threads)
+                            samples[case].append(found)
                     except PachonError as error:
                         problems |= dict.fromkeys(together, str(error))
                     stage.advance(len(together))
@@ -122,12 +126,27 @@ def study(config: Configuration, plan: Plan, *, threads: int | None = None, repo
     return Study(plan, metrics, {case: problems[case] for case in cases if case in problems}, squares)
 
 
+def _models(
+    case: Case,
+    experiment: Experiment,
+    ccds: Sequence[SimulatedCcd],
+    observed: Sequence[ObservedCcd],
+    threads: int | None,
+) -> Sequence[PsfModel | FocalPlanePsf]:
+    """Return the model of each CCD, which may be that of all of them."""
+    if case.interpolation in FOCAL_PLANE:
+        return [fit_focal_plane(case, experiment, ccds, observed, threads)] * len(ccds)
+    return [fit(case, *pair) for pair in zip(ccds, observed, strict=True)]
+
+
 def _fit_key(case: Case) -> tuple[Any, ...]:
     """Return the sort key of a case: cases of one fit are adjacent, by their number of principal components."""
     shared = case.basis == "pca"
     return (case.basis, case.interpolation, case.order, case.stars, 0 if shared else case.components)
 
 
-def _free_parameters(case: Case) -> int:
+def _complexity(case: Case) -> tuple[int, int]:
+    """Return the sort key of a case: focal-plane models last, then the number of free parameters."""
     components = case.components or 10**6
-    return components * (case.stars if case.interpolation == "gp" else case.terms)
+    last = 1 + [*FOCAL_PLANE].index(case.interpolation) if case.interpolation in FOCAL_PLANE else 0
+    return last, components * (case.stars if case.interpolation == "gp" else case.terms)

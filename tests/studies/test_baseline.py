@@ -19,14 +19,16 @@ from pachon.core.errors import ConfigError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.io.prescription import DATA, load_telescope, save_telescope
 from pachon.models.shapes.shape import EvenAsphere
-from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.simulate.ccd_exposure import expose_ccd
+from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.studies.baseline.baseline import bundled_baselines, check_baseline, make_baseline
 from pachon.studies.baseline.file import baseline_text, read_baseline, rounded, write_baseline
 from pachon.studies.metrics import camera as camera_metrics
 from pachon.studies.metrics.camera import CAMERA
 from pachon.studies.metrics.optics import OPTICS
 from pachon.studies.metrics.scene import Scene
+from pachon.studies.metrics.scene import make_plan as scene_plan
 from pachon.testing import assert_matches_baseline
 
 #: All of them need a finished study, of seconds.
@@ -239,10 +241,51 @@ def test_a_telescope_that_loses_a_figure_is_out(project):
 # --- files -------------------------------------------------------------------------------------------------------
 
 
-def test_a_focal_plane_model_has_no_baseline():
-    experiment = Experiment.from_config(with_options(Configuration(), reconstruction__model="focal_plane"))
-    with pytest.raises(ConfigError, match=r"^reconstruction\.model = focal_plane: expected ccd, a baseline takes"):
-        CAMERA["reconstruction"].compute(Scene(experiment.telescope, experiment))
+def test_a_focal_plane_model_is_fitted_to_all_ccds_of_the_plan(focal_plane_config, plane_model):
+    experiment = Experiment.from_config(focal_plane_config())
+    names = ("R22_S12", "R22_S11", "R24_S12")  # not the run's own
+    found = CAMERA["reconstruction"].compute(
+        Scene(experiment.telescope, experiment, scene_plan(experiment.telescope, experiment, ccds=names))
+    )
+    products = [model_ccd(experiment, expose_ccd(experiment, name), noisy=False) for name in names]
+    stars = [p.observed for p in products]
+    x, y, e1, e2 = (np.concatenate([getattr(s, key) for s in stars]) for key in ("x", "y", "e1", "e2"))
+    planes, *_ = np.linalg.lstsq(np.stack([np.ones(len(x)), x, y], axis=1), np.stack([e1, e2], axis=1), rcond=None)
+
+    def rms(s):
+        left = np.stack([s.e1, s.e2], axis=1) - np.stack([np.ones(len(s)), s.x, s.y], axis=1) @ planes
+        return np.sqrt(np.mean(left**2))
+
+    first = products[0]
+    expected = {
+        "mean e truth": np.hypot(first.holdout.e1, first.holdout.e2).mean(),
+        "rms residual at stars": rms(first.observed),
+        "rms residual away": rms(first.holdout),
+    }
+    assert found == {f"reconstruction R22_S12 {key}": pytest.approx(v, rel=1e-9) for key, v in expected.items()}
+    own = np.sqrt(np.mean([first.holdout.residual_e1**2, first.holdout.residual_e2**2]))
+    assert abs(own - expected["rms residual away"]) > 1e-4
+
+
+@pytest.mark.slow
+def test_rounding_does_not_move_the_focal_plane_model(focal_plane_config, monkeypatch):
+    experiment = Experiment.from_config(focal_plane_config())
+    plan = scene_plan(experiment.telescope, experiment, ccds=("R22_S11", "R22_S12"))
+    before = CAMERA["reconstruction"].compute(Scene(experiment.telescope, experiment, plan, threads=1))
+    rng = np.random.default_rng(0)
+
+    def rounded_otherwise(*arguments, **keywords):
+        product = model_ccd(*arguments, **keywords)
+        noise = 1e-7 * rng.normal(size=(3, len(product.observed)))  # five times that of fused multiply-adds
+        e1, e2, size = (getattr(product.observed, key) for key in ("e1", "e2", "size"))
+        moved = replace(product.observed, e1=e1 + noise[0], e2=e2 + noise[1], size=size * (1.0 + noise[2]))
+        return replace(product, observed=moved)
+
+    monkeypatch.setattr(camera_metrics, "model_ccd", rounded_otherwise)
+    after = CAMERA["reconstruction"].compute(Scene(experiment.telescope, experiment, plan, threads=2))
+    # A tenth of the tolerance; 3e-8 measured.
+    assert after == {key: pytest.approx(value, abs=2e-7) for key, value in before.items()}
+    assert after != before
 
 
 def test_one_figure_stands_on_one_line_in_order(project):

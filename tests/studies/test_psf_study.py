@@ -242,14 +242,6 @@ def test_stars_with_defects_are_refused(tiny):
         study(config, make_plan(config))
 
 
-def test_a_focal_plane_model_is_refused(tiny):
-    config = tiny(reconstruction__model="focal_plane")
-    with pytest.raises(
-        ConfigError, match=r"^reconstruction\.model = focal_plane: expected ccd, a study compares models"
-    ):
-        study_experiment(config, make_plan(config))
-
-
 def test_command_line(settings_file, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     command = ["study", str(settings_file), "--threads", "1", "--components", "4", "--snr", "30", "--draws", "1"]
