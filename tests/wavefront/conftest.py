@@ -85,6 +85,7 @@ class PolynomialPupil:
             lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
             jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
             reference_points=np.zeros((len(fields), 3)),
+            reference_cosines=np.zeros((len(fields), 2)),
             fields=fields,
             wavelengths=wavelengths,
         )
