@@ -62,6 +62,7 @@ from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
+from .models.camera.silicon import Silicon as Silicon
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums
 from .models.first_order import first_order as first_order

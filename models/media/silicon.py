@@ -110,5 +110,9 @@ def _measured() -> _Measured:
     content = read_mapping(_DATA)
     wavelength, index, extinction, slope = np.array(content["rows"]).T
     light = wavelength * 1e-9
-    interpolators = (PchipInterpolator(light, values) for values in (index, np.log(extinction), slope))
-    return _Measured(*interpolators, content["temperature"])
+    return _Measured(
+        PchipInterpolator(light, index),
+        PchipInterpolator(light, np.log(extinction)),
+        PchipInterpolator(light, slope),
+        content["temperature"],
+    )

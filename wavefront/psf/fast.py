@@ -170,7 +170,7 @@ class FastPsfEngine(PsfEngine):
         return np.stack(stamps) * (self._oversampling**2 / light)[:, None, None]
 
     def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
-        """Return the rays of each star, with their light, on the fine grid, [n_star, n_channel, grid_size, grid_size]."""
+        """Return the rays of each star, with their light, on the fine grid, [n_star, n_channel, size, size]."""
         n_star, n_channel = len(optics.lit), len(self._channels.wave)
         atmosphere = self._atmosphere
         if atmosphere is None:

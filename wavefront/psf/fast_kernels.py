@@ -59,10 +59,11 @@ def deposit_rays(
 
     Arguments: screens [layer, y * size + x]: packed slopes; unit [layer] of their counts [rad]; start [star, layer, 2]:
     screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per moment];
-    moment [time]; channel [wave, time, packet] of the rays; lattice [packet]: row * size + column of the pupil points [pixels]; reach: the largest row or column, plus one;
-    cells_per_slope [star, 4]: Jacobian, row by row, over the cell of the grid; displacement [star, channel, packet, 2]
-    by the optics [cells]; weight [star, wave, packet] of the light; slope [star, packet, 2]: room for the slopes of all
-    layers [rad]; image [star, (channel * size + y) * size + x], with the origin in the cell size // 2.
+    moment [time]; channel [wave, time, packet] of the rays; lattice [packet]: row * size + column of the pupil points
+    [pixels]; reach: the largest row or column, plus one; cells_per_slope [star, 4]: Jacobian, row by row, over the cell
+    of the grid; displacement [star, channel, packet, 2] by the optics [cells]; weight [star, wave, packet] of the
+    light; slope [star, packet, 2]: room for the slopes of all layers [rad]; image [star, (channel * size + y) * size +
+    x], with the origin in the cell size // 2.
     """
     star = first + wp.tid()
     n_packet = lattice.shape[0]
@@ -139,10 +140,10 @@ def combine_wavelengths(
 ):
     """Filter the transforms of one star's channels and add them up, one row of frequencies an item.
 
-    Arguments: spectra [star, channel, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy of
-    jacobian @ jacobian.T [m^2/rad^2]; baseline [channel]: wavelength / 2 pi [m]; table [channel, sample]: filter against the
-    baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all channels; ramp_x
-    [star, channel, kx], ramp_y [star, channel, ky]: phase factors and weights; combined [star, ky, kx]: the sum.
+    Arguments: spectra [star, channel, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy
+    of jacobian @ jacobian.T [m^2/rad^2]; baseline [channel]: wavelength / 2 pi [m]; table [channel, sample]: filter
+    against the baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all channels;
+    ramp_x [star, channel, kx], ramp_y [star, channel, ky]: phase factors and weights; combined [star, ky, kx]: the sum.
     """
     item = first + wp.tid()
     n_row = spectra.shape[2]

@@ -69,14 +69,14 @@ def place_points(
 ):
     """Lay the points of one spoke over the clear pupil of one star, and find the strips cut off its ends.
 
-    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m];
-    fraction [ring] of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]:
-    direction; edges [star, spoke, 2] [m]; displacement [star, channel, ring * n_spoke + spoke, 2] of the traced
-    points [m]; landed [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion
-    [channel] [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of
-    the traced ones and rims as [2, n_spoke]: place [star, channel, 2, point] [periods]; light [star, point]: part of the
-    pupil; cut [star, rim, 2]: part of the pupil per metre of wavelength and step of frequency; lean [star, channel,
-    rim, 2]: phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
+    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m]; fraction
+    [ring] of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]: direction;
+    edges [star, spoke, 2] [m]; displacement [star, channel, ring * n_spoke + spoke, 2] of the traced points [m]; landed
+    [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion [channel]
+    [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of the traced
+    ones and rims as [2, n_spoke]: place [star, channel, 2, point] [periods]; light [star, point]: part of the pupil;
+    cut [star, rim, 2]: part of the pupil per metre of wavelength and step of frequency; lean [star, channel, rim, 2]:
+    phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
     """
     item = first + wp.tid()
     n_spoke = unit.shape[0]
@@ -194,11 +194,11 @@ def transform_pupils(
 
     Arguments: place, light, cut as ``place_points`` leaves them; lean [star, wave, rim, 2] of the channels of a
     wavelength together; fade_x, fade_y [channel, packet]: their filters along x, with their weights, and along y;
-    wavelength [wave] [m]; rows [packet of
-    columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against
-    the baseline; per_step [wave]: samples of the table per step of frequency, for a unit Jacobian; along_x, along_y
-    [star, depth * n_point + point, packet, 2]: room for cosines and sines; at_y: along_y as plain numbers [star, ...]; spectrum [star,
-    4, row, packet]: real and imaginary parts at +n, and at -n.
+    wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @
+    jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of the table per step of
+    frequency, for a unit Jacobian; along_x, along_y [star, depth * n_point + point, packet, 2]: room for cosines and
+    sines; at_y: along_y as plain numbers [star, ...]; spectrum [star, 4, row, packet]: real and imaginary parts at +n,
+    and at -n.
     """
     star = first + wp.tid()
     n_wave = wavelength.shape[0]
