@@ -58,7 +58,7 @@ class WavePsfEngine(PsfEngine):
     """Fourier optics, one star per thread."""
 
     name = "wave"
-    depths = 2
+    depths = 3
     options = ("padding", "pupil_spacing")
     screens = ("low", "high")
 
