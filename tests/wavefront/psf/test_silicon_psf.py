@@ -17,6 +17,7 @@ from pachon.wavefront.psf.channels import Channels
 from pachon.wavefront.psf.engines import ENGINES
 from pachon.wavefront.psf.image_plane import ImagePlane
 from pachon.wavefront.psf.psf import make_psfs
+from pachon.wavefront.silicon_focus import focus_height
 
 PLANE = ImagePlane(25, 10e-6, 4e-6)
 STAR = np.zeros((1, 2)), np.zeros((1, 2))
@@ -192,7 +193,8 @@ def test_equivalent_defocus_is_that_of_photons(band, wavelength):
         2,
     )
     focus = -0.5 * moved[1] / moved[0] + 0.5 * before[1] / before[0]
-    assert focus == pytest.approx(-mean * cosine, rel=0.02)
+    assert focus == pytest.approx(focus_height(telescope, silicon, wavelength), rel=0.02)
+    assert focus < 0.0
 
 
 def test_turns_give_each_depth_its_light():
