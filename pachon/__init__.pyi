@@ -66,6 +66,7 @@ from .models.camera.height_budget import HeightBudget as HeightBudget
 from .models.camera.height_statistics import HeightStatistics as HeightStatistics
 from .models.camera.height_statistics import height_statistics as height_statistics
 from .models.camera.sensor_heights import CornerSensor as CornerSensor
+from .models.camera.silicon import Silicon as Silicon
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums
 from .models.first_order import first_order as first_order
@@ -159,6 +160,7 @@ from .wavefront.pupil_sampling import PupilSampling as PupilSampling
 from .wavefront.pupil_sampling import pupil_sampling as pupil_sampling
 from .wavefront.request import Request as Request
 from .wavefront.request import field_points as field_points
+from .wavefront.silicon_focus import focus_height as focus_height
 from .wavefront.zernike import fit_zernikes as fit_zernikes
 
 __version__: str

@@ -112,6 +112,18 @@ class ActiveOpticsConfig(Section):
     )
 
 
+class DetectorConfig(Section):
+    """Silicon of the CCDs, in which red light turns into charge below the surface."""
+
+    silicon: Switch = Field(False, description="false: all light turns into charge at the surface")
+    thickness_um: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=1, le=1000)] = Field(
+        100.0, description="thickness [um]"
+    )
+    temperature_k: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=100, le=350)] = Field(
+        173.0, description="temperature, on which the absorption depends [K]"
+    )
+
+
 class AtmosphereConfig(Section):
     """Turbulence and refraction above the telescope."""
 
@@ -144,7 +156,9 @@ class PsfConfig(Section):
     )
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")
-    diffusion_pixels: NotNegative | None = Field(None, description="rms of the charge diffusion [CCD pixels of 10 um]")
+    diffusion_pixels: NotNegative | None = Field(
+        None, description="rms of the charge diffusion, in silicon that from its surface [CCD pixels of 10 um]"
+    )
     jitter_arcsec: NotNegative = Field(0.0, description="rms of the telescope's pointing along each axis [arcsec]")
 
 
@@ -188,6 +202,7 @@ class Configuration(Section):
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()
     active_optics: ActiveOpticsConfig = ActiveOpticsConfig()
+    detector: DetectorConfig = DetectorConfig()
     atmosphere: AtmosphereConfig = AtmosphereConfig()
     psf: PsfConfig = PsfConfig()
     reconstruction: ReconstructionConfig = ReconstructionConfig()

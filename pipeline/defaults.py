@@ -18,6 +18,7 @@ from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
 from ..models.io.site_file import load_site
+from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
@@ -140,6 +141,11 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         if not low <= wavelength <= high:
             raise ConfigError(
                 f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g}, which {telescope.name} covers"
+            )
+        low, high = (1e9 * w for w in SILICON_RANGE)
+        if config.detector.silicon and not low <= wavelength <= high:
+            raise ConfigError(
+                f"wavelengths_nm[{i}] = {wavelength:g}: expected {low:g} to {high:g} with detector.silicon = true"
             )
     if not config.wavelengths_nm:
         raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")

@@ -20,6 +20,7 @@ from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.height_budget import load_budget
+from ..models.camera.silicon import Silicon
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, bundled_names
@@ -115,8 +116,14 @@ class Experiment:
 
     @property
     def diffusion(self) -> float:
-        """Charge diffusion, rms [m]."""
+        """Charge diffusion, rms [m]; in silicon that of charge from the surface."""
         return given(self.config.psf.diffusion_pixels) * self.camera.pixel_size
+
+    @property
+    def silicon(self) -> Silicon | None:
+        """Silicon of the CCDs; None where all light turns into charge at their surface."""
+        detector = self.config.detector
+        return Silicon(detector.thickness_um * 1e-6, detector.temperature_k) if detector.silicon else None
 
     @property
     def jitter(self) -> float:
@@ -188,6 +195,9 @@ class Experiment:
         """
         content = self.config.as_dict()
         del content["ccds"]
+        if not self.config.detector.silicon:
+            # Nothing is made of it.
+            del content["detector"]
         content["telescope"] = _name_or_content(given(self.config.telescope), bundled_names())
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())

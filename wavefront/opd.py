@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 from ..core.errors import ConfigError, DomainError
 from ..core.units import metres
 from ..models.camera.focal_plane import FocalPlane
+from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus
 from ..raytrace.trace import trace
-from .chief_rays import reference_rays
+from .chief_rays import image_jacobians, reference_rays
 from .opd_map import OpdMap, OpdMaps
 from .opd_packets import traced_opds
 from .pupil_sampling import CHIEF_RAY
@@ -34,6 +35,7 @@ def wavefront_opd(
     reference: str = "chief",
     sphere_radius: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
+    silicon: Silicon | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> OpdMap:
@@ -62,6 +64,11 @@ def wavefront_opd(
         Radius of the reference sphere [m]; the telescope's own by default.
     focal_plane : FocalPlane, optional
         CCD surfaces; the nominal detector surface without it.
+    silicon : Silicon, optional
+        Silicon behind that surface: the OPD is then that of light at the mean depth at which it turns into charge, to
+        the point where the chief ray (or the mean of the lit rays) is there. Silicon adds s/(2n) times the square of
+        the distance of the light's direction cosines from those of the chief ray, with the mean path s in silicon of
+        index n.
 
     Returns
     -------
@@ -72,7 +79,8 @@ def wavefront_opd(
     ConfigError
         If both ``pupil`` and ``grid`` are given, or the reference or projection is unknown.
     DomainError
-        If field or wavelength lie outside what the telescope covers, or no reference point exists.
+        If field or wavelength lie outside what the telescope covers, silicon is transparent, or no reference point
+        exists.
     """
     if reference not in ("chief", "mean"):
         raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
@@ -93,6 +101,9 @@ def wavefront_opd(
             raise DomainError(f"field = {field!r}: no ray reaches the image")
         center = end.position[lit].mean(axis=0)
     path = path_to_sphere(end.path_length, index, end.position, end.direction, center, radius)
+    if silicon is not None:
+        middle = (0.0, 0.0) if reference == "chief" else (x.ravel()[lit].mean(), y.ravel()[lit].mean())
+        path = path - _silicon_opd(request, silicon, x - middle[0], y - middle[1]).ravel()
     zero = sphere[3] if reference == "chief" else path[lit].mean()
     return OpdMap(
         value=np.where(lit, zero - path, np.nan).reshape(x.shape),
@@ -117,6 +128,7 @@ def wavefront_opds(
     grid: int | None = None,
     sphere_radius: ArrayLike | None = None,
     focal_plane: FocalPlane | None = None,
+    silicon: Silicon | None = None,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -129,7 +141,7 @@ def wavefront_opds(
 
     Parameters
     ----------
-    telescope, wavelength, pupil, grid, sphere_radius, focal_plane, projection, threads
+    telescope, wavelength, pupil, grid, sphere_radius, focal_plane, silicon, projection, threads
         As in :func:`wavefront_opd`; the pupil points are the same for all fields.
     fields : array_like or Quantity, shape [n_field, 2]
         Field angles [rad], in the stated projection.
@@ -152,9 +164,9 @@ def wavefront_opds(
     radius = _sphere_radius(telescope, sphere_radius)
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     spheres = _spheres(request, radius, focal_plane)
-    value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress)
+    value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress).reshape(-1, *x.shape)
     return OpdMaps(
-        value=value.reshape(-1, *x.shape),
+        value=value if silicon is None else value + _silicon_opd(request, silicon, x, y),
         x=x,
         y=y,
         wavelength=request.wavelength,
@@ -179,6 +191,17 @@ def _pupil_points(
     else:
         x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
     return x, y
+
+
+def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return what silicon adds to the OPD [m], shape [n_field, *x.shape], at pupil coordinates from the reference [m].
+
+    The direction cosines of the light are those of the pupil and the Jacobian, good to 1e-4 (:doc:`conventions`).
+    """
+    jacobian = image_jacobians(request.telescope, request.directions, request.wavelength, request.threads)
+    cosines = np.stack([x.ravel(), y.ravel()], axis=-1) @ np.linalg.inv(jacobian)
+    shift, _ = silicon.defocus(request.wavelength)
+    return np.asarray(0.5 * shift * (cosines**2).sum(axis=-1)).reshape(-1, *x.shape)
 
 
 def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> float:

@@ -43,8 +43,17 @@ class PupilOptics:
     lit: np.ndarray  #: [n_star, n_wave, n_pupil] bool
     jacobian: np.ndarray  #: [n_star, 2, 2] m/rad: detector position by direction cosines of the incoming light
     reference_points: np.ndarray  #: [n_star, 3] m, telescope frame
+    reference_cosines: np.ndarray  #: [n_star, 2] direction cosines of the chief rays along x and y of the detector
     fields: np.ndarray  #: [n_star, 2] rad
     wavelengths: np.ndarray  #: [n_wave] m, in vacuum
+
+    @property
+    def exit_cosines(self) -> np.ndarray:
+        """Direction cosines of the light at the image along x and y of the detector, shape [n_star, n_pupil, 2].
+
+        From pupil coordinates and Jacobians, good to 1e-4 (:doc:`conventions`).
+        """
+        return self.reference_cosines[:, None] - self.pupil @ np.linalg.inv(self.jacobian)
 
 
 def trace_pupils(
@@ -142,6 +151,7 @@ def trace_pupils(
         lit=trimmed(out_status) == RayStatus.OK,
         jacobian=jacobian,
         reference_points=reference_points,
+        reference_cosines=(chief.direction @ rotation)[:, :2],
         fields=request.fields,
         wavelengths=waves,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,6 +16,7 @@ from ...core.errors import ProductError
 from ...models.camera.camera import Camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.silicon import Silicon
 from ...models.io.yaml.reader import read_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
@@ -85,6 +87,8 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
         about["degree"] = optics.prior.degree
         about["atmosphere"] = {"r0": air.r0, "outer_scale": air.outer_scale}
         about["instrument"] = {k: getattr(instrument, k) for k in ("pixel_size", "diffusion", "jitter")}
+        if instrument.silicon is not None:
+            about["silicon"] = asdict(instrument.silicon)
         about["radius"] = optics.response.radius
         surfaces = optics.plane.surfaces
         hdus += [
@@ -173,6 +177,7 @@ def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camer
         weight_fwhm=about["weight_fwhm"],
         dispersion=part("DISPERSION") if "DISPERSION" in found else None,
         stamp_size=about["stamp_size"],
+        silicon=Silicon(**about["silicon"]) if "silicon" in about else None,
     )
     cubic = part("HEIGHT_CUBIC")
     grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in found else None

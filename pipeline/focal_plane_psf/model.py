@@ -18,6 +18,7 @@ from ...core.version import CREATOR
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
+from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ..experiment import Experiment
@@ -96,6 +97,7 @@ class FocalPlanePsf:
         atmosphere: Atmosphere | None = None,
         pixel_size: ArrayLike = 10e-6,
         diffusion: ArrayLike = 4e-6,
+        silicon: Silicon | None = None,
         jitter: ArrayLike = 0.0,
         weight_fwhm: ArrayLike | None = None,
         dispersion: ArrayLike | None = None,
@@ -127,6 +129,8 @@ class FocalPlanePsf:
             Its Fried parameter, from which the fit starts, and its outer scale; by default Cerro Pachon's.
         pixel_size, diffusion : float or Quantity
             Pixel and rms charge diffusion [m].
+        silicon : Silicon, optional
+            Silicon of the CCDs; by default light turns into charge at their surface.
         jitter : float or Quantity
             Pointing, rms along each axis [rad].
         weight_fwhm : float or Quantity, optional
@@ -176,6 +180,7 @@ class FocalPlanePsf:
                 atmosphere,
                 pixel_size=pixel_size,
                 diffusion=diffusion,
+                silicon=silicon,
                 jitter=jitter,
                 weight_fwhm=weight,
                 dispersion=dispersion,
@@ -233,6 +238,7 @@ class FocalPlanePsf:
             atmosphere=experiment.atmosphere,
             pixel_size=experiment.pixel_size,
             diffusion=experiment.diffusion,
+            silicon=experiment.silicon,
             jitter=experiment.jitter,
             dispersion=experiment.dispersion,
             budget=experiment.focal_plane.budget,

@@ -20,6 +20,7 @@ from ...core.errors import DomainError
 from ...core.units import ARCSEC, metres, positive_angle, radians
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.silicon import Silicon
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...wavefront.aberration import ResidualWavefront
@@ -64,6 +65,8 @@ class Instrument:
         Shift of each wavelength by the air [rad].
     stamp_size : int
         Pixels on a side of a stamp.
+    silicon : Silicon or None
+        Silicon of the CCDs; None where all light turns into charge at their surface.
     """
 
     telescope: Telescope
@@ -75,6 +78,7 @@ class Instrument:
     weight_fwhm: float
     dispersion: np.ndarray | None
     stamp_size: int
+    silicon: Silicon | None
 
     @classmethod
     def of(
@@ -89,6 +93,7 @@ class Instrument:
         weight_fwhm: ArrayLike = 0.7 * ARCSEC,
         dispersion: ArrayLike | None = None,
         stamp_size: int = 31,
+        silicon: Silicon | None = None,
     ) -> Instrument:
         """Return an instrument of numbers in SI or quantities, by default of five wavelengths over the band."""
         if wavelengths is None:
@@ -104,6 +109,7 @@ class Instrument:
             positive_angle(weight_fwhm, "weight_fwhm"),
             None if dispersion is None else radians(dispersion, "dispersion"),
             stamp_size,
+            silicon,
         )
 
     @property
@@ -115,6 +121,7 @@ class Instrument:
         text = (
             telescope_to_yaml(self.telescope) + repr((*numbers, self.stamp_size)) + repr([a.tolist() for a in arrays])
         )
+        text += "" if self.silicon is None else repr(self.silicon)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def fields(self, xy: np.ndarray, threads: int | None = None) -> np.ndarray:
@@ -140,6 +147,7 @@ class Instrument:
             focal_plane=plane,
             atmosphere=atmosphere,
             aberration=aberration,
+            silicon=self.silicon,
             engine="long_exposure",
             stamp_size=self.stamp_size,
             pixel_size=self.pixel_size,

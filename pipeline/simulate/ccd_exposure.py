@@ -120,6 +120,7 @@ def _expose(
         focal_plane=experiment.focal_plane if optical else None,
         atmosphere=experiment.atmosphere,
         aberration=experiment.aberration if optical else None,
+        silicon=experiment.silicon,
         engine=config.psf.engine,
         stamp_size=experiment.stamp_size + room,
         pixel_size=experiment.pixel_size * magnification,

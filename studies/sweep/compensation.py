@@ -12,6 +12,7 @@ from ...design.optimize.optimize import optimize
 from ...design.parameters.changes import parse_change
 from ...pipeline.experiment import Experiment
 from ...wavefront.chief_rays import fields_at
+from ...wavefront.silicon_focus import focus_height
 
 # Positions of the spots on each CCD, in units of half its side: the centre and, for few CCDs, the middles of its
 # quarters.
@@ -41,7 +42,11 @@ def compensated(
     wavelength = float(experiment.wavelengths[len(experiment.wavelengths) // 2])
     fields = fields_at(telescope, places, wavelength, threads=threads)
     rays = Beams.of(telescope, fields, [wavelength], n_pupil=_RINGS, threads=threads)
-    merit = SpotMerit(telescope, rays, heights=experiment.focal_plane.height(*places.T))
+    heights = experiment.focal_plane.height(*places.T)
+    if experiment.silicon is not None:
+        # Spots are smallest where the light turns into charge.
+        heights = heights - focus_height(telescope, experiment.silicon, wavelength, threads)
+    merit = SpotMerit(telescope, rays, heights=heights)
     found = optimize(
         telescope, [p for p, _ in chosen], merit, fields, [wavelength], tolerance=_TOLERANCE, threads=threads
     )

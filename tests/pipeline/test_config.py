@@ -7,6 +7,7 @@ import pytest
 
 from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.io.site_file import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
@@ -42,6 +43,10 @@ def written(tmp_path, text):
         ("active_optics: {residual_um: -0.1}", ["active_optics.residual_um = -0.1", "from 0"]),
         ("active_optics: {residual_um: 200}", ["active_optics.residual_um = 200", "up to 2"]),
         ("psf: {jitter_arcsec: -1}", ["psf.jitter_arcsec = -1", "from 0"]),
+        ("detector: {silicon: 1}", ["detector.silicon = 1", "true or false"]),
+        ("detector: {silikon: true}", ["unknown key detector.silikon", "did you mean silicon?"]),
+        ("detector: {thickness_um: 0.1}", ["detector.thickness_um = 0.1", "from 1"]),
+        ("detector: {temperature_k: -100}", ["detector.temperature_k = -100", "from 100"]),
         ("psf: {engine: fats}", ['psf.engine = "fats"', "one of fast, wave"]),
         ("band: q", ['band = "q"', "u, g, r, i, z, y"]),
         ("wavelengths_nm: [600, red]", ['wavelengths_nm[1] = "red"', "a number"]),
@@ -218,6 +223,33 @@ def test_visits_differ_in_air_and_aberration_and_not_in_the_telescope():
     largest = Experiment.from_config(with_options(Configuration(), **(options | {"active_optics__residual_um": 2.0})))
     assert largest.aberration is not None
     assert LARGEST_RMS == 2e-6
+
+
+def test_silicon_is_off_by_default_and_then_no_part_of_the_hash():
+    plain = Experiment.from_config(with_options(Configuration(), **SMALL))
+    assert plain.silicon is None
+    thin = Experiment.from_config(with_options(Configuration(), detector__thickness_um=20.0, **SMALL))
+    assert thin.silicon is None
+    # Runs of before silicon go on.
+    content = plain.config.as_dict()
+    del content["ccds"], content["detector"]
+    assert thin.config_hash == plain.config_hash == digest(content)
+    options = {"detector__silicon": True, "detector__thickness_um": 80.0, "detector__temperature_k": 180.0, **SMALL}
+    silicon = Experiment.from_config(with_options(Configuration(), **options))
+    assert silicon.silicon == Silicon(80.0 * 1e-6, 180.0)
+    assert silicon.config_hash != plain.config_hash
+
+
+def test_wavelengths_to_which_silicon_is_transparent_are_refused(tmp_path):
+    path = tmp_path / "clear.yaml"
+    telescope = replace(load_telescope("lsst_v3.3_y"), wavelength_range=(0.9e-6, 1.2e-6))
+    save_telescope(telescope, path)
+    options = {"telescope": str(path), "wavelengths_nm": (970.0, 1120.0), **SMALL}
+    assert Experiment.from_config(with_options(Configuration(), **options)).silicon is None
+    with pytest.raises(
+        ConfigError, match=r"^wavelengths_nm\[1\] = 1120: expected 300 to 1100 with detector.silicon = t"
+    ):
+        Experiment.from_config(with_options(Configuration(), detector__silicon=True, **options))
 
 
 def test_differences_name_key_old_and_new():

@@ -42,7 +42,8 @@ class PolynomialPupil:
     """Optics whose path over the unit pupil is a polynomial.
 
     Path = defocus r^2 + coma r^2 x [m] + tilt . p [rad]; vignetting beyond ``cut`` (in units of the radius along x, one
-    number or one a wavelength); ``jacobian`` for every star; ``clear``: radii of the ring that is clear [m].
+    number or one a wavelength); ``jacobian`` for every star; ``clear``: radii of the ring that is clear [m];
+    ``cosines``: direction cosines of the chief rays at the focus.
     """
 
     defocus: float = 0.0
@@ -53,6 +54,7 @@ class PolynomialPupil:
     diameter: float = 8.36
     obscuration: float = 0.612
     clear: tuple | None = None
+    cosines: tuple = (0.0, 0.0)
 
     @property
     def telescope(self):
@@ -85,6 +87,7 @@ class PolynomialPupil:
             lit=np.broadcast_to(lit, (len(fields), len(wavelengths), len(x))).copy(),
             jacobian=np.broadcast_to(jacobian, (len(fields), 2, 2)).copy(),
             reference_points=np.zeros((len(fields), 3)),
+            reference_cosines=np.tile(self.cosines, (len(fields), 1)),
             fields=fields,
             wavelengths=wavelengths,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
@@ -13,11 +13,13 @@ import numpy as np
 from ...core.errors import ConfigError
 from ...core.threads import thread_count
 from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
 from ...raytrace.rays import field_direction
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
 from ..pupil_optics import PupilOptics, trace_pupils
+from .channels import Channels
 from .image_plane import ImagePlane, focal_length
 
 #: Options of :class:`PsfInputs` that some engines take.
@@ -41,6 +43,7 @@ class PsfInputs:
     focal_plane: FocalPlane | None = None
     atmosphere: Atmosphere | None = None
     aberration: ResidualWavefront | None = None
+    silicon: Silicon | None = None
     projection: str = "zemax"
     threads: int | None = None
     n_pupil: int | None = None
@@ -77,6 +80,7 @@ class PsfEngine(ABC):
     name: ClassVar[str]
     options: ClassVar[tuple[str, ...]]  #: members of :data:`OPTIONS` that the engine takes
     screens: ClassVar[tuple[str, ...]]  #: kinds of screens that it uses, as :meth:`.Atmosphere.screens` names them
+    depths: ClassVar[int]  #: conversion depths in silicon of each wavelength
     batch: int  #: number of stars to render at a time
     focal_length: float  #: effective one at the centre of the field [m]
 
@@ -93,7 +97,8 @@ class PsfEngine(ABC):
         self._diameter = inputs.telescope.pupil_diameter
         self._obscuration = inputs.telescope.pupil_obscuration
         self._wavelengths = np.asarray(inputs.wavelengths, dtype=np.float64)
-        self._plane = inputs.plane
+        self._channels = Channels.of(inputs.silicon, self._wavelengths, inputs.plane.diffusion, self.depths)
+        self._plane = replace(inputs.plane, diffusion=self._channels.diffusion)
         self._atmosphere = inputs.atmosphere
         self._threads = inputs.threads
         zero = np.zeros((len(self._wavelengths), 2))

@@ -34,7 +34,7 @@ from .engine import Exposed, PsfEngine, PsfInputs, metric_of
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
 from .pupil_lattice import PupilLattice
-from .sample_packets import indices, samples, to_packets
+from .sample_packets import LANES, indices, samples, to_packets
 
 #: Pupil points by default, with and without an atmosphere (which smears the pattern of the points).
 PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
@@ -68,6 +68,7 @@ class FastPsfEngine(PsfEngine):
     """
 
     name = "fast"
+    depths = 2
     options = ("n_pupil", "oversampling")
     screens = ("slopes",)
 
@@ -86,13 +87,15 @@ class FastPsfEngine(PsfEngine):
         self._place_pupil(n_pupil)
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
+        n_time = 1 if inputs.atmosphere is None else len(inputs.atmosphere.times)
+        self._turns = self._channels.turns(n_time, -(-len(self._lattice.points) // LANES))
         if inputs.atmosphere is None:
             self._slopes, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
         else:
             slopes = inputs.atmosphere.screens("slopes", inputs.threads)
             self._slopes = slopes.reshape(len(slopes), -1)
             self._units = np.array([inputs.atmosphere.slope_unit(n) for n in range(len(slopes))], dtype=np.float32)
-        star_bytes = 4 * len(self._wavelengths) * self._grid_size**2
+        star_bytes = 4 * len(self._channels.wave) * self._grid_size**2
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
     def _place_pupil(self, n_pupil: int) -> None:
@@ -136,7 +139,7 @@ class FastPsfEngine(PsfEngine):
         if atmosphere is not None:
             rest = rest_structure_function(baseline, atmosphere.r0, atmosphere.outer_scale, atmosphere.cutoff)
             table *= coherence(rest, self._wavelengths[:, None])
-        return float(baseline[1]), table.astype(np.float32)
+        return float(baseline[1]), table[self._channels.wave].astype(np.float32)
 
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
         optics = self._trace(fields, self._lattice.points, self._threads)
@@ -144,9 +147,8 @@ class FastPsfEngine(PsfEngine):
         deposit = self._deposit(optics, light)
         # One transform a star, so that its bytes do not depend on its neighbours.
         combined = self._combine(np.stack(self._map(scipy.fft.rfft2, deposit)), optics, offsets)
-        n_time = 1 if self._atmosphere is None else len(self._atmosphere.times)
         # A dark star has no light to divide by.
-        total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * n_time
+        total = np.where(optics.lit.any(axis=(1, 2)), light.sum(axis=(1, 2)), 1.0) * len(self._turns.time)
 
         def draw(shift: np.ndarray | None) -> np.ndarray:
             moved = combined
@@ -168,26 +170,27 @@ class FastPsfEngine(PsfEngine):
         return np.stack(stamps) * (self._oversampling**2 / light)[:, None, None]
 
     def _deposit(self, optics: PupilOptics, light: np.ndarray) -> np.ndarray:
-        """Return the rays of each star, with their light, on the fine grid, [n_star, n_wave, grid_size, grid_size]."""
-        n_star, n_wave = optics.lit.shape[:2]
+        """Return the rays of each star, with their light, on the fine grid, [n_star, n_channel, size, size]."""
+        n_star, n_channel = len(optics.lit), len(self._channels.wave)
         atmosphere = self._atmosphere
         if atmosphere is None:
-            pixel, screen_size, n_layer, n_time = 1.0, 1, 0, 1
+            pixel, screen_size, n_layer = 1.0, 1, 0
             start, step = np.zeros((n_star, 1, 2)), np.zeros((1, 2))
         else:
             pixel, screen_size = atmosphere.screen_pixel, atmosphere.screen_size
-            n_layer, n_time = atmosphere.layer_count, len(atmosphere.times)
+            n_layer = atmosphere.layer_count
             start = (
                 atmosphere.pupil_centers(self._direction(optics.fields), atmosphere.times[0]) + self._lattice.origin
             ) / pixel
-            step = -atmosphere.velocities * (atmosphere.exposure / n_time) / pixel
+            step = -atmosphere.velocities * (atmosphere.exposure / len(atmosphere.times)) / pixel
         column, row = self._lattice.column * self._stride, self._lattice.row * self._stride
         lattice = to_packets(row * screen_size + column, np.int32)
         # Rays that were lost have no place to land; they carry no light either.
-        landed = np.where(optics.lit[..., None], optics.displacement, 0.0) / self._cell
+        lit = optics.lit[:, self._channels.wave, :, None]
+        landed = np.where(lit, self._channels.displacement(optics), 0.0) / self._cell
         displacement = np.stack([to_packets(landed[..., axis], np.float32) for axis in (0, 1)], axis=-2)
         cells_per_slope = optics.jacobian.reshape(n_star, 4) / self._cell
-        image = np.zeros((n_star, n_wave * self._grid_size**2), dtype=np.float32)
+        image = np.zeros((n_star, n_channel * self._grid_size**2), dtype=np.float32)
         launch(
             deposit_rays,
             n_star,
@@ -196,9 +199,11 @@ class FastPsfEngine(PsfEngine):
                 warp_array(self._units, wp.float32),
                 screen_size,
                 n_layer,
-                n_time,
+                len(self._turns.time),
                 warp_array(start, wp.float64),
                 warp_array(step, wp.float64),
+                warp_array(self._turns.time.astype(np.int32), wp.int32),
+                warp_array(self._turns.channel, wp.int32),
                 warp_array(lattice, indices),
                 int(max(column.max(), row.max())) + 1,
                 warp_array(cells_per_slope.astype(np.float32), wp.float32),
@@ -210,15 +215,19 @@ class FastPsfEngine(PsfEngine):
             ],
             threads=self._threads,
         )
-        return image.reshape(n_star, n_wave, self._grid_size, self._grid_size)
+        return image.reshape(n_star, n_channel, self._grid_size, self._grid_size)
 
     def _combine(self, spectra: np.ndarray, optics: PupilOptics, offsets: np.ndarray) -> np.ndarray:
-        """Return the filtered sum over wavelengths of the transforms of each star, shape [n_star, ky, kx]."""
+        """Return the filtered sum over channels of the transforms of each star, shape [n_star, ky, kx]."""
         n_star, _, n_row, n_column = spectra.shape
-        shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)
+        channels, wave = self._channels, self._channels.wave
+        shift = np.einsum("sij,wj->swi", optics.jacobian, self._dispersion)[:, wave]
         # The deposit has its origin in the middle cell; the first pixel of the stamp belongs in the first.
         middle = self._plane.middle * self._plane.pixel_size - self._grid_size // 2 * self._cell
         shift = shift + (offsets * self._plane.pixel_size + middle)[:, None, :]
+        # Rays of a channel stand for its light; the further diffusion is a product of Gaussians along x and y.
+        across = (channels.weight / self._turns.fraction)[:, None] * channels.spread(self._kx)
+        along = channels.spread(self._ky)
         combined = np.empty((n_star, n_row, n_column), dtype=np.complex64)
         launch(
             combine_wavelengths,
@@ -227,12 +236,12 @@ class FastPsfEngine(PsfEngine):
                 warp_array(spectra, wp.vec2f),
                 float(self._kx[1]),
                 warp_array(metric_of(optics.jacobian), wp.float32),
-                warp_array((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
+                warp_array((self._wavelengths[wave] / (2.0 * math.pi)).astype(np.float32), wp.float32),
                 warp_array(self._filter, wp.float32),
                 self._filter_step,
                 warp_array(self._detector, wp.float32),
-                warp_array(np.exp(-1j * shift[..., :1] * self._kx).astype(np.complex64), wp.vec2f),
-                warp_array(np.exp(-1j * shift[..., 1:] * self._ky).astype(np.complex64), wp.vec2f),
+                warp_array((across * np.exp(-1j * shift[..., :1] * self._kx)).astype(np.complex64), wp.vec2f),
+                warp_array((along * np.exp(-1j * shift[..., 1:] * self._ky)).astype(np.complex64), wp.vec2f),
                 warp_array(combined, wp.vec2f),
             ],
             threads=self._threads,

@@ -41,6 +41,8 @@ def deposit_rays(
     n_time: wp.int32,
     start: wp.array3d(dtype=wp.float64),
     step: wp.array2d(dtype=wp.float64),
+    moment: wp.array(dtype=wp.int32),
+    channel: wp.array3d(dtype=wp.int32),
     lattice: wp.array(dtype=indices),
     reach: wp.int32,
     cells_per_slope: wp.array2d(dtype=wp.float32),
@@ -56,11 +58,12 @@ def deposit_rays(
     layer as a whole by part of a pixel, another at every time, and is lost in the mean over the exposure.
 
     Arguments: screens [layer, y * size + x]: packed slopes; unit [layer] of their counts [rad]; start [star, layer, 2]:
-    screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per time step];
-    lattice [packet]: row * size + column of the pupil points [pixels]; reach: the largest row or column, plus one;
-    cells_per_slope [star, 4]: Jacobian, row by row, over the cell of the grid; displacement [star, wave, packet, 2] by
-    the optics [cells]; weight [star, wave, packet] of the light; slope [star, packet, 2]: room for the slopes of all
-    layers [rad]; image [star, (wave * size + y) * size + x], with the origin in the cell size // 2.
+    screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per moment];
+    moment [time]; channel [wave, time, packet] of the rays; lattice [packet]: row * size + column of the pupil points
+    [pixels]; reach: the largest row or column, plus one; cells_per_slope [star, 4]: Jacobian, row by row, over the cell
+    of the grid; displacement [star, channel, packet, 2] by the optics [cells]; weight [star, wave, packet] of the
+    light; slope [star, packet, 2]: room for the slopes of all layers [rad]; image [star, (channel * size + y) * size +
+    x], with the origin in the cell size // 2.
     """
     star = first + wp.tid()
     n_packet = lattice.shape[0]
@@ -75,7 +78,7 @@ def deposit_rays(
             slope[star, packet, 0] = samples()
             slope[star, packet, 1] = samples()
         for layer in range(n_layer):
-            time = wp.float64(t)
+            time = wp.float64(moment[t])
             corner_x = nearest_sample(start[star, layer, 0] + time * step[layer, 0], screen_size)
             corner_y = nearest_sample(start[star, layer, 1] + time * step[layer, 1], screen_size)
             corner = corner_y * screen_size + corner_x
@@ -106,8 +109,9 @@ def deposit_rays(
             moved_x = angle_x * xx + angle_y * xy
             moved_y = angle_x * yx + angle_y * yy
             for wave in range(n_wave):
-                cell_x = moved_x + displacement[star, wave, packet, 0]
-                cell_y = moved_y + displacement[star, wave, packet, 1]
+                part = channel[wave, t, packet]
+                cell_x = moved_x + displacement[star, part, packet, 0]
+                cell_y = moved_y + displacement[star, part, packet, 1]
                 light = weight[star, wave, packet]
                 for i in range(LANES):
                     # No branch, so that the lanes stay together; light beyond the grid is left out.
@@ -116,7 +120,7 @@ def deposit_rays(
                     near_column = wp.clamp(column, 0, grid_size - 1)
                     near_row = wp.clamp(row, 0, grid_size - 1)
                     caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
-                    cell = (wave * grid_size + near_row) * grid_size + near_column
+                    cell = (part * grid_size + near_row) * grid_size + near_column
                     image[star, cell] = image[star, cell] + caught
 
 
@@ -134,12 +138,12 @@ def combine_wavelengths(
     ramp_y: wp.array3d(dtype=wp.vec2f),
     combined: wp.array3d(dtype=wp.vec2f),
 ):
-    """Filter the transforms of one star's wavelengths and add them up, one row of frequencies an item.
+    """Filter the transforms of one star's channels and add them up, one row of frequencies an item.
 
-    Arguments: spectra [star, wave, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy of
-    jacobian @ jacobian.T [m^2/rad^2]; baseline [wave]: wavelength / 2 pi [m]; table [wave, sample]: filter against the
-    baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all wavelengths; ramp_x
-    [star, wave, kx], ramp_y [star, wave, ky]: phase factors; combined [star, ky, kx]: the sum.
+    Arguments: spectra [star, channel, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy
+    of jacobian @ jacobian.T [m^2/rad^2]; baseline [channel]: wavelength / 2 pi [m]; table [channel, sample]: filter
+    against the baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all channels;
+    ramp_x [star, channel, kx], ramp_y [star, channel, ky]: phase factors and weights; combined [star, ky, kx]: the sum.
     """
     item = first + wp.tid()
     n_row = spectra.shape[2]

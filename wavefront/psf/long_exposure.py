@@ -59,6 +59,7 @@ class LongExposureEngine(PsfEngine):
     """
 
     name = "long_exposure"
+    depths = 2
     options = ("n_pupil",)
     screens = ()
 
@@ -80,7 +81,7 @@ class LongExposureEngine(PsfEngine):
         self._choose_frequencies()
         self._tabulate_filter()
         self._tabulate_pixels()
-        star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points)
+        star_bytes = 2 * 2 * 4 * LANES * self._detector.shape[2] * len(self._pupil.points) * self._channels.depths
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
     def _turbulence(self, baseline: np.ndarray) -> np.ndarray:
@@ -96,6 +97,7 @@ class LongExposureEngine(PsfEngine):
         diagonal = math.sqrt(0.5) * k
         detector = [self._plane.transfer(*along) for along in ((k, 0 * k), (0 * k, k), (diagonal, diagonal))]
         left = np.array([self._turbulence(s * count)[w] for w, s in enumerate(step)]) * np.max(np.abs(detector), axis=0)
+        left = left * self._channels.of_wavelength(self._channels.spread(k))
         beyond = left[np.arange(len(step)), np.minimum(np.ceil(width / step).astype(int), largest) - 1]
         if beyond.max() > _LARGEST_LEFT:
             raise DomainError(
@@ -117,8 +119,8 @@ class LongExposureEngine(PsfEngine):
             1.0 - 2.0 * ring / (math.pi * self._width)
         )
         table = self._turbulence(baseline) * overlap / len(self._wavelengths)
-        self._filter = np.ascontiguousarray(table, dtype=np.float32)
         # The baseline of frequency k is wavelength / 2 pi |J^T k|.
+        self._filter = np.ascontiguousarray(table, dtype=np.float32)
         self._filter_steps = (self._wavelengths / (self.period * baseline[1])).astype(np.float32)
 
     def _tabulate_pixels(self) -> None:
@@ -141,6 +143,9 @@ class LongExposureEngine(PsfEngine):
         columns = np.zeros((2, n_row, across * LANES), dtype=np.float32)
         columns[:, :, : plane.stamp_size] = np.stack([np.cos(angle.T), np.sin(angle.T)])
         self._pixel_columns = columns.reshape(2, n_row, across, LANES)
+        spread = self._channels.spread(k * column).reshape(-1, n_packet, LANES)
+        self._fade_x = (self._channels.weight[:, None, None] * spread).astype(np.float32)
+        self._fade_y = spread.astype(np.float32)
 
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
         optics = self._trace(fields, self._pupil.points, self._threads)
@@ -161,11 +166,12 @@ class LongExposureEngine(PsfEngine):
     def _transform(self, optics: PupilOptics, edges: np.ndarray, area: np.ndarray) -> np.ndarray:
         """Return the transfer functions of stars without the detector, as the kernel lays them out."""
         pupil = self._pupil
-        n_star, n_wave, n_point = optics.lit.shape
+        n_star, _, n_point = optics.lit.shape
         n_row, n_packet = self._detector.shape[1:3]
         landed = np.isfinite(optics.displacement).all(axis=(1, 3)).astype(np.float64)
+        wave = self._channels.wave
         # Place and light of the points, cut and lean of the strips along the rims.
-        shapes = (n_wave, 2, n_point), (n_point,), (2 * pupil.n_spoke, 2), (n_wave, 2 * pupil.n_spoke, 2)
+        shapes = (len(wave), 2, n_point), (n_point,), (2 * pupil.n_spoke, 2), (len(wave), 2 * pupil.n_spoke, 2)
         points = [wp.empty((n_star, *shape), dtype=wp.float32, device="cpu") for shape in shapes]
         launch(
             place_points,
@@ -174,24 +180,32 @@ class LongExposureEngine(PsfEngine):
                 *(warp_array(rule) for rule in (pupil.radius, pupil.inverse, pupil.fraction, pupil.quadrature)),
                 warp_array(pupil.unit, wp.vec2d),
                 warp_array(edges, wp.float64),
-                warp_array(optics.displacement, wp.float32),
+                warp_array(self._channels.displacement(optics), wp.float32),
                 warp_array(landed, wp.float64),
                 warp_array(optics.jacobian, wp.mat22d),
-                warp_array(self._dispersion, wp.vec2d),
+                warp_array(self._dispersion[wave], wp.vec2d),
                 self.period,
                 warp_array(area, wp.float64),
                 *points,
             ],
             threads=self._threads,
         )
-        along_x, along_y = (np.empty((n_star, n_point, n_packet, 2, LANES), dtype=np.float32) for _ in range(2))
+        *points, lean = points
+        depths = self._channels.depths
+        lean = np.moveaxis(self._channels.of_wavelength(np.moveaxis(lean.numpy(), 1, 0)), 0, 1).astype(np.float32)
+        room = (n_star, depths * n_point, n_packet, 2, LANES)
+        along_x, along_y = np.empty(room, dtype=np.float32), np.empty(room, dtype=np.float32)
         spectrum = np.empty((n_star, 4, n_row, n_packet, LANES), dtype=np.float32)
         launch(
             transform_pupils,
             n_star,
             [
                 pupil.n_spoke,
+                depths,
                 *points,
+                warp_array(lean, wp.float32),
+                warp_array(self._fade_x, samples),
+                warp_array(self._fade_y, samples),
                 warp_array(self._wavelengths.astype(np.float32), wp.float32),
                 warp_array(self._rows, wp.int32),
                 warp_array(metric_of(optics.jacobian), wp.float32),

@@ -69,14 +69,14 @@ def place_points(
 ):
     """Lay the points of one spoke over the clear pupil of one star, and find the strips cut off its ends.
 
-    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m];
-    fraction [ring] of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]:
-    direction; edges [star, spoke, 2] [m]; displacement [star, wave, ring * n_spoke + spoke, 2] of the traced points
-    [m]; landed [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion
-    [wave] [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of
-    the traced ones and rims as [2, n_spoke]: place [star, wave, 2, point] [periods]; light [star, point]: part of the
-    pupil; cut [star, rim, 2]: part of the pupil per metre of wavelength and step of frequency; lean [star, wave, rim,
-    2]: phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
+    Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m]; fraction
+    [ring] of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]: direction;
+    edges [star, spoke, 2] [m]; displacement [star, channel, ring * n_spoke + spoke, 2] of the traced points [m]; landed
+    [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion [channel]
+    [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of the traced
+    ones and rims as [2, n_spoke]: place [star, channel, 2, point] [periods]; light [star, point]: part of the pupil;
+    cut [star, rim, 2]: part of the pupil per metre of wavelength and step of frequency; lean [star, channel, rim, 2]:
+    phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
     """
     item = first + wp.tid()
     n_spoke = unit.shape[0]
@@ -112,21 +112,21 @@ def place_points(
             across = across * (half / (period * area[star]))
             if at > zero:
                 depth = wp.where(end == 0, -half, half) * area[star] / (at * angle)
-        for wave in range(displacement.shape[1]):
-            landing = jacobian[star] * dispersion[wave]
+        for part in range(displacement.shape[1]):
+            landing = jacobian[star] * dispersion[part]
             slope = wp.vec2d(zero, zero)
             for k in range(n_ring):
                 if landed[star, k * n_spoke + spoke] > zero:
                     value, rate = basis(radius, inverse, landed, star, spoke, n_spoke, k, at)
-                    x = wp.float64(displacement[star, wave, k * n_spoke + spoke, 0])
-                    y = wp.float64(displacement[star, wave, k * n_spoke + spoke, 1])
+                    x = wp.float64(displacement[star, part, k * n_spoke + spoke, 0])
+                    y = wp.float64(displacement[star, part, k * n_spoke + spoke, 1])
                     landing = landing + wp.vec2d(value * x, value * y)
                     slope = slope + wp.vec2d(rate * x, rate * y)
-            place[star, wave, 0, point] = wp.float32(landing[0] / period)
-            place[star, wave, 1, point] = wp.float32(landing[1] / period)
+            place[star, part, 0, point] = wp.float32(landing[0] / period)
+            place[star, part, 1, point] = wp.float32(landing[1] / period)
             if outermost:
-                lean[star, wave, rim, 0] = wp.float32(depth * tau / period * slope[0])
-                lean[star, wave, rim, 1] = wp.float32(depth * tau / period * slope[1])
+                lean[star, part, rim, 0] = wp.float32(depth * tau / period * slope[0])
+                lean[star, part, rim, 1] = wp.float32(depth * tau / period * slope[1])
         if outermost:
             cut[star, rim, 0] = wp.float32(across[0])
             cut[star, rim, 1] = wp.float32(across[1])
@@ -171,10 +171,13 @@ def filtered(
 def transform_pupils(
     first: wp.int32,
     n_spoke: wp.int32,
+    n_depth: wp.int32,
     place: wp.array4d(dtype=wp.float32),
     light: wp.array2d(dtype=wp.float32),
     cut: wp.array3d(dtype=wp.float32),
     lean: wp.array4d(dtype=wp.float32),
+    fade_x: wp.array2d(dtype=samples),
+    fade_y: wp.array2d(dtype=samples),
     wavelength: wp.array(dtype=wp.float32),
     rows: wp.array(dtype=wp.int32),
     metric: wp.array2d(dtype=wp.float32),
@@ -187,14 +190,18 @@ def transform_pupils(
 ):
     """Add up the transfer functions of one star's wavelengths, over columns m and rows +n and -n of frequencies.
 
-    Arguments: place, light, cut, lean as ``place_points`` leaves them; wavelength [wave] [m]; rows [packet of
-    columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against
-    the baseline; per_step [wave]: samples of the table per step of frequency, for a unit Jacobian; along_x, along_y
-    [star, point, packet, 2]: room for cosines and sines; at_y: along_y as plain numbers [star, ...]; spectrum [star,
-    4, row, packet]: real and imaginary parts at +n, and at -n.
+    A wavelength has ``n_depth`` channels, with the light of the same points at other places.
+
+    Arguments: place, light, cut as ``place_points`` leaves them; lean [star, wave, rim, 2] of the channels of a
+    wavelength together; fade_x, fade_y [channel, packet]: their filters along x, with their weights, and along y;
+    wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @
+    jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of the table per step of
+    frequency, for a unit Jacobian; along_x, along_y [star, depth * n_point + point, packet, 2]: room for cosines and
+    sines; at_y: along_y as plain numbers [star, ...]; spectrum [star, 4, row, packet]: real and imaginary parts at +n,
+    and at -n.
     """
     star = first + wp.tid()
-    n_wave = place.shape[1]
+    n_wave = wavelength.shape[0]
     n_point = place.shape[3]
     n_packet = rows.shape[0]
     inner_end = n_spoke
@@ -204,22 +211,27 @@ def transform_pupils(
             for part in range(4):
                 spectrum[star, part, row, packet] = samples()
     for wave in range(n_wave):
-        for point in range(n_point):
-            x = place[star, wave, 0, point]
-            y = place[star, wave, 1, point]
-            scale = light[star, point]
-            if point < inner_end or point >= outer_start:
-                scale = wp.float32(1.0)
-            for packet in range(n_packet):
-                number = lane_numbers(packet)
-                cosine, sine = unit_circle(-x * number)
-                along_x[star, point, packet, 0] = scale * cosine
-                along_x[star, point, packet, 1] = scale * sine
-            for packet in range(along_y.shape[2]):
-                number = lane_numbers(packet)
-                cosine, sine = unit_circle(-y * number)
-                along_y[star, point, packet, 0] = cosine
-                along_y[star, point, packet, 1] = sine
+        for depth in range(n_depth):
+            part = wave * n_depth + depth
+            for point in range(n_point):
+                x = place[star, part, 0, point]
+                y = place[star, part, 1, point]
+                scale = light[star, point]
+                if point < inner_end or point >= outer_start:
+                    scale = wp.float32(1.0)
+                here = depth * n_point + point
+                for packet in range(n_packet):
+                    number = lane_numbers(packet)
+                    cosine, sine = unit_circle(-x * number)
+                    fade = scale * fade_x[part, packet]
+                    along_x[star, here, packet, 0] = wp.cw_mul(fade, cosine)
+                    along_x[star, here, packet, 1] = wp.cw_mul(fade, sine)
+                for packet in range(along_y.shape[2]):
+                    number = lane_numbers(packet)
+                    cosine, sine = unit_circle(-y * number)
+                    fade = fade_y[part, packet]
+                    along_y[star, here, packet, 0] = wp.cw_mul(fade, cosine)
+                    along_y[star, here, packet, 1] = wp.cw_mul(fade, sine)
         stride = 2 * LANES * along_y.shape[2]
         for packet in range(n_packet):
             number = lane_numbers(packet)
@@ -230,15 +242,16 @@ def transform_pupils(
                 ss = samples()
                 cs = samples()
                 sc = samples()
-                for point in range(inner_end, outer_start):
-                    a = along_x[star, point, packet, 0]
-                    b = along_x[star, point, packet, 1]
-                    c = at_y[star, point * stride + here]
-                    d = at_y[star, point * stride + here + LANES]
-                    cc = cc + c * a
-                    ss = ss + d * b
-                    cs = cs + d * a
-                    sc = sc + c * b
+                for depth in range(n_depth):
+                    for point in range(depth * n_point + inner_end, depth * n_point + outer_start):
+                        a = along_x[star, point, packet, 0]
+                        b = along_x[star, point, packet, 1]
+                        c = at_y[star, point * stride + here]
+                        d = at_y[star, point * stride + here + LANES]
+                        cc = cc + c * a
+                        ss = ss + d * b
+                        cs = cs + d * a
+                        sc = sc + c * b
                 # At -n the sine along y has the other sign.
                 re_plus = cc - ss
                 im_plus = cs + sc
@@ -256,6 +269,16 @@ def transform_pupils(
                     ss = d * b
                     cs = d * a
                     sc = c * b
+                    for depth in range(1, n_depth):
+                        deeper = depth * n_point + point
+                        a = along_x[star, deeper, packet, 0]
+                        b = along_x[star, deeper, packet, 1]
+                        c = at_y[star, deeper * stride + here]
+                        d = at_y[star, deeper * stride + here + LANES]
+                        cc = cc + c * a
+                        ss = ss + d * b
+                        cs = cs + d * a
+                        sc = sc + c * b
                     width_x = (wavelength[wave] * cut[star, rim, 0]) * number
                     width_y = wavelength[wave] * cut[star, rim, 1] * ky
                     lean_x = lean[star, wave, rim, 0] * number

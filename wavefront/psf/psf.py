@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ...core.errors import DomainError, check_choice
 from ...core.units import metres, radians
 from ...models.camera.focal_plane import FocalPlane
+from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
 from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
@@ -45,7 +46,7 @@ class Psfs:
     lit_fraction : ndarray, shape [n_star, n_wave]
         Lit fraction of the annular pupil.
     inside : ndarray, shape [n_star]
-        Fraction of the light that falls on the stamp.
+        Fraction of the light that falls on the stamp and, in silicon, turns into charge.
     flags : ndarray of int, shape [n_star]
         0, or :data:`DARK`.
     """
@@ -69,6 +70,7 @@ def make_psfs(
     focal_plane: FocalPlane | None = None,
     atmosphere: Atmosphere | None = None,
     aberration: ResidualWavefront | None = None,
+    silicon: Silicon | None = None,
     engine: str = "fast",
     stamp_size: int = 31,
     pixel_size: ArrayLike = 10e-6,
@@ -104,6 +106,9 @@ def make_psfs(
         The exposure; none outside the atmosphere.
     aberration : ResidualWavefront, optional
         Wavefront error that active optics leaves; none by default.
+    silicon : Silicon, optional
+        Silicon of the CCDs, in which light turns into charge below the surface, and some of it not at all; by default
+        all of it does so at the surface.
     engine : {"fast", "wave", "long_exposure"}
         ``"fast"``: geometric optics with filters. ``"wave"``: Fourier optics, the slow reference engine.
         ``"long_exposure"``: mean over all turbulence, the quickest for many stars per call. It needs an atmosphere, of
@@ -113,7 +118,8 @@ def make_psfs(
     pixel_size : float or Quantity
         Side of a pixel [m].
     diffusion : float or Quantity
-        Root mean square of the charge diffusion along each axis [m].
+        Root mean square of the charge diffusion along each axis [m]; in silicon that of charge from the surface, and
+        less from deeper down.
     jitter : float or Quantity
         Root mean square of the telescope's pointing along each axis during the exposure [rad]: a Gaussian blur, the
         same for all stars.
@@ -152,7 +158,8 @@ def make_psfs(
     ConfigError
         If the engine or the projection is unknown, or the engine needs an atmosphere or does not take an option.
     DomainError
-        If an argument is outside its range or of the wrong shape, or a star falls between the CCDs.
+        If an argument is outside its range or of the wrong shape, silicon is transparent at a wavelength, or a star
+        falls between the CCDs.
     """
     check_choice("engine", engine, ENGINES)
     angles = _table(radians(fields, "fields"), "fields", None)
@@ -177,6 +184,7 @@ def make_psfs(
             focal_plane=focal_plane,
             atmosphere=atmosphere,
             aberration=aberration,
+            silicon=silicon,
             projection=projection,
             threads=threads,
             n_pupil=n_pupil,

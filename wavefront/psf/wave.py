@@ -58,6 +58,7 @@ class WavePsfEngine(PsfEngine):
     """Fourier optics, one star per thread."""
 
     name = "wave"
+    depths = 3
     options = ("padding", "pupil_spacing")
     screens = ("low", "high")
 
@@ -65,6 +66,7 @@ class WavePsfEngine(PsfEngine):
         super().__init__(inputs)
         self._lay_grid(inputs.padding, inputs.pupil_spacing)
         self._take_screens()
+        self._turns = self._channels.turns(1 if inputs.atmosphere is None else len(inputs.atmosphere.times))
         self.batch = thread_count(inputs.threads)
 
     def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
@@ -75,7 +77,8 @@ class WavePsfEngine(PsfEngine):
             raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")
         if padding is None:
             k = 2.0 * math.pi * LONGEST_BASELINE / (float(self._wavelengths.max()) * self.focal_length)
-            left = math.exp(-0.5 * (k * self._plane.diffusion) ** 2)
+            spread = self._channels.of_wavelength(self._channels.spread(np.array([k]))).max()
+            left = float(spread) * math.exp(-0.5 * (k * self._plane.diffusion) ** 2)
             padding = self._atmosphere is None or left > _NEGLIGIBLE
         diameter = self._diameter
         longest = diameter if padding else LONGEST_BASELINE
@@ -127,38 +130,42 @@ class WavePsfEngine(PsfEngine):
         return optics, self._filtered(self._intensity(field, optics), optics.jacobian[0])
 
     def _intensity(self, field: np.ndarray, optics: PupilOptics) -> np.ndarray:
-        """Return the squared field on the focal plane, averaged over time, shape [n_wave, size, size].
+        """Return the squared field on the focal plane, averaged over time, shape [n_channel, size, size].
 
-        Scaled so that the means over the grid add up to 1 over the wavelengths.
+        Scaled so that the means over the grid add up to 1 over the channels, if all turn light into charge.
         """
         n_wave, size, line = len(self._wavelengths), self._size, self._lattice.size
+        channels, n_channel = self._channels, len(self._channels.wave)
         lit = optics.lit[0]
         if not lit.any():
-            return np.zeros((n_wave, size, size))
-        turns = optics.path[0] / self._wavelengths[:, None]
-        turns = np.where(lit, turns - np.rint(turns), 0.0)
+            return np.zeros((n_channel, size, size))
+        turns = channels.path(optics)[0] / self._wavelengths[channels.wave, None]
+        turns = np.where(lit[channels.wave], turns - np.rint(turns), 0.0)
         phase, amplitude = (self._rows(values) for values in (turns, lit))
         used = np.asarray(amplitude.any(axis=(0, 3)), dtype=np.int32)
         fields = np.zeros((n_wave, size, size), dtype=np.complex64)
-        squares = [wp.zeros(2 * size * size // LANES, dtype=samples, device="cpu") for _ in range(n_wave)]
+        squares = [wp.zeros(2 * size * size // LANES, dtype=samples, device="cpu") for _ in range(n_channel)]
         screens, n_layer = self._packed_screens(), 0 if self._atmosphere is None else self._atmosphere.layer_count
+        before = [warp_array(used, wp.int32), warp_array((1.0 / self._wavelengths).astype(np.float32), wp.float32)]
         after: list[Any] = [
-            warp_array(used, wp.int32),
-            warp_array((1.0 / self._wavelengths).astype(np.float32), wp.float32),
             warp_array(phase, samples),
             warp_array(amplitude, samples),
             wp.empty((line, max(self._runs) * LANES), dtype=wp.float32, device="cpu"),
             wp.empty((line, self._packets), dtype=samples, device="cpu"),
             warp_array(fields, wp.vec2f),
         ]
-        steps = self._screen_places(field)
-        for places in steps:
-            launch(pupil_fields, line, [*screens, n_layer, self._taps(places), *after], threads=1)
+        moments = self._screen_places(field)
+        for step, time in enumerate(self._turns.time):
+            chosen = np.ascontiguousarray(self._turns.channel[:, step, 0])
+            now = [*screens, n_layer, self._taps(moments[time]), *before, warp_array(chosen, wp.int32)]
+            launch(pupil_fields, line, [*now, *after], threads=1)
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
-                launch(add_squares, len(focused), [warp_array(focused, samples), squares[wave]], threads=1)
-        parts = np.stack([square.numpy() for square in squares]).reshape(n_wave, size, size, 2)
-        return parts.sum(axis=-1, dtype=np.float64) / (len(steps) * lit.sum())
+                launch(add_squares, len(focused), [warp_array(focused, samples), squares[chosen[wave]]], threads=1)
+        parts = np.stack([square.numpy() for square in squares]).reshape(n_channel, size, size, 2)
+        part = channels.weight / self._turns.fraction
+        mean = parts.sum(axis=-1, dtype=np.float64) / (len(self._turns.time) * lit.sum())
+        return np.asarray(part[:, None, None] * mean)
 
     def _rows(self, values: np.ndarray) -> np.ndarray:
         """Return values [n_wave, n_pupil] as float32 packets along the pupil's rows, [n_wave, row, packet, LANES]."""
@@ -205,10 +212,12 @@ class WavePsfEngine(PsfEngine):
         step = np.arange(-self._reach, self._reach + 1)
         # the wavenumber on the focal plane of a baseline of one step in x and in y, by the sign of the transform
         per_step = -2.0 * math.pi * self._lattice.spacing * np.linalg.inv(jacobian)
-        spectra = np.empty((len(intensity), len(step), len(step)), dtype=np.complex128)
-        for wave, wavelength in enumerate(self._wavelengths):
-            k = (per_step[0, :, None, None] * step + per_step[1, :, None, None] * step[:, None]) / wavelength
-            spectra[wave] = scipy.fft.ifft2(intensity[wave])[np.ix_(step, step)] * self._plane.transfer(*k)
+        spectra = np.zeros((len(self._wavelengths), len(step), len(step)), dtype=np.complex128)
+        for wave, variance, square in zip(self._channels.wave, self._channels.variance, intensity, strict=True):
+            along = per_step[0, :, None, None] * step + per_step[1, :, None, None] * step[:, None]
+            k = along / self._wavelengths[wave]
+            spread = np.exp(-0.5 * variance * (k * k).sum(axis=0)) if variance else 1.0
+            spectra[wave] += scipy.fft.ifft2(square)[np.ix_(step, step)] * (self._plane.transfer(*k) * spread)
         return spectra
 
     def _sample(self, spectra: np.ndarray, jacobian: np.ndarray, offset: np.ndarray) -> np.ndarray:

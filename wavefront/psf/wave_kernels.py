@@ -123,6 +123,7 @@ def pupil_fields(
     taps: Taps,
     lit: wp.array2d(dtype=wp.int32),
     turns_per_meter: wp.array(dtype=wp.float32),
+    channel: wp.array(dtype=wp.int32),
     optics: wp.array3d(dtype=samples),
     amplitude: wp.array3d(dtype=samples),
     blended: wp.array2d(dtype=wp.float32),
@@ -134,9 +135,10 @@ def pupil_fields(
     The pupil is a square lattice along the axes of the screens, so interpolation is done row by row: first between the
     rows of a screen, then along the row so gained.
 
-    Arguments: lit [item, packet]: 1 where a packet holds light; turns_per_meter [wave]; optics [wave, item, packet]:
-    phase [turns]; amplitude [wave, item, packet]; blended [item, column], path [item, packet]: room for a row of a
-    screen and for the path [m]; field [wave, y, x], of which the pupil fills the first corner.
+    Arguments: lit [item, packet]: 1 where a packet holds light; turns_per_meter [wave]; channel [wave]: that of the
+    moment; optics [channel, item, packet]: phase [turns]; amplitude [wave, item, packet]; blended [item, column], path
+    [item, packet]: room for a row of a screen and for the path [m]; field [wave, y, x], of which the pupil fills the
+    first corner.
     """
     item = first + wp.tid()
     for packet in range(path.shape[1]):
@@ -147,7 +149,9 @@ def pupil_fields(
     for packet in range(path.shape[1]):
         if lit[item, packet] == 1:
             for wave in range(turns_per_meter.shape[0]):
-                cosine, sine = unit_circle(path[item, packet] * turns_per_meter[wave] + optics[wave, item, packet])
+                cosine, sine = unit_circle(
+                    path[item, packet] * turns_per_meter[wave] + optics[channel[wave], item, packet]
+                )
                 light = amplitude[wave, item, packet]
                 for i in range(LANES):
                     field[wave, item, packet * LANES + i] = wp.vec2f(light[i] * cosine[i], light[i] * sine[i])

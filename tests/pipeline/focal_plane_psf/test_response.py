@@ -4,6 +4,8 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.polynomial.polynomial import polyvander2d
 
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.camera.silicon import Silicon
+from pachon.models.io.prescription import load_telescope
 from pachon.pipeline.focal_plane_psf import response
 from pachon.pipeline.focal_plane_psf.response import (
     NOLL,
@@ -15,6 +17,7 @@ from pachon.pipeline.focal_plane_psf.response import (
     wavefront,
 )
 from pachon.wavefront.aberration import ResidualWavefront
+from pachon.wavefront.psf.psf import make_psfs
 
 UM = 1e-6
 
@@ -152,3 +155,33 @@ def test_batches_change_nothing(instrument, plane, monkeypatch):
         instrument.shapes(fields, plane, None, progress=counted.append), whole, atol=1e-12
     )  # the batches of a transform
     assert counted == [3, 3, 1]
+
+
+def test_silicon_is_part_of_the_instrument(lsst_r, plane):
+    y = load_telescope("lsst_v3.3_y")
+    without, thick, thin = (Instrument.of(y, [970e-9], silicon=s) for s in (None, Silicon(), Silicon(50e-6)))
+    assert len({without.key, thick.key, thin.key}) == 3
+    fields = thick.fields(stars(plane, 4, 5))
+    images, _ = thick.images(fields, plane, None)
+    exact = make_psfs(
+        y,
+        fields,
+        [970e-9],
+        focal_plane=plane,
+        atmosphere=thick.atmosphere,
+        engine="long_exposure",
+        silicon=Silicon(),
+    ).image
+    np.testing.assert_array_equal(images, exact)
+    assert (thick.shapes(fields, plane, None) != without.shapes(fields, plane, None)).all()
+
+
+@pytest.mark.long
+def test_shapes_at_heights_in_silicon(plane):
+    # Silicon puts the focus 12 um to one side, so the polynomial of the heights reaches farther out of it.
+    instrument = Instrument.of(load_telescope("lsst_v3.3_y"), [970e-9], silicon=Silicon())
+    fields = instrument.fields(stars(plane, 16, 1))
+    found = HeightResponse.of(instrument, fields, plane, None)
+    for height in np.array([-18.0, -7.0, 3.0, 16.0]) * UM:
+        truth = instrument.shapes(fields, level_plane(plane, height), None)
+        np.testing.assert_allclose(found.at(np.full(16, height)), truth, atol=2e-4)

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PachonError
-from pachon.pipeline.config import configuration_of
+from pachon.pipeline.config import configuration_of, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.rays import launch_rays
 from pachon.raytrace.trace import trace
 from pachon.studies.sweep.compensation import compensated
 from pachon.wavefront.chief_rays import fields_at
+from pachon.wavefront.silicon_focus import focus_height
 
 #: All of them need a finished study, of seconds.
 pytestmark = pytest.mark.long
@@ -72,3 +73,22 @@ def test_nothing_to_solve_changes_nothing():
 def test_unknown_compensators_are_refused():
     with pytest.raises(PachonError, match="M7"):
         compensated(experiment(), ("M7.dz_um",))
+
+
+def test_silicon_is_focused_where_light_turns_into_charge():
+    with_silicon = configuration_of(
+        {
+            "band": "y",
+            "ccds": ["R22_S11"],
+            "wavelengths_nm": [970],
+            "focal_plane": {"budget": "flat"},
+            "detector": {"silicon": True},
+        },
+        "test",
+    )
+    in_silicon = Experiment.from_config(with_silicon)
+    at_surface = Experiment.from_config(with_options(with_silicon, detector__silicon=False))
+    (_, deep), (_, still) = (compensated(e, ["Detector.dz_um"]) for e in (in_silicon, at_surface))
+    found = (deep["Detector.dz_um"] - still["Detector.dz_um"]) * 1e-6
+    # Nothing but the detector moves, so this is the height itself; the design's own focus varies over a CCD.
+    assert found == pytest.approx(focus_height(in_silicon.telescope, in_silicon.silicon, 970e-9), rel=0.01)
