@@ -175,6 +175,7 @@ class Configuration(Section):
     changes: dict[str, Real] = Field(
         default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"
     )
+    rotator_deg: Real = Field(0.0, description="angle of the camera, from +x towards +y of the telescope [deg]")
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()

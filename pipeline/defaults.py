@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +42,7 @@ class ResolvedConfiguration:
     """Configuration without open values, and the models that it names."""
 
     config: Configuration  #: every default filled in, paths absolute
-    telescope: Telescope  #: changes applied
+    telescope: Telescope  #: changes applied, camera rotated
     camera: Camera
     site: Site  #: of the atmosphere
 
@@ -95,10 +96,15 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             ),
         }
     )
-    telescope = apply_changes(telescope, resolved.changes)
+    telescope = as_configured(telescope, resolved)
     _check(resolved, telescope)
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
+
+
+def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
+    """Return a telescope with the changes and the rotator angle of a configuration."""
+    return apply_changes(telescope, config.changes).with_rotator(math.radians(config.rotator_deg))
 
 
 def noise_free_components(config: Configuration) -> int:

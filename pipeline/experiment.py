@@ -125,6 +125,11 @@ class Experiment:
         return given(self.config.reconstruction.weight_fwhm_arcsec) * ARCSEC
 
     @property
+    def rotator(self) -> float:
+        """Angle of the camera from +x towards +y of the telescope frame [rad]."""
+        return math.radians(self.config.rotator_deg)
+
+    @property
     def dispersion(self) -> np.ndarray | None:
         """Shift in field angle of each wavelength by the air [rad], shape [n_wave, 2]; None without an atmosphere."""
         settings = self.config.atmosphere

@@ -110,7 +110,7 @@ def _expose(
     fields = fields_at(telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
     optical, magnification = not experiment.atmosphere_only, 1.0
     if not optical:
-        ideal = without_aberration(telescope, _IDEAL_RATIO)
+        ideal = without_aberration(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
         here, there = (center_focal_length(t, wavelengths) for t in (telescope, ideal))
         telescope, magnification = ideal, there / here
     psfs = make_psfs(

@@ -91,6 +91,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         observed_images=observation.images.astype(np.float32),
         model=model,
         noise_free_model=noise_free_model,
+        rotator=experiment.rotator,
     )
 
 
