@@ -23,6 +23,7 @@ from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .config import BandName, Configuration
 from .psf_model.fit import COMPONENTS
 from .psf_model.polynomial import term_count
+from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
 from .simulate.screen_cover import check_screens
 
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
@@ -143,6 +144,11 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")
     if given(config.psf.stamp) % 2 == 0:
         raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
+    if config.sensor.brighter_fatter is not None and config.psf.pixel_um != BRIGHTER_FATTER_PIXEL * 1e6:
+        raise ConfigError(
+            f"psf.pixel_um = {config.psf.pixel_um:g}: expected {BRIGHTER_FATTER_PIXEL * 1e6:g}, whose boundaries"
+            f" sensor.brighter_fatter = {config.sensor.brighter_fatter} moves"
+        )
     fit, stars = config.reconstruction, config.stars
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")

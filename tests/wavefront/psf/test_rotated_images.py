@@ -43,7 +43,7 @@ def heights():
         pytest.param("wave", 90.0, 1e-6, marks=pytest.mark.long),
         # They do not, and sample the pupil at other points: as any other set of as many points.
         ("long_exposure", 30.0, 2e-3),
-        pytest.param("wave", 30.0, 2e-3, marks=pytest.mark.long),
+        pytest.param("wave", 30.0, 2e-3, marks=pytest.mark.slow),
     ],
 )
 def test_turning_the_camera_is_turning_all_else_the_other_way(lsst_r, air, heights, engine, degrees, tolerance):
