@@ -63,25 +63,24 @@ def test_areas_of_pixels_under_a_star(make, vertices):
 
 
 @pytest.mark.parametrize(
-    "make", [pytest.param("itl", marks=pytest.mark.long), pytest.param("e2v", marks=pytest.mark.slow)]
+    ("make", "electrons", "count"),
+    [
+        pytest.param("itl", 1_000_000, 4, marks=pytest.mark.long),
+        pytest.param("e2v", 1_000_000, 4, marks=pytest.mark.slow),
+        pytest.param("itl", 100_000, 60, marks=pytest.mark.slow),
+        pytest.param("e2v", 100_000, 60, marks=pytest.mark.slow),
+        pytest.param("e2v", 10_000, 200, marks=pytest.mark.slow),
+    ],
 )
-def test_growth_of_stars_with_their_electrons(make, star):
-    before = moments(star)
-    slopes = []
-    batches = 10
-    for electrons, count in ((50_000, 8), (1_000_000, 4)):
-        # GalSim moves the boundaries after every tenth of the star, so that the first tenth falls into still pixels: on
-        # average 9/20 of the charge act in place of half.
-        theirs, error = np.multiply(
-            changes(electrons, count, f"lsst_{make}_50_8", nrecalc=electrons / batches), batches / (batches - 1)
-        )
-        ours = moments(brighter_fatter(star[None], [electrons], sensor=make)[0]) - before
-        # Three standard errors; 2 % for the first order and for 8 vertices in place of 32.
-        assert (np.abs(ours - theirs)[2:4] < 3.0 * error[2:4] + 0.02 * theirs[2:4]).all()
-        slopes.append(ours[2:4] / electrons)
-    # The brightest stars tell the effect to 3 %.
-    assert (error[2:4] < 0.03 * theirs[2:4]).all()
-    np.testing.assert_allclose(slopes[0], slopes[1], rtol=0.02)
+def test_growth_of_stars_with_their_electrons(make, electrons, count, star):
+    # GalSim moves the boundaries after every tenth of the star, so that the first tenth falls into still pixels: on
+    # average 9/20 of the charge act in place of half.
+    theirs, error = np.multiply(changes(electrons, count, f"lsst_{make}_50_8", nrecalc=electrons / 10), 10.0 / 9.0)
+    ours = moments(brighter_fatter(star[None], [electrons], sensor=make)[0]) - moments(star)
+    # Three standard errors; 2 % for the first order and for 8 vertices in place of 32.
+    assert (np.abs(ours - theirs)[2:4] < 3.0 * error[2:4] + 0.02 * theirs[2:4]).all()
+    # What there is to find is many standard errors: the brightest stars tell it to 3 %.
+    assert (error[2:4] < (0.03 if electrons == 1_000_000 else 0.1) * theirs[2:4]).all()
 
 
 @pytest.mark.long

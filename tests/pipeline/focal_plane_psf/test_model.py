@@ -397,5 +397,6 @@ def test_a_rotated_camera_is_fitted_as_any_other(aligned, exposure, few, lsst_r,
     # Not so where M2 is off its axis: its coma stays with the telescope.
     asymmetric = lsst_r.perturbed("M2", shift=(1e-3, 0.0, 0.0))
     shapes = [Instrument.of(t, wavelengths) for t in (asymmetric, asymmetric.with_rotator(0.5 * np.pi))]
+    assert shapes[0].key != shapes[1].key
     e = [i.shapes(i.fields(exposure.xy[:20]), FocalPlane.flat(exposure.camera), None) for i in shapes]
     assert np.abs(e[0] - e[1]).max() > 1e-3

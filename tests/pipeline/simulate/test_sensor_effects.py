@@ -37,6 +37,7 @@ def plain(settings):
     return exposure, model_ccd(experiment, exposure)
 
 
+@pytest.mark.long
 def test_bright_stars_are_fatter_and_the_truth_is_not(settings, plain):
     exposure, without = plain
     # The brighter-fatter effect is no part of the exposure: the same stars again.
@@ -60,6 +61,7 @@ def test_bright_stars_are_fatter_and_the_truth_is_not(settings, plain):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [RINGS, EDGE])
 def test_static_displacements_act_on_all_stars(settings, plain, options):
     exposure, _ = plain
