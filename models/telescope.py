@@ -284,6 +284,30 @@ class Telescope:
                     frames[group] = move_frame(*frames[group], rotation=rotation, about=centre, shift=dr)
         return replace(self, surfaces=surfaces, group_frames=frames)
 
+    def with_rotator(self, angle: ArrayLike) -> Telescope:
+        """Return the telescope with its camera rotated about the camera's own axis.
+
+        The detector is rotated, and with it the axes of positions, CCD heights and images. Lenses and filter rotate
+        too, which changes nothing of a rotationally symmetric lens; shifts, tilts and deformations of them stay as they
+        are in the telescope frame (``perturbed("Camera", tilt=(0, 0, angle))`` rotates these as well). So do
+        obstructions.
+
+        Parameters
+        ----------
+        angle : float or Quantity
+            From +x towards +y of the telescope frame [rad].
+
+        Raises
+        ------
+        DomainError
+            If the angle is not one finite number.
+        """
+        turn = radians(angle, "angle")
+        if turn.ndim or not np.isfinite(turn):
+            raise DomainError(f"angle = {turn.tolist()}: expected one finite number")
+        # Whole turns leave no trace of rounding.
+        return self.perturbed(self.surfaces[-1].name, tilt=(0.0, 0.0, math.remainder(float(turn), 2.0 * math.pi)))
+
     def with_obstructions(self, *obstructions: Obstruction) -> Telescope:
         """Return the telescope with more meshes that block light.
 

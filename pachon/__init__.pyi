@@ -127,6 +127,10 @@ from .pipeline.measure.star_selection import flag_stars as flag_stars
 from .pipeline.psf_model.model import PsfModel as PsfModel
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run
+from .pipeline.sensor.brighter_fatter import brighter_fatter as brighter_fatter
+from .pipeline.sensor.displacement import EdgeRolloff as EdgeRolloff
+from .pipeline.sensor.displacement import TreeRings as TreeRings
+from .pipeline.sensor.displacement import displace_stamps as displace_stamps
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus

@@ -6,6 +6,7 @@ same input.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -32,6 +33,8 @@ KINDS = ("truth", "observed", "residual", "left_out", "away")
 CCD_KINDS = ("residual_ccd", "away_ccd")
 #: FITS card that says which model the columns MODEL_E1 and so on are of; only in runs with a focal-plane model.
 MODEL_CARD = "PSFMODEL"
+# FITS card of the angle of the camera; only in runs with one.
+_ROTATOR_CARD = "ROTATOR"
 _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "x": ("X", _MM, "detector x"),
     "y": ("Y", _MM, "detector y"),
@@ -166,6 +169,7 @@ class CcdProduct:
     observed_images: np.ndarray  #: likewise; NaN where a star could not be centred
     model: PsfModel  #: fitted to the observed stars
     noise_free_model: PsfModel  #: fitted to the noise-free PSFs
+    rotator: float = 0.0  #: angle of the camera from +x towards +y of the telescope frame [rad]
 
     @property
     def of_focal_plane(self) -> bool:
@@ -185,6 +189,14 @@ class CcdProduct:
             return of_ccd_model(self.holdout) if kind == "away_ccd" else of_ccd_model(self.observed)
         return self.holdout if kind in ("truth", "away") else self.observed
 
+    def sky_positions(self, kind: str) -> np.ndarray:
+        """Return field angles along the axes of the detector [rad], [2, n], at the positions of :meth:`stars`.
+
+        Ellipticities refer to these axes, so correlations need them.
+        """
+        stars = self.stars(kind)
+        return to_detector_axes(np.stack([stars.field_x, stars.field_y]), self.rotator)
+
     def ellipticity(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
         """Return e1 and e2 of one kind, at the positions of :meth:`stars`.
 
@@ -199,6 +211,14 @@ class CcdProduct:
         if kind == "left_out":
             return stars.e1 - self.observed.leave_one_out_e1, stars.e2 - self.observed.leave_one_out_e2
         return stars.residual_e1, stars.residual_e2
+
+
+def to_detector_axes(field: np.ndarray, rotator: float) -> np.ndarray:
+    """Return field angles [2, ...] [rad] along the axes of a detector that is rotated by an angle [rad]."""
+    if rotator == 0.0:
+        return field
+    cosine, sine = math.cos(rotator), math.sin(rotator)
+    return np.stack([cosine * field[0] + sine * field[1], cosine * field[1] - sine * field[0]])
 
 
 def product_path(folder: Path, ccd: str) -> Path:
@@ -217,6 +237,8 @@ def write_product(folder: Path, product: CcdProduct, stamp: Stamp, cards: list[t
         ("NOISE", product.noise[1], "[electron/pixel] rms noise without light"),
         *cards,
     ]
+    if product.rotator:
+        header.append((_ROTATOR_CARD, math.degrees(product.rotator), "[deg] camera, +x towards +y of telescope"))
     hdus = [
         table_hdu("STARS", _table(product.observed)),
         table_hdu("TRUTH", _table(product.holdout)),
@@ -268,6 +290,7 @@ def read_product(path: Path, stamp: Stamp | None = None, *, holdout_images: bool
             observed_images=_image(hdus["STAMPS"]),
             model=PsfModel.from_hdus(hdus, _MODEL),
             noise_free_model=PsfModel.from_hdus(hdus, _NOISE_FREE_MODEL),
+            rotator=math.radians(header.get(_ROTATOR_CARD, 0.0)),
         )
     except KeyError as error:
         raise ProductError(f"no product of a CCD ({' '.join(str(error).split())})", file=path) from None

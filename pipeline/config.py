@@ -162,6 +162,21 @@ class PsfConfig(Section):
     jitter_arcsec: NotNegative = Field(0.0, description="rms of the telescope's pointing along each axis [arcsec]")
 
 
+class SensorConfig(Section):
+    """What the CCDs do to images of stars; all of it is off by default."""
+
+    brighter_fatter: Literal["itl", "e2v"] | None = Field(
+        None, description="make of the CCDs, for the brighter-fatter effect on observed stars"
+    )
+    tree_rings_um: NotNegative = Field(0.0, description="largest displacement by tree rings [um]")
+    tree_ring_period_um: Positive = Field(600.0, description="distance of the rings [um]")
+    tree_ring_center_mm: tuple[Real, Real] = Field(
+        (30.0, 30.0), description="axis of the rings from the centre of each CCD [mm]"
+    )
+    edge_rolloff_um: Real = Field(0.0, description="outward displacement at the edges of a CCD [um]")
+    edge_rolloff_length_um: Positive = Field(50.0, description="distance over which it falls by e [um]")
+
+
 class ReconstructionConfig(Section):
     """How the PSF is measured and modelled."""
 
@@ -198,6 +213,7 @@ class Configuration(Section):
     changes: dict[str, Real] = Field(
         default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"
     )
+    rotator_deg: Real = Field(0.0, description="angle of the camera, from +x towards +y of the telescope [deg]")
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()
@@ -205,6 +221,7 @@ class Configuration(Section):
     detector: DetectorConfig = DetectorConfig()
     atmosphere: AtmosphereConfig = AtmosphereConfig()
     psf: PsfConfig = PsfConfig()
+    sensor: SensorConfig = SensorConfig()
     reconstruction: ReconstructionConfig = ReconstructionConfig()
 
     def as_dict(self) -> dict[str, Any]:

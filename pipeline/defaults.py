@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .config import BandName, Configuration
 from .psf_model.fit import COMPONENTS
 from .psf_model.polynomial import term_count
+from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
 from .simulate.screen_cover import check_screens
 
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
@@ -45,7 +47,7 @@ class ResolvedConfiguration:
     """Configuration without open values, and the models that it names."""
 
     config: Configuration  #: every default filled in, paths absolute
-    telescope: Telescope  #: changes applied
+    telescope: Telescope  #: changes applied, camera rotated
     camera: Camera
     site: Site  #: of the atmosphere
 
@@ -104,10 +106,15 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             ),
         }
     )
-    telescope = apply_changes(telescope, resolved.changes)
+    telescope = as_configured(telescope, resolved)
     _check(resolved, telescope)
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
+
+
+def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
+    """Return a telescope with the changes and the rotator angle of a configuration."""
+    return apply_changes(telescope, config.changes).with_rotator(math.radians(config.rotator_deg))
 
 
 def noise_free_components(config: Configuration) -> int:
@@ -151,6 +158,11 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         raise ConfigError("wavelengths_nm = []: expected at least one wavelength in nm")
     if given(config.psf.stamp) % 2 == 0:
         raise ConfigError(f"psf.stamp = {config.psf.stamp}: expected an odd number of pixels")
+    if config.sensor.brighter_fatter is not None and config.psf.pixel_um != BRIGHTER_FATTER_PIXEL * 1e6:
+        raise ConfigError(
+            f"psf.pixel_um = {config.psf.pixel_um:g}: expected {BRIGHTER_FATTER_PIXEL * 1e6:g}, whose boundaries"
+            f" sensor.brighter_fatter = {config.sensor.brighter_fatter} moves"
+        )
     fit, stars = config.reconstruction, config.stars
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.errors import ConfigError, PachonError, PrescriptionError, error_context
 from ..core.files import read_bytes
 from ..core.progress import Reporter
+from ..core.random_streams import stream
 from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
 from ..models.camera.focal_plane import FocalPlane
@@ -34,6 +35,7 @@ from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
 from .config import Configuration, digest
 from .defaults import given, resolve
+from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,26 @@ class Experiment:
     def weight_fwhm(self) -> float:
         """FWHM of the weight of the moments [rad]."""
         return given(self.config.reconstruction.weight_fwhm_arcsec) * ARCSEC
+
+    @property
+    def rotator(self) -> float:
+        """Angle of the camera from +x towards +y of the telescope frame [rad]."""
+        return math.radians(self.config.rotator_deg)
+
+    def displacements(self, name: str) -> tuple[Displacement, ...]:
+        """Return the static displacements of charge on a CCD; the rings of each CCD have a phase of their own."""
+        sensor = self.config.sensor
+        found: list[Displacement] = []
+        if sensor.tree_rings_um:
+            phase = stream(self.config.seed, "tree rings", name).uniform(0.0, 2.0 * math.pi)
+            x, y = sensor.tree_ring_center_mm
+            found.append(
+                TreeRings(sensor.tree_rings_um * 1e-6, sensor.tree_ring_period_um * 1e-6, (x * 1e-3, y * 1e-3), phase)
+            )
+        if sensor.edge_rolloff_um:
+            length = sensor.edge_rolloff_length_um * 1e-6
+            found.append(EdgeRolloff(sensor.edge_rolloff_um * 1e-6, length, self.camera.half_size))
+        return tuple(found)
 
     @property
     def dispersion(self) -> np.ndarray | None:

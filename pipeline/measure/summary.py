@@ -35,7 +35,7 @@ def correlations(products: Sequence[CcdProduct], kinds: Sequence[str] | None = N
     result = {}
     for kind in kinds:
         stars = [p.stars(kind) for p in products]
-        x, y = (np.concatenate([getattr(s, key) for s in stars]) for key in ("field_x", "field_y"))
+        x, y = np.concatenate([p.sky_positions(kind) for p in products], axis=1)
         result[kind] = shear_correlation(x, y, *ellipticities(products, kind), patch=patches(stars), **bins)
     return result
 

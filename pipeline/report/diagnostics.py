@@ -161,9 +161,10 @@ def _growth(stars: Stars) -> np.ndarray:
 
 def _rho(products: Sequence[CcdProduct], kind: str) -> RhoStatistics:
     stars = [p.stars(kind) for p in products]
-    keys = ("field_x", "field_y", "e1", "e2", "size", "model_e1", "model_e2", "model_size")
+    x, y = np.concatenate([p.sky_positions(kind) for p in products], axis=1)
+    keys = ("e1", "e2", "size", "model_e1", "model_e2", "model_size")
     columns = (np.concatenate([getattr(s, key) for s in stars]) for key in keys)
-    return rho_statistics(*columns, patch=patches(stars), **separation_bins(products))
+    return rho_statistics(x, y, *columns, patch=patches(stars), **separation_bins(products))
 
 
 def _moments(products: Sequence[CcdProduct], kind: str) -> dict[str, float]:

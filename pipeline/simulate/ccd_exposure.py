@@ -16,6 +16,7 @@ from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
+from ..sensor.displacement import displace_stamps
 from .photometry import limiting_magnitude
 from .star_field import StarField, make_star_field
 
@@ -110,7 +111,7 @@ def _expose(
     fields = fields_at(telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
     optical, magnification = not experiment.atmosphere_only, 1.0
     if not optical:
-        ideal = without_aberration(telescope, _IDEAL_RATIO)
+        ideal = without_aberration(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)
         here, there = (center_focal_length(t, wavelengths) for t in (telescope, ideal))
         telescope, magnification = ideal, there / here
     psfs = make_psfs(
@@ -133,7 +134,28 @@ def _expose(
         threads=threads,
         progress=progress,
     )
-    return NoiseFreeStars(psfs.image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
+    image = _displaced(experiment, positions - psfs.offset * experiment.pixel_size, psfs.image)
+    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
+
+
+def _displaced(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Return stamps as the static effects of the CCDs distort them; `middles` are the centres of their middle pixels.
+
+    No star is moved as a whole: stamps are centred on their star.
+    """
+    camera = experiment.camera
+    ccds = camera.ccd_at(*middles.T, margin=camera.pixel_size)
+    for ccd in np.unique(ccds[ccds >= 0]):
+        effects = experiment.displacements(camera.ccd_names[ccd])
+        if not effects:
+            return images
+        own = ccds == ccd
+        stamps = images[own].astype(np.float64)
+        moved = displace_stamps(stamps, effects, middles[own] - camera.centers[ccd], experiment.pixel_size)
+        # What crosses the rim of a stamp must not change the sum, which is 1, or 0 of a dark star.
+        total = moved.sum(axis=(1, 2), keepdims=True)
+        images[own] = moved * (stamps.sum(axis=(1, 2), keepdims=True) / np.where(total > 0.0, total, 1.0))
+    return images
 
 
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:

@@ -13,7 +13,7 @@ from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
 from ..psf_model.polynomial import term_count
 from .ccd_exposure import CcdExposure, ccd_stars
-from .ccd_observation import observe_ccd
+from .ccd_observation import collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
 
 
@@ -33,7 +33,8 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     snr = signal_to_noise(
         stars.magnitude - 2.5 * np.log10(observed.lit_fraction), stars.band, config.atmosphere.exposure_s, width
     )
-    observation = observe_ccd(experiment, name, observed.image, observed.pixel_scale, electrons, noisy=noisy)
+    collected = collected_images(experiment, observed.image, observed.pixel_scale, electrons)
+    observation = observe_ccd(experiment, name, collected, observed.pixel_scale, electrons, noisy=noisy)
     fit, used = config.reconstruction, observation.used
     least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
     require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
@@ -91,6 +92,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         observed_images=observation.images.astype(np.float32),
         model=model,
         noise_free_model=noise_free_model,
+        rotator=experiment.rotator,
     )
 
 

@@ -10,6 +10,7 @@ from ...core.random_streams import stream
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, measure_shapes
 from ..measure.star_selection import StarFlag, flag_stars
+from ..sensor.brighter_fatter import brighter_fatter
 from .photometry import instrument_noise, sky_electrons_per_pixel
 from .stamps import center_stamps, observe_stamps
 from .star_defects import add_defects
@@ -55,6 +56,17 @@ def observe_ccd(
         shapes = replace(shapes, e1=e1, e2=e2, size=size)
     used = shapes.usable & np.isfinite(stamps).all(axis=(1, 2)) & (defects == 0)
     return Observation((sky, noise), stamps, shapes, defects, used)
+
+
+def collected_images(
+    experiment: Experiment, images: np.ndarray, pixel_scale: float, electrons: np.ndarray
+) -> np.ndarray:
+    """Return images of stars of given electrons as the CCD collects them: under the brighter-fatter effect, if on."""
+    config = experiment.config
+    if config.sensor.brighter_fatter is None:
+        return images
+    sky = sky_electrons_per_pixel(config.band or "r", config.atmosphere.exposure_s, pixel_scale)
+    return brighter_fatter(images, electrons, sensor=config.sensor.brighter_fatter, sky=sky)
 
 
 def _with_defects(

@@ -17,11 +17,11 @@ import numpy as np
 
 from ...core.errors import ConfigError, PachonError
 from ...core.version import VERSION
-from ...design.parameters.changes import apply_changes
 from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
+from ...pipeline.defaults import as_configured
 from ...pipeline.experiment import Experiment, hashed_heights
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
@@ -240,7 +240,7 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
     try:
         config = with_options(base, telescope=model, psf__engine=engine)
         experiment = Experiment.from_config(config, configuration.parent)
-        return replace(experiment, telescope=apply_changes(telescope, experiment.config.changes))
+        return replace(experiment, telescope=as_configured(telescope, experiment.config))
     except PachonError as error:
         raise ConfigError(f"{configuration}: {error}") from None
 

@@ -15,6 +15,7 @@ from ...core.schema import Positive, Real, Section
 from ...core.units import ARCMIN
 from ...design.metrics.distortion import distortion
 from ...models.telescope import Telescope
+from ...pipeline.ccd_product import to_detector_axes
 from ...pipeline.experiment import Experiment
 from ...pipeline.measure.correlation import Correlation, shear_correlation
 from ...pipeline.measure.shapes import Shapes, measure_shapes
@@ -173,7 +174,8 @@ class Scene:
         """Correlation of the ellipticities of the noise-free stars, over all CCDs."""
         fields, shapes = self.stars.fields, self.shapes
         longest = max(float(np.hypot(*np.ptp(fields, axis=0))), 2.0 * SHORTEST_ARCMIN * ARCMIN)
-        (x, y), shortest = fields.T, SHORTEST_ARCMIN * ARCMIN
+        x, y = to_detector_axes(fields.T, self.camera_experiment.rotator)
+        shortest = SHORTEST_ARCMIN * ARCMIN
         return shear_correlation(
             x, y, shapes.e1, shapes.e2, min_sep=shortest, max_sep=longest, n_bins=_CORRELATION_BINS
         )

@@ -14,7 +14,7 @@ from ...pipeline.psf_model.checks import snr_weights
 from ...pipeline.psf_model.model import CLIP_SIGMA, PsfModel
 from ...pipeline.simulate.ccd_exposure import CcdExposure
 from ...pipeline.simulate.ccd_loop import simulate_ccds
-from ...pipeline.simulate.ccd_observation import Observation, observe_ccd
+from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
 from ...pipeline.simulate.photometry import (
     effective_fwhm,
     instrument_noise,
@@ -93,7 +93,8 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     sky = sky_electrons_per_pixel(places.band, places.exposure, exposed.pixel_scale)
     rng = stream(seed, "study", "noise", name, draw)
     electrons = stars.electrons * light
-    images = observe_stamps(exposed.image, electrons, sky, instrument_noise(places.exposure), rng)
+    collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons)
+    images = observe_stamps(collected, electrons, sky, instrument_noise(places.exposure), rng)
     found = _look_at(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
     # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.

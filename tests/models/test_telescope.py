@@ -197,3 +197,28 @@ def test_arguments_of_a_surface_of_another_kind_are_refused(wrong, message):
     right = {"shape": pachon.Plane(), "medium_after": vacuum, "interaction": pachon.Interaction.MIRROR}
     with pytest.raises(PrescriptionError, match=message):
         pachon.Surface(name="M1", vertex=(0.0, 0.0, 0.0), **right | wrong)
+
+
+def test_a_rotator_turns_the_detector_alone():
+    tilted = LSST.perturbed("Detector", tilt=(1e-3, -2e-3, 0.0)).perturbed("L1", tilt=(0.0, 1e-3, 0.0))
+    rotated = tilted.with_rotator(30.0 * u.deg)
+    assert rotated.surfaces[:-1] == tilted.surfaces[:-1]
+    before, after = tilted.surfaces[-1], rotated.surfaces[-1]
+    assert after.vertex == before.vertex
+    # About its own normal, which keeps the tilt that it has in the telescope frame; x goes towards y.
+    np.testing.assert_allclose(after.matrix[:, 2], before.matrix[:, 2], atol=1e-15)
+    expected = np.cos(np.pi / 6) * before.matrix[:, 0] + np.sin(np.pi / 6) * before.matrix[:, 1]
+    np.testing.assert_allclose(after.matrix[:, 0], expected, atol=1e-15)
+    assert np.abs(after.matrix[:, 0] - before.matrix[:, 0]).max() > 0.1
+
+
+@pytest.mark.parametrize("turns", [0.0, 1.0, -2.0])
+def test_whole_turns_of_the_rotator_change_no_bit(turns):
+    assert LSST.with_rotator(turns * 2.0 * np.pi) == LSST
+    assert LSST.with_rotator(turns * 360.0 * u.deg) == LSST
+
+
+@pytest.mark.parametrize("angle", [np.nan, np.inf, [0.1, 0.2]])
+def test_an_angle_of_the_rotator_that_is_no_number_is_refused(angle):
+    with pytest.raises(DomainError, match=r"angle = .*: expected one finite number"):
+        LSST.with_rotator(angle)

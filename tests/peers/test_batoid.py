@@ -66,6 +66,28 @@ def test_rigid_body_perturbations(lsst_r, annulus_points, name, theirs, shift, t
     assert_same(*both(telescope, optic, 622e-9, (0.015, -0.02), annulus_points(50)))
 
 
+@pytest.mark.parametrize("degrees", [0.0, 35.0, -110.0])
+def test_a_tilted_ccd_turns_with_the_camera(lsst_r, annulus_points, degrees):
+    # The tilt of the central CCD, about the camera's own x axis: in batoid that of a detector rotated before.
+    tilt, angle = 4e-4, np.deg2rad(degrees)
+    heights = pachon.FocalPlane.flat("lsst").with_moved("R22_S11", dz=2e-5, rx=tilt)
+    pupil, field = annulus_points(50), (2e-4, -5e-4)
+    telescope = lsst_r.with_rotator(angle)
+    ours = pachon.trace(telescope, pachon.launch_rays(telescope, field, 622e-9, pupil), focal_plane=heights)
+    optic = batoid.Optic.fromYaml("LSST_r.yaml")
+    optic = optic.withLocallyRotatedOptic("Detector", batoid.RotZ(angle) @ batoid.RotX(tilt))
+    optic = optic.withGloballyShiftedOptic("Detector", (0.0, 0.0, 2e-5))
+    theirs = batoid.RayVector.fromStop(
+        *pupil, optic=optic, wavelength=622e-9, theta_x=field[0], theta_y=field[1], projection="zemax"
+    )
+    optic.trace(theirs)
+    position = theirs.toCoordSys(batoid.CoordSys()).r
+    assert (ours.ccd == heights.ccd_index("R22_S11")).all()
+    assert np.abs(ours.position - position).max() < NEAR
+    # The tilt matters, ten thousand times the tolerance: these stars lie 5 mm from its axis.
+    assert np.abs(position[:, 2] - lsst_r.surfaces[-1].vertex[2] - 2e-5).max() > 2e-7
+
+
 @pytest.mark.parametrize("field", [(0.0, 0.0), (0.02, 0.0), (-0.011, 0.017)])
 def test_opd(lsst_r, field):
     optic = batoid.Optic.fromYaml("LSST_r.yaml")

@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 from pachon.core.errors import DomainError, PachonError, ProductError, UnknownNameError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
+from pachon.pipeline.focal_plane_psf.response import Instrument
 from pachon.pipeline.measure.shapes import measure_shapes
 
 UM = 1e-6
@@ -356,3 +357,30 @@ def test_outliers_are_left_out(exposure, few):
     changed[17, 0] += 0.15
     model = FocalPlanePsf.fit(exposure.stars(few, values=changed), camera=exposure.camera)
     np.testing.assert_array_equal(np.flatnonzero(~model.used), [17])
+
+
+@pytest.mark.long
+def test_a_rotated_camera_is_fitted_as_any_other(aligned, exposure, few, lsst_r, wavelengths, tmp_path):
+    # Axially symmetric optics: in the camera's own axes the stars are those of the camera that is not rotated.
+    rotated = FocalPlanePsf.fit(
+        exposure.stars(few),
+        lsst_r.with_rotator(0.5 * np.pi),
+        camera=exposure.camera,
+        wavelengths=wavelengths,
+        alignment_rms=0.0,
+        threads=1,
+    )
+    x, y = exposure.xy.T
+    # The search for the hyperparameters ends a little elsewhere.
+    np.testing.assert_allclose(rotated.heights.height(x, y), aligned.heights.height(x, y), atol=5e-9)
+    where = (list(exposure.names), x, y)
+    np.testing.assert_allclose(values(rotated.shapes(*where)), values(aligned.shapes(*where)), atol=1e-5)
+    rotated.write(tmp_path / "model.fits")
+    again = FocalPlanePsf.read(tmp_path / "model.fits")
+    np.testing.assert_allclose(values(again.shapes(*where)), values(rotated.shapes(*where)), atol=1e-6)
+    # Not so where M2 is off its axis: its coma stays with the telescope.
+    asymmetric = lsst_r.perturbed("M2", shift=(1e-3, 0.0, 0.0))
+    shapes = [Instrument.of(t, wavelengths) for t in (asymmetric, asymmetric.with_rotator(0.5 * np.pi))]
+    assert shapes[0].key != shapes[1].key
+    e = [i.shapes(i.fields(exposure.xy[:20]), FocalPlane.flat(exposure.camera), None) for i in shapes]
+    assert np.abs(e[0] - e[1]).max() > 1e-3

@@ -1,0 +1,128 @@
+r"""Static displacements of charge within a CCD: tree rings and edge roll-off.
+
+Transverse fields in the silicon carry charge sideways. Light that would land at :math:`b - d(b)` lands at b, so a pixel
+boundary at b stands for one at :math:`b - d(b)`. Positions are those on the CCD, from its centre.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError
+from .pixel_boundaries import RIM, collect, with_rim, without_rim
+
+
+class Displacement(ABC):
+    """A field of displacements over a CCD."""
+
+    @abstractmethod
+    def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the displacement (dx, dy) [m] of the light that lands at x, y [m] from the centre of the CCD.
+
+        Its shape is that of x and y, broadcast, with an axis of two at the end.
+        """
+
+
+@dataclass(frozen=True)
+class TreeRings(Displacement):
+    r"""Rings of doping about the axis of the silicon boule: radial displacement :math:`A \cos(2 \pi r/P + \varphi)`.
+
+    ``galsim.SiliconSensor`` moves pixel boundaries: its ``treering_func`` is the negative of this displacement, in
+    pixels.
+    """
+
+    amplitude: float  #: largest displacement A [m]
+    period: float  #: distance of the rings P [m]
+    center: tuple[float, float]  #: axis of the rings from the centre of the CCD [m]
+    phase: float = 0.0  #: at the axis [rad]
+
+    def __post_init__(self) -> None:
+        numbers = (self.amplitude, self.period, *self.center, self.phase)
+        if not np.isfinite(numbers).all() or not self.period > 0.0:
+            raise DomainError(f"tree rings = {numbers!r}: expected finite numbers, and a period above 0")
+
+    def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the displacement, as :meth:`Displacement.at` says."""
+        along = np.stack(np.broadcast_arrays(np.subtract(x, self.center[0]), np.subtract(y, self.center[1])), axis=-1)
+        radius = np.hypot(along[..., 0], along[..., 1])[..., None]
+        size = self.amplitude * np.cos(2.0 * np.pi * radius / self.period + self.phase)
+        # On the axis itself there is no direction.
+        return size * along / np.where(radius > 0.0, radius, 1.0)
+
+
+@dataclass(frozen=True)
+class EdgeRolloff(Displacement):
+    """Outward displacement near the edges of a CCD, which falls exponentially with the distance from each edge.
+
+    A positive one stretches images and makes the pixels at the edge collect less of an even light: they roll off. A
+    negative one makes them glow.
+    """
+
+    amplitude: float  #: displacement at the edge [m]
+    length: float  #: distance over which it falls by e [m]
+    half_size: float  #: half the side of the CCD [m]
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.amplitude) or not 0.0 < self.length < np.inf or not 0.0 < self.half_size < np.inf:
+            numbers = (self.amplitude, self.length, self.half_size)
+            raise DomainError(f"edge roll-off = {numbers!r}: expected finite numbers, and lengths above 0")
+
+    def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Return the displacement, as :meth:`Displacement.at` says."""
+        place = np.stack(np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float)), axis=-1)
+        # Beyond an edge, where the rim of a stamp may lie, it stays that of the edge.
+        upper, lower = (np.maximum(self.half_size - sign * place, 0.0) for sign in (1.0, -1.0))
+        return self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))
+
+
+def displace_stamps(
+    images: np.ndarray, effects: Sequence[Displacement], places: np.ndarray, pixel_size: float
+) -> np.ndarray:
+    """Return stamps of stars as the displacements distort them.
+
+    The displacement at the middle pixel is left out: it moves the star as a whole, which stamps are not about, and is
+    that of :meth:`Displacement.at`.
+
+    Parameters
+    ----------
+    images : ndarray, shape [n, ny, nx]
+        Stamps.
+    effects : sequence of Displacement
+        Displacements, which add up.
+    places : ndarray, shape [n, 2]
+        Centre of the middle pixel ``[ny // 2, nx // 2]`` of each stamp, from the centre of the CCD [m].
+    pixel_size : float
+        Side of a pixel [m].
+
+    Returns
+    -------
+    ndarray, shape [n, ny, nx]
+        Charge in the pixels. What crosses the rim of a stamp is as in its outermost pixels.
+    """
+    if not effects:
+        return images
+    padded = with_rim(images)
+    x, y = (
+        pixel_size * (np.arange(size) - size // 2)[None] + place[:, None]
+        for size, place in zip(images.shape[:0:-1], places.T, strict=True)
+    )
+    wide_x, wide_y = _continued(x, pixel_size), _continued(y, pixel_size)
+    half = 0.5 * pixel_size
+    boundary_x, boundary_y = (np.concatenate([v - half, v[:, -1:] + half], axis=1) for v in (wide_x, wide_y))
+    shift_x = shift_y = np.zeros(1)
+    for effect in effects:
+        own = effect.at(*places.T)
+        shift_x = shift_x + own[:, 0, None, None] - effect.at(boundary_x[:, None, :], wide_y[:, :, None])[..., 0]
+        shift_y = shift_y + own[:, 1, None, None] - effect.at(wide_x[:, None, :], boundary_y[:, :, None])[..., 1]
+    return without_rim(collect(padded, shift_x / pixel_size, shift_y / pixel_size))
+
+
+def _continued(centers: np.ndarray, pixel_size: float) -> np.ndarray:
+    """Return pixel centres [n, size] with those of the rim."""
+    beyond = pixel_size * np.arange(1, RIM + 1)
+    return np.concatenate([centers[:, :1] - beyond[::-1], centers, centers[:, -1:] + beyond], axis=1)
