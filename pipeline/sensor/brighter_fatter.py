@@ -87,7 +87,8 @@ def boundary_shifts(charge: np.ndarray, sensor: str) -> tuple[np.ndarray, np.nda
 
 
 def _shifts(charge: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    # From both sides of the boundary towards the charge: negative on its left.
+    """Return the displacements of the boundaries across rows, [n, ny, nx + 1]."""
+    # Charge on the left of a boundary draws it to the left, to negative displacements.
     across = np.concatenate([-coefficients[:, ::-1], coefficients], axis=1)
     kernel = 1e-9 * np.concatenate([across[:0:-1], across])
     padded = np.pad(charge, ((0, 0), (_REACH - 1, _REACH - 1), (_REACH, _REACH)), mode="edge")
@@ -122,14 +123,16 @@ def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = 
     ConfigError
         If the sensor is unknown.
     DomainError
-        If electrons are not positive, or the sky is negative.
+        If shapes do not fit, electrons are not positive, or the sky is negative.
     """
     check_choice("sensor", sensor, COEFFICIENTS)
-    counts = np.asarray(electrons, dtype=np.float64)
+    stamps, counts = np.asarray(images, dtype=np.float64), np.asarray(electrons, dtype=np.float64)
+    if stamps.ndim != 3 or counts.shape != stamps.shape[:1]:
+        raise DomainError(f"images, electrons of shapes {stamps.shape}, {counts.shape}: expected [n, ny, nx] and [n]")
     if not (np.isfinite(counts).all() and (counts > 0.0).all()):
         raise DomainError(f"electrons = {electrons}: expected positive numbers")
     if not (np.isfinite(sky) and sky >= 0.0):
         raise DomainError(f"sky = {sky}: expected a number of electrons that is not negative")
-    light = with_rim(np.asarray(images, dtype=np.float64) * counts[:, None, None] + sky)
+    light = with_rim(stamps * counts[:, None, None] + sky)
     collected = without_rim(collect(light, *boundary_shifts(0.5 * light, sensor)))
     return (collected - sky) / counts[:, None, None]

@@ -103,7 +103,14 @@ def displace_stamps(
     -------
     ndarray, shape [n, ny, nx]
         Charge in the pixels. What crosses the rim of a stamp is as in its outermost pixels.
+
+    Raises
+    ------
+    DomainError
+        If shapes do not fit.
     """
+    if images.ndim != 3 or places.shape != (len(images), 2):
+        raise DomainError(f"images, places of shapes {images.shape}, {places.shape}: expected [n, ny, nx] and [n, 2]")
     if not effects:
         return images
     padded = with_rim(images)

@@ -74,6 +74,7 @@ def test_the_sky_under_a_star_is_pushed_away_too(star):
     [
         ({"electrons": [0.0]}, DomainError, "positive"),
         ({"electrons": [np.nan]}, DomainError, "positive"),
+        ({"electrons": [1.0, 2.0]}, DomainError, r"\[n, ny, nx\] and \[n\]"),
         ({"sky": -1.0}, DomainError, "not negative"),
         ({"sensor": "kodak"}, ConfigError, "itl, e2v"),
     ],

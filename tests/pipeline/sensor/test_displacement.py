@@ -109,3 +109,8 @@ def test_effects_add_up_and_none_leaves_the_stamps(star):
 def test_bad_numbers(make):
     with pytest.raises(DomainError, match="expected finite numbers"):
         make()
+
+
+def test_places_are_one_for_each_stamp(star):
+    with pytest.raises(DomainError, match=r"expected \[n, ny, nx\] and \[n, 2\]"):
+        displace_stamps(star[None], [EdgeRolloff(1e-6, 1e-5, HALF)], np.zeros((2, 2)), PIXEL)
