@@ -92,7 +92,8 @@ def fit_focal_plane_model(
     if telescope:
         return FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
     stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
-    return FocalPlanePsf.fit(stars, camera=experiment.camera, threads=threads, reporter=reporter)
+    names = [product.name for product in products]
+    return FocalPlanePsf.fit(stars, camera=experiment.camera, ccds=names, threads=threads, reporter=reporter)
 
 
 def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf, stamp: Stamp) -> None:
