@@ -84,11 +84,30 @@ def fit_focal_plane_model(
     experiment: Experiment,
     products: Sequence[Any],
     *,
-    telescope: bool = True,
+    telescope: bool,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> FocalPlanePsf:
-    """Fit one model to the used stars of all products, with the telescope of the experiment or without any."""
+    """Fit one model to the used stars of all CCDs.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Telescope, camera and atmosphere of the products.
+    products : sequence of CcdProduct
+        Products, or objects with the name, noise, pixel scale, observed stars and stamps of products.
+    telescope : bool
+        Whether the model has the telescope of the experiment, or is of turbulence and CCDs alone.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    DomainError
+        If there are too few stars.
+    """
     if telescope:
         return FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
     stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
