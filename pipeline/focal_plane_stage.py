@@ -84,15 +84,35 @@ def fit_focal_plane_model(
     experiment: Experiment,
     products: Sequence[Any],
     *,
-    telescope: bool = True,
+    telescope: bool,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> FocalPlanePsf:
-    """Fit one model to the used stars of all products, with the telescope of the experiment or without any."""
+    """Fit one model to the used stars of all CCDs.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Telescope, camera and atmosphere of the products.
+    products : sequence of CcdProduct
+        Products, or objects with the name, noise, pixel scale, observed stars and stamps of products.
+    telescope : bool
+        Whether the model has the telescope of the experiment, or is of turbulence and CCDs alone.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    DomainError
+        If there are too few stars.
+    """
     if telescope:
         return FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
     stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
-    return FocalPlanePsf.fit(stars, camera=experiment.camera, threads=threads, reporter=reporter)
+    names = [product.name for product in products]
+    return FocalPlanePsf.fit(stars, camera=experiment.camera, ccds=names, threads=threads, reporter=reporter)
 
 
 def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf, stamp: Stamp) -> None:

@@ -127,7 +127,8 @@ def test_stated_noise_is_the_scatter_of_the_draws(focal_plane_config):
     draws = [[observe(experiment, ccd, 60.0, k) for ccd in ccds] for k in range(20)]
     stated = []
 
-    def keep(_, products, **__):
+    def keep(_, products, *, telescope, threads):
+        assert not telescope
         stated.append(FocalPlaneStars.from_products(products, experiment.weight_fwhm))
 
     with pytest.MonkeyPatch.context() as patch:
