@@ -10,7 +10,7 @@ from astropy.table import Table
 
 import pachon
 from pachon import FocalPlane, HeightWarning
-from pachon.core.errors import DomainError, PachonError, PrescriptionError
+from pachon.core.errors import DomainError, PachonError, PrescriptionError, UnknownNameError
 from pachon.models.camera.camera import Camera, lsst_camera
 
 HALF = 20.48e-3
@@ -295,6 +295,8 @@ def test_other_files_are_refused_in_one_line(tmp_path):
         with pytest.raises(PachonError, match=part) as caught:
             FocalPlane.from_file(tmp_path / name, SMALL)
         assert "\n" not in str(caught.value)
+    with pytest.raises(UnknownNameError, match="unknown camera 'lst': did you mean lsst"):
+        FocalPlane.from_file(tmp_path / "others.fits", "lst")
 
 
 def test_quantities_of_the_camera_as_built_do_not_depend_on_the_reader():
