@@ -70,7 +70,7 @@ def shims_plot(shims: Shims) -> bytes:
     with styled():
         figure = new_figure(13.0, 4.6)
         for i, (axes, (title, plane)) in enumerate(zip(figure.subplots(1, 3), planes.items(), strict=True)):
-            image = draw_heights(axes, plane, limits, 450, bounds=bounds)
+            image = draw_heights(axes, plane, limits, 350, bounds=bounds)
             draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
             frame_axes(axes, limits, y_label=i == 0)
             axes.set_title(title)

@@ -29,8 +29,11 @@ def bundles(lsst_r, annulus_points):
     return [pachon.launch_rays(lsst_r, field, 620e-9, annulus_points(60, i)) for i, field in enumerate(fields)]
 
 
-def test_rays_end_on_the_surface_and_on_their_own_line(lsst_r, focal_plane, bundles):
-    for rays in bundles:
+@pytest.mark.parametrize("heights", ["budget", "as built"])
+def test_rays_end_on_the_surface_and_on_their_own_line(lsst_r, focal_plane, bundles, heights):
+    if heights == "as built":
+        focal_plane = pachon.FocalPlane.as_measured("lsstcam")
+    for rays in bundles[:20]:
         flat = pachon.trace(lsst_r, rays)
         end = pachon.trace(lsst_r, rays, focal_plane=focal_plane)
         x, y, z = lsst_r.surfaces[-1].to_local(end.position).T

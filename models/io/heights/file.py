@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 
 from ....core.errors import HeightWarning, PrescriptionError, error_context
 from ...camera.camera import Camera
@@ -32,7 +33,16 @@ _COVERED = 0.9
 _LARGEST = 0.2e-3
 # Cells a side into which a CCD is divided to find gaps, and points that a cell should have.
 _MOST_CELLS, _POINTS_PER_CELL = 16, 4
-_FITS_PROBLEMS = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError)
+_FITS_PROBLEMS = (
+    AstropyUserWarning,
+    fits.VerifyError,
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +96,8 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
     try:
         if path.suffix.lower() == ".ecsv":
             return Table.read(path, format="ascii.ecsv")
-        with fits.open(path, memmap=False) as hdus:
+        with warnings.catch_warnings(), fits.open(path, memmap=False) as hdus:
+            warnings.filterwarnings("error", ".*truncated", AstropyUserWarning)
             images = [hdu for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
             if not images:
                 return Table.read(hdus)

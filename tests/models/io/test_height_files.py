@@ -10,7 +10,7 @@ from astropy.table import Table
 
 import pachon
 from pachon import FocalPlane, HeightWarning
-from pachon.core.errors import DomainError, PachonError, PrescriptionError
+from pachon.core.errors import DomainError, PachonError, PrescriptionError, UnknownNameError
 from pachon.models.camera.camera import Camera, lsst_camera
 
 HALF = 20.48e-3
@@ -282,12 +282,18 @@ def test_bad_images_are_refused_in_one_line(tmp_path, cards, parts):
 def test_other_files_are_refused_in_one_line(tmp_path):
     (tmp_path / "empty.fits").write_bytes(b"")
     (tmp_path / "text.ecsv").write_text("not a table")
+    images().writeto(tmp_path / "card.fits")
+    damaged = (tmp_path / "card.fits").read_bytes().replace(b"CRVAL2  =", b"CRVAL2  '=")
+    (tmp_path / "card.fits").write_bytes(damaged)
+    (tmp_path / "short.fits").write_bytes(damaged[:20000])
     fits.HDUList([fits.PrimaryHDU()]).writeto(tmp_path / "nothing.fits")
     images(names=("B", "C")).writeto(tmp_path / "others.fits")
     for name, part in [
         ("empty.fits", "cannot be read"),
         ("text.ecsv", "cannot be read"),
         ("nothing.fits", "cannot be read"),
+        ("card.fits", "cannot be read"),
+        ("short.fits", "cannot be read"),
         ("missing.fits", "no such file"),
         ("heights.txt", "expected a file of heights that ends in .ecsv, .fits, .fit"),
         ("others.fits", "images B, C: expected names such as A_S00"),
@@ -295,6 +301,8 @@ def test_other_files_are_refused_in_one_line(tmp_path):
         with pytest.raises(PachonError, match=part) as caught:
             FocalPlane.from_file(tmp_path / name, SMALL)
         assert "\n" not in str(caught.value)
+    with pytest.raises(UnknownNameError, match="unknown camera 'lst': did you mean lsst"):
+        FocalPlane.from_file(tmp_path / "others.fits", "lst")
 
 
 def test_quantities_of_the_camera_as_built_do_not_depend_on_the_reader():
