@@ -135,11 +135,10 @@ def transform(places, k):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("band", "wavelength"), [("z", 870e-9), ("y", 970e-9)])
-def test_against_photons_one_by_one(band, wavelength):
+def test_against_photons_one_by_one():
     """The transfer function of the silicon, with diffraction and pixel divided out, is that of 400 000 photons."""
-    telescope = pachon.load_telescope(f"lsst_v3.3_{band}").perturbed("Detector", shift=(0.0, 0.0, -6e-6))
-    field, silicon = np.deg2rad([0.9, 0.8]), Silicon()
+    telescope = pachon.load_telescope("lsst_v3.3_y").perturbed("Detector", shift=(0.0, 0.0, -6e-6))
+    field, wavelength, silicon = np.deg2rad([0.9, 0.8]), 970e-9, Silicon()
     star = {
         "stamp_size": 81,
         "pixel_size": 4e-6,
@@ -213,6 +212,7 @@ def test_turns_give_each_depth_its_light():
     np.testing.assert_allclose(few.fraction, 1.0 / 3.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ["fast", "wave", "long_exposure"])
 def test_bytes_do_not_depend_on_threads(engine):
     telescope = pachon.load_telescope("lsst_v3.3_y")
