@@ -16,8 +16,8 @@ from ..pupil_optics import PupilOptics
 
 # Fewest time steps over which conversion depths take turns; of fewer, each is computed at every depth.
 _FEW_STEPS = 128
-# Irrational steps of a sequence that fills the unit square evenly (Roberts 2018; roots of x^3 = x + 1).
-_STEPS = 1.0 / 1.32471795724474602596 ** np.array([1.0, 2.0])
+# Irrational steps of a sequence that fills the unit cube evenly (Roberts 2018): powers of the root of x^4 = x + 1.
+_STEPS = 1.0 / 1.2207440846057596 ** np.array([1.0, 2.0, 3.0])
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,12 @@ class Channels:
             channel = np.broadcast_to(first + depth, (len(first), len(time), n_group))
         else:
             time = np.arange(n_time)
-            place = (_STEPS[0] * time[:, None] + _STEPS[1] * np.arange(n_group)) % 1.0
+            # Wavelengths have other turns: what one depth has too much of the air's motion is not that of all.
+            place = np.add.outer(
+                _STEPS[2] * np.arange(len(first)), np.add.outer(_STEPS[0] * time, _STEPS[1] * np.arange(n_group))
+            )
             weight = self.weight.reshape(-1, depths)
             ends = np.cumsum(weight, axis=1)[:, :-1] / weight.sum(axis=1)[:, None]
-            channel = first + (place >= ends[:, :, None, None]).sum(axis=1)
+            channel = first + (place[:, None] % 1.0 >= ends[:, :, None, None]).sum(axis=1)
         number = np.bincount(channel.ravel(), minlength=len(self.wave))
         return Turns(time, np.ascontiguousarray(channel, dtype=np.int32), number / (len(time) * n_group))
