@@ -202,7 +202,7 @@ def test_turns_give_each_depth_its_light():
     assert turns.time.tolist() == list(range(300))
     assert (turns.channel // 3 == np.arange(3)[:, None, None]).all()
     share = channels.weight.reshape(3, 3) / channels.weight.reshape(3, 3).sum(axis=1)[:, None]
-    np.testing.assert_allclose(turns.fraction.reshape(3, 3), share, atol=1e-3)
+    np.testing.assert_allclose(turns.fraction.reshape(3, 3), share, atol=3e-3)
     # Also over the moments of one group, and over the groups of one moment.
     for axis, allowed in ((1, 0.02), (2, 0.15)):
         of_depth = np.stack([(turns.channel % 3 == d).mean(axis=axis) for d in range(3)])
