@@ -21,6 +21,8 @@ Transforms are those of SciPy in single precision. On 480 to 512 points a side F
 as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. They
 would cost hundreds of megabytes for one make of processor (MKL) or another licence (FFTW), and bytes that depend on the
 machine or on a timing.
+
+In silicon w is the path to one depth; time steps take turns at the depths, and each depth has a mean of its own.
 """
 
 from __future__ import annotations
