@@ -13,8 +13,9 @@ from .experiment import Experiment
 # 3 to 18 % above the peak. Python with its libraries and kernels while PSFs are made, and with the pictures of the
 # report, when the screens are gone.
 _BASE, _REPORT = 400_000_000, 600_000_000
-# Memory of a thread of the wave engine: fields, intensities and spectra of a star at five wavelengths.
-_WAVE_THREAD = 150_000_000
+# Memory of a thread of the wave engine: fields, intensities and spectra of a star at five wavelengths; and in silicon
+# intensities and phases of three depths of each.
+_WAVE_THREAD, _SILICON_THREAD = 150_000_000, 110_000_000
 # Copies of the stamps of a CCD's stars that are held at once, in bytes a pixel.
 _STAMP_BYTES = 48
 
@@ -30,7 +31,8 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     stars = config.stars.truth + config.stars.observed
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
-    return max(_REPORT, _BASE + screen_bytes(experiment) + workers * _WAVE_THREAD + stamps)
+    of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
+    return max(_REPORT, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)
 
 
 def check_memory(experiment: Experiment, threads: int | None = None) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..core.units import metres
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
 from .chief_rays import chief_rays, image_jacobians
 
 
-def focus_height(telescope: Telescope, silicon: Silicon, wavelength: float, threads: int | None = None) -> float:
+def focus_height(telescope: Telescope, silicon: Silicon, wavelength: ArrayLike, threads: int | None = None) -> float:
     """Return the height of CCDs at which silicon is best in focus, along +z of the telescope [m].
 
     The surface then stands in front of the focus, by the mean equivalent defocus times the mean cosine of the cone of
@@ -22,9 +24,10 @@ def focus_height(telescope: Telescope, silicon: Silicon, wavelength: float, thre
     DomainError
         If silicon is transparent at the wavelength.
     """
+    light = float(metres(wavelength, "wavelength"))
     axis = np.array([[0.0, 0.0, -1.0]])
-    scale = abs(float(np.linalg.det(image_jacobians(telescope, axis, wavelength, threads)[0])))
+    scale = abs(float(np.linalg.det(image_jacobians(telescope, axis, light, threads)[0])))
     # The mean over the annulus of the square of the light's direction cosines, pupil coordinate over focal length.
     square = 0.125 * telescope.pupil_diameter**2 * (1.0 + telescope.pupil_obscuration**2) / scale
-    travel = float(chief_rays(telescope, axis, wavelength, threads=threads).direction[0, 2])
-    return -math.copysign(silicon.defocus(wavelength)[0] * math.sqrt(1.0 - square), travel)
+    travel = float(chief_rays(telescope, axis, light, threads=threads).direction[0, 2])
+    return -math.copysign(silicon.defocus(light)[0] * math.sqrt(1.0 - square), travel)

@@ -17,9 +17,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import eigh_tridiagonal
 
 from ...core.errors import DomainError
+from ...core.units import metres
 from ..media.silicon import absorption_length, check_temperature, silicon_index
 
 # Absorption lengths beyond which no light is left, to double precision.
@@ -42,7 +44,7 @@ class Silicon:
 
     Parameters
     ----------
-    thickness : float
+    thickness : float or Quantity
         Thickness [m], from the surface that light enters to the gates.
     temperature : float
         Temperature [K].
@@ -52,23 +54,24 @@ class Silicon:
     temperature: float = 173.0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "thickness", float(metres(self.thickness, "thickness")))
         if not 1e-6 <= self.thickness <= 1e-3:
             raise DomainError(f"thickness = {self.thickness!r}: expected 1e-06 to 0.001 m of silicon")
         check_temperature(self.temperature)
 
-    def index(self, wavelength: float) -> float:
+    def index(self, wavelength: ArrayLike) -> float:
         """Return the refractive index at a vacuum wavelength [m]."""
         return float(silicon_index(wavelength, self.temperature))
 
-    def absorption_length(self, wavelength: float) -> float:
+    def absorption_length(self, wavelength: ArrayLike) -> float:
         """Return the absorption length at a vacuum wavelength [m]."""
         return float(absorption_length(wavelength, self.temperature))
 
-    def absorbed(self, wavelength: float) -> float:
+    def absorbed(self, wavelength: ArrayLike) -> float:
         """Return the part of the light that is absorbed before it reaches the gates."""
         return -math.expm1(-self.thickness / self.absorption_length(wavelength))
 
-    def paths(self, wavelength: float, count: int) -> ConversionPaths:
+    def paths(self, wavelength: ArrayLike, count: int) -> ConversionPaths:
         """Return the Gauss rule of ``count`` points over the distribution of paths at a vacuum wavelength [m].
 
         It integrates polynomials of the path up to the order ``2 count - 1`` (Golub & Welsch 1969, Math. Comp. 23,
@@ -89,7 +92,7 @@ class Silicon:
         roots, vectors = eigh_tridiagonal(diagonal, beside[: count - 1])
         return ConversionPaths(length * roots, self.absorbed(wavelength) * vectors[0] ** 2)
 
-    def defocus(self, wavelength: float) -> tuple[float, float]:
+    def defocus(self, wavelength: ArrayLike) -> tuple[float, float]:
         """Return mean and rms about it of the equivalent defocus [m], behind the surface, at a vacuum wavelength [m].
 
         This is that of rays near the axis; moving the detector towards the light by the mean times the mean cosine of

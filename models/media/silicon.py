@@ -3,8 +3,8 @@
 Both start from measurements at 295 K (Schinke et al. 2015, Vogt 2015). The index changes with temperature by the slope
 of Franta et al. (2017). The absorption length changes as in the formula of Rajkanan, Singh & Shewchun (1979,
 Solid-State Electronics 22, 793) for indirect transitions with two phonons and a direct one: its ratio between two
-temperatures is used, not its value, which is 30 % too short at 295 K. Between 173 K and 295 K the ratio differs from
-that of Franta et al. by 12 to 25 % from 620 to 970 nm, which is the uncertainty of the absorption length there.
+temperatures is used, not its value, which is 30 % too short at 295 K. Between 173 K and 293 K the ratio differs from
+that of Franta et al. by 10 to 20 % from 620 to 970 nm, which is the uncertainty of the absorption length there.
 """
 
 from __future__ import annotations

@@ -32,6 +32,9 @@ def test_screens_are_most_of_what_is_needed():
     assert larger - default > 3 * 6 * 8192**2 * 4
     wave = [needed_bytes(experiment(psf__engine="wave"), threads) for threads in (1, 5)]
     assert default < wave[0] < wave[1]
+    # Silicon keeps the intensities of ten more channels, at least, of some 500 x 500 complex numbers.
+    deep = needed_bytes(experiment(psf__engine="wave", detector__silicon=True), 5)
+    assert deep - wave[1] > 5 * 10 * 500**2 * 8
     # Without an atmosphere there are no screens.
     assert needed_bytes(experiment(atmosphere__enabled=False)) < GB
     # A stamp of 31 x 31 pixels in single precision, at least.

@@ -319,6 +319,24 @@ def test_residual_aberration_and_jitter_reach_the_stars(tiny):
     assert np.all(np.hypot(shaken.e1, shaken.e2) < np.hypot(plain.e1, plain.e2) + 0.01)
 
 
+@pytest.mark.long
+def test_silicon_reaches_the_stars(tiny):
+    options = {"ccds": ("R22_S11",), "band": "y", "wavelengths_nm": (970.0,), "psf__engine": "long_exposure"}
+    options |= {"telescope": None, "psf__n_pupil": 80, "focal_plane__budget": "flat"}
+    plain, deep, refocused = (
+        computed(tiny(**options, **more)).holdout
+        for more in (
+            {"psf__diffusion_pixels": 0.0},
+            {"psf__diffusion_pixels": 0.0, "detector__silicon": True},
+            {"psf__diffusion_pixels": 0.0, "detector__silicon": True, "changes": {"Detector.dz_um": -12.3}},
+        )
+    )
+    # On the axis the design is in focus at the surface, and light that goes on in silicon is not.
+    assert np.all(deep.size > 1.015 * plain.size)
+    assert np.all(refocused.size < 0.99 * deep.size)
+    assert np.all(refocused.size > plain.size)
+
+
 def test_without_an_atmosphere_the_optics_alone_make_the_psf(tmp_path, tiny, no_report):
     config = tiny(ccds=("R22_S11",), atmosphere__enabled=False, stars__truth=8, stars__observed=8)
     config = Experiment.from_config(with_options(config, reconstruction__components=2)).config

@@ -16,8 +16,9 @@ from ..pupil_optics import PupilOptics
 
 # Fewest time steps over which conversion depths take turns; of fewer, each is computed at every depth.
 _FEW_STEPS = 128
-# Irrational steps of a sequence that fills the unit square evenly (Roberts 2018; roots of x^3 = x + 1).
-_STEPS = 1.0 / 1.32471795724474602596 ** np.array([1.0, 2.0])
+# Parts of a turn from one time step, group of pupil points and wavelength to the next: irrational, and far from simple
+# fractions and from each other, so that few or many of them fill a turn evenly.
+_TIME_STEP, _GROUP_STEP, _WAVE_STEP = 0.5 * (5.0**0.5 - 1.0), 2.0**0.5 - 1.0, 0.5497004779019703
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,11 @@ class Channels:
             channel = np.broadcast_to(first + depth, (len(first), len(time), n_group))
         else:
             time = np.arange(n_time)
-            place = (_STEPS[0] * time[:, None] + _STEPS[1] * np.arange(n_group)) % 1.0
+            # Wavelengths have other turns: what one depth has too much of the air's motion is not that of all.
+            wave = _WAVE_STEP * np.arange(len(first))
+            place = np.add.outer(wave, np.add.outer(_TIME_STEP * time, _GROUP_STEP * np.arange(n_group))) % 1.0
             weight = self.weight.reshape(-1, depths)
             ends = np.cumsum(weight, axis=1)[:, :-1] / weight.sum(axis=1)[:, None]
-            channel = first + (place >= ends[:, :, None, None]).sum(axis=1)
+            channel = first + (place[:, None] >= ends[:, :, None, None]).sum(axis=1)
         number = np.bincount(channel.ravel(), minlength=len(self.wave))
         return Turns(time, np.ascontiguousarray(channel, dtype=np.int32), number / (len(time) * n_group))

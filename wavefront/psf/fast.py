@@ -5,7 +5,8 @@ the Jacobian of the star turns that into a displacement on its CCD, to which the
 optics is added. All rays of a star are binned on a fine grid, at every wavelength from one pass over the atmosphere.
 Filters multiply the transform of that image: the ensemble average of the high modes (the
 "second kick" of Peterson et al. 2015, as a filter), diffraction by the annular pupil, charge diffusion, the pixel, and
-a phase ramp for atmospheric dispersion and the place within the pixel.
+a phase ramp for atmospheric dispersion and the place within the pixel. In silicon each depth has an image of its own,
+and rays take turns at the depths.
 
 The filter of the atmosphere is chosen so that the mean over many exposures is right. With the structure function
 :math:`D(b)` of the whole atmosphere and the variance :math:`g` of one component of the low gradient, rays alone give

@@ -16,6 +16,8 @@ pupil on each spoke; the points of a Gauss-Lobatto rule in the square of the rad
 are put between them, and landing points interpolated along the spoke. Unlike a count of rays that pass, this moves
 smoothly when the telescope is perturbed. A strip along a rim is as wide as half the baseline across the rim; its phase
 is that of its middle, to first order.
+
+In silicon the rays of a wavelength land at several depths, and their waves are added up before the strips are cut off.
 """
 
 from __future__ import annotations

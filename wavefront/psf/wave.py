@@ -21,6 +21,8 @@ Transforms are those of SciPy in single precision. On 480 to 512 points a side F
 as much (``benchmarks/fft_libraries.py``); a third of a star's time goes into them, so either would win a sixth. They
 would cost hundreds of megabytes for one make of processor (MKL) or another licence (FFTW), and bytes that depend on the
 machine or on a timing.
+
+In silicon w is the path to one depth; time steps take turns at the depths, and each depth has a mean of its own.
 """
 
 from __future__ import annotations
@@ -162,10 +164,12 @@ class WavePsfEngine(PsfEngine):
             for wave in range(n_wave):
                 focused = scipy.fft.fft2(fields[wave]).view(np.float32).reshape(-1, LANES)
                 launch(add_squares, len(focused), [warp_array(focused, samples), squares[chosen[wave]]], threads=1)
-        parts = np.stack([square.numpy() for square in squares]).reshape(n_channel, size, size, 2)
-        part = channels.weight / self._turns.fraction
-        mean = parts.sum(axis=-1, dtype=np.float64) / (len(self._turns.time) * lit.sum())
-        return np.asarray(part[:, None, None] * mean)
+        intensity = np.empty((n_channel, size, size))
+        count = len(self._turns.time) * lit.sum()
+        for channel, part in enumerate(channels.weight / self._turns.fraction):
+            parts = squares[channel].numpy().reshape(size, size, 2)
+            intensity[channel] = part * (parts.sum(axis=-1, dtype=np.float64) / count)
+        return intensity
 
     def _rows(self, values: np.ndarray) -> np.ndarray:
         """Return values [n_wave, n_pupil] as float32 packets along the pupil's rows, [n_wave, row, packet, LANES]."""

@@ -4,10 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from astropy import units as u
 from scipy.integrate import quad
 
 from pachon.core.errors import DomainError
 from pachon.models.camera.silicon import Silicon
+from pachon.models.io.prescription import load_telescope
+from pachon.wavefront.silicon_focus import focus_height
 
 #: Nearly all light is absorbed, about half, next to none.
 WAVELENGTHS = (400e-9, 754e-9, 940e-9, 1090e-9)
@@ -42,6 +45,16 @@ def test_defocus_is_that_of_the_closed_form(wavelength):
     variance = length**2 - thickness**2 * lost * (1.0 + lost)
     # Where silicon is nearly transparent the variance is a difference of numbers 1e6 times larger.
     assert silicon.defocus(wavelength) == pytest.approx((mean / index, math.sqrt(variance) / index), rel=1e-6)
+
+
+def test_quantities_are_lengths():
+    silicon = Silicon(thickness=100 * u.um)
+    assert silicon == Silicon(100 * 1e-6)
+    assert silicon.defocus(870 * u.nm) == pytest.approx(silicon.defocus(870e-9), rel=1e-12)
+    telescope = load_telescope("lsst_v3.3_z")
+    assert focus_height(telescope, silicon, 870 * u.nm) == pytest.approx(
+        focus_height(telescope, silicon, 870e-9), rel=1e-9
+    )
 
 
 def test_charge_spreads_with_the_root_of_the_distance_drifted():

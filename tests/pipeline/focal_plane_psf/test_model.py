@@ -1,6 +1,7 @@
 """The model against synthetic exposures: holdout positions, heights, uncertainties, files, bad input."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from pachon.core.errors import DomainError, PachonError, ProductError, UnknownNameError
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.camera.silicon import Silicon
 from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
 from pachon.pipeline.focal_plane_psf.response import Instrument
 from pachon.pipeline.measure.shapes import measure_shapes
@@ -228,6 +230,15 @@ def test_a_written_model_is_the_same(which, tmp_path, request):
     assert read.evidence == pytest.approx(model.evidence, nan_ok=True, abs=0.0)
     read.write(tmp_path / "again.fits")
     assert (tmp_path / "again.fits").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.long
+def test_a_written_model_has_its_silicon(tmp_path, aligned):
+    optics = aligned.field.optics
+    instrument = replace(optics.instrument, silicon=Silicon(80e-6, 180.0))
+    model = replace(aligned, field=replace(aligned.field, optics=replace(optics, instrument=instrument)))
+    model.write(tmp_path / "silicon.fits")
+    assert FocalPlanePsf.read(tmp_path / "silicon.fits").field.optics.instrument.silicon == Silicon(80e-6, 180.0)
 
 
 def test_files_that_are_no_models_give_one_clear_line(tmp_path):
