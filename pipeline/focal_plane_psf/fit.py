@@ -44,6 +44,8 @@ _MEAN = (0.02, 0.02, 0.01)
 _BLOCK = 750
 # Steps of Gauss-Newton and of the covariances, before the optics are evaluated again about the alignment found.
 _STEPS = 3
+# Rounds after these, as long as a coefficient of the wavefront moved by more [m] since the optics were evaluated.
+_ROUNDS, _MOVED = 3, 20e-9
 # Most times that a step is halved.
 _HALVINGS = 6
 
@@ -189,12 +191,11 @@ class ExposureFit:
             self.optics = HeightResponse.of(
                 self.instrument, self.fields, self.flat, aberration, seeing, self.threads, stage.advance
             )
-        if self._response is None:
-            with self.reporter.stage("response to alignment and seeing"):
-                self._response = ExposureResponse.of(
-                    self.instrument, self.fields, self.flat, aberration, seeing, self.threads
-                )
-            self._column_slopes = self._response.height_slopes(self.fields)
+        with self.reporter.stage(f"response to alignment and seeing{again}"):
+            self._response = ExposureResponse.of(
+                self.instrument, self.fields, self.flat, aberration, seeing, self.threads
+            )
+        self._column_slopes = self._response.height_slopes(self.fields)
         self._base = self.exposure.copy()
 
     def solve_exposure(self) -> list[BlockEquations]:
@@ -379,12 +380,16 @@ class ExposureFit:
             for _ in range(_STEPS):
                 self.solve(1)
                 self.fit_covariances()
-        if self.sigma[0] > _NO_WAVEFRONT:
-            self.linearise()
-        with self.reporter.stage("heights, alignment and turbulence, again"):
-            self.solve(1)
-            self.fit_covariances()
-            self.solve(1)
+        for number in range(_ROUNDS):
+            moved = np.abs(self.exposure - self._base)[:-1].max() > _MOVED
+            if number and not moved:
+                break
+            if moved:
+                self.linearise()
+            with self.reporter.stage("heights, alignment and turbulence, again"):
+                self.solve(1)
+                self.fit_covariances()
+                self.solve(1)
         assert self.covariance is not None
         return OpticsFit(
             self.heights,

@@ -27,6 +27,10 @@ BLOCK = 300
 _AMPLITUDES, _LENGTHS, _SHEAR = (-14.0, 2.0), (-6.5, 1.0), (-10.0, 10.0)
 # Lengths from which the fit starts, over the extent of the field: 3 and 16 arcmin over 3.5 degrees.
 _START = (0.014, 0.08, 0.3)
+# Widths of the priors about the first guess: logarithms of amplitudes and lengths, shear, logarithms of the variances
+# of the terms of the CCDs and of the nugget. Many stars decide for themselves; of some hundred stars in a few streaks
+# the likelihood has maxima far away.
+_AMPLITUDE_WIDTH, _LENGTH_WIDTH, _SHEAR_WIDTH, _VARIANCE_WIDTH = 1.0, 1.0, 1.5, 3.0
 # Logarithm of the amplitude of a component over the variance of the values, below which there is none.
 _VANISHED = -6.0
 #: Variance of what all stars share, over the mean square of the values.
@@ -132,7 +136,8 @@ def fit_covariance(
     bounds = [_AMPLITUDES, _LENGTHS, _LENGTHS, _SHEAR] * COMPONENTS + [_AMPLITUDES] * (n_ccd + 1)
     # Inverse lengths are fitted.
     bounds = [(-b[1], -b[0]) if "length" in n else b for n, b in zip(names, bounds, strict=True)]
-    first = _first_guess(centred, noise, power, n_ccd)
+    guess = _first_guess(centred, noise, power, n_ccd)
+    first = guess.copy()
     if start is not None:
         again = _packed(start, power, extent, n_ccd)
         for j in range(COMPONENTS):
@@ -141,10 +146,18 @@ def fit_covariance(
                 first[4 * j : 4 * j + 4] = again[4 * j : 4 * j + 4]
         first[4 * COMPONENTS :] = again[4 * COMPONENTS :]
     first = np.clip(first, *np.transpose(bounds))
+    width = np.array(
+        [_AMPLITUDE_WIDTH, _LENGTH_WIDTH, _LENGTH_WIDTH, _SHEAR_WIDTH] * COMPONENTS + [_VARIANCE_WIDTH] * (n_ccd + 1)
+    )
+
+    def objective(packed: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = _negative_log_likelihood(packed, prepared)
+        away = (packed - guess) / width
+        return value + 0.5 * float(away @ away), gradient + away / width
+
     found = minimize(
-        _negative_log_likelihood,
+        objective,
         first,
-        args=(prepared,),
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
