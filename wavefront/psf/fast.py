@@ -193,7 +193,7 @@ class FastPsfEngine(PsfEngine):
         cells_per_slope = optics.jacobian.reshape(n_star, 4) / self._cell
         image = np.zeros((n_star, n_channel * self._grid_size**2), dtype=np.float32)
         launch(
-            deposit_rays,
+            deposit_rays.plain if self._channels.depths == 1 else deposit_rays.special,
             n_star,
             [
                 warp_array(self._slopes, wp.int32),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from ...raytrace.kernels.kernel_pair import kernel_pair
 from .packet_functions import squared_baseline, tabulated
 from .sample_packets import LANES, indices, samples
 
@@ -31,97 +32,118 @@ def unpack(counts: indices, unit: wp.float32):
     return x, y
 
 
-@wp.kernel
-def deposit_rays(
-    first: wp.int32,
-    screens: wp.array2d(dtype=wp.int32),
-    unit: wp.array(dtype=wp.float32),
-    screen_size: wp.int32,
-    n_layer: wp.int32,
-    n_time: wp.int32,
-    start: wp.array3d(dtype=wp.float64),
-    step: wp.array2d(dtype=wp.float64),
-    moment: wp.array(dtype=wp.int32),
-    channel: wp.array3d(dtype=wp.int32),
-    lattice: wp.array(dtype=indices),
-    reach: wp.int32,
-    cells_per_slope: wp.array2d(dtype=wp.float32),
-    displacement: wp.array4d(dtype=samples),
-    weight: wp.array3d(dtype=samples),
-    grid_size: wp.int32,
-    slope: wp.array3d(dtype=samples),
-    image: wp.array2d(dtype=wp.float32),
-):
-    """Deposit all rays of one star, at every wavelength, on its fine grid.
+@wp.func
+def own_channel(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
+    """Channel of a wavelength that has but one."""
+    return wave
 
-    The pupil points lie on the lattice of the screens, and the slopes are read at the nearest sample: that displaces a
-    layer as a whole by part of a pixel, another at every time, and is lost in the mean over the exposure.
 
-    Arguments: screens [layer, y * size + x]: packed slopes; unit [layer] of their counts [rad]; start [star, layer, 2]:
-    screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per moment];
-    moment [time]; channel [wave, time, packet] of the rays; lattice [packet]: row * size + column of the pupil points
-    [pixels]; reach: the largest row or column, plus one; cells_per_slope [star, 4]: Jacobian, row by row, over the cell
-    of the grid; displacement [star, channel, packet, 2] by the optics [cells]; weight [star, wave, packet] of the
-    light; slope [star, packet, 2]: room for the slopes of all layers [rad]; image [star, (channel * size + y) * size +
-    x], with the origin in the cell size // 2.
-    """
-    star = first + wp.tid()
-    n_packet = lattice.shape[0]
-    n_wave = weight.shape[1]
-    xx = cells_per_slope[star, 0]
-    xy = cells_per_slope[star, 1]
-    yx = cells_per_slope[star, 2]
-    yy = cells_per_slope[star, 3]
-    origin = wp.float32(grid_size // 2) + wp.float32(0.5)
-    for t in range(n_time):
-        for packet in range(n_packet):
-            slope[star, packet, 0] = samples()
-            slope[star, packet, 1] = samples()
-        for layer in range(n_layer):
-            time = wp.float64(moment[t])
-            corner_x = nearest_sample(start[star, layer, 0] + time * step[layer, 0], screen_size)
-            corner_y = nearest_sample(start[star, layer, 1] + time * step[layer, 1], screen_size)
-            corner = corner_y * screen_size + corner_x
-            counts = indices()
-            # Two loops, each to its end: with a choice or a shared function inside, the compiler makes slower code.
-            if corner_x + reach <= screen_size and corner_y + reach <= screen_size:
-                for packet in range(n_packet):
-                    offset = lattice[packet]
+@wp.func
+def channel_of_turn(channel: wp.array3d(dtype=wp.int32), wave: wp.int32, t: wp.int32, packet: wp.int32):
+    """Channel of a wavelength at the turn of a packet."""
+    return channel[wave, t, packet]
+
+
+@kernel_pair
+def deposit_rays(special: bool, module: wp.Module) -> wp.Kernel:
+    """Return the kernel that deposits rays; the special one is that of wavelengths with several channels."""
+    channel_of = channel_of_turn if special else own_channel
+
+    @wp.kernel(module=module)
+    def deposit_rays(
+        first: wp.int32,
+        screens: wp.array2d(dtype=wp.int32),
+        unit: wp.array(dtype=wp.float32),
+        screen_size: wp.int32,
+        n_layer: wp.int32,
+        n_time: wp.int32,
+        start: wp.array3d(dtype=wp.float64),
+        step: wp.array2d(dtype=wp.float64),
+        moment: wp.array(dtype=wp.int32),
+        channel: wp.array3d(dtype=wp.int32),
+        lattice: wp.array(dtype=indices),
+        reach: wp.int32,
+        cells_per_slope: wp.array2d(dtype=wp.float32),
+        displacement: wp.array4d(dtype=samples),
+        weight: wp.array3d(dtype=samples),
+        grid_size: wp.int32,
+        slope: wp.array3d(dtype=samples),
+        image: wp.array2d(dtype=wp.float32),
+    ):
+        """Deposit all rays of one star, at every wavelength, on its fine grid.
+
+        The pupil points lie on the lattice of the screens, and the slopes are read at the nearest sample: that
+        displaces a layer as a whole by part of a pixel, another at every time, and is lost in the mean over the
+        exposure.
+
+        Arguments: screens [layer, y * size + x]: packed slopes; unit [layer] of their counts [rad]; start [star, layer,
+        2]: screen coordinates of the first lattice point at the first time [pixels]; step [layer, 2] [pixels per
+        moment]; moment [time]; channel [wave, time, packet] of the rays; lattice [packet]: row * size + column of the
+        pupil points [pixels]; reach: the largest row or column, plus one; cells_per_slope [star, 4]: Jacobian, row by
+        row, over the cell of the grid; displacement [star, channel, packet, 2] by the optics [cells]; weight [star,
+        wave, packet] of the light; slope [star, packet, 2]: room for the slopes of all layers [rad]; image [star,
+        (channel * size + y) * size + x], with the origin in the cell size // 2.
+        """
+        star = first + wp.tid()
+        n_packet = lattice.shape[0]
+        n_wave = weight.shape[1]
+        xx = cells_per_slope[star, 0]
+        xy = cells_per_slope[star, 1]
+        yx = cells_per_slope[star, 2]
+        yy = cells_per_slope[star, 3]
+        origin = wp.float32(grid_size // 2) + wp.float32(0.5)
+        for t in range(n_time):
+            for packet in range(n_packet):
+                slope[star, packet, 0] = samples()
+                slope[star, packet, 1] = samples()
+            for layer in range(n_layer):
+                time = wp.float64(moment[t])
+                corner_x = nearest_sample(start[star, layer, 0] + time * step[layer, 0], screen_size)
+                corner_y = nearest_sample(start[star, layer, 1] + time * step[layer, 1], screen_size)
+                corner = corner_y * screen_size + corner_x
+                counts = indices()
+                # Two loops, each to its end: with a choice or a shared function inside, the compiler makes slower code.
+                if corner_x + reach <= screen_size and corner_y + reach <= screen_size:
+                    for packet in range(n_packet):
+                        offset = lattice[packet]
+                        for i in range(LANES):
+                            counts[i] = screens[layer, corner + offset[i]]
+                        slope_x, slope_y = unpack(counts, unit[layer])
+                        slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                        slope[star, packet, 1] = slope[star, packet, 1] + slope_y
+                else:
+                    for packet in range(n_packet):
+                        offset = lattice[packet]
+                        for i in range(LANES):
+                            # Columns and rows are added apart: a column past the border must not run on into the next
+                            # row.
+                            x = (corner_x + offset[i] % screen_size) % screen_size
+                            y = (corner_y + offset[i] // screen_size) % screen_size
+                            counts[i] = screens[layer, y * screen_size + x]
+                        slope_x, slope_y = unpack(counts, unit[layer])
+                        slope[star, packet, 0] = slope[star, packet, 0] + slope_x
+                        slope[star, packet, 1] = slope[star, packet, 1] + slope_y
+            for packet in range(n_packet):
+                angle_x = slope[star, packet, 0]
+                angle_y = slope[star, packet, 1]
+                moved_x = angle_x * xx + angle_y * xy
+                moved_y = angle_x * yx + angle_y * yy
+                for wave in range(n_wave):
+                    part = channel_of(channel, wave, t, packet)
+                    cell_x = moved_x + displacement[star, part, packet, 0]
+                    cell_y = moved_y + displacement[star, part, packet, 1]
+                    light = weight[star, wave, packet]
                     for i in range(LANES):
-                        counts[i] = screens[layer, corner + offset[i]]
-                    slope_x, slope_y = unpack(counts, unit[layer])
-                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
-                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
-            else:
-                for packet in range(n_packet):
-                    offset = lattice[packet]
-                    for i in range(LANES):
-                        # columns and rows are added apart: a column past the border must not run on into the next row
-                        x = (corner_x + offset[i] % screen_size) % screen_size
-                        y = (corner_y + offset[i] // screen_size) % screen_size
-                        counts[i] = screens[layer, y * screen_size + x]
-                    slope_x, slope_y = unpack(counts, unit[layer])
-                    slope[star, packet, 0] = slope[star, packet, 0] + slope_x
-                    slope[star, packet, 1] = slope[star, packet, 1] + slope_y
-        for packet in range(n_packet):
-            angle_x = slope[star, packet, 0]
-            angle_y = slope[star, packet, 1]
-            moved_x = angle_x * xx + angle_y * xy
-            moved_y = angle_x * yx + angle_y * yy
-            for wave in range(n_wave):
-                part = channel[wave, t, packet]
-                cell_x = moved_x + displacement[star, part, packet, 0]
-                cell_y = moved_y + displacement[star, part, packet, 1]
-                light = weight[star, wave, packet]
-                for i in range(LANES):
-                    # No branch, so that the lanes stay together; light beyond the grid is left out.
-                    column = wp.int32(cell_x[i] + origin)
-                    row = wp.int32(cell_y[i] + origin)
-                    near_column = wp.clamp(column, 0, grid_size - 1)
-                    near_row = wp.clamp(row, 0, grid_size - 1)
-                    caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
-                    cell = (part * grid_size + near_row) * grid_size + near_column
-                    image[star, cell] = image[star, cell] + caught
+                        # No branch, so that the lanes stay together; light beyond the grid is left out.
+                        column = wp.int32(cell_x[i] + origin)
+                        row = wp.int32(cell_y[i] + origin)
+                        near_column = wp.clamp(column, 0, grid_size - 1)
+                        near_row = wp.clamp(row, 0, grid_size - 1)
+                        caught = wp.where(column == near_column and row == near_row, light[i], wp.float32(0.0))
+                        cell = (part * grid_size + near_row) * grid_size + near_column
+                        image[star, cell] = image[star, cell] + caught
+
+    return deposit_rays
 
 
 @wp.kernel
