@@ -72,6 +72,12 @@ def slope(dz, left, patch):
     return of(slice(None)), np.sqrt((len(patches) - 1) * without.var())
 
 
+def by_raft(left, patch):
+    """Return the mean of residuals, and its error from the scatter of the rafts."""
+    means = np.array([left[patch == p].mean() for p in np.unique(patch)])
+    return left.mean(), means.std() / np.sqrt(max(len(means) - 1, 1))
+
+
 def one_run(folder):
     """Return the residuals of each model, the heights [um] and the rafts of the holdout positions of a run."""
     summary = json.loads((folder / SUMMARY_NAME).read_text())
@@ -154,8 +160,8 @@ def main() -> None:
                 + " ".join(f"{1e3 * v:9.3f}e-3" for v in rms)
             )
             for row in range(2):
-                mean = [values[bins == b, row].mean() for b in range(_BINS)]
-                axes[row, column].plot(centers, mean, marker="o", label=label)
+                mean, error = np.transpose([by_raft(values[bins == b, row], rafts[bins == b]) for b in range(_BINS)])
+                axes[row, column].errorbar(centers, mean, error, marker="o", markersize=4, capsize=2, label=label)
         axes[0, column].set(title=folder.name, ylabel="residual of the size [%]")
         axes[1, column].set(xlabel="height within the CCD [um]", ylabel="residual of e along its change [1e-3]")
         for row in range(2):

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from .covariance import Covariance, Places
-from .fit import N_EXPOSURE, ShapeData, columns_acting_on
+from .fit import ShapeData, columns_acting_on
 from .kriging import Neighbourhood, leave_one_out, neighbourhood, neighbours_of, on_threads
 from .likelihood import blocks_of
 from .mosaic import Mosaic
 from .optics_part import OpticsPart
+from .response import N_EXPOSURE
 
 #: Stars that deviate by more standard deviations from the prediction of all others are left out.
 CLIP_SIGMA = 6.0

@@ -89,7 +89,7 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
         about["instrument"] = {k: getattr(instrument, k) for k in ("pixel_size", "diffusion", "jitter")}
         if instrument.silicon is not None:
             about["silicon"] = asdict(instrument.silicon)
-        about["radius"] = optics.response.radius
+        about["radius"], about["center"] = optics.response.radius, optics.response.center
         surfaces = optics.plane.surfaces
         hdus += [
             _image("WAVELENGTHS", instrument.wavelengths),
@@ -192,7 +192,7 @@ def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camer
         about["seeing"],
         HeightPrior.broad(camera, degree=about["degree"]),
         part("PARAMETER_COVARIANCE"),
-        ExposureResponse(part("RESPONSE"), about["radius"]),
+        ExposureResponse(part("RESPONSE"), about["radius"], about["center"]),
     )
 
 

@@ -21,22 +21,25 @@ import scipy.linalg
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
 from ...models.camera.focal_plane import FocalPlane
-from ...models.zernike_polynomials import noll_to_nm
-from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
+from ...wavefront.aberration import ResidualWavefront
 from .covariance import Covariance, Places, inverse_of_root
 from .heights import HeightPrior
 from .kriging import on_threads
 from .likelihood import CovarianceFit, blocks_of, fit_covariance, log_likelihood
-from .response import LARGEST_HEIGHT, NOLL, ExposureResponse, HeightResponse, Instrument, wavefront
+from .response import (
+    LARGEST_HEIGHT,
+    N_EXPOSURE,
+    ExposureResponse,
+    HeightResponse,
+    Instrument,
+    exposure_sigma,
+    wavefront,
+)
 
 #: Names of the shape parameters.
 SHAPES = ("e1", "e2", "ln size")
-#: Number of parameters of an exposure: Noll terms on the axis and along x and y, and the Fried parameter.
-N_EXPOSURE = 3 * len(NOLL) + 1
 # Standard deviation of the wavefront coefficients of an aligned telescope [m].
 _NO_WAVEFRONT = 1e-15
-#: Standard deviation of the logarithm of the Fried parameter.
-_SEEING = 0.3
 # Standard deviations of what turbulence adds to the shapes of all stars alike. The mean size is the seeing, which
 # is fitted.
 _MEAN = (0.02, 0.02, 0.01)
@@ -52,21 +55,11 @@ _HALVINGS = 6
 
 @dataclass(frozen=True, eq=False)
 class ShapeData:
-    """Measured shapes of the stars of one exposure.
-
-    Attributes
-    ----------
-    places : Places
-        Positions and CCDs.
-    values : ndarray, shape [n, 3]
-        e1, e2 and the logarithm of the size [rad].
-    noise : ndarray, shape [n, 3]
-        Variances of their noise.
-    """
+    """Measured shapes of the stars of one exposure."""
 
     places: Places
-    values: np.ndarray
-    noise: np.ndarray
+    values: np.ndarray  #: e1, e2 and the logarithm of the size [rad], [n, 3]
+    noise: np.ndarray  #: variances of their noise, [n, 3]
 
     def __len__(self) -> int:
         return len(self.values)
@@ -118,15 +111,6 @@ class BlockEquations(NamedTuple):
     vector: np.ndarray  #: [m]
 
 
-def exposure_sigma(alignment_rms: float) -> np.ndarray:
-    """Return the prior standard deviations of the parameters of an exposure, those of :class:`.ResidualWavefront`."""
-    degree = np.array([float(noll_to_nm(j)[0]) for j in NOLL])
-    variance = degree ** (-11.0 / 3.0)
-    sigma = alignment_rms * np.sqrt(variance / variance.sum())
-    along = np.sqrt(2.0 * LINEAR_FRACTION) * sigma
-    return np.concatenate([np.sqrt(1.0 - LINEAR_FRACTION) * sigma, along, along, [_SEEING]])
-
-
 def columns_acting_on(prior: HeightPrior, ccds: np.ndarray) -> np.ndarray:
     """Return the columns of the parameters that act on some CCDs: the common ones, those of each, the exposure's."""
     every = np.arange(prior.n_parameter + N_EXPOSURE)
@@ -155,9 +139,8 @@ class ExposureFit:
     ) -> None:
         self.data, self.instrument, self.prior = data, instrument, prior
         self.threads, self.reporter = threads, reporter
-        self.sigma = exposure_sigma(alignment_rms)
         # A wavefront that is not to change keeps its place among the parameters.
-        self.sigma = np.maximum(self.sigma, _NO_WAVEFRONT)
+        self.sigma = np.maximum(exposure_sigma(alignment_rms), _NO_WAVEFRONT)
         self.fields = instrument.fields(data.places.xy, threads)
         self.flat = FocalPlane.flat(prior.camera)
         self.common = prior.common_terms(data.places)
@@ -165,6 +148,7 @@ class ExposureFit:
         self.blocks = blocks_of(data.places.xy, _BLOCK)
         self.heights = np.zeros(prior.n_parameter)
         self.exposure = np.zeros(N_EXPOSURE)
+        self._center = float(np.mean(prior.heights(self.heights, data.places)))
         self.covariances: list[Covariance] = []
         self.at_bounds: tuple[str, ...] = ()
         self.covariance: np.ndarray | None = None
@@ -189,11 +173,18 @@ class ExposureFit:
         again = ", again" if self._response is not None else ""
         with self.reporter.stage(f"optics at the stars{again}", total=5 * len(self.data)) as stage:
             self.optics = HeightResponse.of(
-                self.instrument, self.fields, self.flat, aberration, seeing, self.threads, stage.advance
+                self.instrument,
+                self.fields,
+                self.flat,
+                aberration,
+                seeing,
+                self.threads,
+                stage.advance,
+                center=self._center,
             )
         with self.reporter.stage(f"response to alignment and seeing{again}"):
             self._response = ExposureResponse.of(
-                self.instrument, self.fields, self.flat, aberration, seeing, self.threads
+                self.instrument, self.fields, self.flat, aberration, seeing, self.threads, center=self._center
             )
         self._column_slopes = self._response.height_slopes(self.fields)
         self._base = self.exposure.copy()
@@ -219,7 +210,8 @@ class ExposureFit:
     def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return residuals, slopes with height [n, 3] and columns of the exposure [n, 25, 3] at the parameters."""
         assert self._response is not None
-        heights = np.clip(self.prior.heights(self.heights, self.data.places), -LARGEST_HEIGHT, LARGEST_HEIGHT)
+        heights = self.prior.heights(self.heights, self.data.places)
+        heights = np.clip(heights, self._center - LARGEST_HEIGHT, self._center + LARGEST_HEIGHT)
         columns = self._response.columns(self.fields, heights)
         change = self.exposure - self._base
         shapes = self.optics.at(heights) + np.einsum("npf,p->nf", columns, change)

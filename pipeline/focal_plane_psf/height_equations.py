@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -12,7 +12,8 @@ import scipy.linalg
 from ...core.files import write_bytes
 from ...core.threads import one_blas_thread
 from .covariance import Covariance
-from .fit import N_EXPOSURE, BlockEquations, ExposureFit
+from .fit import BlockEquations, ExposureFit
+from .response import N_EXPOSURE
 
 
 class ExposureState(NamedTuple):
@@ -61,7 +62,7 @@ class HeightEquations(NamedTuple):
 
     def write(self, path: Path, key: str) -> None:
         """Write a file, with a key of all that the equations were made of."""
-        arrays: dict[str, np.ndarray] = {"factor": self.factor, "vector": self.vector, "exposure": self.state.exposure}
+        arrays: dict[str, Any] = {"factor": self.factor, "vector": self.vector, "exposure": self.state.exposure}
         for i, block in enumerate(self.blocks):
             arrays[f"block_used_{i}"] = block.used
             arrays[f"block_matrix_{i}"] = block.matrix[np.tril_indices(len(block.used))]
@@ -90,8 +91,9 @@ class HeightEquations(NamedTuple):
                 # The right side of a block is in the vector of all.
                 blocks.append(BlockEquations(used, lower + np.tril(lower, -1).T, np.zeros(0)))
             for i in range(sum(name.startswith("constant_") for name in kept.files)):
-                values = {name: kept[f"{name}_{i}"] for name in Covariance.__dataclass_fields__}
-                covariances.append(Covariance(**{k: v if v.ndim else float(v) for k, v in values.items()}))
+                amplitude, matrix, ccd = (kept[f"{name}_{i}"] for name in ("amplitude", "matrix", "ccd"))
+                constant, nugget = float(kept[f"constant_{i}"]), float(kept[f"nugget_{i}"])
+                covariances.append(Covariance(constant, amplitude, matrix, ccd, nugget))
             return cls(blocks, kept["factor"], kept["vector"], ExposureState(kept["exposure"], covariances))
         except (OSError, ValueError, KeyError):
             return None

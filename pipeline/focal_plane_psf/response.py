@@ -23,7 +23,8 @@ from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
-from ...wavefront.aberration import ResidualWavefront
+from ...models.zernike_polynomials import noll_to_nm
+from ...wavefront.aberration import LINEAR_FRACTION, ResidualWavefront
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs
@@ -31,15 +32,19 @@ from ..measure.shapes import measure_shapes
 
 #: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.
 NOLL = tuple(range(4, 12))
-#: Height range of the polynomial [m].
+#: Number of parameters of an exposure: Noll terms on the axis and along x and y, and the Fried parameter.
+N_EXPOSURE = 3 * len(NOLL) + 1
+# Standard deviation of the logarithm of the Fried parameter.
+_SEEING = 0.3
+#: Height range of the polynomial about its centre [m].
 LARGEST_HEIGHT = 25e-6
 _NODES = 5
 # Steps of the differences: wavefront [m] and logarithm of the Fried parameter.
 _WAVEFRONT_STEP, _SEEING_STEP = 0.05e-6, 0.05
 # Stars at which derivatives are computed, and the degree of their dependence on the field.
 _SAMPLES, _FIELD_DEGREE = 300, 6
-# Heights [m] between which these derivatives are linear.
-_LEVELS = (-8e-6, 8e-6)
+# Heights about the centre [m] between which these derivatives are linear.
+_LEVEL = 8e-6
 _BATCH = 2048
 
 
@@ -181,9 +186,10 @@ class Instrument:
 
 @dataclass(frozen=True, eq=False)
 class HeightResponse:
-    """Shapes of stars as polynomials of the height of the CCD: coefficients [n_node, n, 3] of Chebyshev terms."""
+    """Shapes of stars as polynomials of the height of the CCD."""
 
-    coefficients: np.ndarray
+    coefficients: np.ndarray  #: of Chebyshev terms, [n_node, n, 3]
+    center: float  #: middle of the range of heights [m]
 
     @classmethod
     def of(
@@ -195,32 +201,30 @@ class HeightResponse:
         seeing: float = 0.0,
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
+        *,
+        center: float = 0.0,
     ) -> HeightResponse:
         """Evaluate the engine at the nodes; `plane` gives the camera alone."""
         nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-        values = np.stack(
-            [
-                instrument.shapes(fields, level_plane(plane, LARGEST_HEIGHT * n), aberration, seeing, threads, progress)
-                for n in nodes
-            ]
-        )
+        levels = [level_plane(plane, center + LARGEST_HEIGHT * n) for n in nodes]
+        values = np.stack([instrument.shapes(fields, p, aberration, seeing, threads, progress) for p in levels])
         lost = int((~np.isfinite(values).all(axis=(0, 2))).sum())
         if lost:
             raise DomainError(
                 f"{instrument.telescope.name}: the PSF at {lost} of {len(fields)} stars has no shape within"
-                f" {1e6 * LARGEST_HEIGHT:g} um of the focal plane: expected the telescope that they were taken with"
+                f" {1e6 * LARGEST_HEIGHT:g} um of the heights: expected the telescope that they were taken with"
             )
         inverse = np.linalg.inv(chebyshev.chebvander(nodes, _NODES - 1))
-        return cls(np.einsum("kn,nsf->ksf", inverse, values))
+        return cls(np.einsum("kn,nsf->ksf", inverse, values), center)
 
     def at(self, heights: np.ndarray) -> np.ndarray:
         """Return the shapes at heights [m], shape [n, 3]."""
-        terms = chebyshev.chebvander(heights / LARGEST_HEIGHT, _NODES - 1)
+        terms = chebyshev.chebvander((heights - self.center) / LARGEST_HEIGHT, _NODES - 1)
         return np.einsum("sk,ksf->sf", terms, self.coefficients)
 
     def slope(self, heights: np.ndarray) -> np.ndarray:
         """Return the derivatives of the shapes with respect to the height [1/m], shape [n, 3]."""
-        terms = chebyshev.chebvander(heights / LARGEST_HEIGHT, _NODES - 2)
+        terms = chebyshev.chebvander((heights - self.center) / LARGEST_HEIGHT, _NODES - 2)
         change = chebyshev.chebder(self.coefficients, axis=0) / LARGEST_HEIGHT
         return np.einsum("sk,ksf->sf", terms, change)
 
@@ -235,6 +239,7 @@ class ExposureResponse:
 
     polynomial: np.ndarray  #: [n_term + 1, level, field term, 3]
     radius: float  #: of the field [rad]
+    center: float  #: height about which they are linear in the height [m]
 
     @classmethod
     def of(
@@ -246,6 +251,8 @@ class ExposureResponse:
         seeing: float,
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
+        *,
+        center: float = 0.0,
     ) -> ExposureResponse:
         """Compute central differences at some of the stars, and fit them over the field."""
         radius = float(np.hypot(*fields.T).max()) or instrument.telescope.field_radius
@@ -255,7 +262,7 @@ class ExposureResponse:
         found = []
         for parameter in range(len(NOLL) + 1):
             levels = []
-            for level in _LEVELS:
+            for level in (center - _LEVEL, center + _LEVEL):
                 flat, ends = level_plane(plane, level), []
                 for sign in (1.0, -1.0):
                     changed, air = aberration, seeing
@@ -270,18 +277,18 @@ class ExposureResponse:
                 change = (ends[0] - ends[1]) / width
                 levels.append(np.linalg.lstsq(terms, change, rcond=None)[0])
             found.append(levels)
-        return cls(np.array(found), radius)
+        return cls(np.array(found), radius, center)
 
     def columns(self, fields: np.ndarray, heights: np.ndarray) -> np.ndarray:
         """Return the derivatives at field angles [rad] and heights [m], shape [n, n_parameter, 3]."""
-        low, high = _LEVELS
         first, second = self._at_levels(fields)
-        return self._with_field(fields, first + ((heights - low) / (high - low))[:, None, None] * (second - first))
+        upper = 0.5 + (heights - self.center) / (2.0 * _LEVEL)
+        return self._with_field(fields, first + upper[:, None, None] * (second - first))
 
     def height_slopes(self, fields: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`columns` with respect to the height [1/m], shape [n, n_parameter, 3]."""
         first, second = self._at_levels(fields)
-        return self._with_field(fields, (second - first) / (_LEVELS[1] - _LEVELS[0]))
+        return self._with_field(fields, (second - first) / (2.0 * _LEVEL))
 
     def _at_levels(self, fields: np.ndarray) -> np.ndarray:
         """Return the derivatives at the two heights, parameters on the axis alone: [level, n, n_term + 1, 3]."""
@@ -295,6 +302,15 @@ class ExposureResponse:
         return np.concatenate(
             [waves, along[:, 0, None, None] * waves, along[:, 1, None, None] * waves, own[:, -1:]], axis=1
         )
+
+
+def exposure_sigma(alignment_rms: float) -> np.ndarray:
+    """Return the prior standard deviations of the parameters of an exposure, those of :class:`.ResidualWavefront`."""
+    degree = np.array([float(noll_to_nm(j)[0]) for j in NOLL])
+    variance = degree ** (-11.0 / 3.0)
+    sigma = alignment_rms * np.sqrt(variance / variance.sum())
+    along = np.sqrt(2.0 * LINEAR_FRACTION) * sigma
+    return np.concatenate([np.sqrt(1.0 - LINEAR_FRACTION) * sigma, along, along, [_SEEING]])
 
 
 def wavefront(
