@@ -46,9 +46,9 @@ _MEAN = (0.02, 0.02, 0.01)
 # Stars of a block of the linear fit.
 _BLOCK = 750
 # Steps of Gauss-Newton and of the covariances, before the optics are evaluated again about the alignment found.
-_STEPS = 3
+_STEPS = 2
 # Rounds after these, as long as a coefficient of the wavefront moved by more [m] since the optics were evaluated.
-_ROUNDS, _MOVED = 3, 20e-9
+_ROUNDS, _MOVED = 3, 50e-9
 # Most times that a step is halved.
 _HALVINGS = 6
 

@@ -1,4 +1,4 @@
-r"""Hyperparameters of a covariance by maximum likelihood.
+r"""Hyperparameters of a covariance by maximum likelihood, with weak priors.
 
 Where the values are residuals of fitted parameters, the covariance S that the uncertain parameters make among them is
 added to the products of the values, which is the M step of expectation maximisation (Dempster, Laird & Rubin 1977).
@@ -27,10 +27,10 @@ BLOCK = 300
 _AMPLITUDES, _LENGTHS, _SHEAR = (-14.0, 2.0), (-6.5, 1.0), (-10.0, 10.0)
 # Lengths from which the fit starts, over the extent of the field: 3 and 16 arcmin over 3.5 degrees.
 _START = (0.014, 0.08, 0.3)
-# Widths of the priors about the first guess: logarithms of amplitudes and lengths, shear, logarithms of the variances
-# of the terms of the CCDs and of the nugget. Many stars decide for themselves; of some hundred stars in a few streaks
-# the likelihood has maxima far away.
-_AMPLITUDE_WIDTH, _LENGTH_WIDTH, _SHEAR_WIDTH, _VARIANCE_WIDTH = 1.0, 1.0, 1.5, 3.0
+# Widths of the priors about the first guess: of each component (logarithm of the amplitude, of two lengths, shear), and
+# of the logarithms of the variances of the terms of the CCDs and of the nugget. Many stars decide for themselves; the
+# likelihood of some hundred stars in a few streaks has maxima far away.
+_WIDTHS, _VARIANCE_WIDTH = (1.0, 1.0, 1.0, 1.5), 3.0
 # Logarithm of the amplitude of a component over the variance of the values, below which there is none.
 _VANISHED = -6.0
 #: Variance of what all stars share, over the mean square of the values.
@@ -146,18 +146,11 @@ def fit_covariance(
                 first[4 * j : 4 * j + 4] = again[4 * j : 4 * j + 4]
         first[4 * COMPONENTS :] = again[4 * COMPONENTS :]
     first = np.clip(first, *np.transpose(bounds))
-    width = np.array(
-        [_AMPLITUDE_WIDTH, _LENGTH_WIDTH, _LENGTH_WIDTH, _SHEAR_WIDTH] * COMPONENTS + [_VARIANCE_WIDTH] * (n_ccd + 1)
-    )
-
-    def objective(packed: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _negative_log_likelihood(packed, prepared)
-        away = (packed - guess) / width
-        return value + 0.5 * float(away @ away), gradient + away / width
-
+    width = np.array([*_WIDTHS * COMPONENTS, *[_VARIANCE_WIDTH] * (n_ccd + 1)])
     found = minimize(
-        objective,
+        _negative_log_posterior,
         first,
+        args=(prepared, guess, width),
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
@@ -171,7 +164,8 @@ def fit_covariance(
     )
     covariance = _unpacked(found.x, power, extent, constant, n_ccd)
     count = sum(len(block.fixed) for block in prepared)
-    return CovarianceFit(covariance, -float(found.fun) - 0.5 * count * np.log(power), at_bounds)
+    value, _ = _negative_log_likelihood(found.x, prepared)
+    return CovarianceFit(covariance, -value - 0.5 * count * np.log(power), at_bounds)
 
 
 def log_likelihood(
@@ -213,6 +207,15 @@ def _unpacked(packed: np.ndarray, power: float, extent: float, constant: float, 
     ccd = np.zeros(3)
     ccd[:n_ccd] = power * np.exp(packed[4 * COMPONENTS : -1])
     return Covariance(constant, amplitude, matrix, ccd, float(power * np.exp(packed[-1])))
+
+
+def _negative_log_posterior(
+    packed: np.ndarray, blocks: Sequence[_Block], guess: np.ndarray, width: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return minus the logarithm of the likelihood times the priors, and its gradient."""
+    value, gradient = _negative_log_likelihood(packed, blocks)
+    away = (packed - guess) / width
+    return value + 0.5 * float(away @ away), gradient + away / width
 
 
 def _negative_log_likelihood(packed: np.ndarray, blocks: Sequence[_Block]) -> tuple[float, np.ndarray]:

@@ -33,6 +33,8 @@ from .response import Instrument
 from .stars import FocalPlaneStars, places_of, stars_of
 from .static_heights import StaticHeights
 
+# Mean wavefront of the air over an exposure of 15 s, common to all stars, rms [m].
+_AIR_WAVEFRONT = 0.1e-6
 # Images that are deformed at a time.
 _BATCH = 512
 # Brightest stars, from which the principal components of the residual stamps are made.
@@ -225,7 +227,8 @@ class FocalPlanePsf:
     ) -> FocalPlanePsf:
         """Fit the model to the products of a run, with its telescope but without its heights.
 
-        The budget of the heights is known, their draw is not; so is the size of the residual of the active optics.
+        The budget of the heights is known, their draw is not; so is the size of the residual of the active optics, to
+        which the air near the ground adds its mean over the exposure.
         """
         config = experiment.config
         focal = config.focal_plane
@@ -242,7 +245,7 @@ class FocalPlanePsf:
             jitter=experiment.jitter,
             dispersion=experiment.dispersion,
             budget=experiment.focal_plane.budget,
-            alignment_rms=config.active_optics.residual_um * 1e-6,
+            alignment_rms=float(np.hypot(config.active_optics.residual_um * 1e-6, _AIR_WAVEFRONT)),
             ccds=[product.name for product in products],
             threads=threads,
             reporter=reporter,

@@ -63,8 +63,8 @@ def test_shapes_at_heights_are_those_of_the_engine(instrument, plane):
 
 def test_slopes_are_those_of_differences():
     # Any coefficients will do: the derivative of the polynomial is exact.
-    found = HeightResponse(np.random.default_rng(4).normal(0.0, 0.01, (5, 9, 3)))
-    heights = np.random.default_rng(5).uniform(-20.0, 20.0, 9) * UM
+    found = HeightResponse(np.random.default_rng(4).normal(0.0, 0.01, (5, 9, 3)), 7 * UM)
+    heights = np.random.default_rng(5).uniform(-13.0, 27.0, 9) * UM
     step = 0.01 * UM
     near, far = ((found.at(heights + k * step) - found.at(heights - k * step)) / (2 * k * step) for k in (1, 2))
     # Richardson leaves (step / 25 um)^4; rounding is 1e-16 / 1e-8 m of slopes of 1e3 / m.
@@ -73,13 +73,25 @@ def test_slopes_are_those_of_differences():
 
 
 @pytest.mark.long
-def test_columns_are_differences_of_the_engine(instrument, plane):
+def test_heights_far_from_zero_have_a_range_of_their_own(instrument, plane):
+    fields = instrument.fields(stars(plane, 8, 9))
+    found = HeightResponse.of(instrument, fields, plane, None, center=30 * UM)
+    truth = instrument.shapes(fields, level_plane(plane, 41 * UM), None)
+    # 16 um beyond the range about zero; the bound is that of the nodes, as above.
+    np.testing.assert_allclose(found.at(np.full(8, 41 * UM)), truth, atol=2e-4)
+    about_zero = HeightResponse.of(instrument, fields, plane, None)
+    assert np.abs(about_zero.at(np.full(8, 41 * UM)) - truth).max() > 2e-3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("center", [0.0, 11 * UM])
+def test_columns_are_differences_of_the_engine(instrument, plane, center):
     xy = stars(plane, 60, 6)
     fields = instrument.fields(xy)
-    found = ExposureResponse.of(instrument, fields, plane, None, 0.0)
+    found = ExposureResponse.of(instrument, fields, plane, None, 0.0, center=center)
     radius = np.hypot(*fields.T).max()
     assert found.radius == radius
-    height = 8 * UM
+    height = center + 8 * UM
     columns = found.columns(fields, np.full(60, height))
     assert columns.shape == (60, 3 * len(NOLL) + 1, 3)
     level = level_plane(plane, height)
@@ -105,10 +117,11 @@ def test_columns_are_differences_of_the_engine(instrument, plane):
 
 def test_columns_are_linear_between_the_levels_and_along_the_field():
     rng = np.random.default_rng(7)
-    found = ExposureResponse(rng.normal(0.0, 1.0, (len(NOLL) + 1, 2, 10, 3)), 0.03)
+    found = ExposureResponse(rng.normal(0.0, 1.0, (len(NOLL) + 1, 2, 10, 3)), 0.03, 5 * UM)
     fields = rng.uniform(-0.02, 0.02, (11, 2))
-    low, middle, high = (found.columns(fields, np.full(11, h * UM)) for h in (-8.0, 2.0, 8.0))
+    low, middle, high = (found.columns(fields, np.full(11, h * UM)) for h in (-3.0, 7.0, 13.0))
     np.testing.assert_allclose(middle, low + (10.0 / 16.0) * (high - low), atol=1e-12)
+    np.testing.assert_allclose(found.height_slopes(fields), (high - low) / (16.0 * UM), rtol=1e-10, atol=1e-6)
     n = len(NOLL)
     # Slopes along the field are the terms on the axis times the field.
     np.testing.assert_allclose(low[:, n : 2 * n], low[:, :n] * (fields[:, 0] / 0.03)[:, None, None], atol=1e-13)
