@@ -82,7 +82,7 @@ def test_a_fit_that_was_stopped_goes_on(both, fit, monkeypatch):
     def never(self):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(ExposureFit, "block_equations", never)
+    monkeypatch.setattr(ExposureFit, "linearise", never)
     again = fit([0, 1], folder=folder)
     assert again.covariance.tobytes() == first.covariance.tobytes()
     np.testing.assert_array_equal(again.focal_plane.grid, first.focal_plane.grid)
@@ -96,7 +96,7 @@ def test_a_fit_goes_on_with_another_number_of_threads_of_blas(both, fit, monkeyp
     def never(self):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(ExposureFit, "block_equations", never)
+    monkeypatch.setattr(ExposureFit, "linearise", never)
     with threadpool_limits(2, user_api="blas"):
         fit([0, 1], folder=both[1])
 
@@ -109,7 +109,7 @@ def test_what_belongs_to_other_stars_or_is_damaged_is_computed_again(both, fit, 
     def never(self):
         raise InterruptedError
 
-    monkeypatch.setattr(ExposureFit, "block_equations", never)
+    monkeypatch.setattr(ExposureFit, "linearise", never)
     with pytest.raises(InterruptedError):
         fit([1, 0], folder=folder)
     (folder / "exposure_00000_step_0.npz").write_bytes(b"PK")
@@ -122,7 +122,7 @@ def test_files_of_another_telescope_are_computed_again(both, fit, exposures, mon
     def never(self):
         raise InterruptedError
 
-    monkeypatch.setattr(ExposureFit, "block_equations", never)
+    monkeypatch.setattr(ExposureFit, "linearise", never)
     moved = Instrument.of(lsst_r.perturbed("M2", shift=(1e-3, 0.0, 0.0)), wavelengths)
     with pytest.raises(InterruptedError):
         fit([0, 1], folder=both[1], instrument=moved)
