@@ -139,6 +139,7 @@ def main() -> None:
         "atmosphere": experiment.atmosphere,
         "pixel_size": experiment.pixel_size,
         "diffusion": experiment.diffusion,
+        "silicon": experiment.silicon,
         "jitter": experiment.jitter,
         "dispersion": experiment.dispersion,
         "budget": experiment.focal_plane.budget,

@@ -1,4 +1,4 @@
-"""What CCD heights do to the long-exposure PSF: FWHM against height, shear correlations with and without polynomials.
+"""Effect of CCD heights on the long-exposure PSF: FWHM against height, shear correlations before and after models.
 
 Run: python benchmarks/height_cost.py [--bands r y]
 

@@ -97,9 +97,9 @@ def one_run(folder):
     for key, of in (("stars", stars), ("holdout", truth)):
         of["u"], of["v"] = (np.stack([of["x"], of["y"]]) - camera.centers[ccds[key]].T) / camera.half_size
         dz[key] = 1e6 * plane.height(of["x"], of["y"])
-    means = np.array([dz["holdout"][ccds["holdout"] == c].mean() for c in range(len(camera)) if c in index])
-    mean = dict(zip(sorted(index), means, strict=True))
-    dz = {key: values - np.array([mean[c] for c in ccds[key]]) for key, values in dz.items()}
+    count = np.bincount(ccds["holdout"], minlength=len(camera))
+    mean = np.bincount(ccds["holdout"], dz["holdout"], len(camera)) / np.maximum(count, 1)
+    dz = {key: values - mean[ccds[key]] for key, values in dz.items()}
     values = np.stack([truth["e1"], truth["e2"], np.log(truth["size"])], axis=1)
     instrument = Instrument.of(
         experiment.telescope,
@@ -107,6 +107,7 @@ def one_run(folder):
         experiment.atmosphere,
         pixel_size=experiment.pixel_size,
         diffusion=experiment.diffusion,
+        silicon=experiment.silicon,
         jitter=experiment.jitter,
         weight_fwhm=experiment.weight_fwhm,
         dispersion=experiment.dispersion,
@@ -122,7 +123,8 @@ def one_run(folder):
     }
     names = [camera.ccd_names[c] for c in ccds["holdout"]]
     options = {"camera": camera, "components": 0, "wavelengths": experiment.wavelengths, "budget": None}
-    options |= {k: getattr(experiment, k) for k in ("atmosphere", "pixel_size", "diffusion", "jitter", "dispersion")}
+    shared = ("atmosphere", "pixel_size", "diffusion", "silicon", "jitter", "dispersion")
+    options |= {key: getattr(experiment, key) for key in shared}
     for label, heights in (("focal plane", None), ("focal plane, heights known", plane)):
         start = time.perf_counter()
         model = pachon.FocalPlanePsf.fit(table, experiment.telescope, heights, **options)

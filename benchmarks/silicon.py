@@ -1,4 +1,4 @@
-"""What silicon does to the PSF of the LSST, and what it costs.
+"""Effect of silicon on the PSF of the LSST, and its cost in computing time.
 
     python benchmarks/silicon.py
 

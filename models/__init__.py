@@ -1,1 +1,1 @@
-"""What exists: telescopes, surfaces, media, cameras, sites and their files. NumPy only, no Warp."""
+"""Physical models: telescopes, surfaces, media, cameras, sites and their files. NumPy only, no Warp."""

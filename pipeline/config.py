@@ -105,7 +105,7 @@ class FocalPlaneConfig(Section):
 
 
 class ActiveOpticsConfig(Section):
-    """What the active optics leaves uncorrected: an aberration of each visit (0.2 um in Jee & Tyson 2011)."""
+    """Residual aberration that active optics leaves in each visit (0.2 um in Jee & Tyson 2011)."""
 
     residual_um: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=2)] = Field(
         0.0, description="rms of the wavefront left over, over pupil and field [um]"
@@ -163,7 +163,7 @@ class PsfConfig(Section):
 
 
 class SensorConfig(Section):
-    """What the CCDs do to images of stars; all of it is off by default."""
+    """Sensor effects on images of stars; all are off by default."""
 
     brighter_fatter: Literal["itl", "e2v"] | None = Field(
         None, description="make of the CCDs, for the brighter-fatter effect on observed stars"

@@ -104,7 +104,7 @@ class NormalEquations:
 
 
 class BlockEquations(NamedTuple):
-    """What one block of stars adds to the normal equations."""
+    """Contribution of one block of stars to the normal equations."""
 
     used: np.ndarray  #: parameters that act on its stars, [m]
     matrix: np.ndarray  #: [m, m]

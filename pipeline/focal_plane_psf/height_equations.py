@@ -26,7 +26,7 @@ class ExposureState(NamedTuple):
 class HeightEquations(NamedTuple):
     """Normal equations of the heights: a sum over blocks of stars, less what the exposure's own parameters explain."""
 
-    blocks: list[BlockEquations]
+    blocks: list[tuple[np.ndarray, np.ndarray]]  #: parameters of each block [m], and its matrix [m, m]
     factor: np.ndarray  #: [n_height, n_exposure]: ``factor @ factor.T`` is to be subtracted
     vector: np.ndarray  #: [n_height]
     state: ExposureState
@@ -40,7 +40,7 @@ class HeightEquations(NamedTuple):
         heights = []
         for block in blocks:
             used, m = block.used[:-N_EXPOSURE], len(block.used) - N_EXPOSURE
-            heights.append(BlockEquations(used, block.matrix[:m, :m], block.vector[:m]))
+            heights.append((used, block.matrix[:m, :m]))
             cross[used] += block.matrix[:m, m:]
             vector[used] += block.vector[:m]
             own += block.matrix[m:, m:]
@@ -54,8 +54,8 @@ class HeightEquations(NamedTuple):
 
     def add_to(self, matrix: np.ndarray, vector: np.ndarray) -> None:
         """Add to the normal equations of all exposures."""
-        for block in self.blocks:
-            matrix[np.ix_(block.used, block.used)] += block.matrix
+        for used, part in self.blocks:
+            matrix[np.ix_(used, used)] += part
         with one_blas_thread():
             matrix -= self.factor @ self.factor.T
         vector += self.vector
@@ -63,9 +63,9 @@ class HeightEquations(NamedTuple):
     def write(self, path: Path, key: str) -> None:
         """Write a file, with a key of all that the equations were made of."""
         arrays: dict[str, Any] = {"factor": self.factor, "vector": self.vector, "exposure": self.state.exposure}
-        for i, block in enumerate(self.blocks):
-            arrays[f"block_used_{i}"] = block.used
-            arrays[f"block_matrix_{i}"] = block.matrix[np.tril_indices(len(block.used))]
+        for i, (used, part) in enumerate(self.blocks):
+            arrays[f"block_used_{i}"] = used
+            arrays[f"block_matrix_{i}"] = part[np.tril_indices(len(used))]
         for i, covariance in enumerate(self.state.covariances):
             for name, value in vars(covariance).items():
                 arrays[f"{name}_{i}"] = np.asarray(value)
@@ -88,8 +88,7 @@ class HeightEquations(NamedTuple):
                 used = kept[f"block_used_{i}"]
                 lower = np.zeros((len(used), len(used)))
                 lower[np.tril_indices(len(used))] = kept[f"block_matrix_{i}"]
-                # The right side of a block is in the vector of all.
-                blocks.append(BlockEquations(used, lower + np.tril(lower, -1).T, np.zeros(0)))
+                blocks.append((used, lower + np.tril(lower, -1).T))
             for i in range(sum(name.startswith("constant_") for name in kept.files)):
                 amplitude, matrix, ccd = (kept[f"{name}_{i}"] for name in ("amplitude", "matrix", "ccd"))
                 constant, nugget = float(kept[f"constant_{i}"]), float(kept[f"nugget_{i}"])

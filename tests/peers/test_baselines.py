@@ -1,4 +1,4 @@
-"""What the bundled baselines say that their figures were checked against: each claim, figure by figure.
+"""Each claim of the bundled baselines about the peer that their values were checked against.
 
 batoid traces the rays here; what is made of them is restated.
 """

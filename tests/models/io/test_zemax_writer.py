@@ -1,4 +1,4 @@
-"""What writing a telescope as a Zemax file makes of it, and what it refuses; rays are compared in test_zemax_rays."""
+"""Content of written Zemax files, and telescopes that are refused; rays are compared in test_zemax_rays."""
 
 from dataclasses import replace
 
