@@ -126,13 +126,12 @@ def draw_galaxies(
     """
     check_choice("way", way, WAYS)
     part = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
-    with one_blas_thread():
-        if way == "direct":
-            return _direct(galaxies, electrons, psf, wcs, part, noise, threads, progress)
-        margin = psf.stamp // 2 + 1
-        wide = part.grown(margin)
-        scene = _direct(galaxies, electrons, None, wcs, wide, noise, threads, progress)
-        return _convolved(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
+    if way == "direct":
+        return _direct(galaxies, electrons, psf, wcs, part, noise, threads, progress)
+    margin = psf.stamp // 2 + 1
+    wide = part.grown(margin)
+    scene = _direct(galaxies, electrons, None, wcs, wide, noise, threads, progress)
+    return _convolved(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
 
 
 def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float) -> np.ndarray:
@@ -209,7 +208,9 @@ def _direct(
     def drawn(block: tuple[np.ndarray, int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         own, size, basis = block
         spectrum = galaxies.transform(own, jacobians[own], pixels[own] - nearest[own], size, threads=1)
-        spectrum *= (amplitudes[own] @ basis).view(np.complex64).reshape(spectrum.shape)
+        with one_blas_thread():
+            kernel = amplitudes[own] @ basis
+        spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
         corners = nearest[own] - size // 2 - (window.x, window.y)
         return fft.irfft2(spectrum, s=(size, size), workers=1), corners
 
@@ -249,8 +250,9 @@ def _convolved(scene: np.ndarray, psf: PsfField, window: Window, threads: int | 
         amplitudes = psf.amplitudes(at).T.reshape(-1, _NODES, _NODES)
         along_x, along_y = (_interpolation(p, np.arange(n)) for p, n in zip(places, (width, height), strict=True))
         total = np.zeros((_TILE_GRID, _TILE_GRID // 2 + 1), dtype=np.complex64)
-        for table, component in zip(amplitudes, basis, strict=True):
-            field = (along_y @ table @ along_x.T).astype(np.float32)
+        with one_blas_thread():
+            maps = (along_y @ amplitudes @ along_x.T).astype(np.float32)
+        for field, component in zip(maps, basis, strict=True):
             total += fft.rfft2(tile * field, s=(_TILE_GRID, _TILE_GRID), workers=1) * component
         found = fft.irfft2(total, s=(_TILE_GRID, _TILE_GRID), workers=1)
         # What lies more than half of the spread before the tile has come round the other end of the grid.
