@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BeforeValidator, Field
@@ -31,6 +31,7 @@ from ..core.schema import (
 from ..core.yaml_reader import read_mapping
 
 BandName = Literal["u", "g", "r", "i", "z", "y"]
+_Model = TypeVar("_Model", bound=Section)
 
 
 class StarsConfig(Section):
@@ -247,7 +248,7 @@ def load_configuration(path: Path) -> Configuration:
     return configuration_of(read_mapping(path, ConfigError), str(path))
 
 
-def with_options(config: Configuration, **options: Any) -> Configuration:
+def with_options(config: _Model, **options: Any) -> _Model:
     """Return the configuration with command line options in place of its values; None leaves a value as it is.
 
     Options are named by dotted key, dots written as two underscores: ``stars__truth=50``.
@@ -262,7 +263,7 @@ def with_options(config: Configuration, **options: Any) -> Configuration:
         for section in sections:
             target = target[section]
         target[key] = value
-    return validated(Configuration, content, "command line")
+    return validated(type(config), content, "command line")
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
