@@ -137,6 +137,9 @@ from .raytrace.rays import RayStatus as RayStatus
 from .raytrace.rays import launch_rays as launch_rays
 from .raytrace.trace import TraceResult as TraceResult
 from .raytrace.trace import trace as trace
+from .sky.galaxies import Galaxies as Galaxies
+from .sky.population import GalaxyPopulation as GalaxyPopulation
+from .sky.population import draw_galaxies as draw_galaxies
 from .studies.baseline.baseline import check_baseline as check_baseline
 from .studies.baseline.baseline import make_baseline as make_baseline
 from .studies.baseline.check import BaselineCheck as BaselineCheck

@@ -59,13 +59,22 @@ def holdout_positions(experiment: Experiment, name: str) -> np.ndarray:
     return ccd_stars(experiment, name, _PROVISIONAL_FWHM).holdout
 
 
-def expose_positions(experiment: Experiment, positions: np.ndarray, threads: int | None = None) -> NoiseFreeStars:
+def expose_positions(
+    experiment: Experiment,
+    positions: np.ndarray,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+    *,
+    room: int = 0,
+    offsets: np.ndarray | None = None,
+) -> NoiseFreeStars:
     """Make noise-free PSFs at positions on the detector [m], shape [n, 2], of any CCDs.
 
-    The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel. DomainError if
-    no light reaches one of them.
+    The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel, or `offsets`
+    [pixel] from it; stamps are larger than those of the run by `room` pixels. DomainError if no light reaches one of
+    them.
     """
-    return _lit(_expose(experiment, positions, threads))
+    return _lit(_expose(experiment, positions, threads, progress, room=room, offsets=offsets))
 
 
 def expose_ccd(

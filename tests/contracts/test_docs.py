@@ -65,7 +65,7 @@ def test_pictures_and_links_are_there(name):
 
 @pytest.mark.parametrize("name", PAGES)
 def test_files_named_in_pages_exist(name):
-    folders = "tests|models|raytrace|wavefront|design|pipeline|studies|commands|core|benchmarks|docs"
+    folders = "tests|models|raytrace|wavefront|design|sky|pipeline|imaging|studies|commands|core|benchmarks|docs"
     for path in re.findall(rf"`(?:python |pytest (?:-m slow )?)?((?:{folders})/[\w./]+)", PAGES[name]):
         assert (DOCS.parent / path).exists(), path
 

@@ -1,0 +1,89 @@
+"""The command ``pachon images``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from .interrupt import interruptible
+from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
+from .tables import Rows, print_json
+
+app = typer.Typer()
+
+#: Settings of --quick: the mean over all turbulence, the middle of a CCD, galaxies that a few minutes would show.
+_QUICK = {"run__psf__engine": "long_exposure", "galaxies__faintest": 26.0, "image__side": 1024}
+
+
+@app.command("images")
+def images_command(
+    config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    ccds: Ccds = None,
+    raft: Raft = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder of the images.")] = Path("pachon_images"),
+    exposures: Annotated[int | None, Option(min=1, help="Exposures of the run's time that are summed.")] = None,
+    way: Annotated[
+        str | None, Option(help="direct: each galaxy under its own PSF; eigen: the image, component by component.")
+    ] = None,
+    noise: Annotated[bool | None, Option("--noise/--no-noise", help="With noise, or the expected image.")] = None,
+    faintest: Annotated[float | None, Option(help="Faintest galaxy [AB mag].")] = None,
+    seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
+    quick: Annotated[
+        bool, Option("--quick", help="The middle of each CCD, galaxies to magnitude 26, long-exposure PSF: seconds.")
+    ] = False,
+    resume: Annotated[bool, Option("--resume", help="Keep the CCDs that are finished, draw the others.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Make FITS images of the sky as a telescope sees it: galaxies and stars under the PSF of a run, with noise.
+
+    Without a configuration: r band of the LSST, 15 s, all galaxies to magnitude 29, the nine CCDs of `pachon run`.
+
+    Each CCD gets image_CCD.fits (image, variance, mask, world coordinates, table of all objects), a picture of it, and
+    cutouts_CCD.png: the middle in one exposure, in 6000 s and without noise. images.yaml has every default written out.
+
+    **Examples**
+
+    - `pachon images --ccds R22_S11 --quick`: a first look, within seconds
+    - `pachon images --ccds R22_S11`: one whole CCD, a minute on two cores
+    - `pachon images --ccds R22_S11 --exposures 400 -o deep`: 400 exposures of 15 s
+    - `pachon images --ccds R22_S11 --no-noise --way eigen -o expected`
+    - `pachon images my_images.yaml -o field --resume`: go on where it was stopped
+
+    my_images.yaml may read
+
+        run: {band: i, ccds: [R22], seed: 7}     # or the path of a run's configuration
+        pointing: {ra_deg: 53.1, dec_deg: -27.8, position_angle_deg: 30}
+        galaxies: {faintest: 27}                 # or {catalogue: galaxies.ecsv}, {mosaic: udf.fits}
+        image: {exposures: 100, gain: 1.6, sky_mag: 20.8}
+    """
+    from ..imaging.config import ImagesConfig, load_images_configuration
+    from ..imaging.simulate import simulate_images
+    from ..pipeline.config import with_options
+
+    base = ImagesConfig() if config is None else load_images_configuration(config)
+    options = {
+        "run__ccds": one_name_list(ccds=ccds, raft=raft),
+        "run__seed": seed,
+        "image__exposures": exposures,
+        "image__way": way,
+        "image__noise": noise,
+        "galaxies__faintest": faintest,
+    }
+    settings = with_options(with_options(base, **(_QUICK if quick else {})), **options)
+    experiment = settings.experiment(None if config is None else config.parent)
+    with interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter:
+        result = simulate_images(
+            settings, out, experiment=experiment, resume=resume, threads=threads, reporter=reporter
+        )
+    images = {name: str(path.resolve()) for name, path in result.images.items()}
+    if as_json:
+        print_json({"images": images, "objects": result.objects, "kept": list(result.kept)})
+    elif not quiet:
+        rows = [(name, str(result.objects.get(name, "kept"))) for name in images]
+        Rows(("CCD", "objects"), rows, "Stars and galaxies whose centres lie on the image.").show()
+        print(f"images: {out.resolve()}")

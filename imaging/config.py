@@ -1,0 +1,144 @@
+"""Configuration of images: a run, a pointing, galaxies, and how the images are exposed.
+
+::
+
+    run: {band: r, ccds: [R22_S11], seed: 3}       # a run's configuration, or the path of its file
+    pointing: {ra_deg: 53.1, dec_deg: -27.8, position_angle_deg: 30}
+    galaxies: {faintest: 27}
+    image: {exposures: 400, way: direct}
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BeforeValidator, Field
+
+from ..core.errors import ConfigError, error_context
+from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
+from ..core.yaml_reader import read_mapping
+from ..pipeline.config import Configuration, configuration_of, digest, with_options
+from ..pipeline.experiment import Experiment
+
+#: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
+PSF_STAMP = 63
+
+_Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=-90, le=90)]
+
+
+class PointingConfig(Section):
+    """Where the telescope looks."""
+
+    ra_deg: Real = Field(0.0, description="right ascension of the optical axis [deg]")
+    dec_deg: _Declination = Field(0.0, description="declination of the optical axis [deg]")
+    position_angle_deg: Real = Field(0.0, description="of the telescope's +y, from north through east [deg]")
+
+
+class GalaxiesConfig(Section):
+    """Which galaxies there are."""
+
+    faintest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=15, le=30)] = Field(
+        29.0, description="faintest galaxy [AB mag]"
+    )
+    brightest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=10, le=30)] = Field(
+        20.0, description="brightest galaxy of the population [AB mag]"
+    )
+    density: Positive = Field(1.0, description="factor of the counts of the population")
+    catalogue: str | None = Field(None, description="path of a catalogue in place of the population")
+    mosaic: str | None = Field(None, description="path of a FITS mosaic, whose galaxies are planted at random places")
+
+
+class ImageConfig(Section):
+    """How images are drawn and exposed."""
+
+    exposures: Count = Field(1, description="exposures that are summed, all of one PSF")
+    noise: Switch = Field(True, description="false for the expected image")
+    gain: Positive = Field(1.0, description="electrons of one ADU")
+    sky_mag: Real | None = Field(None, description="sky [AB mag/arcsec^2]; the dark sky of the band by default")
+    subtract_background: Switch = Field(True, description="subtract the expected sky and dark current")
+    way: Literal["direct", "eigen"] = Field(
+        "direct", description="direct (each galaxy under its own PSF), eigen (whole image, component by component)"
+    )
+    interpolation: Literal["polynomial", "gp"] = Field("polynomial", description="of the PSF over the CCD")
+    side: Annotated[int, Field(strict=True, ge=64)] | None = Field(
+        None, description="only the central square of a CCD [pixel]; by default all of it"
+    )
+    preview: Switch = Field(True, description="a PNG of each CCD")
+    cutouts: Switch = Field(True, description="a PNG of 100 arcsec at the exposure time, at 6000 s, and without noise")
+
+
+class ImagesConfig(Section):
+    """All that decides images."""
+
+    run: Configuration = Configuration()
+    pointing: PointingConfig = PointingConfig()
+    galaxies: GalaxiesConfig = GalaxiesConfig()
+    image: ImageConfig = ImageConfig()
+
+    def experiment(self, folder: Path | None = None) -> Experiment:
+        """Return the experiment of the run; relative paths in its configuration start from `folder`."""
+        run = self.run
+        if run.psf.stamp is None:
+            run = with_options(run, psf__stamp=PSF_STAMP)
+        with error_context(key="run"):
+            return Experiment.from_config(run, folder)
+
+    def resolved(self, experiment: Experiment) -> ImagesConfig:
+        """Return the configuration with that of the experiment, every default filled in, for its run."""
+        return self.model_copy(update={"run": experiment.config})
+
+    def digest(self, experiment: Experiment) -> str:
+        """SHA-256 of all settings that affect the image of a CCD; files count by their content."""
+        content = self.model_dump(mode="json", exclude={"run"})
+        for key in ("catalogue", "mosaic"):
+            path = content["galaxies"][key]
+            if path is not None:
+                content["galaxies"][key] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        for key in ("preview", "cutouts"):
+            del content["image"][key]
+        return digest({"run": experiment.config_hash, **content})
+
+    def to_yaml(self) -> str:
+        """Return the configuration as a YAML file."""
+        content = self.model_dump(mode="json", by_alias=True)
+        return "# All that decides these images.\n" + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def load_images_configuration(path: Path) -> ImagesConfig:
+    """Read a configuration of images, and that of the run that it names.
+
+    Raises
+    ------
+    ConfigError
+        If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
+    """
+    content = read_mapping(path, ConfigError)
+    run: Any = content.get("run")
+    if isinstance(run, str):
+        content = {**content, "run": read_mapping(path.parent / run, ConfigError)}
+    elif isinstance(run, dict):
+        configuration_of(run, f"{path}, run")
+        content = {**content, "run": {**run, "ccds": [run["ccds"]]}} if isinstance(run.get("ccds"), str) else content
+    config = validated(ImagesConfig, content, str(path))
+    with error_context(file=path):
+        return with_files(config, path.parent)
+
+
+def with_files(config: ImagesConfig, folder: Path) -> ImagesConfig:
+    """Return the configuration with absolute paths of the files of galaxies, which must be there."""
+    galaxies = config.galaxies
+    given = {key: path for key in ("catalogue", "mosaic") if (path := getattr(galaxies, key)) is not None}
+    if len(given) > 1:
+        raise ConfigError("galaxies.catalogue and galaxies.mosaic: expected one of them")
+    if galaxies.brightest >= galaxies.faintest:
+        raise ConfigError(
+            f"galaxies.faintest = {galaxies.faintest:g}: expected more than galaxies.brightest = {galaxies.brightest:g}"
+        )
+    for key, path in given.items():
+        given[key] = str((folder / path).resolve())
+        if not Path(given[key]).is_file():
+            raise ConfigError(f"galaxies.{key} = {path}: no such file", key=f"galaxies.{key}")
+    return config.model_copy(update={"galaxies": galaxies.model_copy(update=given)})

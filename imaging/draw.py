@@ -1,0 +1,275 @@
+"""Noise-free images of galaxies and stars on a CCD, in electrons.
+
+Galaxies are drawn in one of two ways. ``direct``: each by itself, the product of its own Fourier transform and that of
+the PSF at its place. ``eigen``, as in Jee & Tyson 2011, sec. 5: one seeing-free image of all of them, multiplied by the
+map of each amplitude of the PSF and convolved with the component of that amplitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Protocol
+
+import numpy as np
+from scipy import fft
+
+from ..core.errors import check_choice
+from ..core.threads import one_blas_thread, thread_count
+from .psf_field import PsfField
+from .wcs import CcdWcs
+
+WAYS = ("direct", "eigen")
+#: Pixels along a side of the grid of a galaxy.
+SIZES = (32, 48, 64, 96, 128, 192, 256, 384, 512)
+#: Largest light of a galaxy beyond its grid, where it wraps round, in rms of the noise of a pixel.
+_WRAPPED = 0.01
+#: Numbers of a block of galaxies: 8 MB in single precision, so that it stays in the cache of a processor.
+_BLOCK = 2**21
+#: rms width of the Gaussian that the seeing-free image is convolved with, and the PSF deconvolved by [pixel]. Without
+#: it, galaxies smaller than a pixel would ring through the whole image.
+_SOFTENING = 0.6
+#: Side of a tile of the seeing-free image and of the grid that it is convolved on [pixel].
+_TILE, _TILE_GRID = 480, 576
+#: Points along a side of a tile at which amplitudes are evaluated: exact for polynomials up to the sixth order.
+_NODES = 7
+
+
+class Sources(Protocol):
+    """Galaxies that can be drawn, such as :class:`pachon.Galaxies`."""
+
+    xi: np.ndarray
+    eta: np.ndarray
+    magnitude: np.ndarray
+    radius: np.ndarray
+
+    def __len__(self) -> int: ...
+
+    def transform(
+        self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None
+    ) -> np.ndarray:
+        """Return the Fourier transforms of galaxies of unit flux, complex64 [k, size, size // 2 + 1]."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Rectangle of pixels of a CCD; the first one is (x, y)."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of an image of it."""
+        return self.height, self.width
+
+    def contains(self, pixels: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Return whether pixels [n, 2] lie in it, or at most a margin [pixel] outside."""
+        low = np.array([self.x, self.y]) - 0.5 - margin
+        high = low + (self.width, self.height) + 2.0 * margin
+        return ((pixels >= low) & (pixels < high)).all(axis=1)
+
+    def grown(self, margin: int) -> Window:
+        """Return the window larger by a margin on all sides."""
+        return Window(self.x - margin, self.y - margin, self.width + 2 * margin, self.height + 2 * margin)
+
+
+def draw_galaxies(
+    galaxies: Sources,
+    electrons: np.ndarray,
+    psf: PsfField,
+    wcs: CcdWcs,
+    *,
+    window: Window | None = None,
+    noise: float = 1.0,
+    way: str = "direct",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> np.ndarray:
+    """Draw galaxies under the PSF of their places.
+
+    Parameters
+    ----------
+    galaxies : Galaxies
+        Galaxies about the pointing of `wcs`, on the CCD or near it.
+    electrons : ndarray, shape [n]
+        Electrons of each in the image.
+    psf : PsfField
+        PSF of the CCD.
+    wcs : CcdWcs
+        World coordinates of the CCD.
+    window : Window, optional
+        Part of the CCD to draw; all of it by default.
+    noise : float
+        rms noise of a pixel [electron], a hundredth of which is the error allowed where a galaxy's light leaves its
+        grid.
+    way : {"direct", "eigen"}
+        How galaxies are convolved.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    progress : callable, optional
+        Called with the number of galaxies drawn since the last call.
+
+    Returns
+    -------
+    ndarray of float32, shape [ny, nx]
+        Electrons.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such way.
+    """
+    check_choice("way", way, WAYS)
+    part = Window(0, 0, wcs.shape[1], wcs.shape[0]) if window is None else window
+    if way == "direct":
+        return _direct(galaxies, electrons, psf, wcs, part, noise, threads, progress)
+    margin = psf.stamp // 2 + 1
+    wide = part.grown(margin)
+    scene = _direct(galaxies, electrons, None, wcs, wide, noise, threads, progress)
+    return _convolved(scene, psf, wide, threads)[margin:-margin, margin:-margin].copy()
+
+
+def grid_sizes(electrons: np.ndarray, radius: np.ndarray, profile: np.ndarray, noise: float) -> np.ndarray:
+    """Return the size of the grid of each galaxy: the first of :data:`SIZES` that holds its light, [n].
+
+    What lies beyond wraps round, so no light is lost. It is allowed where a de Vaucouleurs galaxy and a star of its
+    electrons are both fainter than a hundredth of the noise.
+
+    Parameters
+    ----------
+    electrons : ndarray, shape [n]
+        Electrons of each galaxy.
+    radius : ndarray, shape [n]
+        Half-light radii [pixel].
+    profile : ndarray
+        Largest value of the PSF beyond each number of pixels; zero after the last.
+    noise : float
+        rms noise of a pixel [electron].
+    """
+    chosen = np.full(len(electrons), SIZES[-1])
+    for size in reversed(SIZES[:-1]):
+        # A pixel of margin for the place of the galaxy between pixels.
+        edge = size // 2 - 1
+        star = profile[edge] if edge < len(profile) else 0.0
+        # Ciotti & Bertin 1999: I = L / (22.665 r^2) exp(-7.669 ((R/r)^(1/4) - 1)).
+        galaxy = np.exp(-7.669 * ((edge / radius) ** 0.25 - 1.0)) / (22.665 * radius**2)
+        chosen[electrons * np.maximum(star, galaxy) < _WRAPPED * noise] = size
+    return chosen
+
+
+def add_stamps(image: np.ndarray, stamps: np.ndarray, corners: np.ndarray) -> None:
+    """Add stamps [n, size, size] to an image, the first pixel of each at (x, y) of it, what lies outside cut off."""
+    low = np.maximum(corners, 0)
+    high = np.minimum(corners + stamps.shape[1], image.shape[::-1])
+    first, last = low - corners, high - corners
+    for stamp, (x0, y0), (x1, y1), (a, b), (c, d) in zip(stamps, low, high, first, last, strict=True):
+        if x0 < x1 and y0 < y1:
+            image[y0:y1, x0:x1] += stamp[b:d, a:c]
+
+
+def _direct(
+    galaxies: Sources,
+    electrons: np.ndarray,
+    psf: PsfField | None,
+    wcs: CcdWcs,
+    window: Window,
+    noise: float,
+    threads: int | None,
+    progress: Callable[[int], None] | None,
+) -> np.ndarray:
+    """Draw galaxies one by one under a PSF, or the softening Gaussian without one."""
+    image = np.zeros(window.shape, dtype=np.float32)
+    if not len(galaxies):
+        return image
+    pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
+    jacobians = wcs.jacobians(pixels)
+    radius = galaxies.radius * np.sqrt(np.abs(np.linalg.det(jacobians)))
+    profile = np.zeros(1) if psf is None else psf.profile()
+    sizes = grid_sizes(electrons, radius, profile, noise)
+    nearest = np.rint(pixels).astype(np.int64)
+    amplitudes = np.ones((len(pixels), 1)) if psf is None else psf.amplitudes(pixels)
+    amplitudes = (electrons[:, None] * amplitudes).astype(np.float32)
+
+    def blocks() -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
+        for size in SIZES:
+            # Those whose grid touches the window.
+            own = np.flatnonzero((sizes == size) & window.contains(pixels, 0.5 * size))
+            if len(own):
+                basis = _softening(size)[None] if psf is None else psf.transforms(size)
+                flat = np.ascontiguousarray(basis).view(np.float32).reshape(len(basis), -1)
+                count = max(1, _BLOCK // size**2)
+                yield from ((own[i : i + count], size, flat) for i in range(0, len(own), count))
+
+    def drawn(block: tuple[np.ndarray, int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        own, size, basis = block
+        spectrum = galaxies.transform(own, jacobians[own], pixels[own] - nearest[own], size, threads=1)
+        with one_blas_thread():
+            kernel = amplitudes[own] @ basis
+        spectrum *= kernel.view(np.complex64).reshape(spectrum.shape)
+        corners = nearest[own] - size // 2 - (window.x, window.y)
+        return fft.irfft2(spectrum, s=(size, size), workers=1), corners
+
+    workers, waiting = thread_count(threads), blocks()
+    with ThreadPoolExecutor(workers) as pool:
+        # A few blocks at a time, so that memory stays small; added in their order, so that no byte depends on threads.
+        while group := tuple(islice(waiting, 2 * workers)):
+            for stamps, corners in pool.map(drawn, group):
+                add_stamps(image, stamps, corners)
+                if progress is not None:
+                    progress(len(stamps))
+    return image
+
+
+def _softening(size: int, centred: bool = True) -> np.ndarray:
+    """Return the transform of the softening Gaussian, complex64 [size, size // 2 + 1], at pixel ``size // 2`` or 0."""
+    fy, fx = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)
+    gauss = np.exp(-2.0 * (np.pi * _SOFTENING) ** 2 * (fx**2 + fy**2))
+    shift = np.exp(-2j * np.pi * (fx + fy) * (size // 2)) if centred else 1.0
+    return (gauss * shift).astype(np.complex64)
+
+
+def _convolved(scene: np.ndarray, psf: PsfField, window: Window, threads: int | None) -> np.ndarray:
+    """Return a softened scene convolved with the PSF of each place, by overlapping tiles."""
+    basis = psf.transforms(_TILE_GRID) / _softening(_TILE_GRID, centred=False)
+    nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    # The grid is longer by what the PSF spreads, half of it on each side of the tile.
+    shift = _TILE_GRID // 2
+    image = np.zeros(scene.shape, dtype=np.float32)
+
+    def convolved(corner: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        x, y = corner
+        tile = scene[y : y + _TILE, x : x + _TILE]
+        height, width = tile.shape
+        places = [0.5 * n * (nodes + 1.0) - 0.5 for n in (width, height)]
+        at = np.stack(np.meshgrid(places[0] + x + window.x, places[1] + y + window.y), axis=-1).reshape(-1, 2)
+        amplitudes = psf.amplitudes(at).T.reshape(-1, _NODES, _NODES)
+        along_x, along_y = (_interpolation(p, np.arange(n)) for p, n in zip(places, (width, height), strict=True))
+        total = np.zeros((_TILE_GRID, _TILE_GRID // 2 + 1), dtype=np.complex64)
+        with one_blas_thread():
+            maps = (along_y @ amplitudes @ along_x.T).astype(np.float32)
+        for field, component in zip(maps, basis, strict=True):
+            total += fft.rfft2(tile * field, s=(_TILE_GRID, _TILE_GRID), workers=1) * component
+        found = fft.irfft2(total, s=(_TILE_GRID, _TILE_GRID), workers=1)
+        # What lies more than half of the spread before the tile has come round the other end of the grid.
+        spread = (_TILE_GRID - _TILE) // 2
+        return np.roll(found, (spread - shift, spread - shift), axis=(0, 1)), np.array([[x - spread, y - spread]])
+
+    corners = [(x, y) for y in range(0, scene.shape[0], _TILE) for x in range(0, scene.shape[1], _TILE)]
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        for found, corner in pool.map(convolved, corners):
+            add_stamps(image, found[None], corner)
+    return image
+
+
+def _interpolation(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the matrix of the polynomial through values at nodes, evaluated at points (Lagrange)."""
+    matrix = np.ones((len(points), len(nodes)))
+    for j, node in enumerate(nodes):
+        for other in np.delete(nodes, j):
+            matrix[:, j] *= (points - other) / (node - other)
+    return matrix

@@ -1,0 +1,175 @@
+"""Exposures of a noise-free scene: sky, dark current, Poisson and read noise, saturation, gain."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..core.errors import DomainError
+from ..core.random_streams import stream
+from ..core.threads import thread_count
+from ..core.units import require_positive
+from ..pipeline.simulate.photometry import (
+    DARK_CURRENT,
+    FULL_WELL,
+    PIXEL_SCALE,
+    READ_NOISE,
+    Band,
+    band_named,
+    sky_electrons_per_pixel,
+)
+
+#: Bit of the mask of a pixel that reaches the full well.
+SATURATED = 1
+#: Names of the bits of the mask, by their value.
+MASK_BITS = {SATURATED: "SATURATED"}
+#: Rows of a band of the image that has random numbers of its own.
+_ROWS = 128
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Settings of an image: the sum of exposures of one scene under one PSF.
+
+    Attributes
+    ----------
+    band : str
+        Filter, ``u`` to ``y``.
+    time : float
+        Time of one exposure [s].
+    exposures : int
+        Number of exposures.
+    gain : float
+        Electrons of one ADU.
+    sky : float or None
+        Brightness of the sky [AB mag/arcsec^2]; the dark sky of the band by default.
+    pixel_scale : float
+        Angle of a pixel [rad].
+    read_noise : float
+        rms of the read noise of one exposure [electron].
+    dark_current : float
+        [electron/s] of a pixel.
+    full_well : float
+        Electrons at which a pixel saturates in one exposure.
+    subtract_background : bool
+        Whether the expected sky and dark current are subtracted.
+    noise : bool
+        Whether there is noise; without it an image is the expected one.
+    """
+
+    band: str = "r"
+    time: float = 15.0
+    exposures: int = 1
+    gain: float = 1.0
+    sky: float | None = None
+    pixel_scale: float = PIXEL_SCALE
+    read_noise: float = READ_NOISE
+    dark_current: float = DARK_CURRENT
+    full_well: float = FULL_WELL
+    subtract_background: bool = True
+    noise: bool = True
+
+    def __post_init__(self) -> None:
+        band_named(self.band)
+        for name in ("time", "gain", "full_well", "pixel_scale"):
+            require_positive(getattr(self, name), name)
+        if self.exposures < 1:
+            raise DomainError(f"exposures = {self.exposures}: expected 1 or more")
+        for name in ("read_noise", "dark_current"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise DomainError(f"{name} = {getattr(self, name)}: expected a number that is not negative")
+        if self.sky is not None and not np.isfinite(self.sky):
+            raise DomainError(f"sky = {self.sky}: expected a finite brightness in AB mag/arcsec^2")
+        if self.background >= self.exposures * self.full_well:
+            raise DomainError(
+                f"sky = {self._brightness:.2f}: the background of {self.background / self.exposures:.0f} electrons fills "
+                f"the full well, {self.full_well:g} electrons; expected a fainter sky or a shorter exposure"
+            )
+
+    @property
+    def total_time(self) -> float:
+        """Time of all exposures [s]."""
+        return self.time * self.exposures
+
+    @property
+    def zero_point(self) -> float:
+        """AB magnitude of one ADU in the whole image."""
+        return self._band.zero_point + 2.5 * np.log10(self.total_time / self.gain)
+
+    @property
+    def background(self) -> float:
+        """Expected electrons of sky and dark current in a pixel."""
+        sky = sky_electrons_per_pixel(self.band, self.total_time, self.pixel_scale, sky=self.sky)
+        return sky + self.dark_current * self.total_time
+
+    @property
+    def noise_rms(self) -> float:
+        """rms noise of a pixel without sources [electron]."""
+        return float(np.sqrt(self.background + self.exposures * self.read_noise**2))
+
+    def electrons(self, magnitude: np.ndarray) -> np.ndarray:
+        """Return the electrons of sources of AB magnitudes above the atmosphere."""
+        return self.total_time * 10.0 ** (0.4 * (self._band.zero_point - np.asarray(magnitude, dtype=np.float64)))
+
+    @property
+    def _band(self) -> Band:
+        return band_named(self.band)
+
+    @property
+    def _brightness(self) -> float:
+        return self._band.dark_sky if self.sky is None else self.sky
+
+
+@dataclass(frozen=True, eq=False)
+class ExposedImage:
+    """An exposed image."""
+
+    image: np.ndarray  #: [ny, nx] ADU, float32
+    variance: np.ndarray  #: expected variance, ADU^2, float32
+    mask: np.ndarray  #: int16, bits of :data:`MASK_BITS`
+
+
+def expose(
+    scene: np.ndarray, exposure: Exposure, seed: int, *key: str | int, threads: int | None = None
+) -> ExposedImage:
+    """Expose a noise-free scene.
+
+    The sum of Poisson numbers is one, so all exposures are drawn at once. A pixel is clipped where its sum reaches as
+    many full wells; its charge does not bleed.
+
+    Parameters
+    ----------
+    scene : ndarray, shape [ny, nx]
+        Expected electrons of the sources in all exposures. Those below zero, from Fourier ringing, count as none in the
+        noise.
+    exposure : Exposure
+        Settings.
+    seed : int
+        Seed.
+    *key : str or int
+        Name of the random stream, such as those of CCD and visit. Bands of 128 rows have their own.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    """
+    image, variance = np.empty(scene.shape, dtype=np.float32), np.empty(scene.shape, dtype=np.float32)
+    mask = np.zeros(scene.shape, dtype=np.int16)
+    well, gain = exposure.exposures * exposure.full_well, exposure.gain
+    read = exposure.exposures * exposure.read_noise**2
+    level = exposure.background if exposure.subtract_background else 0.0
+
+    def fill(band: int) -> None:
+        rows = slice(band * _ROWS, (band + 1) * _ROWS)
+        collected = scene[rows].astype(np.float64) + exposure.background
+        variance[rows] = (np.maximum(collected, 0.0) + read) / gain**2
+        if exposure.noise:
+            random = stream(seed, "image noise", *key, band)
+            collected = random.poisson(np.maximum(collected, 0.0)).astype(np.float64)
+            collected += random.normal(0.0, np.sqrt(read), collected.shape)
+        mask[rows][collected >= well] |= SATURATED
+        image[rows] = (np.minimum(collected, well) - level) / gain
+
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        list(pool.map(fill, range(-(-scene.shape[0] // _ROWS))))
+    return ExposedImage(image, variance, mask)

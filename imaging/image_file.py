@@ -1,0 +1,122 @@
+"""FITS files of images of CCDs: image, variance, mask, world coordinates, table of objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from ..core.errors import ProductError
+from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
+from .exposure import MASK_BITS
+
+#: Columns of the table of objects: unit and description.
+OBJECT_COLUMNS = {
+    "ID": ("", "number of the object on this CCD"),
+    "X": ("pix", "place without turbulence, x, first pixel 0"),
+    "Y": ("pix", "place without turbulence, y, first pixel 0"),
+    "XI": ("rad", "tangent plane about the pointing, east"),
+    "ETA": ("rad", "tangent plane about the pointing, north"),
+    "RA": ("deg", "right ascension"),
+    "DEC": ("deg", "declination"),
+    "MAG": ("mag", "AB magnitude above the atmosphere"),
+    "FLUX": ("electron", "expected electrons in all exposures"),
+    "STAR": ("", "whether it is a star"),
+    "RADIUS": ("arcsec", "half-light radius; 0 of a star"),
+    "E1": ("", "(a - b)/(a + b) along xi; NaN where unknown"),
+    "E2": ("", "the same along xi = eta"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class CcdImage:
+    """Image of a CCD, or of a part of it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the CCD.
+    image : ndarray of float32, shape [ny, nx]
+        ADU.
+    variance : ndarray of float32, shape [ny, nx]
+        Expected variance [ADU^2].
+    mask : ndarray of int16, shape [ny, nx]
+        Bits of :data:`~pachon.imaging.exposure.MASK_BITS`.
+    header : astropy.io.fits.Header
+        World coordinates and cards of the exposure, such as EXPTIME, GAIN, FILTER, ZEROPNT, SKY.
+    objects : dict of str to ndarray
+        Columns of :data:`OBJECT_COLUMNS`.
+    stamp : Stamp or None
+        Origin.
+    """
+
+    name: str
+    image: np.ndarray
+    variance: np.ndarray
+    mask: np.ndarray
+    header: fits.Header
+    objects: dict[str, np.ndarray] = field(default_factory=dict)
+    stamp: Stamp | None = None
+
+    @property
+    def wcs(self) -> WCS:
+        """World coordinates as those of astropy."""
+        return WCS(self.header)
+
+    def write(self, path: str | Path) -> None:
+        """Write a FITS file, whole or not at all, with checksums; equal images give equal bytes.
+
+        Extensions IMAGE, VARIANCE, MASK and TRUTH. ``astropy.nddata.CCDData.read`` reads the image, and the others with
+        ``hdu_uncertainty="VARIANCE", hdu_mask="MASK"``. ProductError if it cannot be written.
+        """
+        image = fits.ImageHDU(np.asarray(self.image, dtype=np.float32), self.header, name="IMAGE")
+        variance = fits.ImageHDU(np.asarray(self.variance, dtype=np.float32), name="VARIANCE")
+        variance.header["BUNIT"] = ("adu2", "expected variance")
+        variance.header["UTYPE"] = "VarianceUncertainty"
+        mask = fits.ImageHDU(np.asarray(self.mask, dtype=np.int16), name="MASK")
+        for bit, name in MASK_BITS.items():
+            mask.header[f"MP_{name[:5]}"] = (bit.bit_length() - 1, f"number of the bit {name}")
+        columns: Columns = {key: (self.objects[key], *OBJECT_COLUMNS[key]) for key in OBJECT_COLUMNS}
+        cards = [("CCD", self.name, "name of the CCD")]
+        write_fits(Path(path), [image, variance, mask, table_hdu("TRUTH", columns)], self.stamp, cards)
+
+    @classmethod
+    def read(cls, path: str | Path) -> CcdImage:
+        """Read a file of :meth:`write`; ProductError if it is none, or damaged."""
+        hdus = read_fits(Path(path))
+        try:
+            primary, image, variance, mask, truth = (hdus[key] for key in (0, "IMAGE", "VARIANCE", "MASK", "TRUTH"))
+            stamp = _stamp(primary.header)
+            return cls(
+                primary.header["CCD"],
+                _native(image.data),
+                _native(variance.data),
+                _native(mask.data),
+                image.header,
+                {key: column(truth, key) for key in OBJECT_COLUMNS},
+                stamp,
+            )
+        except KeyError as error:
+            raise ProductError(f"no image of a CCD ({error.args[0]} is missing)", file=path) from None
+
+
+def is_whole(path: Path, stamp: Stamp) -> bool:
+    """Return whether there is an undamaged image of a CCD with a stamp."""
+    try:
+        return stamp.matches(read_fits(path)[0].header)
+    except ProductError:
+        return False
+
+
+def _stamp(header: Any) -> Stamp | None:
+    if "CONFHASH" not in header:
+        return None
+    return Stamp(header["CONFHASH"], header["SEED"], header["CREATOR"].removeprefix("pachon "))
+
+
+def _native(array: np.ndarray) -> np.ndarray:
+    return array.astype(array.dtype.newbyteorder("="))

@@ -1,0 +1,155 @@
+"""The PSF across one CCD, as noise-free PSFs of a run have it, and its Fourier transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import fft
+
+from ..pipeline.defaults import noise_free_components
+from ..pipeline.experiment import Experiment
+from ..pipeline.psf_model.model import PsfModel
+from ..pipeline.psf_model.polynomial import design_matrix
+from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
+
+
+#: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
+RIM = 40
+
+
+@dataclass(frozen=True, eq=False)
+class PsfField:
+    """PSF and lit fraction across one CCD of `pixels` x `pixels`; positions are pixels (x, y) of the CCD.
+
+    PSF = mean + sum over k of a_k(x, y) component_k (Jee & Tyson 2011, sec. 3). Polynomials are held constant from
+    :data:`RIM` pixels outside the CCD on.
+    """
+
+    model: PsfModel  #: its positions are pixels of the CCD
+    pixels: int  #: along a side of the CCD
+    lit: np.ndarray  #: coefficients of the polynomial of the lit fraction
+    lit_order: int  #: its order
+
+    @classmethod
+    def fit(
+        cls,
+        stamps: ArrayLike,
+        positions: ArrayLike,
+        pixels: int,
+        *,
+        lit_fraction: ArrayLike | None = None,
+        n_components: int | None = None,
+        order: int = 4,
+        interpolation: Literal["polynomial", "gp"] = "polynomial",
+    ) -> PsfField:
+        """Fit noise-free PSFs on one CCD.
+
+        Parameters
+        ----------
+        stamps : array
+            [n, ny, nx], odd numbers of pixels, the reference point of each at the centre of the middle pixel.
+        positions : array
+            [n, 2] pixels (x, y) of the CCD.
+        pixels : int
+            Pixels along a side of the CCD.
+        lit_fraction : array, optional
+            [n], part of the entrance pupil whose light arrives; 1 by default.
+        n_components, order, interpolation
+            As in :meth:`pachon.PsfModel.fit`; 20 components or one less than the PSFs.
+
+        Raises
+        ------
+        PachonError
+            As :meth:`pachon.PsfModel.fit`.
+        """
+        places = np.asarray(positions, dtype=np.float64)
+        extent = (-0.5, pixels - 0.5, -0.5, pixels - 0.5)
+        model = PsfModel.fit(
+            stamps,
+            places,
+            n_components=n_components,
+            order=order if interpolation == "polynomial" else 0,
+            interpolation=interpolation,
+            extent=extent,
+            clip_sigma=None,
+        )
+        light = np.ones(len(places)) if lit_fraction is None else np.asarray(lit_fraction, dtype=np.float64)
+        terms = design_matrix(places, extent, order)
+        return cls(model, pixels, np.linalg.lstsq(terms, light, rcond=None)[0], order)
+
+    @classmethod
+    def of_run(
+        cls,
+        experiment: Experiment,
+        ccd: str,
+        *,
+        interpolation: Literal["polynomial", "gp"] = "polynomial",
+        threads: int | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> PsfField:
+        """Fit the noise-free PSFs of a run at its holdout positions (``stars.truth``) on one CCD.
+
+        Their reference points are centred and not their centroids, so what turbulence moves is moved in the images too.
+        Components and order are those of the run, 20 and 4 by default; screens must have been made
+        (:meth:`~pachon.Experiment.screens`).
+        """
+        config, camera = experiment.config, experiment.camera
+        positions = holdout_positions(experiment, ccd)
+        psfs = expose_positions(experiment, positions, threads, progress=progress)
+        return cls.fit(
+            psfs.image.astype(np.float64),
+            to_pixel(experiment, ccd, positions),
+            camera.pixels,
+            lit_fraction=psfs.lit_fraction,
+            n_components=noise_free_components(config),
+            order=config.reconstruction.truth_order,
+            interpolation=interpolation,
+        )
+
+    @property
+    def stamp(self) -> int:
+        """Pixels along a side of the PSF's stamps."""
+        return self.model.mean.shape[0]
+
+    def amplitudes(self, positions: ArrayLike) -> np.ndarray:
+        """Return amplitudes of mean and components, shape [n, 1 + k]; the first is 1."""
+        found = self.model.amplitudes(self._on_ccd(positions))
+        return np.concatenate([np.ones((len(found), 1)), found], axis=1)
+
+    def lit_fraction(self, positions: ArrayLike) -> np.ndarray:
+        """Return the part of the entrance pupil whose light arrives, shape [n]."""
+        terms = design_matrix(self._on_ccd(positions), self.model.extent, self.lit_order)
+        return np.clip((terms * self.lit).sum(axis=1), 0.0, 1.0)
+
+    def transforms(self, size: int) -> np.ndarray:
+        """Return ``rfft2`` of mean and components, centred on pixel ``size // 2``: complex64 [1 + k, size, size//2+1].
+
+        What of a stamp lies beyond the grid wraps round, so that sums are kept.
+        """
+        images = np.concatenate([self.model.mean[None], self.model.components])
+        half = self.stamp // 2
+        at = (np.arange(self.stamp) - half + size // 2) % size
+        grid = np.zeros((len(images), size, size))
+        np.add.at(grid, (slice(None), at[:, None], at[None, :]), images)
+        return fft.rfft2(grid).astype(np.complex64)
+
+    def profile(self) -> np.ndarray:
+        """Return the largest value of the mean PSF beyond each distance from its middle pixel, [stamp // 2 + 1]."""
+        half = self.stamp // 2
+        y, x = np.indices(self.model.mean.shape) - half
+        beyond = np.maximum(abs(x), abs(y))
+        return np.array([self.model.mean[beyond >= r].max() for r in range(half + 1)])
+
+    def _on_ccd(self, positions: ArrayLike) -> np.ndarray:
+        return np.clip(np.atleast_2d(np.asarray(positions, dtype=np.float64)), -RIM, self.pixels + RIM)
+
+
+def to_pixel(experiment: Experiment, ccd: str, positions: np.ndarray) -> np.ndarray:
+    """Convert positions on the detector [m] to pixels of a CCD, the first pixel's centre at (0, 0)."""
+    camera = experiment.camera
+    center = camera.centers[camera.ccd_index(ccd)]
+    return (positions - center) / camera.pixel_size + 0.5 * (camera.pixels - 1)

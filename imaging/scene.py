@@ -1,0 +1,283 @@
+"""Noise-free scenes of CCDs: galaxies, stars and their table, ready to be exposed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.errors import ConfigError, DomainError
+from ..core.products import Stamp
+from ..core.units import ARCSEC
+from ..pipeline.experiment import Experiment
+from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
+from ..pipeline.simulate.photometry import effective_fwhm
+from .draw import SIZES, Sources, Window, add_stamps, draw_galaxies
+from .exposure import Exposure, expose
+from .image_file import CcdImage
+from .psf_field import PsfField, to_pixel
+from .wcs import CcdWcs, ccd_wcs
+
+#: Pixels by which stamps of stars are larger than those of the PSF: in sums of hundreds of exposures the wings of a
+#: star just below saturation stay above the noise that far out.
+STAR_ROOM = 64
+
+
+@dataclass(frozen=True, eq=False)
+class CcdScene:
+    """Noise-free scene of a CCD, or of a part of it."""
+
+    name: str  #: of the CCD
+    electrons: np.ndarray  #: expected electrons of the sources in all exposures, float32 [ny, nx]
+    objects: dict[str, np.ndarray]  #: columns of the table of objects
+    wcs: CcdWcs
+    window: Window  #: part of the CCD
+    exposure: Exposure
+    telescope: str
+    seed: int
+    epoch: int
+
+    def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
+        """Expose the scene, by other settings than its own if they are given; `threads` change no byte."""
+        settings = self.exposure if exposure is None else exposure
+        ratio = float(settings.electrons(0.0) / self.exposure.electrons(0.0))
+        scene = self.electrons if ratio == 1.0 else (self.electrons * ratio).astype(np.float32)
+        found = expose(scene, settings, self.seed, self.name, self.epoch, threads=threads)
+        header = self.wcs.to_header((self.window.x, self.window.y))
+        for key, value, comment in (
+            ("BUNIT", "adu", ""),
+            ("TELESCOP", self.telescope, "prescription"),
+            ("FILTER", settings.band, "band"),
+            ("EXPTIME", settings.total_time, "[s] all exposures together"),
+            ("NEXP", settings.exposures, "number of exposures"),
+            ("GAIN", settings.gain, "[electron/adu]"),
+            ("ZEROPNT", round(settings.zero_point, 6), "[mag] AB magnitude of 1 adu in EXPTIME"),
+            ("SKY", round(settings.background / settings.gain, 6), "[adu] background: sky and dark current"),
+            ("SKYSUB", settings.subtract_background, "whether the background is subtracted"),
+            ("RDNOISE", settings.read_noise, "[electron] rms of one exposure"),
+            ("SATURATE", settings.exposures * settings.full_well, "[electron] full well, all exposures"),
+            ("NOISE", settings.noise, "whether there is noise"),
+            ("SEED", self.seed, "seed of all random numbers"),
+            ("EPOCH", self.epoch, "number of the visit"),
+            ("CCDX0", self.window.x, "CCD column of the first pixel, from 0"),
+            ("CCDY0", self.window.y, "CCD row of the first pixel, from 0"),
+        ):
+            header[key] = (value, comment)
+        objects = self.objects if ratio == 1.0 else self.objects | {"FLUX": self.objects["FLUX"] * ratio}
+        return CcdImage(self.name, found.image, found.variance, found.mask, header, objects)
+
+
+def draw_ccd(
+    experiment: Experiment,
+    ccd: str,
+    galaxies: Sources | Callable[[tuple[float, float], tuple[float, float]], Sources],
+    *,
+    exposure: Exposure | None = None,
+    pointing: ArrayLike = (0.0, 0.0),
+    position_angle: ArrayLike = 0.0,
+    window: Window | None = None,
+    way: str = "direct",
+    interpolation: Literal["polynomial", "gp"] = "polynomial",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> CcdScene:
+    """Draw galaxies and the stars of a run on a CCD.
+
+    The PSF of galaxies is that of the run's noise-free PSFs (``stars.truth``), interpolated. Stars are those that the
+    run observes (``stars.observed``), each with its own noise-free PSF.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment with an atmosphere, its screens made (:meth:`~pachon.Experiment.screens`).
+    ccd : str
+        Name of the CCD.
+    galaxies : Galaxies or callable
+        Galaxies about the pointing, wherever they are; or a function that gives those with xi and eta in two ranges
+        [rad].
+    exposure : Exposure, optional
+        Band, depth and noise; by default those of the run, in one exposure.
+    pointing, position_angle
+        As in :func:`ccd_wcs`.
+    window : Window, optional
+        Part of the CCD; all of it by default.
+    way : {"direct", "eigen"}
+        How galaxies are convolved, as in :func:`~pachon.imaging.draw.draw_galaxies`.
+    interpolation : {"polynomial", "gp"}
+        Of the PSF between the noise-free ones.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    progress : callable, optional
+        Called with the number of PSFs and galaxies made since the last call.
+
+    Raises
+    ------
+    ConfigError
+        If the run has no atmosphere, without which PSFs are finer than pixels, or its pixels are not those of the
+        camera.
+    DomainError
+        If no light reaches the CCD, or the galaxies bury the sky.
+    """
+    config, camera = experiment.config, experiment.camera
+    if not np.isclose(experiment.pixel_size, camera.pixel_size) or not config.atmosphere.enabled:
+        raise ConfigError(
+            f"psf.pixel_um = {experiment.pixel_size * 1e6:g}, atmosphere.enabled = {str(config.atmosphere.enabled).lower()}: "
+            f"images expect pixels of {camera.pixel_size * 1e6:g} um and an atmosphere"
+        )
+    if exposure is None:
+        exposure = Exposure(config.band or "r", config.atmosphere.exposure_s)
+    part = Window(0, 0, camera.pixels, camera.pixels) if window is None else window
+    wcs = ccd_wcs(
+        experiment.telescope,
+        camera,
+        ccd,
+        pointing=pointing,
+        position_angle=position_angle,
+        wavelength=experiment.wavelengths[len(experiment.wavelengths) // 2],
+        threads=threads,
+    )
+    psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
+    if callable(galaxies):
+        galaxies = galaxies(*_sky_ranges(wcs, part.grown(SIZES[-1] // 2)))
+    pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
+    electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
+    own = part.contains(pixels)
+    _check_density(float(electrons[own].sum()), part, exposure)
+    image = draw_galaxies(
+        galaxies,
+        electrons,
+        psf,
+        wcs,
+        window=part,
+        noise=exposure.noise_rms,
+        way=way,
+        threads=threads,
+        progress=progress,
+    )
+    stars = _add_stars(image, experiment, ccd, psf, exposure, part, threads, progress)
+    tables = [
+        {
+            "PIXEL": stars["PIXEL"],
+            "SKY": wcs.to_sky(stars["PIXEL"]),
+            "MAG": stars["MAG"],
+            "FLUX": stars["FLUX"],
+            "STAR": np.ones(len(stars["MAG"]), dtype=bool),
+            **{key: np.zeros(len(stars["MAG"])) for key in ("RADIUS", "E1", "E2")},
+        },
+        {
+            "PIXEL": pixels[own],
+            "SKY": np.stack([galaxies.xi, galaxies.eta], axis=1)[own],
+            "MAG": galaxies.magnitude[own],
+            "FLUX": electrons[own],
+            "STAR": np.zeros(int(own.sum()), dtype=bool),
+            "RADIUS": galaxies.radius[own] / ARCSEC,
+            **{key: values[own] for key, values in zip(("E1", "E2"), ellipticities(galaxies), strict=True)},
+        },
+    ]
+    return CcdScene(
+        ccd,
+        image,
+        _objects({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs),
+        wcs,
+        part,
+        exposure,
+        experiment.telescope.name,
+        config.seed,
+        config.atmosphere.epoch,
+    )
+
+
+def ellipticities(galaxies: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return e1 and e2 of whole galaxies, from the second moments of their components' half-light ellipses.
+
+    Of a galaxy of one component they are its own; NaN of stamps, which have no components.
+    """
+    if not hasattr(galaxies, "component_radius"):
+        nothing = np.full(len(galaxies), np.nan)
+        return nothing, nothing
+    e, d = galaxies.e1 + 1j * galaxies.e2, galaxies.dx + 1j * galaxies.dy
+    size = galaxies.component_radius**2 / (1.0 - np.abs(e) ** 2)
+    trace = galaxies.fraction * (2.0 * size * (1.0 + np.abs(e) ** 2) + np.abs(d) ** 2)
+    spin = galaxies.fraction * (4.0 * size * e + d**2)
+    if not len(galaxies):
+        return np.zeros(0), np.zeros(0)
+    trace, spin = (np.add.reduceat(v, galaxies.first[:-1]) for v in (trace, spin))
+    # (Q11 - Q22 + 2i Q12) / (Q11 + Q22 + 2 sqrt(det Q)), where 4 det Q = trace^2 - |spin|^2.
+    whole = spin / (trace + np.sqrt(np.maximum(trace**2 - np.abs(spin) ** 2, 0.0)))
+    return whole.real, whole.imag
+
+
+def _add_stars(
+    image: np.ndarray,
+    experiment: Experiment,
+    ccd: str,
+    psf: PsfField,
+    exposure: Exposure,
+    window: Window,
+    threads: int | None,
+    progress: Callable[[int], None] | None,
+) -> dict[str, np.ndarray]:
+    """Add the observed stars of the run; return pixel, magnitude and electrons of those in the window."""
+    scale = exposure.pixel_scale
+    # Places do not depend on the magnitude limits, which follow from the width of the PSF and the vignetting.
+    width = effective_fwhm(psf.model.mean[None], scale)
+    provisional = ccd_stars(experiment, ccd, width)
+    pixels = to_pixel(experiment, ccd, provisional.observed)
+    lit = float(psf.lit_fraction(pixels).min())
+    if not lit > 0.0:
+        raise DomainError("no light reaches some stars: expected a CCD within the field of the telescope")
+    magnitude = ccd_stars(experiment, ccd, width, least_light=lit).magnitude
+    near = window.contains(pixels, 0.5 * (psf.stamp + STAR_ROOM))
+    pixels, magnitude = pixels[near], magnitude[near]
+    if not len(pixels):
+        return {"PIXEL": pixels, "MAG": magnitude, "FLUX": magnitude}
+    nearest = np.rint(pixels).astype(np.int64)
+    stars = expose_positions(
+        experiment, provisional.observed[near], threads, progress, room=STAR_ROOM, offsets=pixels - nearest
+    )
+    electrons = exposure.electrons(magnitude) * stars.lit_fraction
+    corners = nearest - stars.image.shape[1] // 2 - (window.x, window.y)
+    add_stamps(image, stars.image * electrons[:, None, None].astype(np.float32), corners)
+    own = window.contains(pixels)
+    return {"PIXEL": pixels[own], "MAG": magnitude[own], "FLUX": electrons[own]}
+
+
+def _check_density(electrons: float, window: Window, exposure: Exposure) -> None:
+    """Raise DomainError if galaxies are brighter than the sky behind them."""
+    mean = electrons / (window.width * window.height)
+    if mean > exposure.background:
+        raise DomainError(
+            f"galaxies of {mean:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected a lower density "
+            "or fainter galaxies"
+        )
+
+
+def _sky_ranges(wcs: CcdWcs, window: Window) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of xi and eta of a window."""
+    x, y = np.linspace(0.0, window.width, 9) + window.x, np.linspace(0.0, window.height, 9) + window.y
+    sky = wcs.to_sky(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    (xi0, eta0), (xi1, eta1) = sky.min(axis=0), sky.max(axis=0)
+    return (float(xi0), float(xi1)), (float(eta0), float(eta1))
+
+
+def _objects(table: dict[str, np.ndarray], wcs: CcdWcs) -> dict[str, np.ndarray]:
+    """Return the columns of the table of objects."""
+    celestial = np.rad2deg(wcs.to_celestial(table["SKY"]))
+    return {
+        "ID": np.arange(len(table["MAG"]), dtype=np.int32),
+        "X": table["PIXEL"][:, 0],
+        "Y": table["PIXEL"][:, 1],
+        "XI": table["SKY"][:, 0],
+        "ETA": table["SKY"][:, 1],
+        "RA": celestial[:, 0],
+        "DEC": celestial[:, 1],
+        **{key: table[key] for key in ("MAG", "FLUX", "STAR", "RADIUS", "E1", "E2")},
+    }
+
+
+def stamped(image: CcdImage, stamp: Stamp) -> CcdImage:
+    """Return an image with the stamp of its configuration."""
+    return replace(image, stamp=stamp)

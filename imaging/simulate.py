@@ -1,0 +1,197 @@
+"""Images of all CCDs of a configuration, in one folder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..core.errors import ConfigError, PachonError, ProductError, error_context
+from ..core.files import make_folder, write_bytes
+from ..core.memory import require_bytes
+from ..core.products import Stamp
+from ..core.progress import Reporter
+from ..pipeline.config import differences
+from ..pipeline.defaults import given
+from ..pipeline.experiment import Experiment
+from ..pipeline.memory import needed_bytes
+from ..sky.population import GalaxyPopulation
+from .config import ImagesConfig
+from .draw import Window
+from .exposure import Exposure
+from .image_file import is_whole
+from .preview import cutouts_png, preview_png
+from .scene import draw_ccd, stamped
+
+CONFIG_NAME = "images.yaml"
+#: Copies of a CCD's pixels that are held at once, in bytes a pixel: scene, image, variance, mask, and the file twice.
+_BYTES = 40
+
+
+@dataclass(frozen=True)
+class ImagesResult:
+    """Images of a configuration."""
+
+    folder: Path
+    images: dict[str, Path]  #: path of the image of each CCD
+    kept: tuple[str, ...]  #: CCDs that were finished before
+    computed: tuple[str, ...]  #: CCDs of this call
+    objects: dict[str, int]  #: number of objects on each CCD of this call
+
+
+def simulate_images(
+    config: ImagesConfig,
+    folder: Path,
+    *,
+    experiment: Experiment | None = None,
+    resume: bool = False,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> ImagesResult:
+    """Draw, expose and write the CCDs of a configuration.
+
+    Every file has the same bytes whenever and with however many threads it is made, whatever the other CCDs.
+
+    Parameters
+    ----------
+    config : ImagesConfig
+        Configuration.
+    folder : Path
+        Folder of the images, made where missing.
+    experiment : Experiment, optional
+        Experiment of the configuration, if it is made already.
+    resume : bool
+        Keep CCDs that are finished already.
+    threads : int, optional
+        Number of threads; all processors by default.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    PachonError
+        If the configuration does not hold together, the folder holds images of another one, or a file cannot be written.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    experiment = config.experiment() if experiment is None else experiment
+    resolved = config.resolved(experiment)
+    window, exposure = _window(config, experiment), _exposure(config, experiment)
+    galaxies = _galaxies(config, experiment)
+    require_bytes(needed_bytes(experiment, threads) + _BYTES * window.width * window.height, "images")
+    stamp = Stamp(config.digest(experiment), experiment.config.seed)
+    _claim(folder, resolved, resume=resume)
+    names = given(experiment.config.ccds)
+    paths = {name: folder / f"image_{name}.fits" for name in names}
+    kept = tuple(name for name in names if resume and is_whole(paths[name], stamp))
+    missing = [name for name in names if name not in kept]
+    objects: dict[str, int] = {}
+    if missing:
+        with experiment.screens(threads, reporter):
+            bar = reporter.stage(f"images of {len(missing)} CCDs", total=len(missing))
+            with bar as stage:
+                for i, name in enumerate(missing, start=1):
+                    objects[name] = _image(
+                        config, experiment, name, galaxies, exposure, window, stamp, paths[name], threads, stage.advance
+                    )
+                    stage.advance()
+                    stage.step(name, i, len(missing))
+    return ImagesResult(folder, paths, kept, tuple(missing), objects)
+
+
+def _image(
+    config: ImagesConfig,
+    experiment: Experiment,
+    name: str,
+    galaxies: Any,
+    exposure: Exposure,
+    window: Window,
+    stamp: Stamp,
+    path: Path,
+    threads: int | None,
+    check: Any,
+) -> int:
+    """Draw, expose and write one CCD; return its number of objects."""
+    pointing = config.pointing
+    try:
+        scene = draw_ccd(
+            experiment,
+            name,
+            galaxies,
+            exposure=exposure,
+            pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)),
+            position_angle=math.radians(pointing.position_angle_deg),
+            window=window,
+            way=config.image.way,
+            interpolation=config.image.interpolation,
+            threads=threads,
+            progress=lambda _: check(0),
+        )
+    except PachonError as error:
+        raise error.within(subject=f"CCD {name}") from None
+    image = stamped(scene.exposed(threads=threads), stamp)
+    if config.image.preview:
+        write_bytes(path.with_suffix(".png"), preview_png(image))
+    if config.image.cutouts:
+        write_bytes(path.with_name(f"cutouts_{name}.png"), cutouts_png(scene, threads=threads))
+    # Last, since it is what a run that goes on looks for.
+    image.write(path)
+    return len(scene.objects["ID"])
+
+
+def _window(config: ImagesConfig, experiment: Experiment) -> Window:
+    """Return the part of each CCD that is drawn."""
+    pixels, side = experiment.camera.pixels, config.image.side
+    if side is None:
+        return Window(0, 0, pixels, pixels)
+    if side > pixels:
+        raise ConfigError(f"image.side = {side}: expected at most {pixels}, the pixels of a CCD", key="image.side")
+    return Window((pixels - side) // 2, (pixels - side) // 2, side, side)
+
+
+def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
+    """Return depth and noise of the images."""
+    image = config.image
+    with error_context(key="image"):
+        return Exposure(
+            given(experiment.config.band),
+            experiment.config.atmosphere.exposure_s,
+            image.exposures,
+            gain=image.gain,
+            sky=image.sky_mag,
+            subtract_background=image.subtract_background,
+            noise=image.noise,
+        )
+
+
+def _galaxies(config: ImagesConfig, experiment: Experiment) -> Any:
+    """Return the galaxies of the configuration, or the function that draws those of a part of the sky."""
+    wanted = config.galaxies
+    with error_context(key="galaxies"):
+        population = GalaxyPopulation(wanted.faintest, experiment.config.seed, wanted.brightest, wanted.density)
+    return population.galaxies_in
+
+
+def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
+    """Make the folder, or check that its images are of the same configuration, and write images.yaml."""
+    make_folder(folder)
+    path, now = folder / CONFIG_NAME, config.model_dump(mode="json", by_alias=True)
+    if path.exists():
+        try:
+            before = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, yaml.YAMLError, UnicodeDecodeError):
+            raise ProductError(f"{folder} holds a {CONFIG_NAME} that cannot be read; choose another --out") from None
+        # No CCD depends on the others.
+        if resume and isinstance(before, dict) and isinstance(before.get("run"), dict):
+            before["run"]["ccds"] = now["run"]["ccds"]
+        found = differences(before, now) if isinstance(before, dict) else ["all"]
+        if found:
+            text = "; ".join(found[:3])
+            raise ProductError(f"{folder} holds images of another configuration ({text}); choose another --out")
+    elif left := sorted(folder.glob("image_*.fits")):
+        raise ProductError(f"{folder} holds {left[0].name} but no {CONFIG_NAME}; choose another --out")
+    for left_over in folder.glob(".*.partial"):
+        left_over.unlink(missing_ok=True)
+    write_bytes(path, config.to_yaml().encode())

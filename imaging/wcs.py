@@ -1,0 +1,274 @@
+"""World coordinates of a CCD: pixels, tangent plane and celestial coordinates, fitted to traced chief rays.
+
+The tangent plane is the gnomonic one about the pointing of the telescope, xi towards east and eta towards north. The
+source of light of slopes (tx, ty) lies the opposite way, at X = -tx, Y = -ty along the axes of the telescope. With the
+position angle rho of the telescope's +y, from north through east,
+
+    xi = X cos(rho) + Y sin(rho),    eta = -X sin(rho) + Y cos(rho).
+
+Headers are TAN, or TAN-SIP (Shupe et al. 2005, ASP Conf. 347, 491) with the pointing as reference point of all CCDs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+from numpy.polynomial.polynomial import polyder, polyval2d
+from numpy.typing import ArrayLike
+
+from ..core.errors import DomainError
+from ..core.units import ARCSEC, radians
+from ..models.camera.camera import Camera
+from ..models.telescope import Telescope
+from ..wavefront.chief_rays import fields_at
+
+#: Largest error of the fit at pixels between those of the fit [rad]. Catalogues are good to a few milliarcseconds.
+TOLERANCE = 3e-4 * ARCSEC
+#: Largest order that is tried.
+_MOST = 6
+#: Points along a side of the CCD at which chief rays are traced for the fit, and for its check.
+_FIT_POINTS, _CHECK_POINTS = 9, 14
+#: Steps of Newton's method from the inverse polynomial, which is good to a thousandth of a pixel.
+_NEWTON_STEPS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CcdWcs:
+    """World coordinates of a CCD.
+
+    Pixels (x, y) are those of arrays, ``image[y, x]``, the first pixel's centre at (0, 0); FITS headers count from 1.
+    With u = pixel - reference_pixel, (xi, eta) = cd (u + distortion(u)).
+
+    Attributes
+    ----------
+    pointing : tuple of float
+        Right ascension and declination of the optical axis [rad].
+    shape : tuple of int
+        Rows and columns of the CCD.
+    reference_pixel : ndarray, shape [2]
+        Pixel of the pointing, mostly far outside the CCD.
+    cd : ndarray, shape [2, 2]
+        d(xi, eta)/d(pixel) there [rad/pixel].
+    distortion, inverse : ndarray, shape [2, order + 1, order + 1]
+        SIP polynomials A, B and AP, BP; [axis, i, j] is the coefficient of u^i v^j.
+    error : float
+        Largest distance from traced chief rays, at pixels that are not those of the fit [rad].
+    """
+
+    pointing: tuple[float, float]
+    shape: tuple[int, int]
+    reference_pixel: np.ndarray
+    cd: np.ndarray
+    distortion: np.ndarray
+    inverse: np.ndarray
+    error: float
+
+    @property
+    def order(self) -> int:
+        """Order of the polynomials: 1 is TAN without SIP."""
+        return self.distortion.shape[1] - 1
+
+    def to_sky(self, pixels: ArrayLike) -> np.ndarray:
+        """Return (xi, eta) [rad], shape [n, 2], of pixels (x, y), shape [n, 2]."""
+        u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
+        return (u + _values(self.distortion, u)) @ self.cd.T
+
+    def to_pixel(self, sky: ArrayLike) -> np.ndarray:
+        """Return pixels (x, y), shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
+        target = np.atleast_2d(np.asarray(sky, dtype=np.float64)) @ np.linalg.inv(self.cd).T
+        u = target + _values(self.inverse, target)
+        for _ in range(_NEWTON_STEPS):
+            miss = target - u - _values(self.distortion, u)
+            u = u + np.linalg.solve(self._derivative(u), miss[..., None])[..., 0]
+        return u + self.reference_pixel
+
+    def jacobians(self, pixels: ArrayLike) -> np.ndarray:
+        """Return d(x, y)/d(xi, eta) [pixel/rad] at pixels, shape [n, 2, 2]."""
+        u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
+        return np.linalg.inv(self.cd @ self._derivative(u))
+
+    def to_celestial(self, sky: ArrayLike) -> np.ndarray:
+        """Return right ascension and declination [rad], shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
+        xi, eta = np.atleast_2d(np.asarray(sky, dtype=np.float64)).T
+        ra, dec = self.pointing
+        along = np.cos(dec) - eta * np.sin(dec)
+        alpha = ra + np.arctan2(xi, along)
+        delta = np.arctan2(np.sin(dec) + eta * np.cos(dec), np.hypot(xi, along))
+        return np.stack([alpha % (2.0 * np.pi), delta], axis=1)
+
+    def to_header(self, corner: tuple[int, int] = (0, 0)) -> fits.Header:
+        """Return the cards of a FITS image whose first pixel is the pixel (x, y) = `corner` of the CCD."""
+        header = fits.Header()
+        kind = "TAN" if self.order == 1 else "TAN-SIP"
+        header["WCSAXES"] = 2
+        header["CTYPE1"], header["CTYPE2"] = f"RA---{kind}", f"DEC--{kind}"
+        header["CUNIT1"] = header["CUNIT2"] = "deg"
+        header["RADESYS"] = "ICRS"
+        for i, key in enumerate("12"):
+            header[f"CRVAL{key}"] = (float(np.rad2deg(self.pointing[i])), "[deg] optical axis of the telescope")
+            header[f"CRPIX{key}"] = float(self.reference_pixel[i] - corner[i] + 1.0)
+            for j in range(2):
+                header[f"CD{key}_{j + 1}"] = float(np.rad2deg(self.cd[i, j]))
+        if self.order > 1:
+            for names, tables in ((("A", "B"), self.distortion), (("AP", "BP"), self.inverse)):
+                for name, table in zip(names, tables, strict=True):
+                    header[f"{name}_ORDER"] = self.order
+                    for i, j in _terms(self.order):
+                        if table[i, j]:
+                            header[f"{name}_{i}_{j}"] = float(table[i, j])
+        return header
+
+    def astropy(self, corner: tuple[int, int] = (0, 0)) -> WCS:
+        """Return the WCS of astropy, with the number of pixels of the CCD less those before `corner`."""
+        wcs = WCS(self.to_header(corner))
+        wcs.pixel_shape = (self.shape[1] - corner[0], self.shape[0] - corner[1])
+        return wcs
+
+    def _derivative(self, u: np.ndarray) -> np.ndarray:
+        """Return d(u + distortion)/du, shape [n, 2, 2]."""
+        derivative = np.empty((len(u), 2, 2))
+        for axis in range(2):
+            derivative[:, :, axis] = _values(np.stack([polyder(t, axis=axis) for t in self.distortion]), u)
+        return derivative + np.eye(2)
+
+
+def ccd_wcs(
+    telescope: Telescope,
+    camera: Camera,
+    ccd: str,
+    *,
+    pointing: ArrayLike = (0.0, 0.0),
+    position_angle: ArrayLike = 0.0,
+    wavelength: ArrayLike | None = None,
+    threads: int | None = None,
+) -> CcdWcs:
+    """Fit the world coordinates of a CCD to chief rays traced to its pixels.
+
+    The chief rays end on the nominal flat detector: the height of a CCD moves a star by a hundredth of an arcsecond at
+    most, and turbulence by more. The order is the lowest one that leaves less than :data:`TOLERANCE`.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope, its rotator included (:meth:`~pachon.Telescope.with_rotator`).
+    camera : Camera
+        The camera.
+    ccd : str
+        Name of the CCD.
+    pointing : array_like or Quantity, shape [2]
+        Right ascension and declination of the optical axis [rad].
+    position_angle : float or Quantity
+        Angle of the telescope's +y from north through east [rad].
+    wavelength : float or Quantity, optional
+        Vacuum wavelength [m]; the telescope's default if not given.
+    threads : int, optional
+        Number of threads; all processors by default.
+
+    Raises
+    ------
+    UnknownNameError
+        If the camera has no such CCD.
+    DomainError
+        If the pointing is no pair of finite angles with a declination up to 90 deg, or no polynomial is good enough.
+    """
+    angles, rho = radians(pointing, "pointing"), float(radians(position_angle, "position_angle"))
+    if angles.shape != (2,) or not np.isfinite(angles).all() or abs(angles[1]) > 0.5 * np.pi or not np.isfinite(rho):
+        raise DomainError(
+            f"pointing = {pointing}, position_angle = {position_angle}: expected finite right ascension and declination, "
+            "declination from -90 to 90 deg, and a finite angle"
+        )
+    center, pixels = camera.centers[camera.ccd_index(ccd)], camera.pixels
+    middle, half = 0.5 * (pixels - 1), 0.5 * pixels
+
+    def traced(points: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return places on the CCD, from -1 to 1 along both axes, and their (xi, eta)."""
+        # Chebyshev points: a polynomial through them errs about equally everywhere.
+        line = np.cos(np.pi * (np.arange(points) + 0.5) / points) / np.cos(0.5 * np.pi / points)
+        places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        positions = center + half * camera.pixel_size * places
+        slopes = fields_at(telescope, positions, wavelength, projection="gnomonic", threads=threads)
+        x, y = -slopes.T
+        return places, np.stack([x * np.cos(rho) + y * np.sin(rho), y * np.cos(rho) - x * np.sin(rho)], axis=1)
+
+    fit, check = traced(_FIT_POINTS), traced(_CHECK_POINTS)
+    for order in range(1, _MOST + 1):
+        linear, reference, distortion = _forward(*fit, order, half)
+        u = half * check[0] - reference
+        error = float(np.abs((u + _values(distortion, u)) @ linear.T - check[1]).max())
+        if error < TOLERANCE:
+            break
+    else:
+        raise DomainError(
+            f"CCD {ccd}: polynomials of order {_MOST} leave {error / ARCSEC:.2g} arcsec between pixels and sky; expected "
+            "a telescope whose images move smoothly with the field angle"
+        )
+    target = fit[1] @ np.linalg.inv(linear).T
+    offset = half * fit[0] - reference - target
+    inverse = _fitted(target, offset, order)
+    # Zero point and angles of the pointing modulo a turn: equal skies have equal headers.
+    return CcdWcs(
+        pointing=(float(angles[0] % (2.0 * np.pi)), float(angles[1])),
+        shape=(pixels, pixels),
+        reference_pixel=reference + middle,
+        cd=linear,
+        distortion=distortion,
+        inverse=inverse,
+        error=error,
+    )
+
+
+def _forward(
+    places: np.ndarray, sky: np.ndarray, order: int, half: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return linear part, reference pixel from the middle of the CCD, and distortion of a polynomial of an order."""
+    tables = _fitted(half * places, sky, order)
+    # The reference pixel is the root of the polynomial.
+    reference = np.zeros(2)
+    for _ in range(20):
+        at = _shifted(tables, reference)
+        reference = reference - np.linalg.solve(_linear(at), at[:, 0, 0])
+    tables = _shifted(tables, reference)
+    linear = _linear(tables)
+    distortion = np.einsum("ab,bij->aij", np.linalg.inv(linear), tables)
+    distortion[:, [0, 0, 1], [0, 1, 0]] = 0.0
+    return linear, reference, distortion
+
+
+def _linear(tables: np.ndarray) -> np.ndarray:
+    """Return the matrix of the linear terms of two polynomials."""
+    return np.stack([tables[:, 1, 0], tables[:, 0, 1]], axis=1)
+
+
+def _fitted(points: np.ndarray, values: np.ndarray, order: int) -> np.ndarray:
+    """Return the coefficients [2, order + 1, order + 1] of polynomials through values [n, 2] at points [n, 2]."""
+    # Scaled to [-1, 1] for the fit, and then expanded about the origin of the points.
+    middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
+    scale = 0.5 * np.ptp(points, axis=0).max()
+    s, t = ((points - middle) / scale).T
+    terms = _terms(order)
+    found = np.linalg.lstsq(np.stack([s**i * t**j for i, j in terms], axis=1), values, rcond=None)[0]
+    tables = np.zeros((2, order + 1, order + 1))
+    for (i, j), coefficient in zip(terms, found, strict=True):
+        tables[:, i, j] = coefficient / scale ** (i + j)
+    return _shifted(tables, -middle)
+
+
+def _shifted(tables: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return the coefficients of polynomials p(u + shift), by the binomial theorem."""
+    n = tables.shape[1]
+    x, y = (np.array([[comb(i, m) * d ** max(i - m, 0) for m in range(n)] for i in range(n)]) for d in shift)
+    return np.einsum("aij,im,jn->amn", tables, x, y)
+
+
+def _values(tables: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the values of two polynomials at points, shape [n, 2]."""
+    return np.stack([polyval2d(*u.T, table) for table in tables], axis=1)
+
+
+def _terms(order: int) -> list[tuple[int, int]]:
+    """Return the exponents (i, j) of the terms up to a total order."""
+    return [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]

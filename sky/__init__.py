@@ -1,0 +1,1 @@
+"""Galaxies on the sky: populations, catalogues, stamps of real mosaics, and their Fourier transforms."""

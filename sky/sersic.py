@@ -1,0 +1,83 @@
+"""Table of the Fourier transforms of Sersic profiles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import gammaincinv, loggamma
+
+from ..core.threads import one_blas_thread
+
+#: Range of the Sersic index, that of GalSim.
+LEAST_INDEX, GREATEST_INDEX = 0.3, 6.2
+# Steps of the table. Interpolation with four points each way is off by 4e-6 of the flux at most, at an index of 0.3,
+# whose transform oscillates.
+_INDICES = 48
+_WAVE_NUMBERS = 476
+# Below exp(-9) / radius the transform is 1 to 5e-7, beyond exp(10) / radius less than 3e-6.
+_LOG_WAVE_NUMBERS = (-9.0, 10.0)
+# Mellin-Barnes integral: real part of the path, step and end of the trapezoidal rule.
+_REAL, _STEP, _END = 1.0, 0.15, 80.0
+
+
+@dataclass(frozen=True)
+class SersicTable:
+    """Fourier transform of the untruncated Sersic profile of unit flux and half-light radius 1.
+
+    Steps are even in the logarithms of the Sersic index and of the wave number.
+    """
+
+    values: np.ndarray  #: [index, wave number], single precision
+    log_index: tuple[float, float]  #: of the first row, and step
+    log_wave_number: tuple[float, float]  #: of the first column, and step
+
+
+@lru_cache(maxsize=1)
+def sersic_table() -> SersicTable:
+    """Return the table, made once in a process."""
+    log_index = np.linspace(np.log(LEAST_INDEX), np.log(GREATEST_INDEX), _INDICES)
+    log_wave_number = np.linspace(*_LOG_WAVE_NUMBERS, _WAVE_NUMBERS)
+    return SersicTable(
+        values=sersic_transform(np.exp(log_index), np.exp(log_wave_number)).astype(np.float32),
+        log_index=(float(log_index[0]), float(log_index[1] - log_index[0])),
+        log_wave_number=(float(log_wave_number[0]), float(log_wave_number[1] - log_wave_number[0])),
+    )
+
+
+def sersic_transform(index: np.ndarray, wave_number: np.ndarray) -> np.ndarray:
+    """Compute Fourier transforms of Sersic profiles of unit flux and half-light radius 1.
+
+    The profile is exp(-b r^(1/n)) with half of its light within r = 1 (Sersic 1963; Ciotti & Bertin 1999, for b). With
+    the Mellin transforms of the profile, n b^(-n s) Gamma(n s), and of J0, 2^(s-1) Gamma(s/2) / Gamma(1 - s/2),
+    Parseval's formula for Mellin transforms gives its Hankel transform as
+
+        F(k) = 1/(2 pi i) int 2^(s-1) Gamma(s/2) / Gamma(1 - s/2) Gamma(n (2 - s)) / Gamma(2n) (b^n / k)^s ds
+
+    along Re s = 1. The integrand falls exponentially and has no singularity nearby, so that the trapezoidal rule is
+    accurate to 1e-12.
+
+    Parameters
+    ----------
+    index : ndarray, shape [n]
+        Sersic index.
+    wave_number : ndarray, shape [k]
+        Angular wave number times half-light radius, positive.
+
+    Returns
+    -------
+    ndarray, shape [n, k]
+    """
+    t = np.arange(0.0, _END, _STEP)
+    s = _REAL + 1j * t
+    n = np.asarray(index, dtype=np.float64)[:, None]
+    bessel = (s - 1.0) * np.log(2.0) + loggamma(0.5 * s) - loggamma(1.0 - 0.5 * s)
+    profile = loggamma(n * (2.0 - s)) - loggamma(2.0 * n) + s * n * np.log(gammaincinv(2.0 * n, 0.5))
+    # The integrand at -t is the complex conjugate of that at t.
+    weight = np.full(len(t), _STEP / np.pi)
+    weight[0] *= 0.5
+    integrand = np.exp(bessel + profile) * weight
+    power = np.exp(-np.outer(s, np.log(wave_number)))
+    with one_blas_thread():
+        return integrand.real @ power.real - integrand.imag @ power.imag
