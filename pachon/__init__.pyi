@@ -138,6 +138,7 @@ from .raytrace.rays import launch_rays as launch_rays
 from .raytrace.trace import TraceResult as TraceResult
 from .raytrace.trace import trace as trace
 from .sky.galaxies import Galaxies as Galaxies
+from .sky.mosaic import GalaxyStamps as GalaxyStamps
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
 from .studies.baseline.baseline import check_baseline as check_baseline
