@@ -86,8 +86,11 @@ def test_planted_galaxies_look_like_those_of_the_mosaic(mosaic, stamps):
     # Squares of five semi-major axes cut off what lies outside, detection some faint parts.
     assert np.all(alike > 0.985)
     assert np.any(mirrored < alike - 0.01)
-    # As much as a quarter of the light of a galaxy.
-    assert np.all(np.abs(stamps.magnitude[found] - galaxies.magnitude[wanted] - 0.12) < 0.15)
+    # They hold less of the light, squares of ten more of it; pieces taken for neighbours are missing in both.
+    lost = stamps.magnitude[found] - galaxies.magnitude[wanted]
+    assert np.all((lost > 0.0) & (lost < 0.35))
+    wider = np.sort(GalaxyStamps.from_mosaic(mosaic.path, side=10.0).magnitude)[:3] - galaxies.magnitude[wanted[:3]]
+    assert np.all((wider > 0.0) & (wider < lost[:3] - 0.02))
 
 
 def test_stars_are_left_out(mosaic, stamps):
