@@ -162,7 +162,8 @@ def _measured(
     window = np.where(np.isfinite(radius), radius, a) * _WINDOW
     wx, wy, failed = sep.winpos(data, found["x"], found["y"], window, mask=ignored)
     moved = np.hypot(wx - found["x"], wy - found["y"])
-    windowed = (failed == 0) & (moved < window)
+    # SEP's windows take in the light of neighbours.
+    windowed = (failed == 0) & (moved < window) & ((found["flag"] & sep.OBJ_MERGED) == 0)
     x, y = np.where(windowed, wx, found["x"]), np.where(windowed, wy, found["y"])
     flags = np.zeros(count, dtype=np.int32)
     flags[((found["flag"] & sep.OBJ_TRUNC) | (aperture_flags & sep.APER_TRUNC)) != 0] |= ObjectFlag.EDGE

@@ -269,9 +269,10 @@ def sum_normal_equations(
     Arguments: psf [template, kx, ky]: transforms at (kx, ky) and (kx, -ky), weighted for the sum over kx >= 0;
     templates, stamps [galaxy]: index of the PSF and of the stamp; step of the frequencies [1/pixel]; params [galaxy,
     6]: flux, x, y, Cxx, Cxy, Cyy from the centre of the stamp [pixel]; cosine, sine [frequency, packet]; data, weight
-    [stamp, y, packet of x], rows and columns above the centre first; spectrum [block * frequency]: work array; columns
-    [block * frequency, 6, y]: another, the same memory as packets and as numbers. Results: [galaxy] chi-square, sums of weight residual derivative (6), of weight derivative
-    derivative (21), both of the derivatives with respect to flux, x, y, Cxx, Cxy, Cyy.
+    [stamp, y, packet of x], rows and columns above the centre first; work arrays: spectrum [block * frequency], and
+    columns [block * frequency, 6, y], the same memory as packets and as numbers. Results: [galaxy] chi-square, sums of
+    weight residual derivative (6) and of weight derivative derivative (21), the derivatives being those with respect
+    to flux, x, y, Cxx, Cxy, Cyy.
     """
     item = first + wp.tid()
     count = cosine.shape[0]

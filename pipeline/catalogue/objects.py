@@ -34,8 +34,7 @@ class DetectedObjects:
     Parameters
     ----------
     x, y : array
-        Windowed centroids (barycentre of the isophote where the iteration failed), pixel centres at integers [pixel],
-        [n].
+        Windowed centroids, of blended objects barycentres of the isophote, pixel centres at integers [pixel], [n].
     flux, flux_error : array
         Flux in the elliptical Kron aperture, and its standard error, in the unit of the image.
     half_light_radius : array
@@ -43,7 +42,8 @@ class DetectedObjects:
     fwhm : array
         Full width at half maximum of the image as it is [pixel], as :func:`~.shapes.fwhm` defines it.
     a, b, theta : array
-        rms lengths of the axes of the isophote [pixel], and direction of the longer one from x towards y [rad].
+        rms lengths of the axes of the isophote [pixel], and direction of the longer one from x towards y [rad], on the
+        filtered image: the filter makes them longer, and rounder.
     peak : array
         Highest pixel.
     neighbour_distance : array

@@ -74,9 +74,9 @@ def shear_calibration(e1: ArrayLike, e2: ArrayLike, shear1: ArrayLike, shear2: A
     lines = []
     for e, g, name in zip(shapes, shears, ("shear1", "shear2"), strict=True):
         mean, true = e[whole].mean(axis=1), g[whole]
-        spread = ((true - true.mean()) ** 2).sum()
-        if not spread > 0.0:
+        if not np.ptp(true) > 0.0:
             raise DomainError(f"{name} = {true[0]:g} of all rings: expected at least two values")
+        spread = ((true - true.mean()) ** 2).sum()
         slope = ((true - true.mean()) * mean).sum() / spread
         level = mean.mean() - slope * true.mean()
         scatter = ((mean - level - slope * true) ** 2).sum() / (count - 2)

@@ -16,8 +16,8 @@ from .objects import DetectedObjects
 from .pixel_checks import check_pixels
 
 # The locus is the fullest interval of half-light radii of this relative width, and has at least so many times the
-# objects that intervals as wide have on its far side, up to this multiple of its radius: galaxies.
-_INTERVAL, _CONTRAST, _FAR_SIDE = 0.08, 2.0, (1.15, 1.75)
+# objects that intervals as wide have to either side of it, between these multiples of its radius.
+_INTERVAL, _CONTRAST, _SIDE = 0.08, 3.0, (1.15, 1.75)
 # Least width of the locus, relative: the PSF varies over a CCD.
 _LEAST_WIDTH = 0.01
 # Pixels around a stamp that keep what its shift wraps around away from it.
@@ -185,16 +185,17 @@ def _locus(radius: np.ndarray, least: int) -> tuple[float, float]:
     inside = np.searchsorted(ordered, ordered * (1.0 + _INTERVAL), side="right") - np.arange(len(ordered))
     first, count = int(inside.argmax()), int(inside.max())
     center, width = _robust(ordered[first : first + count])
-    far = np.log(_FAR_SIDE[1] / _FAR_SIDE[0])
-    galaxies = ((ordered > _FAR_SIDE[0] * center) & (ordered < _FAR_SIDE[1] * center)).sum()
-    expected = galaxies * np.log1p(_INTERVAL) / far
+    nearness = np.abs(np.log(ordered / center))
+    beside = (nearness > np.log(_SIDE[0])) & (nearness < np.log(_SIDE[1]))
+    galaxies = max((beside & (ordered > center)).sum(), (beside & (ordered < center)).sum())
+    expected = galaxies * np.log1p(_INTERVAL) / np.log(_SIDE[1] / _SIDE[0])
     if count < max(least, _CONTRAST * expected):
         raise DomainError(
             f"no stellar locus: {count} of {len(radius)} bright objects within {100.0 * _INTERVAL:g} % of a half-light "
             f"radius of {center:.3g} pixels, expected at least {max(least, int(np.ceil(_CONTRAST * expected)))}"
         )
     for _ in range(5):
-        near = ordered[np.abs(ordered - center) < 3.0 * max(width, _LEAST_WIDTH * center)]
+        near = ordered[np.abs(ordered - center) < min(3.0 * max(width, _LEAST_WIDTH * center), _INTERVAL * center)]
         center, width = _robust(near)
     return center, max(width, _LEAST_WIDTH * center)
 
@@ -212,5 +213,5 @@ def _stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.nd
     side = size + 2 * _MARGIN
     around = cut_out(image, x, y, side, 0.0)
     middle = 0.5 * (side - 1)
-    offsets = (at - first_pixel(at, side) - middle for at in (x, y))
-    return center_stamps(around, *offsets, size=size, normalize=False) if len(x) else np.empty((0, size, size))
+    dx, dy = (at - first_pixel(at, side) - middle for at in (x, y))
+    return center_stamps(around, dx, dy, size, normalize=False)
