@@ -19,6 +19,11 @@ _CAPTION = (
     "stars and at places where no star is. Mean xi+ from 10' to 3 deg."
 )
 
+_NULL_CAPTION = (
+    "Usable galaxies; mean |ξ+| over all separations; ξ+ of the difference of ellipticities by the PSF of the models and "
+    "by the true PSF, beyond 10'; biases of the shear with either."
+)
+
 
 @app.command("visits")
 def visits_command(
@@ -84,3 +89,51 @@ def _show(stacks: dict[str, dict[str, Any]]) -> None:
         for visits, found in stacks.items()
     ]
     Rows(headings, rows, _CAPTION).show()
+
+
+@app.command("null-test")
+def null_test_command(
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder of pachon visits.")],
+    tiles: Annotated[int | None, Option(min=1, help="Most tiles of the sky, from the pointing outwards.")] = None,
+    rings: Annotated[int, Option(min=10, help="Rings of galaxies for the calibration of the shear.")] = 2000,
+    resume: Annotated[bool, Option("--resume", help="Keep the tiles that are finished.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Measure galaxies in stacks of visits, and correlate ellipticities that no shear has touched (Figs. 17, 18).
+
+    Galaxies like those of the Hubble Ultra Deep Field are drawn under the true PSF of the stack and measured twice,
+    with the PSF of the models and with the true one: the difference is what the PSF models do to the shear. Rings of
+    galaxies under a shear of 0.02 give the multiplicative and the additive bias of both. Each galaxy has a stamp of its
+    own; neighbours are left out.
+
+    Tables of galaxies, null_test.json and two pictures go into the folder of the visits.
+
+    **Examples**
+
+    - `pachon null-test pachon_visits`: all stacks that the folder has
+    - `pachon null-test full --tiles 20 --resume`
+    """
+    from ..studies.visits.null_result import null_metrics
+    from ..studies.visits.null_test import null_test
+
+    hint = f"finished tiles are in {folder}, and --resume goes on from there"
+    with interruptible(quiet, hint) as reporter:
+        results = null_test(folder, tiles=tiles, rings=rings, resume=resume, threads=threads, reporter=reporter)
+    found = {str(visits): null_metrics(result) for visits, result in results.items()}
+    if as_json:
+        print_json({"stacks": found})
+    elif not quiet:
+        keys = ("mean_abs_xi_plus", "shot_noise_xi_plus", "xi_plus_difference_long")
+        rows = []
+        for visits, metrics in found.items():
+            biases = [
+                f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
+                for name in ("m1_model", "c1_model", "m1_true", "c1_true")
+            ]
+            density = f"{metrics['usable_per_arcmin2']:.1f}"
+            rows.append((visits, density, *(f"{metrics[key]:.1e}" for key in keys), *biases))
+        headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
+        Rows(headings, rows, _NULL_CAPTION).show()
+        print(f"null test: {folder.resolve()}")
