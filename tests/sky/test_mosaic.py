@@ -115,7 +115,7 @@ def two_galaxies(gap, noise=1.0):
     first = 300.0 * np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / 18.0)
     second = 300.0 * np.exp(-((x - 60 - gap) ** 2 + (y - 60) ** 2) / 18.0)
     sky = np.random.default_rng(3).normal(5.0, noise, x.shape)
-    return first, Mosaic("two", first + second + sky, np.diag([-PIXEL, PIXEL]), 25.0)
+    return first, Mosaic("two", (first + second + sky).astype(np.float32), np.diag([-PIXEL, PIXEL]), 25.0)
 
 
 PIXEL = 0.03 * ARCSEC
@@ -226,6 +226,15 @@ def test_mosaics_without_objects_or_images(mosaic, tmp_path):
     few = write(tmp_path / "few.fits", mosaic.image[:200, :200], mosaic.header)
     with pytest.raises(ProductError, match="to find the stars"):
         GalaxyStamps.from_mosaic(few)
+
+
+def test_images_in_extensions(mosaic, stamps, tmp_path):
+    image = fits.ImageHDU(mosaic.image.astype(np.float32), mosaic.header)
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])])
+    fits.HDUList([fits.PrimaryHDU(), table, image]).writeto(tmp_path / "extension.fits")
+    again = GalaxyStamps.from_mosaic(tmp_path / "extension.fits")
+    assert np.array_equal(again.magnitude, stamps.magnitude)
+    assert all(np.array_equal(a, b) for a, b in zip(again.images, stamps.images, strict=True))
 
 
 def test_zero_points_of_the_hst_header(mosaic, tmp_path):
