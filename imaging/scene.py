@@ -123,9 +123,10 @@ def draw_ccd(
     """
     config, camera = experiment.config, experiment.camera
     if not np.isclose(experiment.pixel_size, camera.pixel_size) or not config.atmosphere.enabled:
+        enabled = str(config.atmosphere.enabled).lower()
         raise ConfigError(
-            f"psf.pixel_um = {experiment.pixel_size * 1e6:g}, atmosphere.enabled = {str(config.atmosphere.enabled).lower()}: "
-            f"images expect pixels of {camera.pixel_size * 1e6:g} um and an atmosphere"
+            f"psf.pixel_um = {experiment.pixel_size * 1e6:g}, atmosphere.enabled = {enabled}: images expect pixels of "
+            f"{camera.pixel_size * 1e6:g} um and an atmosphere"
         )
     if exposure is None:
         exposure = Exposure(config.band or "r", config.atmosphere.exposure_s)
@@ -145,7 +146,7 @@ def draw_ccd(
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
     own = part.contains(pixels)
-    _check_density(float(electrons[own].sum()), part, exposure)
+    check_density(float(electrons[own].sum()) / (part.width * part.height), exposure)
     image = draw_galaxies(
         galaxies,
         electrons,
@@ -245,13 +246,12 @@ def _add_stars(
     return {"PIXEL": pixels[own], "MAG": magnitude[own], "FLUX": electrons[own]}
 
 
-def _check_density(electrons: float, window: Window, exposure: Exposure) -> None:
-    """Raise DomainError if galaxies are brighter than the sky behind them."""
-    mean = electrons / (window.width * window.height)
-    if mean > exposure.background:
+def check_density(electrons: float, exposure: Exposure, start: str = "") -> None:
+    """Raise DomainError if galaxies, of so many electrons in a pixel on average, are brighter than the sky."""
+    if electrons > exposure.background:
         raise DomainError(
-            f"galaxies of {mean:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected a lower density "
-            "or fainter galaxies"
+            f"{start}galaxies of {electrons:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected a "
+            "lower density or fainter galaxies"
         )
 
 
