@@ -148,7 +148,10 @@ from .raytrace.rays import RayStatus as RayStatus
 from .raytrace.rays import launch_rays as launch_rays
 from .raytrace.trace import TraceResult as TraceResult
 from .raytrace.trace import trace as trace
+from .sky.catalogue import read_galaxies as read_galaxies
+from .sky.catalogue import write_galaxies as write_galaxies
 from .sky.galaxies import Galaxies as Galaxies
+from .sky.mosaic import GalaxyStamps as GalaxyStamps
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
 from .studies.baseline.baseline import check_baseline as check_baseline

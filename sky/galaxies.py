@@ -143,9 +143,7 @@ class Galaxies:
         positions : bool
             Whether the positions of the galaxies are sheared too, about the pointing.
         """
-        g = np.broadcast_to(np.asarray(g1, float) + 1j * np.asarray(g2, float), len(self))
-        if not np.all(np.abs(g) < 1.0):
-            raise DomainError("g1, g2: expected a reduced shear below 1")
+        g = reduced_shear(g1, g2, len(self))
         scale = 1.0 / np.sqrt(1.0 - np.abs(g) ** 2)
         inner = g[self.owner]
         e = self.e1 + 1j * self.e2
@@ -227,6 +225,14 @@ class Galaxies:
             threads=threads,
         )
         return result
+
+
+def reduced_shear(g1: Any, g2: Any, count: int) -> np.ndarray:
+    """Return g1 + i g2 of each galaxy, or raise DomainError for a modulus of 1 and more."""
+    g = np.broadcast_to(np.asarray(g1, dtype=np.float64) + 1j * np.asarray(g2, dtype=np.float64), count)
+    if not np.all(np.abs(g) < 1.0):
+        raise DomainError("g1, g2: expected a reduced shear below 1")
+    return g
 
 
 def grid_arguments(

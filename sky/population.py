@@ -3,8 +3,8 @@
 Figures and their sources, in the order in which a galaxy is made:
 
 counts
-    N(< i) = 46 x 10^(0.31 (i - 25)) per square arcminute (LSST Science Book 2009, eq. 3.7): 8800 galaxies to 29.0 in the
-    11 square arcminutes of the Ultra Deep Field, where Coe et al. 2006 (AJ 132, 926) detect 8042 objects at 10 sigma.
+    N(< i) = 46 x 10^(0.31 (i - 25)) per square arcminute (LSST Science Book 2009, eq. 3.7): 8800 galaxies to 29.0 in
+    the 11 square arcminutes of the Ultra Deep Field, where Coe et al. 2006 (AJ 132, 926) detect 8042 at 10 sigma.
 irregular fraction
     Rising steeply to half at I = 22 (Glazebrook et al. 1995, MNRAS 275, L19) and on to I = 25 (Abraham et al. 1996,
     MNRAS 279, L47); 515 of the 884 resolved galaxies of the Ultra Deep Field (Elmegreen et al. 2005, ApJ 631, 85). Here
@@ -22,7 +22,7 @@ scale lengths
     scatter of 0.4 in the natural logarithm is theirs for late types of one mass.
 ellipticities
     Of discs and of spheroids, the two priors of Miller et al. 2013, appendix B: 0.256 and 0.224 a component. Envelopes
-    of irregular galaxies have axis ratios by kind, chosen to look like them and to keep the dispersion of all near 0.26.
+    of irregular galaxies have axis ratios by kind, chosen to look like them, with the dispersion of all near 0.26.
 bulges
     Bulge-to-total ratios are half a Gaussian of sigma 0.1; bulges have index 4 and half-light radii of 0.6 r_d (Miller
     et al. 2013).

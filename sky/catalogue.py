@@ -1,0 +1,255 @@
+"""Galaxies in tables: catalogues of Sersic profiles, and tables of components written and read back."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from astropy import units as u
+from astropy.table import Table
+from astropy.utils.exceptions import AstropyWarning
+
+from ..core.errors import DomainError, ProductError, error_context
+from ..core.files import read_bytes, write_bytes
+from ..core.products import Columns, table_hdu, write_ecsv, write_fits
+from ..core.units import radians
+from .galaxies import Galaxies
+
+#: Endings of the files of tables.
+FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
+#: Names of columns, in any case; the first is the one that messages name.
+NAMES = {
+    "mag": ("mag", "magnitude"),
+    "half_light_radius": ("half_light_radius", "hlr"),
+    "n": ("n", "sersic"),
+}
+# Columns of a table of components: unit, description.
+_PER_GALAXY = {
+    "xi": ("rad", "position on the tangent plane, towards east"),
+    "eta": ("rad", "likewise, towards north"),
+    "magnitude": ("mag", "AB, of the whole galaxy"),
+    "radius": ("rad", "half-light radius of the whole galaxy"),
+}
+_PER_COMPONENT = {
+    "dx": ("rad", "offset from the position, towards east"),
+    "dy": ("rad", "likewise, towards north"),
+    "fraction": ("", "fraction of the light of the galaxy"),
+    "component_radius": ("rad", "half-light radius sqrt(a b)"),
+    "e1": ("", "(a - b)/(a + b), > 0 along xi"),
+    "e2": ("", "likewise, > 0 along xi = eta"),
+    "sersic": ("", "Sersic index"),
+}
+
+
+def read_galaxies(path: str | Path, *, pointing: Any = None) -> Galaxies:
+    """Read galaxies from a table: ECSV, FITS (its first table) or Parquet.
+
+    Columns of a catalogue, in any case; units of the file are honoured, and where it has none these hold:
+
+    ====================== =======================================================================================
+    ``ra``, ``dec``        positions [deg], with `pointing`; or ``xi``, ``eta``, on the tangent plane [rad]
+    ``mag``                AB magnitude
+    ``half_light_radius``  sqrt(a b) of the isophote that holds half of the light [arcsec]
+    ``e1``, ``e2``         (a - b)/(a + b), e1 > 0 towards east, e2 > 0 towards north-east; default 0
+    ``q``, ``pa``          instead: axis ratio b/a, and position angle from north towards east [deg]
+    ``n``                  Sersic index, 0.3 to 6.2; default 1
+    ====================== =======================================================================================
+
+    A table of components, as :func:`write_galaxies` writes it, is recognised by its columns.
+
+    Parameters
+    ----------
+    path : str or Path
+        The table.
+    pointing : (float, float) or Quantity, optional
+        Right ascension and declination of the pointing [rad], for ``ra`` and ``dec``.
+
+    Returns
+    -------
+    Galaxies
+
+    Raises
+    ------
+    ProductError
+        If the file cannot be read, or lacks a column.
+    DomainError
+        If a value is none of a galaxy.
+    """
+    path = Path(path)
+    columns = _read_columns(path)
+    with error_context(file=path):
+        if {"galaxy", "component_radius"} <= set(columns):
+            return _from_components(columns)
+        return _from_catalogue(columns, pointing)
+
+
+def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
+    """Write galaxies as a table of their components, ECSV, FITS or Parquet by the ending of the path.
+
+    Every row is a component, attributes of its galaxy repeated. :func:`read_galaxies` returns the same numbers.
+
+    Raises
+    ------
+    ProductError
+        If the ending is another, or the file cannot be written.
+    """
+    path = Path(path)
+    kind = _format(path)
+    owner = galaxies.owner
+    columns: Columns = {"galaxy": (owner.astype(np.int32), "", "index of the galaxy")}
+    columns |= {name: (getattr(galaxies, name)[owner], *text) for name, text in _PER_GALAXY.items()}
+    columns |= {name: (getattr(galaxies, name), *text) for name, text in _PER_COMPONENT.items()}
+    if kind == "ECSV":
+        write_ecsv(path, columns, {})
+    elif kind == "FITS":
+        write_fits(path, [table_hdu("COMPONENTS", columns)], None, [])
+    else:
+        pyarrow, parquet = _pyarrow(path)
+        data = io.BytesIO()
+        parquet.write_table(pyarrow.table({name: values for name, (values, _, _) in columns.items()}), data)
+        write_bytes(path, data.getvalue())
+
+
+def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Project positions on the plane that touches the sky at the pointing.
+
+    Parameters
+    ----------
+    ra, dec : ndarray or Quantity
+        Right ascensions and declinations [rad].
+    pointing : (float, float) or Quantity
+        Those of the pointing [rad].
+
+    Returns
+    -------
+    xi, eta : ndarray
+        Gnomonic coordinates towards east and north [rad] (Calabretta & Greisen 2002, sec. 5.1.3).
+
+    Raises
+    ------
+    DomainError
+        If a position is 90 degrees or more from the pointing.
+    """
+    ra, dec = radians(ra, "ra"), radians(dec, "dec")
+    center = radians(pointing, "pointing")
+    if center.shape != (2,):
+        raise DomainError(f"pointing = {pointing}: expected right ascension and declination")
+    turn = ra - center[0]
+    sine, cosine = np.sin(center[1]), np.cos(center[1])
+    depth = sine * np.sin(dec) + cosine * np.cos(dec) * np.cos(turn)
+    if not np.all(depth > 0.0):
+        raise DomainError("ra, dec: expected positions within 90 deg of the pointing")
+    east = np.cos(dec) * np.sin(turn)
+    north = cosine * np.sin(dec) - sine * np.cos(dec) * np.cos(turn)
+    return east / depth, north / depth
+
+
+def _format(path: Path) -> str:
+    """Return the kind of a file by its ending."""
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise ProductError(f"ending {path.suffix!r}: expected one of {', '.join(FORMATS)}", file=path)
+    return kind
+
+
+def _pyarrow(path: Path) -> tuple[Any, Any]:
+    """Return pyarrow and its module for Parquet."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        raise ProductError("Parquet needs the package pyarrow: pip install 'pachon[parquet]'", file=path) from None
+    return pyarrow, parquet
+
+
+def _read_columns(path: Path) -> dict[str, Any]:
+    """Return the columns of a file by their names in small letters."""
+    kind = _format(path)
+    data = read_bytes(path, ProductError)
+    table: Any
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        try:
+            if kind == "Parquet":
+                content = _pyarrow(path)[1].read_table(io.BytesIO(data))
+                table = {name: content[name].to_numpy() for name in content.column_names}
+            elif kind == "FITS":
+                table = Table.read(io.BytesIO(data), format="fits")
+            else:
+                table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
+        except (OSError, ValueError, KeyError, TypeError, IndexError, yaml.YAMLError) as error:
+            text = " ".join(str(error).split())
+            raise ProductError(f"damaged or no {kind} table ({text})", file=path) from None
+    names = table.colnames if isinstance(table, Table) else list(table)
+    return {name.lower(): table[name] for name in names}
+
+
+def _values(columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, default: Any = None) -> np.ndarray:
+    """Return a column as numbers, in rad where it has a unit of angle; `unit` is that of a column without one."""
+    key = next((alias for alias in NAMES.get(name, (name,)) if alias in columns), None)
+    if key is None and default is not None:
+        return np.full(len(next(iter(columns.values()))), float(default))
+    if key is None:
+        raise ProductError(f"no column {name!r}; columns are {', '.join(columns) or 'none'}", key=name)
+    column = columns[key]
+    values = np.ma.filled(np.ma.asarray(column).astype(object), np.nan) if hasattr(column, "mask") else column
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros((0, 0))
+    if numbers.ndim != 1:
+        raise DomainError(f"column {key!r}: expected one number in every row", key=key)
+    bad = np.flatnonzero(~np.isfinite(numbers))
+    if len(bad):
+        raise DomainError(f"column {key!r}, row {bad[0] + 1}: expected a finite number", key=key)
+    if unit is None:
+        return numbers
+    return radians(u.Quantity(numbers, getattr(column, "unit", None) or unit), key)
+
+
+def _from_catalogue(columns: dict[str, Any], pointing: Any) -> Galaxies:
+    """Return galaxies of one component from the columns of a catalogue."""
+    if "xi" in columns or "eta" in columns:
+        xi, eta = (_values(columns, name, u.rad) for name in ("xi", "eta"))
+    elif "ra" in columns or "dec" in columns:
+        ra, dec = (_values(columns, name, u.deg) for name in ("ra", "dec"))
+        if pointing is None:
+            raise DomainError("ra, dec: expected pointing=(right ascension, declination)", key="pointing")
+        xi, eta = tangent_plane(ra, dec, pointing)
+    else:
+        found = ", ".join(columns) or "none"
+        raise ProductError(f"no columns 'ra' and 'dec', nor 'xi' and 'eta'; columns are {found}", key="ra")
+    magnitude = _values(columns, "mag")
+    radius = _values(columns, "half_light_radius", u.arcsec)
+    if "q" in columns:
+        ratio = _values(columns, "q")
+        if not np.all((ratio > 0.0) & (ratio <= 1.0)):
+            raise DomainError("column 'q': expected axis ratios above 0, at most 1", key="q")
+        # From north towards east is from eta towards xi.
+        e = (1.0 - ratio) / (1.0 + ratio) * np.exp(2j * (0.5 * np.pi - _values(columns, "pa", u.deg)))
+        e1, e2 = e.real, e.imag
+    else:
+        given = "e1" in columns or "e2" in columns
+        e1, e2 = (_values(columns, name, default=None if given else 0.0) for name in ("e1", "e2"))
+    sersic = _values(columns, "n", default=1.0)
+    return Galaxies.single(xi, eta, magnitude, radius, e1=e1, e2=e2, sersic=sersic)
+
+
+def _from_components(columns: dict[str, Any]) -> Galaxies:
+    """Return galaxies from the columns of a table of components."""
+    owner = _values(columns, "galaxy")
+    first = np.flatnonzero(np.diff(owner, prepend=-1.0))
+    if not np.array_equal(owner[first], np.arange(len(first))):
+        raise DomainError(
+            "column 'galaxy': expected 0, 1, 2..., with the components of a galaxy together", key="galaxy"
+        )
+    values = {
+        name: _values(columns, name, u.rad if unit == "rad" else None)
+        for name, (unit, _) in (_PER_GALAXY | _PER_COMPONENT).items()
+    }
+    values |= {name: values[name][first] for name in _PER_GALAXY}
+    return Galaxies(first=np.append(first, len(owner)), **values)
