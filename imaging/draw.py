@@ -47,6 +47,9 @@ class Sources(Protocol):
 
     def __len__(self) -> int: ...
 
+    def take(self, indices: Any) -> Sources:
+        """Return some of the galaxies."""
+
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None
     ) -> np.ndarray:

@@ -26,6 +26,10 @@ from .wcs import CcdWcs, ccd_wcs
 STAR_ROOM = 64
 
 
+#: Function that gives the galaxies with xi and eta in two ranges [rad].
+GalaxiesIn = Callable[[tuple[float, float], tuple[float, float]], Sources]
+
+
 @dataclass(frozen=True, eq=False)
 class CcdScene:
     """Noise-free scene of a CCD, or of a part of it."""
@@ -73,7 +77,7 @@ class CcdScene:
 def draw_ccd(
     experiment: Experiment,
     ccd: str,
-    galaxies: Sources | Callable[[tuple[float, float], tuple[float, float]], Sources],
+    galaxies: Sources | GalaxiesIn,
     *,
     exposure: Exposure | None = None,
     pointing: ArrayLike = (0.0, 0.0),
@@ -141,8 +145,7 @@ def draw_ccd(
         threads=threads,
     )
     psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
-    if callable(galaxies):
-        galaxies = galaxies(*_sky_ranges(wcs, part.grown(SIZES[-1] // 2)))
+    galaxies = galaxies_near(galaxies, wcs, part)
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
     own = part.contains(pixels)
@@ -250,9 +253,18 @@ def check_density(electrons: float, exposure: Exposure, start: str = "") -> None
     """Raise DomainError if galaxies, of so many electrons in a pixel on average, are brighter than the sky."""
     if electrons > exposure.background:
         raise DomainError(
-            f"{start}galaxies of {electrons:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected a "
-            "lower density or fainter galaxies"
+            f"{start}galaxies of {electrons:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected "
+            "a lower density or fainter galaxies"
         )
+
+
+def galaxies_near(galaxies: Sources | GalaxiesIn, wcs: CcdWcs, window: Window) -> Sources:
+    """Return the galaxies on a window and so near that their light may reach it."""
+    xi, eta = _sky_ranges(wcs, window.grown(SIZES[-1] // 2))
+    if callable(galaxies):
+        return galaxies(xi, eta)
+    near = (xi[0] <= galaxies.xi) & (galaxies.xi <= xi[1]) & (eta[0] <= galaxies.eta) & (galaxies.eta <= eta[1])
+    return galaxies.take(np.flatnonzero(near))
 
 
 def _sky_ranges(wcs: CcdWcs, window: Window) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -20,6 +20,8 @@ from ..pipeline.config import differences
 from ..pipeline.defaults import given
 from ..pipeline.experiment import Experiment
 from ..pipeline.memory import needed_bytes
+from ..sky.catalogue import read_galaxies
+from ..sky.mosaic import GalaxyStamps
 from ..sky.population import GalaxyPopulation, counts
 from .config import ImagesConfig
 from .draw import Window
@@ -173,7 +175,19 @@ def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
 
 def _galaxies(config: ImagesConfig, experiment: Experiment, exposure: Exposure) -> Any:
     """Return the galaxies of the configuration, or the function that draws those of a part of the sky."""
-    wanted = config.galaxies
+    wanted, pointing = config.galaxies, config.pointing
+    if wanted.catalogue is not None:
+        return read_galaxies(wanted.catalogue, pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)))
+    if wanted.mosaic is not None:
+        seed = experiment.config.seed
+        stamps = GalaxyStamps.from_mosaic(
+            wanted.mosaic, zero_point=wanted.mosaic_zero_point, finest_pixel=exposure.pixel_scale, seed=seed
+        )
+        with error_context(key="galaxies"):
+            planted = wanted.density * stamps.surface_density
+            mean = planted * exposure.pixel_scale**2 * float(exposure.electrons(stamps.magnitude).mean())
+            check_density(mean, exposure, f"density = {wanted.density:g}: ")
+            return stamps.population(seed, density=planted * ARCMIN**2).galaxies_in
     with error_context(key="galaxies"):
         population = GalaxyPopulation(wanted.faintest, experiment.config.seed, wanted.brightest, wanted.density)
         magnitude = np.linspace(wanted.brightest, wanted.faintest, _MAGNITUDES)

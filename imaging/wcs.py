@@ -148,7 +148,7 @@ def ccd_wcs(
 ) -> CcdWcs:
     """Fit the world coordinates of a CCD to chief rays traced to its pixels.
 
-    The chief rays end on the nominal flat detector: the height of a CCD moves a star by a hundredth of an arcsecond at
+    The chief rays end on the nominal flat detector: heights of CCDs move stars of the LSST by 0.008 arcsec rms, 0.03 at
     most, and turbulence by more. The order is the lowest one that leaves less than :data:`TOLERANCE`.
 
     Parameters
