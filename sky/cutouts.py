@@ -13,6 +13,7 @@ from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
 from ..core.errors import ProductError
+from ..core.memory import require_bytes
 from ..core.random_streams import stream
 from ..core.units import ARCMIN
 
@@ -26,6 +27,8 @@ LOCUS_SNR, LOCUS_COUNT = 50.0, 8
 LOCUS_WIDTH = 1.15
 # Half-light radii are measured within so many semi-major axes.
 _REACH = 6.0
+# Of background, noise, segmentation and the pixels of objects.
+_BYTES_PER_PIXEL = 30
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Mosaic:
     """Image of the sky."""
 
     path: str
-    image: np.ndarray  #: [y, x], double precision
+    image: np.ndarray  #: [y, x], single precision
     scale: np.ndarray  #: d(xi, eta) / d(x, y) [rad/pixel], [2, 2]
     zero_point: float  #: AB magnitude of one unit of the image
 
@@ -88,7 +91,7 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
             raise ProductError(f"celestial coordinates: {' '.join(str(error).split())}", file=path) from None
     if scale is None or not abs(np.linalg.det(scale)) > 0.0:
         raise ProductError("has no celestial coordinates, expected CTYPE1 = 'RA---TAN' and the like", file=path)
-    return Mosaic(str(path), np.asarray(data, dtype=np.float64), scale, _zero_point(path, header, zero_point))
+    return Mosaic(str(path), np.asarray(data, dtype=np.float32), scale, _zero_point(path, header, zero_point))
 
 
 def _zero_point(path: str | Path, header: fits.Header, given: float | str | None) -> float:
@@ -131,13 +134,14 @@ def cut_galaxies(mosaic: Mosaic, *, side: float, psf_radius: float | None, seed:
     ProductError
         If there are no objects, too few to find the stars among them, or none larger than the PSF.
     """
+    require_bytes(_BYTES_PER_PIXEL * mosaic.image.size, f"galaxies of {mosaic.path}")
     missing = ~np.isfinite(mosaic.image)
     if missing.all():
         raise ProductError("has no finite pixels", file=mosaic.path)
-    data = np.ascontiguousarray(np.where(missing, 0.0, mosaic.image))
+    data = np.ascontiguousarray(np.where(missing, np.float32(0.0), mosaic.image))
     background = sep.Background(data, mask=missing)
-    data -= background.back()
-    noise = background.rms()
+    data -= background.back(dtype=np.float32)
+    noise = background.rms(dtype=np.float32)
     if not np.all(noise[~missing] > 0.0):
         raise ProductError("the sky has no noise, expected a mosaic with a measurable rms", file=mosaic.path)
     # Bright galaxies have more pixels than sep reserves room for.

@@ -133,7 +133,7 @@ class Galaxies:
         """Return the galaxies under a reduced shear that conserves areas.
 
         A source at theta is seen at S theta, S = [[1 + g1, g2], [g2, 1 - g1]] / sqrt(1 - |g|^2). An ellipticity e
-        becomes (e + g) / (1 + conj(g) e) (Seitz & Schneider 1997, eq. 3.2). The half-light radius of a whole galaxy is
+        becomes (e + g) / (1 + conj(g) e) (Seitz & Schneider 1997). The half-light radius of a whole galaxy is
         kept, which holds to first order in g.
 
         Parameters
@@ -206,14 +206,14 @@ class Galaxies:
         chosen, jacobian, offset = grid_arguments(len(self), indices, jacobian, offset, size)
         start_warp()
         table = sersic_table()
+        drawn = self.take(chosen)
         result = np.zeros((len(chosen), size, size // 2 + 1), dtype=np.complex64)
         launch(
             transform_galaxies,
             len(chosen),
             [
-                warp_array(chosen, wp.int32),
-                warp_array(self.first, wp.int32),
-                warp_array(np.stack([getattr(self, name) for name in _PER_COMPONENT], axis=1)),
+                warp_array(drawn.first, wp.int32),
+                warp_array(np.stack([getattr(drawn, name) for name in _PER_COMPONENT], axis=1)),
                 warp_array(jacobian, wp.mat22d),
                 warp_array(offset, wp.vec2d),
                 warp_array(table.values, wp.float32),
@@ -251,4 +251,5 @@ def grid_arguments(
         raise DomainError(f"offset: shape {offset.shape}, expected finite numbers of shape ({n}, 2)")
     if not (isinstance(size, int | np.integer) and size >= 1):
         raise DomainError(f"size = {size!r}: expected a positive number of pixels")
-    return chosen, jacobian, offset
+    # An empty list has no type.
+    return chosen.astype(np.int64), jacobian, offset

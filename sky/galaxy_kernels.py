@@ -59,7 +59,6 @@ def half_logarithms(x: samples):
 @wp.kernel
 def transform_galaxies(
     first: wp.int32,
-    indices: wp.array(dtype=wp.int32),
     components: wp.array(dtype=wp.int32),
     numbers: wp.array2d(dtype=wp.float64),
     jacobian: wp.array(dtype=wp.mat22d),
@@ -72,17 +71,16 @@ def transform_galaxies(
 ):
     """Add the transforms of the components of one galaxy.
 
-    Arguments: indices [item] of the galaxies; components [galaxy + 1]: first component of each; numbers [component, 7]:
-    offset dx, dy [rad], fraction, half-light radius [rad], e1, e2, Sersic index; jacobian [item]: d(pixel) / d(sky)
-    [pixel/rad]; offset [item] of the galaxy [pixel]; table [index, wave number] of the transforms; steps: first value
-    and step of the logarithm of the index, then of the wave number; size of the grid; profile [item, wave number]:
-    working space, for the transform of one component. Result [item, ky, kx]: complex, zero before.
+    Arguments: components [item + 1]: first component of each galaxy; numbers [component, 7]: offset dx, dy [rad],
+    fraction, half-light radius [rad], e1, e2, Sersic index; jacobian [item]: d(pixel) / d(sky) [pixel/rad]; offset
+    [item] of the galaxy [pixel]; table [index, wave number] of the transforms; steps: first value and step of the
+    logarithm of the index, then of the wave number; size of the grid; profile [item, wave number]: working space, for
+    the transform of one component. Result [item, ky, kx]: complex, zero before.
     """
     item = first + wp.tid()
-    galaxy = indices[item]
     one = wp.float64(1.0)
     two_pi = wp.float64(wp.TAU)
-    for c in range(components[galaxy], components[galaxy + 1]):
+    for c in range(components[item], components[item + 1]):
         fraction = numbers[c, 2]
         e1 = numbers[c, 4]
         e2 = numbers[c, 5]

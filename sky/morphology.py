@@ -24,7 +24,7 @@ class IrregularKind(NamedTuple):
     """A kind of galaxy that consists of clumps in an envelope. Lengths are in half-light radii of the envelope."""
 
     name: str
-    count: int  #: of 515 in the Ultra Deep Field (Elmegreen et al. 2005)
+    number: int  #: of 515 in the Ultra Deep Field (Elmegreen et al. 2005)
     axis_ratio: tuple[float, float]  #: of the envelope, uniform between the two
     clumps: tuple[int, int]  #: fewest and most
     light: float  #: fraction of the light in clumps
@@ -71,7 +71,7 @@ def irregular_fraction(magnitude: np.ndarray) -> np.ndarray:
 
 def galaxy_kinds(magnitude: np.ndarray, kind: np.ndarray, irregular_kind: np.ndarray) -> np.ndarray:
     """Return 0 for a spheroid, 1 for a disc, 2 and more for the irregular kinds, from two uniform numbers each, [n]."""
-    share = np.cumsum([k.count for k in IRREGULAR_KINDS])
+    share = np.cumsum([k.number for k in IRREGULAR_KINDS])
     which = np.searchsorted(share[:-1], irregular_kind * share[-1], side="right")
     regular = np.where(kind < SPHEROIDS, SPHEROID, DISC)
     return np.where(kind >= 1.0 - irregular_fraction(magnitude), FIRST_IRREGULAR + which, regular)

@@ -150,7 +150,7 @@ class GalaxyStamps:
             raise DomainError(f"seed = {seed}: expected a number that is not negative")
         return StampPopulation(self, seed, number)
 
-    @property
+    @cached_property
     def steps(self) -> np.ndarray:
         """Steps of each stamp's table in one cycle per pixel of the mosaic, [n]."""
         return OVERSAMPLING * np.array([len(image) for image in self.images])

@@ -63,7 +63,7 @@ def sersic_transform(index: np.ndarray, wave_number: np.ndarray) -> np.ndarray:
     index : ndarray, shape [n]
         Sersic index.
     wave_number : ndarray, shape [k]
-        Angular wave number times half-light radius, positive.
+        Angular wave number times half-light radius, 1e-5 and more: below, the sum loses digits.
 
     Returns
     -------

@@ -115,7 +115,7 @@ def two_galaxies(gap, noise=1.0):
     first = 300.0 * np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / 18.0)
     second = 300.0 * np.exp(-((x - 60 - gap) ** 2 + (y - 60) ** 2) / 18.0)
     sky = np.random.default_rng(3).normal(5.0, noise, x.shape)
-    return first, Mosaic("two", first + second + sky, np.diag([-PIXEL, PIXEL]), 25.0)
+    return first, Mosaic("two", (first + second + sky).astype(np.float32), np.diag([-PIXEL, PIXEL]), 25.0)
 
 
 PIXEL = 0.03 * ARCSEC

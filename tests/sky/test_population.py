@@ -128,7 +128,7 @@ def test_bright_galaxies_are_more_regular():
     uniform = (np.arange(1000) + 0.5) / 1000
     kinds = [galaxy_kinds(np.full(1000, m), uniform, uniform) for m in (20.0, 22.0, 24.0, 29.0)]
     assert np.allclose([np.mean(k >= 2) for k in kinds], [0.2, 0.35, 0.5, 0.5], atol=2e-3)
-    assert sum(k.count for k in IRREGULAR_KINDS) == 178 + 114 + 126 + 97
+    assert sum(k.number for k in IRREGULAR_KINDS) == 178 + 114 + 126 + 97
 
 
 def test_half_of_the_light_lies_within_the_half_light_radius(wide):
