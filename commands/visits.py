@@ -20,8 +20,8 @@ _CAPTION = (
 )
 
 _NULL_CAPTION = (
-    "Usable galaxies; mean |ξ+| over all separations; ξ+ of the difference of ellipticities by the PSF of the models and "
-    "by the true PSF, beyond 10'; biases of the shear with either."
+    "Usable galaxies; mean |ξ+| over all separations; ξ+ of the difference of ellipticities by the PSF of the models "
+    "and by the true PSF, beyond 10'; biases of the shear with either."
 )
 
 

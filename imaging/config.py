@@ -46,9 +46,12 @@ class GalaxiesConfig(Section):
     brightest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=10, le=30)] = Field(
         20.0, description="brightest galaxy of the population [AB mag]"
     )
-    density: Positive = Field(1.0, description="factor of the counts of the population")
+    density: Positive = Field(1.0, description="factor of the counts, of the population or of the mosaic")
     catalogue: str | None = Field(None, description="path of a catalogue in place of the population")
     mosaic: str | None = Field(None, description="path of a FITS mosaic, whose galaxies are planted at random places")
+    mosaic_zero_point: Real | None = Field(
+        None, description="AB magnitude of one unit of the mosaic; by default that of its header"
+    )
 
 
 class ImageConfig(Section):

@@ -47,6 +47,9 @@ class Sources(Protocol):
 
     def __len__(self) -> int: ...
 
+    def take(self, indices: Any) -> Sources:
+        """Return some of the galaxies."""
+
     def transform(
         self, indices: Any, jacobian: np.ndarray, offset: np.ndarray, size: int, *, threads: int | None = None
     ) -> np.ndarray:
@@ -71,7 +74,7 @@ class Window:
         """Return whether pixels [n, 2] lie in it, or at most a margin [pixel] outside."""
         low = np.array([self.x, self.y]) - 0.5 - margin
         high = low + (self.width, self.height) + 2.0 * margin
-        return ((pixels >= low) & (pixels < high)).all(axis=1)
+        return np.asarray(((pixels >= low) & (pixels < high)).all(axis=1))
 
     def grown(self, margin: int) -> Window:
         """Return the window larger by a margin on all sides."""

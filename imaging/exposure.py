@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import DomainError
 from ..core.random_streams import stream
@@ -84,8 +85,8 @@ class Exposure:
             raise DomainError(f"sky = {self.sky}: expected a finite brightness in AB mag/arcsec^2")
         if self.background >= self.exposures * self.full_well:
             raise DomainError(
-                f"sky = {self._brightness:.2f}: the background of {self.background / self.exposures:.0f} electrons fills "
-                f"the full well, {self.full_well:g} electrons; expected a fainter sky or a shorter exposure"
+                f"sky = {self._brightness:.2f}: its {self.background / self.exposures:.0f} electrons a pixel fill the "
+                f"full well of {self.full_well:g}; expected a fainter sky or a shorter exposure"
             )
 
     @property
@@ -106,10 +107,10 @@ class Exposure:
 
     @property
     def noise_rms(self) -> float:
-        """rms noise of a pixel without sources [electron]."""
+        """Noise of a pixel without sources, rms [electron]."""
         return float(np.sqrt(self.background + self.exposures * self.read_noise**2))
 
-    def electrons(self, magnitude: np.ndarray) -> np.ndarray:
+    def electrons(self, magnitude: ArrayLike) -> np.ndarray:
         """Return the electrons of sources of AB magnitudes above the atmosphere."""
         return self.total_time * 10.0 ** (0.4 * (self._band.zero_point - np.asarray(magnitude, dtype=np.float64)))
 

@@ -24,7 +24,7 @@ OBJECT_COLUMNS = {
     "RA": ("deg", "right ascension"),
     "DEC": ("deg", "declination"),
     "MAG": ("mag", "AB magnitude above the atmosphere"),
-    "FLUX": ("electron", "expected electrons in all exposures"),
+    "FLUX": ("", "expected electrons in all exposures"),
     "STAR": ("", "whether it is a star"),
     "RADIUS": ("arcsec", "half-light radius; 0 of a star"),
     "E1": ("", "(a - b)/(a + b) along xi; NaN where unknown"),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..core.plotting import new_figure, png_bytes, styled
+from ..core.plotting import ORANGE, new_figure, png_bytes, styled
 from ..core.units import ARCSEC
 from .image_file import CcdImage
 from .scene import CcdScene
@@ -99,8 +99,7 @@ def _compass(axes: Axes, image: CcdImage) -> None:
     start, length = np.array([0.88, 0.12]), 0.07
     for label, step in zip("EN", steps.T, strict=True):
         end = start + length * step / np.hypot(*step)
-        axes.annotate(
-            "", end, start, "axes fraction", "axes fraction", arrowprops={"arrowstyle": "->", "color": "#e08a00"}
-        )
+        arrow = {"arrowstyle": "->", "color": ORANGE}
+        axes.annotate("", tuple(end), tuple(start), "axes fraction", "axes fraction", arrowprops=arrow)
         x, y = start + 1.25 * (end - start)
-        axes.text(x, y, label, color="#e08a00", ha="center", va="center", transform=axes.transAxes)
+        axes.text(x, y, label, color=ORANGE, ha="center", va="center", transform=axes.transAxes)

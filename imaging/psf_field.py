@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
+from ..core.threads import one_blas_thread
 from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
 from ..pipeline.psf_model.model import PsfModel
 from ..pipeline.psf_model.polynomial import design_matrix
 from ..pipeline.simulate.ccd_exposure import expose_positions, holdout_positions
-
 
 #: Pixels around a CCD that the PSF is extrapolated to, for galaxies whose light reaches the CCD.
 RIM = 40
@@ -133,9 +133,10 @@ class PsfField:
         images = np.concatenate([self.model.mean[None], self.model.components])
         half = self.stamp // 2
         at = (np.arange(self.stamp) - half + size // 2) % size
-        grid = np.zeros((len(images), size, size))
-        np.add.at(grid, (slice(None), at[:, None], at[None, :]), images)
-        return fft.rfft2(grid).astype(np.complex64)
+        folded = (np.arange(size)[:, None] == at).astype(np.float64)
+        with one_blas_thread():
+            grid = folded @ images @ folded.T
+        return fft.rfft2(grid, workers=1).astype(np.complex64)
 
     def profile(self) -> np.ndarray:
         """Return the largest value of the mean PSF beyond each distance from its middle pixel, [stamp // 2 + 1]."""

@@ -26,6 +26,10 @@ from .wcs import CcdWcs, ccd_wcs
 STAR_ROOM = 64
 
 
+#: Function that gives the galaxies with xi and eta in two ranges [rad].
+GalaxiesIn = Callable[[tuple[float, float], tuple[float, float]], Sources]
+
+
 @dataclass(frozen=True, eq=False)
 class CcdScene:
     """Noise-free scene of a CCD, or of a part of it."""
@@ -73,7 +77,7 @@ class CcdScene:
 def draw_ccd(
     experiment: Experiment,
     ccd: str,
-    galaxies: Sources | Callable[[tuple[float, float], tuple[float, float]], Sources],
+    galaxies: Sources | GalaxiesIn,
     *,
     exposure: Exposure | None = None,
     pointing: ArrayLike = (0.0, 0.0),
@@ -123,9 +127,10 @@ def draw_ccd(
     """
     config, camera = experiment.config, experiment.camera
     if not np.isclose(experiment.pixel_size, camera.pixel_size) or not config.atmosphere.enabled:
+        enabled = str(config.atmosphere.enabled).lower()
         raise ConfigError(
-            f"psf.pixel_um = {experiment.pixel_size * 1e6:g}, atmosphere.enabled = {str(config.atmosphere.enabled).lower()}: "
-            f"images expect pixels of {camera.pixel_size * 1e6:g} um and an atmosphere"
+            f"psf.pixel_um = {experiment.pixel_size * 1e6:g}, atmosphere.enabled = {enabled}: images expect pixels of "
+            f"{camera.pixel_size * 1e6:g} um and an atmosphere"
         )
     if exposure is None:
         exposure = Exposure(config.band or "r", config.atmosphere.exposure_s)
@@ -140,12 +145,11 @@ def draw_ccd(
         threads=threads,
     )
     psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
-    if callable(galaxies):
-        galaxies = galaxies(*_sky_ranges(wcs, part.grown(SIZES[-1] // 2)))
+    galaxies = galaxies_near(galaxies, wcs, part)
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
     electrons = exposure.electrons(galaxies.magnitude) * psf.lit_fraction(pixels)
     own = part.contains(pixels)
-    _check_density(float(electrons[own].sum()), part, exposure)
+    check_density(float(electrons[own].sum()) / (part.width * part.height), exposure)
     image = draw_galaxies(
         galaxies,
         electrons,
@@ -245,14 +249,22 @@ def _add_stars(
     return {"PIXEL": pixels[own], "MAG": magnitude[own], "FLUX": electrons[own]}
 
 
-def _check_density(electrons: float, window: Window, exposure: Exposure) -> None:
-    """Raise DomainError if galaxies are brighter than the sky behind them."""
-    mean = electrons / (window.width * window.height)
-    if mean > exposure.background:
+def check_density(electrons: float, exposure: Exposure, start: str = "") -> None:
+    """Raise DomainError if galaxies, of so many electrons in a pixel on average, are brighter than the sky."""
+    if electrons > exposure.background:
         raise DomainError(
-            f"galaxies of {mean:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected a lower density "
-            "or fainter galaxies"
+            f"{start}galaxies of {electrons:.3g} electrons a pixel bury the sky of {exposure.background:.3g}; expected "
+            "a lower density or fainter galaxies"
         )
+
+
+def galaxies_near(galaxies: Sources | GalaxiesIn, wcs: CcdWcs, window: Window) -> Sources:
+    """Return the galaxies on a window and so near that their light may reach it."""
+    xi, eta = _sky_ranges(wcs, window.grown(SIZES[-1] // 2))
+    if callable(galaxies):
+        return galaxies(xi, eta)
+    near = (xi[0] <= galaxies.xi) & (galaxies.xi <= xi[1]) & (eta[0] <= galaxies.eta) & (galaxies.eta <= eta[1])
+    return galaxies.take(np.flatnonzero(near))
 
 
 def _sky_ranges(wcs: CcdWcs, window: Window) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ..core.errors import ConfigError, PachonError, ProductError, error_context
@@ -14,18 +15,23 @@ from ..core.files import make_folder, write_bytes
 from ..core.memory import require_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
+from ..core.units import ARCMIN
 from ..pipeline.config import differences
 from ..pipeline.defaults import given
 from ..pipeline.experiment import Experiment
 from ..pipeline.memory import needed_bytes
-from ..sky.population import GalaxyPopulation
+from ..sky.catalogue import read_galaxies
+from ..sky.mosaic import GalaxyStamps
+from ..sky.population import GalaxyPopulation, counts
 from .config import ImagesConfig
 from .draw import Window
 from .exposure import Exposure
 from .image_file import is_whole
 from .preview import cutouts_png, preview_png
-from .scene import draw_ccd, stamped
+from .scene import check_density, draw_ccd, stamped
 
+#: Limits of the bins over which the light of a population is summed.
+_MAGNITUDES = 200
 CONFIG_NAME = "images.yaml"
 #: Copies of a CCD's pixels that are held at once, in bytes a pixel: scene, image, variance, mask, and the file twice.
 _BYTES = 40
@@ -73,13 +79,14 @@ def simulate_images(
     Raises
     ------
     PachonError
-        If the configuration does not hold together, the folder holds images of another one, or a file cannot be written.
+        If the configuration does not hold together, the folder holds images of another one, or a file cannot be
+        written.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = config.experiment() if experiment is None else experiment
     resolved = config.resolved(experiment)
     window, exposure = _window(config, experiment), _exposure(config, experiment)
-    galaxies = _galaxies(config, experiment)
+    galaxies = _galaxies(config, experiment, exposure)
     require_bytes(needed_bytes(experiment, threads) + _BYTES * window.width * window.height, "images")
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
     _claim(folder, resolved, resume=resume)
@@ -166,11 +173,27 @@ def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
         )
 
 
-def _galaxies(config: ImagesConfig, experiment: Experiment) -> Any:
+def _galaxies(config: ImagesConfig, experiment: Experiment, exposure: Exposure) -> Any:
     """Return the galaxies of the configuration, or the function that draws those of a part of the sky."""
-    wanted = config.galaxies
+    wanted, pointing = config.galaxies, config.pointing
+    if wanted.catalogue is not None:
+        return read_galaxies(wanted.catalogue, pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)))
+    if wanted.mosaic is not None:
+        seed = experiment.config.seed
+        stamps = GalaxyStamps.from_mosaic(
+            wanted.mosaic, zero_point=wanted.mosaic_zero_point, finest_pixel=exposure.pixel_scale, seed=seed
+        )
+        with error_context(key="galaxies"):
+            planted = wanted.density * stamps.surface_density
+            mean = planted * exposure.pixel_scale**2 * float(exposure.electrons(stamps.magnitude).mean())
+            check_density(mean, exposure, f"density = {wanted.density:g}: ")
+            return stamps.population(seed, density=planted * ARCMIN**2).galaxies_in
     with error_context(key="galaxies"):
         population = GalaxyPopulation(wanted.faintest, experiment.config.seed, wanted.brightest, wanted.density)
+        magnitude = np.linspace(wanted.brightest, wanted.faintest, _MAGNITUDES)
+        number = wanted.density * np.diff(counts(magnitude)) * (exposure.pixel_scale / ARCMIN) ** 2
+        light = number * exposure.electrons(0.5 * (magnitude[:-1] + magnitude[1:]))
+        check_density(float(light.sum()), exposure, f"density = {wanted.density:g}: ")
     return population.galaxies_in
 
 

@@ -51,6 +51,17 @@ from .design.parameters.degrees_of_freedom_file import load_degrees_of_freedom a
 from .design.parameters.parameters import Parameter as Parameter
 from .design.parameters.thermal import thermal as thermal
 from .design.parameters.tolerances import Tolerance as Tolerance
+from .imaging.config import ImagesConfig as ImagesConfig
+from .imaging.config import load_images_configuration as load_images_configuration
+from .imaging.draw import Window as Window
+from .imaging.exposure import Exposure as Exposure
+from .imaging.image_file import CcdImage as CcdImage
+from .imaging.psf_field import PsfField as PsfField
+from .imaging.scene import CcdScene as CcdScene
+from .imaging.scene import draw_ccd as draw_ccd
+from .imaging.simulate import simulate_images as simulate_images
+from .imaging.wcs import CcdWcs as CcdWcs
+from .imaging.wcs import ccd_wcs as ccd_wcs
 from .models.aperture import Annulus as Annulus
 from .models.aperture import Circle as Circle
 from .models.aperture import Complement as Complement

@@ -128,9 +128,7 @@ def null_test(
                 galaxies,
                 float(galaxies.usable.sum() / area),
                 _correlations(galaxies, patch),
-                _calibration(
-                    stack, frame, population, exposure, cell, chosen[0], rings, seed, _REACH * spacing, threads
-                ),
+                _calibration(stack, frame.matrix, some, exposure, seed, reach, threads),
             )
     write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in results.items()}})
     write_bytes(folder / "null_test.png", null_test_picture(results))

@@ -1,0 +1,96 @@
+"""Noise, saturation and levels of exposures against their statistics, and the formulas of SMTN-002."""
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import DomainError, UnknownNameError
+from pachon.imaging.exposure import SATURATED, Exposure, expose
+
+SCENE = np.full((300, 400), 250.0, dtype=np.float32)
+#: Background of 15 s in r: dark sky of 21.2 mag over 0.04 arcsec^2, zero point 28.36 + 0.13, and 0.2 e-/s dark current.
+BACKGROUND = 15.0 * (0.04 * 10.0 ** (0.4 * (28.36 + 0.13 - 21.2)) + 0.2)
+
+
+@pytest.mark.parametrize(("exposures", "gain"), [(1, 1.0), (400, 1.0), (4, 2.5)])
+def test_mean_and_variance_are_those_of_the_electrons(exposures, gain):
+    settings = Exposure("r", 15.0, exposures, gain=gain)
+    found = expose(SCENE * exposures, settings, 1, "A")
+    mean, variance = 250.0 * exposures / gain, exposures * (250.0 + BACKGROUND + 8.8**2) / gain**2
+    pixels = SCENE.size
+    assert found.variance == pytest.approx(variance, rel=1e-6)
+    # Five standard deviations of the mean of all pixels, and of their variance.
+    assert found.image.mean(dtype=np.float64) == pytest.approx(mean, abs=5.0 * np.sqrt(variance / pixels))
+    assert found.image.var(dtype=np.float64) == pytest.approx(variance, rel=5.0 * np.sqrt(2.0 / pixels))
+    assert settings.background == pytest.approx(exposures * BACKGROUND, rel=1e-12)
+    assert settings.noise_rms == pytest.approx(np.sqrt(exposures * (BACKGROUND + 8.8**2)), rel=1e-12)
+
+
+def test_the_zero_point_is_the_magnitude_of_one_adu():
+    settings = Exposure("i", 30.0, 10, gain=1.7)
+    assert settings.electrons(settings.zero_point) == pytest.approx(1.7, rel=1e-12)
+    # SMTN-002: 28.17 gives one electron a second in i.
+    assert settings.zero_point == pytest.approx(28.17 + 2.5 * np.log10(300.0 / 1.7), abs=1e-12)
+
+
+def test_without_noise_an_image_is_the_expected_one():
+    kept = expose(SCENE, Exposure(noise=False, subtract_background=False), 1, "A")
+    assert kept.image == pytest.approx(250.0 + BACKGROUND, rel=1e-6)
+    subtracted = expose(SCENE, Exposure(noise=False), 1, "A")
+    assert subtracted.image == pytest.approx(250.0, rel=1e-6)
+    assert (subtracted.variance == kept.variance).all()
+
+
+def test_the_sky_of_the_configuration_sets_the_background():
+    # A magnitude brighter: 10^0.4 times the electrons of the sky.
+    dark, bright = Exposure(dark_current=0.0), Exposure(dark_current=0.0, sky=20.2)
+    assert bright.background / dark.background == pytest.approx(10.0**0.4, rel=1e-12)
+
+
+def test_pixels_at_the_full_well_are_clipped_and_marked():
+    scene = SCENE.copy()
+    scene[10, 20], scene[200, 30] = 99_000.0, 250_000.0
+    found = expose(scene, Exposure(subtract_background=False, noise=False), 1, "A")
+    assert np.argwhere(found.mask).tolist() == [[200, 30]]
+    assert found.mask[200, 30] == SATURATED
+    assert found.image[200, 30] == 1e5
+    assert found.mask.dtype == np.int16
+    # Two exposures hold twice as much.
+    assert not expose(scene, Exposure(exposures=3, noise=False), 1, "A").mask.any()
+
+
+def test_random_numbers_belong_to_their_key_and_to_no_thread():
+    one, four = (expose(SCENE, Exposure(), 1, "A", 0, threads=n).image for n in (1, 4))
+    assert one.tobytes() == four.tobytes()
+    for seed, key in ((2, ("A", 0)), (1, ("B", 0)), (1, ("A", 1))):
+        other = expose(SCENE, Exposure(), seed, *key).image
+        correlation = np.corrcoef(one.ravel(), other.ravel())[0, 1]
+        assert abs(correlation) < 5.0 / np.sqrt(SCENE.size)
+    rows = np.corrcoef(one[:128].ravel(), one[128:256].ravel())[0, 1]
+    assert abs(rows) < 5.0 / np.sqrt(SCENE.size / 2)
+
+
+def test_light_below_zero_is_none():
+    found = expose(np.full((64, 64), -1e4, dtype=np.float32), Exposure(), 1, "A")
+    assert found.variance == pytest.approx(8.8**2, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"time": 0.0}, "time = 0.0"),
+        ({"exposures": 0}, "exposures = 0"),
+        ({"gain": -1.0}, "gain = -1.0"),
+        ({"read_noise": -1.0}, "read_noise = -1.0"),
+        ({"sky": np.nan}, "sky = nan"),
+        ({"sky": 10.0}, "sky = 10.00: .* full well"),
+        ({"time": 1e5}, "full well"),
+    ],
+)
+def test_bad_settings_are_named(options, text):
+    with pytest.raises(DomainError, match=text):
+        Exposure(**options)
+
+
+def test_an_unknown_band_is_named():
+    with pytest.raises(UnknownNameError, match="'v'"):
+        Exposure(band="v")

@@ -1,0 +1,197 @@
+"""Scenes and files of a small run: stars against their own PSFs, places, table, bytes."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.nddata import CCDData
+from astropy.table import Table
+
+import pachon
+from pachon.core.errors import ConfigError, DomainError, ProductError
+from pachon.core.units import ARCSEC
+from pachon.imaging.draw import Window
+from pachon.imaging.exposure import Exposure
+from pachon.imaging.image_file import OBJECT_COLUMNS, CcdImage
+from pachon.imaging.scene import STAR_ROOM, draw_ccd, ellipticities
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
+from pachon.sky.galaxies import Galaxies
+
+POINTING, ROLL = (0.3, 0.2), 0.7
+
+
+def nothing(xi, eta):
+    return Galaxies.concatenate([])
+
+
+def two_galaxies(xi, eta):
+    middle = np.mean(xi), np.mean(eta)
+    places = [[-60.0, 20.0], [30.0, -40.0]] * np.full((2, 1), ARCSEC) + middle
+    return Galaxies.single(*places.T, [20.0, 21.0], [0.8 * ARCSEC, 0.5 * ARCSEC], e1=[0.2, 0.0], e2=[0.1, -0.3])
+
+
+@pytest.fixture(scope="module")
+def stars(small_run):
+    """Scene of stars alone on the whole CCD."""
+    return draw_ccd(small_run, "R22_S11", nothing, pointing=POINTING, position_angle=ROLL)
+
+
+@pytest.fixture(scope="module")
+def image(small_run):
+    scene = draw_ccd(
+        small_run,
+        "R22_S11",
+        two_galaxies,
+        pointing=POINTING,
+        position_angle=ROLL,
+        window=Window(1500, 1500, 900, 800),
+        exposure=Exposure("r", 2.0, 3),
+    )
+    return scene.exposed()
+
+
+def test_stars_are_their_own_psfs_times_their_electrons(stars, small_run):
+    field = ccd_stars(small_run, "R22_S11", 0.7 * ARCSEC)
+    pixels = np.stack([stars.objects["X"], stars.objects["Y"]], axis=1)
+    center = small_run.camera.centers[small_run.camera.ccd_index("R22_S11")]
+    assert np.allclose((field.observed - center) / 10e-6 + 2047.5, pixels, rtol=0, atol=1e-6)
+    nearest = np.rint(pixels).astype(int)
+    psfs = expose_positions(small_run, field.observed, room=STAR_ROOM, offsets=pixels - nearest)
+    checked = 0
+    for i, (x, y) in enumerate(nearest):
+        far = np.abs(nearest - (x, y)).max(axis=1) > 130
+        if min(x, y) < 63 or max(x, y) > 4096 - 64 or far.sum() < len(far) - 1:
+            continue
+        expected = psfs.image[i] * stars.objects["FLUX"][i]
+        drawn = stars.electrons[y - 63 : y + 64, x - 63 : x + 64]
+        assert np.abs(drawn - expected).max() < 1e-6 * expected.max()
+        checked += 1
+    assert checked > 3
+
+
+def test_electrons_of_stars_are_those_of_their_magnitudes(stars, small_run):
+    # SMTN-002: r of 28.36 is one electron a second; no vignetting at the centre of the field.
+    light = small_run.config.atmosphere.exposure_s * 10.0 ** (0.4 * (28.36 - stars.objects["MAG"]))
+    assert np.allclose(stars.objects["FLUX"], light, rtol=1e-3)
+    assert stars.objects["STAR"].all()
+
+
+def test_header_and_table_place_stars_where_they_are(stars):
+    image = stars.exposed(Exposure("r", 2.0, noise=False))
+    objects = image.objects
+    celestial = np.stack([objects["RA"], objects["DEC"]], axis=1)
+    pixels = image.wcs.all_world2pix(celestial, 0)
+    assert np.allclose(pixels, np.stack([objects["X"], objects["Y"]], axis=1), rtol=0, atol=2e-3)
+    # The long-exposure PSF has no image motion: what is left is the coma of the design, a few hundredths of a pixel.
+    brightest = np.argsort(objects["MAG"])
+    for i in brightest[:5]:
+        x, y = np.rint(pixels[i]).astype(int)
+        if min(x, y) >= 16 and max(x, y) < 4080:
+            stamp = image.image[y - 15 : y + 16, x - 15 : x + 16].astype(np.float64)[None]
+            found = measure_shapes(stamp, 0.2 * ARCSEC, 0.7 * ARCSEC)
+            assert np.hypot(x + found.x[0] - pixels[i, 0], y + found.y[0] - pixels[i, 1]) < 0.1
+
+
+def test_an_image_comes_back_as_it_was_written(image, tmp_path):
+    path = tmp_path / "image.fits"
+    image.write(path)
+    back = CcdImage.read(path)
+    for name in ("image", "variance", "mask"):
+        assert (getattr(back, name) == getattr(image, name)).all()
+        assert getattr(back, name).dtype == getattr(image, name).dtype
+    for key in OBJECT_COLUMNS:
+        assert np.array_equal(back.objects[key], image.objects[key]), key
+    first = path.read_bytes()
+    back.write(tmp_path / "again.fits")
+    image.write(path)
+    assert path.read_bytes() == first
+    damaged = bytearray(first)
+    damaged[len(first) // 2] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(ProductError, match="checksum"):
+        CcdImage.read(path)
+
+
+def test_another_product_is_no_image(tmp_path):
+    from pachon.core.products import image_hdu, write_fits
+
+    write_fits(tmp_path / "other.fits", [image_hdu("MEAN", np.zeros((3, 3)), "")], None, [])
+    with pytest.raises(ProductError, match=r"other\.fits: no image of a CCD"):
+        CcdImage.read(tmp_path / "other.fits")
+
+
+def test_astropy_reads_image_uncertainty_mask_and_table(image, tmp_path):
+    path = tmp_path / "image.fits"
+    image.write(path)
+    with fits.open(path, checksum=True) as hdus:
+        header = hdus["IMAGE"].header
+        assert [hdu.name for hdu in hdus[1:]] == ["IMAGE", "VARIANCE", "MASK", "TRUTH"]
+        assert (header["EXPTIME"], header["NEXP"], header["GAIN"], header["FILTER"]) == (6.0, 3, 1.0, "r")
+        assert header["ZEROPNT"] == pytest.approx(28.36 + 2.5 * np.log10(6.0), abs=1e-6)
+        assert hdus["MASK"].header["MP_SATUR"] == 0
+        assert "DATE" not in header
+    data = CCDData.read(path, hdu=1, hdu_uncertainty="VARIANCE", hdu_mask="MASK", unit="adu")
+    assert (data.data == image.image).all()
+    assert (data.uncertainty.array == image.variance).all()
+    truth = Table.read(path, hdu="TRUTH")
+    galaxies = truth[~truth["STAR"]]
+    assert len(galaxies) == 2
+    assert galaxies["RADIUS"] == pytest.approx([0.8, 0.5], rel=1e-9)
+    assert galaxies["E1"] == pytest.approx([0.2, 0.0], abs=1e-9)
+    assert galaxies["E2"] == pytest.approx([0.1, -0.3], abs=1e-9)
+    assert galaxies["FLUX"] == pytest.approx(6.0 * 10.0 ** (0.4 * (28.36 - np.array([20.0, 21.0]))), rel=2e-3)
+    place = data.wcs.all_world2pix(np.stack([galaxies["RA"], galaxies["DEC"]], axis=1), 0)
+    # X and Y of the table are pixels of the CCD, those of the image begin at its corner.
+    assert np.allclose(place + 1500.0, np.stack([galaxies["X"], galaxies["Y"]], axis=1), rtol=0, atol=2e-3)
+
+
+@pytest.mark.long
+def test_a_deeper_exposure_of_a_scene_has_more_of_everything(small_run, stars):
+    deep = stars.exposed(Exposure("r", 2.0, 100, noise=False))
+    plain = stars.exposed(Exposure("r", 2.0, noise=False))
+    unclipped = plain.mask == 0
+    assert np.allclose(deep.image[unclipped], 100.0 * plain.image[unclipped], rtol=1e-5, atol=1e-2)
+    assert np.allclose(deep.objects["FLUX"], 100.0 * plain.objects["FLUX"], rtol=1e-12)
+
+
+def test_whole_galaxies_have_the_moments_of_their_components():
+    # Two round components side by side along xi = eta, and a bulge in a disc of the same shape.
+    galaxies = Galaxies(
+        xi=[0.0, 0.0],
+        eta=[0.0, 0.0],
+        magnitude=[20.0, 20.0],
+        radius=[1.0, 1.0],
+        first=[0, 2, 4],
+        dx=[1.0, -1.0, 0.0, 0.0],
+        dy=[1.0, -1.0, 0.0, 0.0],
+        fraction=[0.5, 0.5, 0.3, 0.7],
+        component_radius=[0.5, 0.5, 0.2, 0.9],
+        e1=[0.0, 0.0, 0.3, 0.3],
+        e2=[0.0, 0.0, -0.2, -0.2],
+        sersic=[1.0, 1.0, 4.0, 1.0],
+    )
+    # Q = r^2 + d d^T = [[1.25, 1], [1, 1.25]]: axes sqrt(2.25) and sqrt(0.25), (1.5 - 0.5)/(1.5 + 0.5) along xi = eta.
+    e1, e2 = ellipticities(galaxies)
+    assert np.allclose([e1[0], e2[0]], [0.0, 0.5])
+    assert np.allclose([e1[1], e2[1]], [0.3, -0.2])
+
+
+def test_galaxies_that_bury_the_sky_are_refused(small_run):
+    def crowd(xi, eta):
+        rng = np.random.default_rng(1)
+        return Galaxies.single(rng.uniform(*xi, 300), rng.uniform(*eta, 300), 15.0, ARCSEC)
+
+    with pytest.raises(DomainError, match=r"galaxies of .* electrons a pixel bury the sky"):
+        draw_ccd(small_run, "R22_S11", crowd, window=Window(0, 0, 200, 200))
+
+
+def test_a_run_without_atmosphere_is_refused(tiny):
+    alone = Experiment.from_config(tiny(ccds=("R22_S11",), atmosphere__enabled=False))
+    with pytest.raises(ConfigError, match=r"atmosphere\.enabled = false: images expect pixels of 10 um"):
+        draw_ccd(alone, "R22_S11", nothing)
+
+
+def test_public_names():
+    assert pachon.draw_ccd is draw_ccd
+    assert pachon.CcdImage is CcdImage

@@ -1,0 +1,157 @@
+"""World coordinates against traced chief rays, and against astropy."""
+
+import numpy as np
+import pytest
+from astropy import units as u
+
+import pachon
+from pachon.core.errors import DomainError, UnknownNameError
+from pachon.core.units import ARCSEC
+from pachon.imaging.wcs import TOLERANCE, ccd_wcs
+from pachon.raytrace.rays import field_direction
+from pachon.wavefront.chief_rays import fields_at
+
+CAMERA = pachon.lsst_camera()
+RA, DEC, ROLL = 1.0, -0.5, 0.4
+#: Centre of the field, its edge, and the corner of the camera farthest from the axis.
+CCDS = ("R22_S11", "R24_S12", "R41_S20")
+#: Pixels that are not those of the fit, the very corners among them.
+PIXELS = np.concatenate(
+    [np.random.default_rng(2).uniform(-0.5, 4095.5, (40, 2)), [[-0.5, -0.5], [4095.5, -0.5], [-0.5, 4095.5]]]
+)
+
+
+@pytest.fixture(
+    params=[
+        {},
+        {"rotator": 0.6},
+        {"M2": {"shift": (2e-3, -1e-3, 0.0), "tilt": (3e-4, 2e-4, 0.0)}},
+    ],
+    ids=["as designed", "rotated", "perturbed"],
+)
+def telescope(request, lsst_r):
+    if "rotator" in request.param:
+        return lsst_r.with_rotator(request.param["rotator"])
+    for name, motion in request.param.items():
+        return lsst_r.perturbed(name, **motion)
+    return lsst_r
+
+
+def celestial(slopes):
+    """Right ascension and declination [rad] of the source of light, by the basis vectors of the sky at the pointing."""
+    outwards = np.array([np.cos(DEC) * np.cos(RA), np.cos(DEC) * np.sin(RA), np.sin(DEC)])
+    east = np.array([-np.sin(RA), np.cos(RA), 0.0])
+    north = np.cross(outwards, east)
+    # The telescope's +y lies ROLL from north towards east, its +z points to the sky, and its axes are right-handed.
+    y = np.cos(ROLL) * north + np.sin(ROLL) * east
+    x = np.cross(y, outwards)
+    source = -field_direction(*slopes.T, "gnomonic") @ np.stack([x, y, outwards])
+    return np.stack([np.arctan2(source[:, 1], source[:, 0]), np.arcsin(source[:, 2])], axis=1)
+
+
+def traced(telescope, ccd):
+    """Celestial coordinates [rad] of the pixels, by chief rays."""
+    positions = CAMERA.centers[CAMERA.ccd_index(ccd)] + (PIXELS - 2047.5) * CAMERA.pixel_size
+    return celestial(fields_at(telescope, positions, projection="gnomonic"))
+
+
+def separation(a, b):
+    """Largest distance on the sky [rad]."""
+    d = np.abs(a - b) * np.stack([np.cos(b[:, 1]), np.ones(len(b))], axis=1)
+    return np.hypot(*d.T).max()
+
+
+@pytest.mark.parametrize("ccd", CCDS)
+def test_both_directions_of_astropy_agree_with_the_rays(telescope, ccd):
+    wcs = ccd_wcs(telescope, CAMERA, ccd, pointing=(RA, DEC), position_angle=ROLL)
+    expected = traced(telescope, ccd)
+    header = wcs.astropy()
+    # FITS counts pixels from 1.
+    assert separation(np.deg2rad(header.all_pix2world(PIXELS + 1.0, 1)), expected) < TOLERANCE
+    back = header.all_world2pix(np.rad2deg(expected), 0, tolerance=1e-6)
+    assert np.abs(back - PIXELS).max() * 0.2 * ARCSEC < TOLERANCE
+
+
+def test_the_inverse_polynomials_of_the_header_are_good_to_a_milliarcsecond(telescope):
+    # Programs that do not iterate use AP and BP, here as the SIP paper writes them.
+    wcs = ccd_wcs(telescope, CAMERA, "R41_S20", pointing=(RA, DEC), position_angle=ROLL)
+    header = wcs.to_header()
+    cd = np.array([[header[f"CD{i}_{j}"] for j in (1, 2)] for i in (1, 2)])
+    u, v = np.linalg.solve(cd, np.rad2deg(wcs.to_sky(PIXELS)).T)
+    powers = [(i, j) for i in range(wcs.order + 1) for j in range(wcs.order + 1)]
+    for axis, (name, linear) in enumerate((("AP", u), ("BP", v))):
+        distortion = sum(header.get(f"{name}_{i}_{j}", 0.0) * u**i * v**j for i, j in powers)
+        pixel = linear + distortion + header[f"CRPIX{axis + 1}"] - 1.0
+        assert np.abs(pixel - PIXELS[:, axis]).max() * 0.2 < 1e-3
+
+
+@pytest.mark.parametrize("ccd", CCDS)
+def test_our_own_directions_agree_with_the_rays_and_each_other(telescope, ccd):
+    wcs = ccd_wcs(telescope, CAMERA, ccd, pointing=(RA, DEC), position_angle=ROLL)
+    sky = wcs.to_sky(PIXELS)
+    assert separation(wcs.to_celestial(sky), traced(telescope, ccd)) < TOLERANCE
+    # Newton's method ends at rounding.
+    assert np.abs(wcs.to_pixel(sky) - PIXELS).max() < 1e-8
+
+
+def test_the_order_is_the_lowest_that_is_good_enough(lsst_r):
+    wcs = ccd_wcs(lsst_r, CAMERA, "R22_S11")
+    assert (wcs.order, wcs.error < TOLERANCE) == (3, True)
+    assert wcs.astropy().wcs.ctype[0] == "RA---TAN-SIP"
+
+
+def test_a_telescope_without_distortion_needs_no_sip(lsst_r):
+    from pachon.models.ideal_telescope import without_aberration
+
+    # A long paraboloid: its distortion of a tangent projection is below a milliarcsecond on a small CCD on the axis.
+    ideal = without_aberration(lsst_r, 1e5)
+    small = pachon.Camera("small", ("A_0",), ("A",), np.array([0]), np.zeros((1, 2)), 512, 10e-6 * 1e5 / 1.23)
+    wcs = ccd_wcs(ideal, small, "A_0")
+    assert wcs.order == 1
+    assert wcs.astropy().wcs.ctype[0] == "RA---TAN"
+    assert wcs.astropy().sip is None
+
+
+def test_jacobians_are_derivatives(wcs):
+    step = 1e-7
+    for axis in range(2):
+        shift = np.eye(2)[axis] * step
+        sky = wcs.to_sky(PIXELS)
+        slope = (wcs.to_pixel(sky + shift) - wcs.to_pixel(sky - shift)) / (2.0 * step)
+        assert np.allclose(wcs.jacobians(PIXELS)[:, :, axis], slope, rtol=1e-6, atol=1.0)
+
+
+def test_at_no_roll_east_lies_towards_smaller_x_and_north_towards_smaller_y(lsst_r):
+    # Light of a source in the north travels towards -y, and lands there: the focal plane is an image turned by half.
+    cd = ccd_wcs(lsst_r, CAMERA, "R22_S11").cd / ARCSEC
+    assert np.allclose(cd, [[-0.2, 0.0], [0.0, -0.2]], atol=1e-3)
+
+
+def test_the_header_of_a_part_starts_at_its_corner(wcs):
+    whole, part = wcs.astropy(), wcs.astropy((100, 300))
+    assert np.allclose(part.all_pix2world([[5, 7]], 0), whole.all_pix2world([[105, 307]], 0), rtol=0, atol=1e-12)
+    assert part.pixel_shape == (3996, 3796)
+
+
+def test_quantities_are_angles(lsst_r, wcs):
+    same = ccd_wcs(
+        lsst_r,
+        CAMERA,
+        "R22_S12",
+        pointing=np.rad2deg([1.0, -0.5]) * u.deg,
+        position_angle=np.rad2deg(0.4) * u.deg,
+    )
+    assert np.allclose(same.to_sky(PIXELS), wcs.to_sky(PIXELS), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("pointing", "roll"), [((0.0, 2.0), 0.0), ((np.nan, 0.0), 0.0), ((0.0, 0.0), np.inf), (1.0, 0)]
+)
+def test_a_pointing_that_is_none_is_refused(lsst_r, pointing, roll):
+    with pytest.raises(DomainError, match=r"pointing = .* expected finite angles"):
+        ccd_wcs(lsst_r, CAMERA, "R22_S11", pointing=pointing, position_angle=roll)
+
+
+def test_an_unknown_ccd_is_named(lsst_r):
+    with pytest.raises(UnknownNameError, match="R22_S31"):
+        ccd_wcs(lsst_r, CAMERA, "R22_S31")
