@@ -96,7 +96,7 @@ def detect_objects(
             level = np.zeros_like(data)
             if background_size is not None:
                 level = sep.Background(data, mask=ignored, bw=background_size, bh=background_size).back()
-                data = data - level
+                data = np.where(ignored, 0.0, data - level)
             found, segmentation = sep.extract(data, var=variances, mask=ignored, segmentation_map=True, **options)
         except Exception as error:  # SEP raises Exception itself
             raise DomainError(f"SEP: {' '.join(str(error).split())}") from None
@@ -162,8 +162,10 @@ def _measured(
     window = np.where(np.isfinite(radius), radius, a) * _WINDOW
     wx, wy, failed = sep.winpos(data, found["x"], found["y"], window, mask=ignored)
     moved = np.hypot(wx - found["x"], wy - found["y"])
-    # SEP's windows take in the light of neighbours.
+    # SEP's windows take in the light of neighbours, and may leave the image.
     windowed = (failed == 0) & (moved < window) & ((found["flag"] & sep.OBJ_MERGED) == 0)
+    for at, pixels in ((wx, data.shape[1]), (wy, data.shape[0])):
+        windowed &= (at >= 0.0) & (at <= pixels - 1)
     x, y = np.where(windowed, wx, found["x"]), np.where(windowed, wy, found["y"])
     flags = np.zeros(count, dtype=np.int32)
     flags[((found["flag"] & sep.OBJ_TRUNC) | (aperture_flags & sep.APER_TRUNC)) != 0] |= ObjectFlag.EDGE

@@ -66,6 +66,7 @@ def fit_galaxies(
         PSF at each galaxy, [n, m, m], or one for all, [m, m]: unit sum, m odd, centred on a pixel, pixel included.
     half_light_radius : float or array
         Of the galaxies on the image [pixel], which determines their stamps: :data:`STAMP_RADII` of them to either side.
+        NaN, as of an object without flux, for the smallest stamp.
     mask : array, optional
         [ny, nx], not zero for pixels to ignore.
     segmentation : array of int, optional
@@ -97,6 +98,7 @@ def fit_galaxies(
         radius = np.broadcast_to(np.asarray(half_light_radius, dtype=np.float64), (count,))
     except (TypeError, ValueError) as error:
         raise DomainError(f"half_light_radius: expected one number or {count}") from error
+    radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)
     if not (np.isfinite(radius).all() and (radius > 0.0).all()):
         raise DomainError("half_light_radius: expected positive, finite numbers of pixels")
     psfs, templates = _psfs(psf_images, count)
@@ -199,7 +201,8 @@ def _fit(
     center = place - middle
     side = data.shape[-1]
     used, own = np.unique(templates, return_inverse=True)
-    psf_variance = _psf_variance(psfs[used])[own]
+    # Of round Gaussians with the same peaks: the scale of the start and of the bounds, no more.
+    psf_variance = (0.5 / (np.pi * psfs[used].max(axis=(1, 2))))[own]
     fitter = GaussianStamps(psfs[used], own, data, weight, threads)
     bounds = Bounds(center, _REACH * side, _LEAST_MOMENT * psf_variance, (_MOST_WIDTH * side) ** 2)
     # Steps are solved by LAPACK, whose result must not depend on its threads.
@@ -265,23 +268,6 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     result = np.full(matrix.shape, np.nan)
     result[known] = np.linalg.inv(scaled[known]) / (scale[known, :, None] * scale[known, None, :])
     return result
-
-
-def _psf_variance(psfs: np.ndarray) -> np.ndarray:
-    """Return variances [pixel^2], [m], of round Gaussians that resemble the cores of PSFs.
-
-    A Gaussian under itself as weight has half its variance; far wings, which have most of the second moment, hardly
-    count. It scales the start and the bounds of fits, no more.
-    """
-    m = psfs.shape[-1]
-    square = (np.arange(m) - m // 2) ** 2.0
-    variance = np.full(len(psfs), 4.0)
-    for _ in range(20):
-        window = np.exp(-0.5 * square / variance[:, None])
-        light = np.maximum(psfs, 0.0) * window[:, :, None] * window[:, None, :]
-        along = light.sum(axis=1) + light.sum(axis=2)
-        variance = np.clip(2.0 * (along * square).sum(axis=1) / along.sum(axis=1), 0.1, m**2.0)
-    return variance
 
 
 def _psfs(psf_images: ArrayLike, count: int) -> tuple[np.ndarray, np.ndarray]:

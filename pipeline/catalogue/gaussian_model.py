@@ -82,7 +82,7 @@ class GaussianStamps:
         # Light of the galaxy's part of a stamp that the PSF carries over its edge does not come in at the other one.
         self.period = max(self.side + reach // 2, reach) | 1
         self._step = 2.0 * np.pi / self.period
-        self._psf = warp_array(_transforms(psf_images, self.period), wp.vec4d)
+        self._psf = warp_array(_transforms(psf_images, self.period, self.threads).view(np.float64), wp.vec4d)
         self._tables = [warp_array(table, pixels) for table in _tables(self.period, self.side)]
         self._data, self._weight = (warp_array(_packets(values), pixels) for values in (data, weight))
 
@@ -165,19 +165,20 @@ def _tables(period: int, side: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.ascontiguousarray(f(phase).reshape(len(phase), -1, LANES)) for f in (np.cos, np.sin))  # type: ignore[return-value]
 
 
-def _transforms(psf_images: np.ndarray, period: int) -> np.ndarray:
-    """Return the transforms of PSFs at (kx, ky) and (kx, -ky), [m, kx, ky, 4], weighted for a sum over all frequencies.
+def _transforms(psf_images: np.ndarray, period: int, threads: int) -> np.ndarray:
+    """Return the transforms of PSFs at (kx, ky) and (kx, -ky), [m, kx, ky, 2], weighted for a sum over all frequencies.
 
-    The values at kx > 0 count twice, for kx < 0; those at ky = 0 stand in the first two of four numbers alone.
+    The values at kx > 0 count twice, for kx < 0; those at ky = 0 stand in the first of two numbers alone.
     """
     count, ny, nx = psf_images.shape
+    at_x, at_y = ((np.arange(n) - n // 2) % period for n in (nx, ny))
     padded = np.zeros((count, period, period))
-    padded[:, :ny, :nx] = psf_images
-    padded = np.roll(padded, (-(ny // 2), -(nx // 2)), axis=(1, 2))
-    values = fft.rfft2(padded).transpose(0, 2, 1) / period**2
-    values[:, 1:] *= 2.0
-    half = (period + 1) // 2
-    result = np.zeros((count, half, half, 4))
-    result[..., 0], result[..., 1] = values[..., :half].real, values[..., :half].imag
-    result[:, :, 1:, 2], result[:, :, 1:, 3] = values[..., :-half:-1].real, values[..., :-half:-1].imag
+    padded[:, at_x[:, None], at_y] = psf_images.transpose(0, 2, 1)
+    values = fft.rfft2(padded, workers=threads)
+    half = values.shape[2]
+    result = np.empty((count, half, half, 2), dtype=np.complex128)
+    result[..., 0] = values[:, :half]
+    np.conjugate(values[:, -np.arange(half)], out=result[..., 1])  # the PSF is real
+    result *= (np.where(np.arange(half) > 0, 2.0, 1.0) / period**2)[:, None, None]
+    result[:, :, 0, 1] = 0.0
     return result

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.units import require_positive
+from ...core.units import real_array, require_positive
 from ..simulate.stamps import center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
-from .pixel_checks import check_pixels
 
 # The locus is the fullest interval of half-light radii of this relative width, and has at least so many times the
 # objects that intervals as wide have to either side of it, between these multiples of its radius.
@@ -28,8 +27,9 @@ _MAD_TO_SIGMA = 1.4826
 class StarCut(IntFlag):
     """Reasons why an object is no star to be used; zero for a selected one.
 
-    ``FLAGGED``: edge, saturated, blended or masked. ``FAINT``: below the least S/N. ``SIZE``, ``WIDTH``, ``SHAPE``:
-    half-light radius, FWHM and ellipticity apart from those of the locus. ``NEIGHBOUR``: another object nearby.
+    ``FLAGGED``: edge, saturated, blended or masked, or such pixels within the stamp. ``FAINT``: below the least S/N.
+    ``SIZE``, ``WIDTH``, ``SHAPE``: half-light radius, FWHM and ellipticity apart from those of the locus.
+    ``NEIGHBOUR``: another object nearby.
     """
 
     SELECTED = 0
@@ -104,6 +104,7 @@ def select_stars(
     isolation: float = 12.0,
     min_stars: int = 10,
     size: int = 31,
+    mask: ArrayLike | None = None,
 ) -> StarSelection:
     """Select isolated stars by the stellar locus, and cut out their stamps.
 
@@ -128,6 +129,8 @@ def select_stars(
         Fewest stars that make a locus.
     size : int
         Side of the stamps, odd [pixel].
+    mask : array, optional
+        [ny, nx], not zero for pixels that no stamp may hold; those that are not finite are among them.
 
     Returns
     -------
@@ -140,9 +143,14 @@ def select_stars(
     DomainError
         If the image has another shape, an option is out of range, or there is no stellar locus.
     """
-    pixels, _, _ = check_pixels(image, 1.0, ~np.isfinite(np.asarray(image, dtype=np.float64)))
+    pixels = real_array(image, "image: expected real numbers [ny, nx]")
     if pixels.shape != objects.segmentation.shape:
         raise DomainError(f"image has shape {pixels.shape}: expected {objects.segmentation.shape}, that of the objects")
+    if mask is not None and np.shape(mask) != pixels.shape:
+        raise DomainError(f"mask has shape {np.shape(mask)}: expected {pixels.shape}, that of the image")
+    bad = ~np.isfinite(pixels) | (np.zeros(pixels.shape, dtype=bool) if mask is None else np.asarray(mask) != 0)
+    if size < 1 or size % 2 == 0:
+        raise DomainError(f"size = {size}: expected an odd number of pixels")
     for name, value in (
         ("min_snr", min_snr),
         ("bright_snr", bright_snr),
@@ -153,7 +161,8 @@ def select_stars(
     snr = np.where(np.isfinite(objects.half_light_radius), objects.snr, 0.0)
     radius = np.where(np.isfinite(objects.half_light_radius), objects.half_light_radius, 0.0)
     cuts = np.zeros(len(objects), dtype=np.int32)
-    cuts[objects.flags != 0] |= StarCut.FLAGGED
+    spoilt = cut_out(bad, objects.x, objects.y, size, True).any(axis=(1, 2))
+    cuts[(objects.flags != 0) | spoilt | ~np.isfinite(objects.fwhm)] |= StarCut.FLAGGED
     cuts[~(snr >= min_snr)] |= StarCut.FAINT
     center, width = _locus(radius[(cuts == 0) & (snr >= bright_snr)], min_stars)
     noise = 1.0 / np.maximum(snr, 1.0)
@@ -173,7 +182,7 @@ def select_stars(
         width=width,
         positions=np.stack([x, y], axis=1),
         snr=objects.snr[index],
-        stamps=_stamps(np.where(np.isfinite(pixels), pixels - objects.background, 0.0), x, y, size),
+        stamps=_stamps(np.where(bad, 0.0, pixels - objects.background), x, y, size),
     )
 
 
@@ -207,9 +216,7 @@ def _robust(values: np.ndarray) -> tuple[float, float]:
 
 
 def _stamps(image: np.ndarray, x: np.ndarray, y: np.ndarray, size: int) -> np.ndarray:
-    """Return stamps with stars shifted to the centre of their middle pixel, beyond the image zero."""
-    if size < 1 or size % 2 == 0:
-        raise DomainError(f"size = {size}: expected an odd number of pixels")
+    """Return stamps with stars shifted to the centre of their middle pixel."""
     side = size + 2 * _MARGIN
     around = cut_out(image, x, y, side, 0.0)
     middle = 0.5 * (side - 1)

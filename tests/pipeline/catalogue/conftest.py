@@ -19,7 +19,7 @@ def psf():
 
 @pytest.fixture(scope="session")
 def psf_profile():
-    return PSF.withGSParams(EXACT)
+    return PSF
 
 
 @pytest.fixture(scope="session")

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from scipy.optimize import least_squares
 
 import pachon
+from pachon.core.table_files import write_table
 from pachon.pipeline.catalogue.galaxy_fits import GalaxyFlag
 
 galsim = pytest.importorskip("galsim")
@@ -65,7 +67,8 @@ def test_without_psf_the_adaptive_moments_of_galsim():
     np.testing.assert_allclose(found, [0.15, -0.2, 2.1, 7.0], rtol=0, atol=1e-5)
 
 
-def test_the_minimum_is_that_of_a_brute_force_fit(galaxy, psf):
+@pytest.mark.parametrize("profile", ["gaussian", "exponential"])
+def test_the_minimum_is_that_of_a_brute_force_fit(profile, galaxy, render, psf):
     # Restated in flux, centre, ln size and ellipticity, with numerical derivatives, on a grid of another period.
     period, side = 81, 32
     k = 2.0 * np.pi * np.fft.fftfreq(period)
@@ -75,6 +78,8 @@ def test_the_minimum_is_that_of_a_brute_force_fit(galaxy, psf):
     to_pixels = np.exp(1j * np.outer(np.arange(side) - 15.5, k)) / period
     noise = 2.5
     variance = noise**2 * (1.0 + 0.5 * np.random.default_rng(5).uniform(size=(side, side)))
+    if profile == "exponential":  # which no model fits
+        galaxy = render(galsim.Exponential(half_light_radius=2.4, flux=TRUE["flux"]).shear(g1=0.2, g2=-0.1))
     stamps = with_noise(galaxy, 4, noise, 6)
     masked = np.zeros(stamps.shape, dtype=bool)
     masked[:, 3:12, 20:25] = True
@@ -188,6 +193,8 @@ def test_large_galaxies_get_large_stamps(psf):
     fits = pachon.fit_galaxies(image.array, np.ones((side, side)), *at, round_psf, half_light_radius=8.6)
     assert fits.pixels[0] == 96**2
     np.testing.assert_allclose([fits.size[0], fits.flux[0]], [7.0, 100.0], rtol=1e-4)
+    unknown = pachon.fit_galaxies(image.array, np.ones((side, side)), *at, round_psf, half_light_radius=np.nan)
+    assert unknown.pixels[0] == 32**2
     cut = pachon.fit_galaxies(image.array, np.ones((side, side)), *at, round_psf, half_light_radius=30.0)
     assert cut.flags[0] == GalaxyFlag.CUT_OFF
     assert cut.pixels[0] == 128**2
@@ -249,6 +256,17 @@ def test_usable_galaxies_are_large_and_well_measured(galaxy, psf):
     assert usable.tolist() == [True, False, False, False]
     assert pachon.usable_galaxies(fits, [2.5] * 4, 2.0, least_ratio=1.3).sum() == 0
     assert pachon.usable_galaxies(fits, [np.nan] * 4, 2.0).sum() == 0
+
+
+def test_tables_have_units_and_descriptions(galaxy, psf, tmp_path):
+    fits = pachon.fit_galaxy_stamps(with_noise(galaxy, 3, 1.0, 14), 1.0, psf)
+    write_table(tmp_path / "fits.ecsv", fits.table())
+    table = Table.read(tmp_path / "fits.ecsv", format="ascii.ecsv")
+    assert table["size"].unit == "pix"
+    assert all(table[name].description for name in table.colnames)
+    for name in ("x", "flux_error", "size", "e1", "e2_error", "chi2_per_pixel", "flags"):
+        assert np.array_equal(table[name], getattr(fits, name)), name
+    assert np.array_equal(table["cxy"], fits.moments[:, 1])
 
 
 def test_no_galaxies(psf):

@@ -11,7 +11,7 @@ import pachon
 from pachon.pipeline.catalogue.objects import DetectedObjects
 from pachon.pipeline.catalogue.star_locus import StarCut
 
-SIDE, RADIUS = 900, 2.4
+SIDE, RADIUS = 910, 2.4
 
 
 def catalogue(n_stars=80, n_galaxies=400, seed=1):
@@ -25,7 +25,7 @@ def catalogue(n_stars=80, n_galaxies=400, seed=1):
     e = np.where(star, 0.02, rng.uniform(0.0, 0.5, n))
     a = radius / 1.18 * (1.0 + e)
     order = rng.permutation(n)
-    grid = np.stack(np.meshgrid(np.arange(30) * 30.0 + 15.0, np.arange(30) * 30.0 + 15.0), axis=-1).reshape(-1, 2)[:n]
+    grid = np.stack(np.meshgrid(np.arange(30) * 30.0 + 20.0, np.arange(30) * 30.0 + 20.0), axis=-1).reshape(-1, 2)[:n]
     objects = DetectedObjects(
         x=grid[:, 0] + rng.uniform(-0.5, 0.5, n),
         y=grid[:, 1] + rng.uniform(-0.5, 0.5, n),
@@ -62,7 +62,7 @@ def test_the_locus_of_stars_among_five_times_as_many_galaxies():
 
 
 def test_each_cut_has_its_bit():
-    objects, star = catalogue()
+    objects, _ = catalogue()
     chosen = pachon.select_stars(objects, IMAGE).index[:6]
     fields = {
         name: getattr(objects, name).copy()
@@ -77,6 +77,20 @@ def test_each_cut_has_its_bit():
     cuts = pachon.select_stars(replace(objects, **fields), IMAGE).cuts[chosen]
     expected = [StarCut.FLAGGED, StarCut.FAINT, StarCut.SIZE, StarCut.WIDTH, StarCut.SHAPE, StarCut.NEIGHBOUR]
     assert [int(c) for c in cuts] == [int(c) for c in expected]
+
+
+def test_stars_with_spoilt_stamps_are_left_out():
+    objects, _ = catalogue()
+    first = pachon.select_stars(objects, IMAGE).index[:3]
+    image, mask = IMAGE.copy(), np.zeros(IMAGE.shape, dtype=np.uint8)
+    x, y = (np.rint(v[first]).astype(int) for v in (objects.x, objects.y))
+    image[y[0] + 12, x[0]] = np.nan
+    mask[y[1], x[1] - 12] = 8
+    moved = objects.y.copy()
+    moved[first[2]] = 14.0  # of 15 pixels below the middle of a stamp
+    found = pachon.select_stars(replace(objects, y=moved), image, mask=mask)
+    assert (found.cuts[first] == StarCut.FLAGGED).all()
+    assert not set(first) & set(found.index)
 
 
 def test_completeness_counts_stars_that_are_bright_enough():
@@ -108,7 +122,8 @@ def test_no_locus_is_one_clear_line():
         ({"min_snr": 0.0}, "min_snr = 0.0: expected a positive"),
         ({"n_sigma": np.nan}, "n_sigma = nan"),
         ({"size": 30}, "size = 30: expected an odd number"),
-        ({"image": np.zeros((9, 9))}, r"image has shape \(9, 9\): expected \(900, 900\)"),
+        ({"mask": np.zeros((9, 9))}, r"mask has shape \(9, 9\): expected \(910, 910\)"),
+        ({"image": np.zeros((9, 9))}, r"image has shape \(9, 9\): expected \(910, 910\)"),
     ],
 )
 def test_bad_options(options, message):
