@@ -160,12 +160,14 @@ def _star_fields(
     bright = saturation_magnitude(band, seconds, _NOMINAL_FWHM)
     faint = limiting_magnitude(config.stars.snr_min, band, seconds, _NOMINAL_FWHM)
     fields, index = {}, {}
+    # Beyond its field of view a telescope may have no light, and is not asked for.
+    lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
     for name in config.ccds or ():
         depth = camera.half_size - np.abs(xy - camera.centers[camera.ccd_index(name)]).max(axis=1)
-        stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star)
+        stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star & lit)
         margin = np.where(points.star, _STAR_MARGIN, _PLACE_MARGIN) * camera.pixel_size
-        here = np.flatnonzero(depth >= margin)
-        if not len(here):
+        here = np.flatnonzero((depth >= margin) & lit)
+        if not len(stars):
             continue
         magnitude = magnitudes_at(points.quantile[stars], bright, faint)
         fields[name] = StarField(
