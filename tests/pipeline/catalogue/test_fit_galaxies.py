@@ -35,7 +35,6 @@ def same(one, other):
     )
 
 
-@pytest.mark.long
 def test_gaussians_are_recovered(gaussians, psf):
     # GalSim's own accuracy, and the PSF cut off at 16 pixels, are 1e-6.
     stamps, true = gaussians
