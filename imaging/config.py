@@ -52,6 +52,9 @@ class GalaxiesConfig(Section):
     mosaic_zero_point: Real | None = Field(
         None, description="AB magnitude of one unit of the mosaic; by default that of its header"
     )
+    mosaic_psf_arcsec: Positive | None = Field(
+        None, description="half-light radius of the mosaic's PSF [arcsec]; by default that of its stars"
+    )
 
 
 class ImageConfig(Section):
