@@ -89,7 +89,7 @@ class ImagesConfig(Section):
         run = self.run
         if run.psf.stamp is None:
             run = with_options(run, psf__stamp=PSF_STAMP)
-        with error_context(key="run"):
+        with error_context(subject="run"):
             return Experiment.from_config(run, folder)
 
     def resolved(self, experiment: Experiment) -> ImagesConfig:
