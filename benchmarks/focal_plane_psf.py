@@ -18,6 +18,7 @@ import argparse
 import resource
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import treecorr
@@ -29,6 +30,7 @@ from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
+from pachon.pipeline.focal_plane_stage import fit_focal_plane_model
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.psf_model.checks import snr_weights
 from pachon.pipeline.psf_model.model import PsfModel
@@ -133,28 +135,17 @@ def main() -> None:
             start = time.perf_counter()
             found = piff_gp(stars, holdout["x"], holdout["y"], kernel, optimizer)
             show(f"Piff GPInterp, {optimizer}", found, time.perf_counter() - start)
-    common = {"camera": experiment.camera, "components": 0}
-    optics = common | {
-        "wavelengths": experiment.wavelengths,
-        "atmosphere": experiment.atmosphere,
-        "pixel_size": experiment.pixel_size,
-        "diffusion": experiment.diffusion,
-        "silicon": experiment.silicon,
-        "jitter": experiment.jitter,
-        "dispersion": experiment.dispersion,
-        "budget": experiment.focal_plane.budget,
-    }
-    cases = [
-        ("without telescope", None, None, common),
-        ("telescope, heights unknown", experiment.telescope, None, optics),
+    cases: list[tuple[str, bool, Any]] = [
+        ("without telescope", False, None),
+        ("telescope, heights unknown", True, None),
     ]
     if options.heights:
         known = pachon.StaticHeights.read(options.heights)
-        cases.append((f"heights from {known.exposures} exposures", experiment.telescope, known, optics))
-    cases.append(("heights as drawn (the limit)", experiment.telescope, experiment.focal_plane, optics))
-    for label, telescope, plane, more in cases:
+        cases.append((f"heights from {known.exposures} exposures", True, known))
+    cases.append(("heights as drawn (the limit)", True, experiment.focal_plane))
+    for label, telescope, heights in cases:
         start = time.perf_counter()
-        model = pachon.FocalPlanePsf.fit(stars, telescope, plane, **more)
+        model = fit_focal_plane_model(experiment, stars, heights, telescope=telescope, components=0)
         seconds = time.perf_counter() - start
         shapes, sigma = model.predict(names, holdout["x"], holdout["y"])
         found = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)

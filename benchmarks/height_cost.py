@@ -16,7 +16,8 @@ import treecorr
 import pachon
 from pachon.core.units import ARCMIN, ARCSEC
 from pachon.models.camera.silicon import Silicon
-from pachon.pipeline.focal_plane_psf.response import Instrument, level_plane
+from pachon.pipeline.focal_plane_psf.height_series import level_plane
+from pachon.pipeline.focal_plane_psf.response import Instrument
 from pachon.pipeline.measure.shapes import fwhm, measure_shapes
 
 _HEIGHTS = np.arange(-30.0, 31.0, 5.0)

@@ -27,8 +27,9 @@ import pachon
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.focal_plane_psf.response import HeightResponse, Instrument
+from pachon.pipeline.focal_plane_psf.response import Instrument, height_response
 from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
+from pachon.pipeline.focal_plane_stage import fit_focal_plane_model
 from pachon.pipeline.run_folder import SUMMARY_NAME
 
 matplotlib.use("Agg")
@@ -114,7 +115,7 @@ def one_run(folder):
         stamp_size=experiment.stamp_size,
     )
     fields = instrument.fields(np.stack([truth["x"], truth["y"]], axis=1))
-    change = HeightResponse.of(instrument, fields, plane, None).slope(plane.height(truth["x"], truth["y"]))[:, :2]
+    change = height_response(instrument, fields, plane, None).slope(plane.height(truth["x"], truth["y"]))[:, :2]
     along = change / np.hypot(*change.T)[:, None]
     models = {
         "order 2": by_ccd(stars, truth, ccds, 2),
@@ -122,12 +123,9 @@ def one_run(folder):
         "order 2 and dz": by_ccd(stars, truth, ccds, 2, dz),
     }
     names = [camera.ccd_names[c] for c in ccds["holdout"]]
-    options = {"camera": camera, "components": 0, "wavelengths": experiment.wavelengths, "budget": None}
-    shared = ("atmosphere", "pixel_size", "diffusion", "silicon", "jitter", "dispersion")
-    options |= {key: getattr(experiment, key) for key in shared}
     for label, heights in (("focal plane", None), ("focal plane, heights known", plane)):
         start = time.perf_counter()
-        model = pachon.FocalPlanePsf.fit(table, experiment.telescope, heights, **options)
+        model = fit_focal_plane_model(experiment, table, heights, components=0)
         shapes = model.shapes(names, truth["x"], truth["y"])
         models[label] = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
         print(f"  {label}: {len(table)} stars, {time.perf_counter() - start:.0f} s {' '.join(model.warnings)}")

@@ -15,14 +15,18 @@ import numpy as np
 
 from ..core.products import Stamp, read_fits, write_hdus
 from ..core.progress import Reporter
+from ..models.camera.focal_plane import FocalPlane
 from .ccd_product import CcdProduct, Stars, of_ccd_model, write_focal_plane_columns
 from .experiment import Experiment
 from .focal_plane_psf.model import FocalPlanePsf
 from .focal_plane_psf.stars import FocalPlaneStars
+from .focal_plane_psf.static_heights import StaticHeights
 
 #: Name of the focal-plane model in the folder of a run.
 FOCAL_PLANE_PSF_NAME = "focal_plane_psf.fits"
 _StarsKind = TypeVar("_StarsKind", bound=Stars)
+# Mean wavefront of the air over an exposure of 15 s, common to all stars, rms [m].
+_AIR_WAVEFRONT = 0.1e-6
 
 
 def apply_focal_plane_model(
@@ -61,7 +65,12 @@ def apply_focal_plane_model(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     # Stars of an ideal telescope are no reason to fit one.
     model = fit_focal_plane_model(
-        experiment, products, telescope=not experiment.atmosphere_only, threads=threads, reporter=reporter
+        experiment,
+        FocalPlaneStars.from_products(products, experiment.weight_fwhm),
+        telescope=not experiment.atmosphere_only,
+        ccds=[product.name for product in products],
+        threads=threads,
+        reporter=reporter,
     )
     left_out, first, applied = model.leave_one_out, 0, []
     total = sum(len(p.observed) + len(p.holdout) for p in products)
@@ -82,22 +91,34 @@ def apply_focal_plane_model(
 
 def fit_focal_plane_model(
     experiment: Experiment,
-    products: Sequence[Any],
+    stars: FocalPlaneStars,
+    heights: FocalPlane | StaticHeights | None = None,
     *,
-    telescope: bool,
+    telescope: bool = True,
+    components: int = 3,
+    ccds: Sequence[str] | None = None,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> FocalPlanePsf:
-    """Fit one model to the used stars of all CCDs.
+    """Fit one model to stars of a run, as one who knows its configuration would.
+
+    The size of the residual of the active optics is known, to which the air near the ground adds its mean over the
+    exposure.
 
     Parameters
     ----------
     experiment : Experiment
-        Telescope, camera and atmosphere of the products.
-    products : sequence of CcdProduct
-        Products, or objects with the name, noise, pixel scale, observed stars and stamps of products.
+        Telescope, camera and atmosphere of the stars.
+    stars : FocalPlaneStars
+        The stars.
+    heights : FocalPlane or StaticHeights, optional
+        Heights of the CCDs as far as they are known. By default their budget is known, but not their draw.
     telescope : bool
         Whether the model has the telescope of the experiment, or is of turbulence and CCDs alone.
+    components : int
+        Principal components of the residual stamps.
+    ccds : sequence of str, optional
+        CCDs that the model is for; those without stars are named in its warnings. By default all.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     reporter : Reporter, optional
@@ -108,11 +129,28 @@ def fit_focal_plane_model(
     DomainError
         If there are too few stars.
     """
-    if telescope:
-        return FocalPlanePsf.fit_run(experiment, products, threads=threads, reporter=reporter)
-    stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
-    names = [product.name for product in products]
-    return FocalPlanePsf.fit(stars, camera=experiment.camera, ccds=names, threads=threads, reporter=reporter)
+    options: dict[str, Any] = {"camera": experiment.camera, "components": components, "ccds": ccds}
+    options |= {"threads": threads, "reporter": reporter}
+    if not telescope:
+        return FocalPlanePsf.fit(stars, **options)
+    focal = experiment.config.focal_plane
+    if heights is None and focal.budget == "flat" and focal.heights is None and not focal.moved:
+        heights = FocalPlane.flat(experiment.camera)
+    return FocalPlanePsf.fit(
+        stars,
+        experiment.telescope,
+        heights,
+        wavelengths=experiment.wavelengths,
+        atmosphere=experiment.atmosphere,
+        pixel_size=experiment.pixel_size,
+        diffusion=experiment.diffusion,
+        silicon=experiment.silicon,
+        jitter=experiment.jitter,
+        dispersion=experiment.dispersion,
+        budget=experiment.focal_plane.budget,
+        alignment_rms=float(np.hypot(experiment.config.active_optics.residual_um * 1e-6, _AIR_WAVEFRONT)),
+        **options,
+    )
 
 
 def write_focal_plane_model(folder: Path, products: Sequence[CcdProduct], model: FocalPlanePsf, stamp: Stamp) -> None:

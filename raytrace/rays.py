@@ -83,12 +83,25 @@ class Rays:
         Optical path already travelled [m]; zero for rays that start in phase.
     wavelength : float
         Vacuum wavelength [m].
+
+    Raises
+    ------
+    DomainError
+        If the arrays differ in length, or have other shapes.
     """
 
     position: np.ndarray
     direction: np.ndarray
     path_length: np.ndarray
     wavelength: float
+
+    def __post_init__(self) -> None:
+        # Kernels read as many rays as there are path lengths, whatever the length of the others.
+        n = len(self.path_length) if np.ndim(self.path_length) == 1 else "n"
+        for name, expected in (("position", (n, 3)), ("direction", (n, 3)), ("path_length", (n,))):
+            if np.shape(getattr(self, name)) != expected:
+                shape = f"[{', '.join(map(str, expected))}]"
+                raise DomainError(f"{name} of rays has shape {np.shape(getattr(self, name))}: expected {shape}")
 
     def __len__(self) -> int:
         return len(self.path_length)

@@ -17,7 +17,7 @@ from ..core.memory import require_bytes
 from ..core.random_streams import stream
 from ..core.units import ARCMIN
 
-#: Connected pixels above the rms of the sky that make an object (Jee & Tyson 2011, sec. 5.1).
+#: Connected pixels above the rms of the sky that make an object (Jee & Tyson 2011, sec. 6.2).
 LEAST_AREA = 8
 #: Header keywords of an AB zero point, after the HST's own PHOTFLAM and PHOTPLAM.
 ZERO_POINT_KEYS = ("MAGZPT", "MAGZERO", "MAGZP", "ZEROPNT", "ZEROPT", "ZP", "ABZP")

@@ -114,7 +114,7 @@ def transform_galaxies(
             y = wp.float32(ky)
             angle = step * wp.float64(ky) * place[1]
             phase = wp.vec2d(wp.cos(angle), -wp.sin(angle))
-            for block in range(columns // LANES + 1):
+            for block in range((columns + LANES - 1) // LANES):
                 squared = samples()
                 for lane in range(LANES):
                     x = wp.float32(block * LANES + lane)

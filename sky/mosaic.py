@@ -74,7 +74,7 @@ class GalaxyStamps:
         finest_pixel: Any = 0.2 * ARCSEC,
         seed: int = 0,
     ) -> GalaxyStamps:
-        """Cut galaxies out of a FITS mosaic, as Jee & Tyson (2011, sec. 5.1) did with the Ultra Deep Field.
+        """Cut galaxies out of a FITS mosaic, as Jee & Tyson (2011, sec. 6.2) did with the Ultra Deep Field.
 
         Objects are 8 connected pixels above the rms of the sky. The squares about them have the side of five semi-major
         axes; pixels of neighbours are replaced by noise of the local sky. What is no larger than the PSF is left out.

@@ -8,7 +8,6 @@ from pachon.core.products import image_hdu, write_fits
 from pachon.pipeline import focal_plane_stage
 from pachon.pipeline.config import Configuration, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
 from pachon.pipeline.run import run
 
 # A run small enough for tests: far too few stars and steps for figures that mean anything, every stage real.
@@ -93,11 +92,7 @@ class Plane:
     fits = 0
 
     @classmethod
-    def fit_run(cls, experiment, products, threads=None, reporter=None):
-        return cls.fit(FocalPlaneStars.from_products(products))
-
-    @classmethod
-    def fit(cls, stars, **_):
+    def fit(cls, stars, *_, **__):
         cls.fits += 1
         if len(stars) < 30:
             raise DomainError(f"{len(stars)} stars: expected at least 30")

@@ -30,9 +30,9 @@ from .response import (
     LARGEST_HEIGHT,
     N_EXPOSURE,
     ExposureResponse,
-    HeightResponse,
     Instrument,
     exposure_sigma,
+    height_response,
     wavefront,
 )
 
@@ -172,7 +172,7 @@ class ExposureFit:
         seeing = float(self.exposure[-1])
         again = ", again" if self._response is not None else ""
         with self.reporter.stage(f"optics at the stars{again}", total=5 * len(self.data)) as stage:
-            self.optics = HeightResponse.of(
+            self.optics = height_response(
                 self.instrument,
                 self.fields,
                 self.flat,
@@ -186,6 +186,7 @@ class ExposureFit:
             self._response = ExposureResponse.of(
                 self.instrument, self.fields, self.flat, aberration, seeing, self.threads, center=self._center
             )
+        self._central_columns = self._response.columns(self.fields, np.full(len(self.fields), self._center))
         self._column_slopes = self._response.height_slopes(self.fields)
         self._base = self.exposure.copy()
 
@@ -209,10 +210,9 @@ class ExposureFit:
 
     def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return residuals, slopes with height [n, 3] and columns of the exposure [n, 25, 3] at the parameters."""
-        assert self._response is not None
         heights = self.prior.heights(self.heights, self.data.places)
         heights = np.clip(heights, self._center - LARGEST_HEIGHT, self._center + LARGEST_HEIGHT)
-        columns = self._response.columns(self.fields, heights)
+        columns = self._central_columns + (heights - self._center)[:, None, None] * self._column_slopes
         change = self.exposure - self._base
         shapes = self.optics.at(heights) + np.einsum("npf,p->nf", columns, change)
         slopes = self.optics.slope(heights) + np.einsum("npf,p->nf", self._column_slopes, change)

@@ -21,7 +21,6 @@ from ...models.camera.height_budget import HeightBudget
 from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
-from ..experiment import Experiment
 from .covariance import Covariance, Places
 from .field import ShapeField
 from .field_fit import LEAST_STARS, FittedField, fit_field, height_prior, mosaic_of
@@ -33,8 +32,6 @@ from .response import Instrument
 from .stars import FocalPlaneStars, places_of, stars_of
 from .static_heights import StaticHeights
 
-# Mean wavefront of the air over an exposure of 15 s, common to all stars, rms [m].
-_AIR_WAVEFRONT = 0.1e-6
 # Images that are deformed at a time.
 _BATCH = 512
 # Brightest stars, from which the principal components of the residual stamps are made.
@@ -216,40 +213,6 @@ class FocalPlanePsf:
             stamp_size,
         )
         return model._with_stamps(given, components, threads, reporter)
-
-    @classmethod
-    def fit_run(
-        cls,
-        experiment: Experiment,
-        products: Sequence[Any],
-        threads: int | None = None,
-        reporter: Reporter | None = None,
-    ) -> FocalPlanePsf:
-        """Fit the model to the products of a run, with its telescope but without its heights.
-
-        The budget of the heights is known, their draw is not; so is the size of the residual of the active optics, to
-        which the air near the ground adds its mean over the exposure.
-        """
-        config = experiment.config
-        focal = config.focal_plane
-        return cls.fit(
-            FocalPlaneStars.from_products(products, experiment.weight_fwhm),
-            experiment.telescope,
-            FocalPlane.flat(experiment.camera) if focal.budget == "flat" and not focal.moved else None,
-            camera=experiment.camera,
-            wavelengths=experiment.wavelengths,
-            atmosphere=experiment.atmosphere,
-            pixel_size=experiment.pixel_size,
-            diffusion=experiment.diffusion,
-            silicon=experiment.silicon,
-            jitter=experiment.jitter,
-            dispersion=experiment.dispersion,
-            budget=experiment.focal_plane.budget,
-            alignment_rms=float(np.hypot(config.active_optics.residual_um * 1e-6, _AIR_WAVEFRONT)),
-            ccds=[product.name for product in products],
-            threads=threads,
-            reporter=reporter,
-        )
 
     @property
     def mosaic(self) -> Mosaic:

@@ -13,12 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
 from ...core.units import ARCSEC, metres, positive_angle, radians
-from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.io.yaml.writer import telescope_to_yaml
@@ -29,6 +27,7 @@ from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.psf import make_psfs
 from ..measure.shapes import measure_shapes
+from .height_series import HeightSeries, level_plane
 
 #: Noll terms of the residual wavefront of an exposure, each constant and linear over the field.
 NOLL = tuple(range(4, 12))
@@ -184,49 +183,30 @@ class Instrument:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class HeightResponse:
-    """Shapes of stars as polynomials of the height of the CCD."""
+def height_response(
+    instrument: Instrument,
+    fields: np.ndarray,
+    plane: FocalPlane,
+    aberration: ResidualWavefront | None,
+    seeing: float = 0.0,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+    *,
+    center: float = 0.0,
+) -> HeightSeries:
+    """Return the shapes of stars as series of the height of the CCD; `plane` gives the camera alone."""
 
-    coefficients: np.ndarray  #: of Chebyshev terms, [n_node, n, 3]
-    center: float  #: middle of the range of heights [m]
+    def shapes(level: FocalPlane) -> np.ndarray:
+        return instrument.shapes(fields, level, aberration, seeing, threads, progress)
 
-    @classmethod
-    def of(
-        cls,
-        instrument: Instrument,
-        fields: np.ndarray,
-        plane: FocalPlane,
-        aberration: ResidualWavefront | None,
-        seeing: float = 0.0,
-        threads: int | None = None,
-        progress: Callable[[int], None] | None = None,
-        *,
-        center: float = 0.0,
-    ) -> HeightResponse:
-        """Evaluate the engine at the nodes; `plane` gives the camera alone."""
-        nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-        levels = [level_plane(plane, center + LARGEST_HEIGHT * n) for n in nodes]
-        values = np.stack([instrument.shapes(fields, p, aberration, seeing, threads, progress) for p in levels])
-        lost = int((~np.isfinite(values).all(axis=(0, 2))).sum())
-        if lost:
-            raise DomainError(
-                f"{instrument.telescope.name}: the PSF at {lost} of {len(fields)} stars has no shape within"
-                f" {1e6 * LARGEST_HEIGHT:g} um of the heights: expected the telescope that they were taken with"
-            )
-        inverse = np.linalg.inv(chebyshev.chebvander(nodes, _NODES - 1))
-        return cls(np.einsum("kn,nsf->ksf", inverse, values), center)
-
-    def at(self, heights: np.ndarray) -> np.ndarray:
-        """Return the shapes at heights [m], shape [n, 3]."""
-        terms = chebyshev.chebvander((heights - self.center) / LARGEST_HEIGHT, _NODES - 1)
-        return np.einsum("sk,ksf->sf", terms, self.coefficients)
-
-    def slope(self, heights: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the shapes with respect to the height [1/m], shape [n, 3]."""
-        terms = chebyshev.chebvander((heights - self.center) / LARGEST_HEIGHT, _NODES - 2)
-        change = chebyshev.chebder(self.coefficients, axis=0) / LARGEST_HEIGHT
-        return np.einsum("sk,ksf->sf", terms, change)
+    series = HeightSeries.of(shapes, plane, LARGEST_HEIGHT, _NODES, center=center)
+    lost = int((~np.isfinite(series.coefficients).all(axis=(0, 2))).sum())
+    if lost:
+        raise DomainError(
+            f"{instrument.telescope.name}: the PSF at {lost} of {len(fields)} stars has no shape within"
+            f" {1e6 * LARGEST_HEIGHT:g} um of the heights: expected the telescope that they were taken with"
+        )
+    return series
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,11 +309,3 @@ def field_terms(slopes: np.ndarray, degree: int) -> np.ndarray:
     """Return products of Legendre polynomials over the field up to a total degree, shape [n, n_term]."""
     x, y = (np.polynomial.legendre.legvander(slopes[:, axis], degree) for axis in range(2))
     return np.stack([x[:, i] * y[:, t - i] for t in range(degree + 1) for i in range(t + 1)], axis=1)
-
-
-def level_plane(plane: FocalPlane, height: float) -> FocalPlane:
-    """Return a focal plane of the same camera, all of whose CCDs lie at one height [m]."""
-    polynomial = np.zeros((len(plane.camera), 10))
-    polynomial[:, 0] = height
-    surfaces = CcdSurfaces(plane.camera.half_size, polynomial, np.zeros((len(plane.camera), 2, 4)))
-    return FocalPlane(plane.camera, surfaces, np.zeros(len(plane.camera), dtype=bool))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
@@ -14,8 +14,8 @@ from astropy.table import Table
 
 from ...core.errors import DomainError, ProductError
 from ...core.units import ARCSEC
-from ..ccd_product import CcdProduct, read_product
-from ..measure.shapes import measure_shapes
+from ..ccd_product import CcdProduct, ObservedStars, read_product
+from ..measure.shapes import Shapes, measure_shapes
 from .covariance import Places
 from .mosaic import Mosaic
 
@@ -23,6 +23,27 @@ from .mosaic import Mosaic
 NOISE_PER_SNR = (0.50, 0.50, 0.52)
 #: Columns of a table, in any case; those of the STARS table of ``pachon run`` are among them.
 COLUMNS = ("ccd", "x", "y", "e1", "e2", "size", "e1_noise", "e2_noise", "size_noise", "snr", "stamp", "used")
+
+
+class CcdStars(NamedTuple):
+    """Observed stars of one CCD."""
+
+    name: str  #: of the CCD
+    x: np.ndarray  #: detector position [m]
+    y: np.ndarray
+    shapes: Shapes | ObservedStars  #: measured on the stamps
+    electrons: np.ndarray  #: of each star
+    noise: tuple[float, float]  #: sky, and rms noise without light [electrons/pixel]
+    stamps: np.ndarray  #: centred, of unit sum, [n, ny, nx]
+    used: np.ndarray  #: stars to use, [n] bool
+
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """Return name, x, y, values, electrons, variance of a pixel without the star and stamp of the used stars."""
+        used, shapes = self.used, self.shapes
+        values = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)[used]
+        level = np.full(len(values), self.noise[0] + self.noise[1] ** 2)
+        names = np.full(len(values), self.name)
+        return names, self.x[used], self.y[used], values, self.electrons[used], level, self.stamps[used]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,23 +90,25 @@ class FocalPlaneStars:
         return good & np.isfinite(self.x) & np.isfinite(self.y)
 
     @classmethod
+    def of_ccds(
+        cls, ccds: Iterable[CcdStars], pixel_scale: float, weight_fwhm: float = 0.7 * ARCSEC
+    ) -> FocalPlaneStars:
+        """Take the used stars of CCDs, whose noise is that of their photons and pixels."""
+        parts = [part.columns() for part in ccds]
+        if not any(len(part[0]) for part in parts):
+            raise DomainError("no stars: expected products with stars that a PSF model can use")
+        names, x, y, values, electrons, level, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
+        noise = photon_noise(stamps, electrons, level, pixel_scale, weight_fwhm)
+        return cls(tuple(names.tolist()), x, y, values, noise, stamps, pixel_scale, weight_fwhm)
+
+    @classmethod
     def from_products(cls, products: Sequence[CcdProduct], weight_fwhm: float = 0.7 * ARCSEC) -> FocalPlaneStars:
         """Take the observed stars that are good enough for a PSF model from the products of a run."""
-        parts: list[tuple[np.ndarray, ...]] = []
-        names: list[str] = []
-        for product in products:
-            stars, used = product.observed, product.observed.used
-            shapes = np.stack([stars.e1, stars.e2, np.log(stars.size)], axis=1)[used]
-            level = np.full(int(used.sum()), product.noise[0] + product.noise[1] ** 2)
-            parts.append(
-                (stars.x[used], stars.y[used], shapes, stars.electrons[used], level, product.observed_images[used])
-            )
-            names += [product.name] * int(used.sum())
-        if not names:
-            raise DomainError("no stars: expected products with stars that a PSF model can use")
-        x, y, values, electrons, level, stamps = (np.concatenate(column) for column in zip(*parts, strict=True))
-        noise = photon_noise(stamps, electrons, level, products[0].pixel_scale, weight_fwhm)
-        return cls(tuple(names), x, y, values, noise, stamps, products[0].pixel_scale, weight_fwhm)
+        ccds = [
+            CcdStars(p.name, o.x, o.y, o, o.electrons, p.noise, p.observed_images, o.used)
+            for p, o in ((product, product.observed) for product in products)
+        ]
+        return cls.of_ccds(ccds, products[0].pixel_scale if products else np.nan, weight_fwhm)
 
     @classmethod
     def from_table(

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.units import ARCSEC
+from ...models.camera.camera import Camera
 from ...models.ideal_telescope import without_aberration
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
@@ -77,18 +78,24 @@ def expose_positions(
 
 
 def expose_ccd(
-    experiment: Experiment, name: str, *, threads: int | None = None, progress: Callable[[int], None] | None = None
+    experiment: Experiment,
+    name: str,
+    stars: StarField | None = None,
+    *,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> CcdExposure:
     """Make the PSFs of the stars of one CCD: nearly all of the work, on all threads.
 
-    No byte depends on the number of threads; `progress` is called with the number of PSFs made since the last call.
+    `stars` are by default drawn over the CCD. No byte depends on the number of threads; `progress` is called with the
+    number of PSFs made since the last call.
     """
 
     def centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
         shapes = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
         return np.nan_to_num(np.stack([shapes.x, shapes.y], axis=1))
 
-    positions = ccd_stars(experiment, name, _PROVISIONAL_FWHM)
+    positions = ccd_stars(experiment, name, _PROVISIONAL_FWHM) if stars is None else stars
     # The engine draws them at the position that compensates their shift by the atmosphere. Resampling, as of observed
     # stars, would leave ringing along rows and columns where an image is not quite band-limited.
     holdout = _expose(experiment, positions.holdout, threads, progress, recenter=centroid)
@@ -167,15 +174,20 @@ def _displaced(experiment: Experiment, middles: np.ndarray, images: np.ndarray) 
     return images
 
 
+def ccd_bounds(camera: Camera, name: str) -> tuple[float, float, float, float]:
+    """Return the part of a CCD on which stars may stand, (xmin, xmax, ymin, ymax) [m]."""
+    x, y = map(float, camera.centers[camera.ccd_index(name)])
+    half = camera.half_size - _RIM * camera.pixel_size
+    return x - half, x + half, y - half, y + half
+
+
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
     """Draw the stars of one CCD, the faintest of the S/N limit where vignetting is strongest."""
     config, camera = experiment.config, experiment.camera
     band, exposure = config.band or "r", config.atmosphere.exposure_s
-    x, y = map(float, camera.centers[camera.ccd_index(name)])
-    half = camera.half_size - _RIM * camera.pixel_size
     return make_star_field(
         name,
-        (x - half, x + half, y - half, y + half),
+        ccd_bounds(camera, name),
         config.stars.truth,
         config.stars.observed,
         config.seed,

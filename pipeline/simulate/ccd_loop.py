@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
@@ -12,6 +12,7 @@ from ...core.progress import Reporter
 from ...core.threads import thread_count
 from ..experiment import Experiment
 from .ccd_exposure import CcdExposure, expose_ccd
+from .star_field import StarField
 
 _T = TypeVar("_T")
 
@@ -29,6 +30,7 @@ def simulate_ccds(
     model: Callable[[CcdExposure], _T],
     names: Sequence[str] | None = None,
     *,
+    fields: Mapping[str, StarField] | None = None,
     title: str | None = None,
     strict: bool = True,
     threads: int | None = None,
@@ -38,8 +40,9 @@ def simulate_ccds(
 
     `model` is any reduction of an exposure, such as :func:`~.model_ccd`. It runs on a thread of its own, one CCD at a
     time, in the order of the CCDs; no byte depends on the number of threads. `names` are by default those of the
-    configuration, `title` is that of the progress bar. A CCD that cannot be modelled ends the loop with `strict`, after
-    the models under way; otherwise it is reported and left out.
+    configuration, `fields` are the stars of each CCD, by default drawn over it, and `title` is that of the progress
+    bar. A CCD that cannot be modelled ends the loop with `strict`, after the models under way; otherwise it is reported
+    and left out.
 
     Raises
     ------
@@ -51,14 +54,16 @@ def simulate_ccds(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     names = (experiment.config.ccds or ()) if names is None else names
     simulated: SimulatedCcds[_T] = SimulatedCcds()
-    stars = experiment.config.stars.truth + experiment.config.stars.observed
+    each = experiment.config.stars.truth + experiment.config.stars.observed
+    total = each * len(names) if fields is None else sum(len(f.holdout) + len(f.observed) for f in fields.values())
     overlap = thread_count(threads) > 1
-    bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=stars * len(names))
+    bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=total)
     with bar as stage, ThreadPoolExecutor(1) as modeller:
         pending: list[tuple[str, Future[_T]]] = []
         for i, name in enumerate(names, start=1):
             try:
-                exposure = expose_ccd(experiment, name, threads=threads, progress=stage.advance)
+                stars = None if fields is None else fields[name]
+                exposure = expose_ccd(experiment, name, stars, threads=threads, progress=stage.advance)
             except PachonError as error:
                 raise error.within(subject=f"CCD {name}") from None
             due, pending = pending, [(name, modeller.submit(model, exposure))]

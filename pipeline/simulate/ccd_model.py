@@ -13,8 +13,9 @@ from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
 from ..psf_model.polynomial import term_count
 from .ccd_exposure import CcdExposure, ccd_stars
-from .ccd_observation import collected_images, observe_ccd
+from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
+from .star_field import StarField
 
 
 def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = True) -> CcdProduct:
@@ -35,26 +36,14 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
     )
     collected = collected_images(experiment, observed.image, observed.pixel_scale, electrons)
     observation = observe_ccd(experiment, name, collected, observed.pixel_scale, electrons, noisy=noisy)
-    fit, used = config.reconstruction, observation.used
-    least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
-    require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
-    model = PsfModel.fit(
-        observation.images[used],
-        stars.observed[used],
-        basis=fit.basis,
-        interpolation=fit.interpolation,
-        weights=snr_weights(fit.weights, snr[used]),
-        n_components=fit.components,
-        order=fit.order,
-        extent=positions.bounds,
-        clip_sigma=CLIP_SIGMA if noisy else None,
-    )
+    used = observation.used
+    model = fit_ccd_model(experiment, observation, stars, snr, noisy=noisy)
     # Noise-free stars have no outliers: deviations from the mean are the variation of the PSF.
     noise_free_model = PsfModel.fit(
         holdout_images,
         positions.holdout,
         n_components=noise_free_components(config),
-        order=fit.truth_order,
+        order=config.reconstruction.truth_order,
         extent=positions.bounds,
         clip_sigma=None,
     )
@@ -93,6 +82,26 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         model=model,
         noise_free_model=noise_free_model,
         rotator=experiment.rotator,
+    )
+
+
+def fit_ccd_model(
+    experiment: Experiment, observation: Observation, stars: StarField, snr: np.ndarray, *, noisy: bool = True
+) -> PsfModel:
+    """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
+    fit, used = experiment.config.reconstruction, observation.used
+    least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
+    require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
+    return PsfModel.fit(
+        observation.images[used],
+        stars.observed[used],
+        basis=fit.basis,
+        interpolation=fit.interpolation,
+        weights=snr_weights(fit.weights, snr[used]),
+        n_components=fit.components,
+        order=fit.order,
+        extent=stars.bounds,
+        clip_sigma=CLIP_SIGMA if noisy else None,
     )
 
 

@@ -118,8 +118,13 @@ def draw_magnitudes(rng: np.random.Generator, count: int, bright: float, faint: 
 
     The first magnitudes of a stream stay as they are when `count` grows.
     """
+    return magnitudes_at(rng.random(count), bright, faint)
+
+
+def magnitudes_at(quantile: np.ndarray, bright: float, faint: float) -> np.ndarray:
+    """Return the magnitudes at quantiles, 0 to 1, of counts that go as 10^(0.2 m) between two limits."""
     span = 10.0 ** (COUNT_SLOPE * (faint - bright)) - 1.0
-    return bright + np.log10(1.0 + rng.random(count) * span) / COUNT_SLOPE
+    return bright + np.log10(1.0 + quantile * span) / COUNT_SLOPE
 
 
 def _uniform(seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float, float, float, float]) -> np.ndarray:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
 from ...core.units import ARCSEC
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.experiment import Experiment
-from ...pipeline.focal_plane_psf.response import level_plane
+from ...pipeline.focal_plane_psf.height_series import HeightSeries
 from ...pipeline.measure.shapes import fwhm, measure_shapes
 from ...pipeline.simulate.ccd_exposure import expose_positions
 
@@ -49,36 +48,15 @@ class Places:
         return float(np.einsum("n,n->", self.weight, values))
 
 
-@dataclass(frozen=True, eq=False)
-class FocusCurves:
-    """FWHM [arcsec], e1 and e2 at places as Chebyshev series of the height over +- `reach`."""
-
-    coefficients: np.ndarray  #: [n_node, 3, n]
-    reach: float  #: [m]
-
-    @classmethod
-    def of(cls, experiment: Experiment, places: Places, reach: float, threads: int | None = None) -> FocusCurves:
-        """Evaluate the engine at the nodes, on level focal planes."""
-        nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-        levels = [level_plane(experiment.focal_plane, reach * node) for node in nodes]
-        values = np.stack([measured(experiment, level, places, threads) for level in levels])
-        inverse = np.linalg.inv(chebyshev.chebvander(nodes, _NODES - 1))
-        return cls(np.einsum("kj,jqn->kqn", inverse, values), reach)
-
-    def chosen(self, rows: np.ndarray) -> FocusCurves:
-        """Return the curves of some places."""
-        return FocusCurves(self.coefficients[:, :, rows], self.reach)
-
-    def at(self, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values at heights [m], shape [3, n], and their derivatives with respect to them [1/m]."""
-        t = heights / self.reach
-        slope = chebyshev.chebder(self.coefficients, axis=0) / self.reach
-        terms = chebyshev.chebvander(t, _NODES - 1).T
-        return np.einsum("kn,kqn->qn", terms, self.coefficients), np.einsum("kn,kqn->qn", terms[:-1], slope)
+def focus_curves(experiment: Experiment, places: Places, reach: float, threads: int | None = None) -> HeightSeries:
+    """Return FWHM [arcsec], e1 and e2 at places as series of the height within `reach` [m] of zero."""
+    return HeightSeries.of(
+        lambda level: measured(experiment, level, places, threads), experiment.focal_plane, reach, _NODES
+    )
 
 
 def measured(experiment: Experiment, focal_plane: FocalPlane, places: Places, threads: int | None = None) -> np.ndarray:
-    """Return FWHM [arcsec], e1 and e2 of the PSFs at places of a focal plane, shape [3, n]."""
+    """Return FWHM [arcsec], e1 and e2 of the PSFs at places of a focal plane, shape [n, 3]."""
     stars = expose_positions(replace(experiment, focal_plane=focal_plane), places.position, threads)
     shapes = measure_shapes(stars.image, stars.pixel_scale, experiment.weight_fwhm)
-    return np.stack([fwhm(stars.image, stars.pixel_scale) / ARCSEC, shapes.e1, shapes.e2])
+    return np.stack([fwhm(stars.image, stars.pixel_scale) / ARCSEC, shapes.e1, shapes.e2], axis=1)

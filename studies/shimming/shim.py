@@ -19,7 +19,8 @@ from ...core.progress import Reporter
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
-from .curves import FocusCurves, Places, measured
+from ...pipeline.focal_plane_psf.height_series import HeightSeries
+from .curves import Places, focus_curves, measured
 
 MERITS = ("fwhm", "ellipticity")
 PARTS = ("rafts", "ccds")
@@ -105,9 +106,9 @@ def shim(
     fit, check = (Places.gauss(plane, names, order) for order in (_FIT, _CHECK))
     heights = fit.heights(plane)
     with reporter.stage("widths and ellipticities against height"):
-        curves = FocusCurves.of(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)
+        curves = focus_curves(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)
         if not np.isfinite(curves.coefficients).all():
-            lost = ~np.isfinite(curves.coefficients).all(axis=(0, 1))
+            lost = ~np.isfinite(curves.coefficients).all(axis=(0, 2))
             some = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
             raise DomainError(f"{some}: the PSF has no width or shape within {1e6 * curves.reach:.0f} um of focus")
     whole = np.zeros(2), np.arange(len(fit.ccd))
@@ -126,7 +127,7 @@ def shim(
         "plane": moved_whole(FocalPlane.flat(plane.camera), level),
     }
     by_state = (heights, focused, shimmed, _lift(level, fit.position))
-    fitted = {state: _metrics(fit, curves.at(h)[0]) for state, h in zip(STATES, by_state, strict=True)}
+    fitted = {state: _metrics(fit, curves.at(h)) for state, h in zip(STATES, by_state, strict=True)}
     with reporter.stage("check with the engine at other places"):
         checked = {state: _metrics(check, measured(experiment, planes[state], check, threads)) for state in STATES}
     return Shims(merit, parts, focus, motions, fitted, checked, planes["focused"], planes["shimmed"])
@@ -181,7 +182,7 @@ def _lift(motion: Motion, position: np.ndarray) -> np.ndarray:
 
 
 def _best(
-    curves: FocusCurves, places: Places, heights: np.ndarray, center: np.ndarray, rows: np.ndarray, merit: str
+    curves: HeightSeries, places: Places, heights: np.ndarray, center: np.ndarray, rows: np.ndarray, merit: str
 ) -> Motion:
     """Return the motion of a part, given by its places, that minimises the merit function."""
     some, weight, start = curves.chosen(rows), places.weight[rows], heights[rows]
@@ -194,7 +195,7 @@ def _best(
         new = start + np.einsum("nk,k->n", design, motion)
         # Heights beyond the curves are penalised: the minimum lies within.
         inside = np.clip(new, -some.reach, some.reach)
-        merits, slope = value(*some.at(inside))
+        merits, slope = value(some.at(inside), some.slope(inside))
         beyond = (new - inside) / _UNIT
         total = merits + beyond**2
         slope = np.where(beyond == 0.0, slope, 0.0) + 2.0 * beyond / _UNIT
@@ -206,16 +207,16 @@ def _best(
 
 
 def _width(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return values[0], slopes[0]
+    return values[:, 0], slopes[:, 0]
 
 
 def _square_ellipticity(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # In units of 1e-3, so that the minimiser has numbers of order one.
-    e, change = 1e3 * values[1:], 1e3 * slopes[1:]
-    return (e**2).sum(axis=0), 2.0 * (e * change).sum(axis=0)
+    e, change = 1e3 * values[:, 1:], 1e3 * slopes[:, 1:]
+    return (e**2).sum(axis=1), 2.0 * (e * change).sum(axis=1)
 
 
-#: Merit of a place and its derivative with respect to the height, of values and slopes [3, n].
+#: Merit of a place and its derivative with respect to the height, of values and slopes [n, 3].
 _VALUES: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
     "fwhm": _width,
     "ellipticity": _square_ellipticity,
@@ -223,4 +224,4 @@ _VALUES: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarr
 
 
 def _metrics(places: Places, values: np.ndarray) -> StateMetrics:
-    return StateMetrics(places.mean(values[0]), places.mean(values[1] ** 2 + values[2] ** 2) ** 0.5)
+    return StateMetrics(places.mean(values[:, 0]), places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from dataclasses import dataclass
@@ -12,14 +11,12 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from ...core.errors import ConfigError, ProductError
-from ...core.files import write_bytes
+from ...core.errors import ProductError
 from ...core.products import Columns, described_table
+from ...core.table_files import write_table
 from ..metrics.stars import STARS
 from .store import SweepStore, readable_rows
 
-#: Formats of an export, by the ending of the file.
-FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
 _UNITS = ("um", "nm", "mm", "m", "urad", "rad", "deg", "arcsec", "s")
 
 
@@ -92,9 +89,8 @@ def export_table(store: SweepStore, path: Path) -> int:
     table = read_table(store)
     if not len(table):
         raise ProductError(f"{store.path}: no point has been computed yet")
-    kind = _format(path)
     meta = {"what": f"sweep {table.name}", "pachon": store.about["pachon"], "digest": store.about["digest"]}
-    write_bytes(path, _encoded(_columns(table, meta), kind, path))
+    write_table(path, _columns(table, meta))
     return len(table)
 
 
@@ -106,20 +102,13 @@ def salvage(path: Path, out: Path) -> int:
     ]
     if not rows:
         raise ProductError("nothing can be read of it; was it a store of a sweep?", file=path)
-    kind = _format(out)
     table = Table(meta={"what": f"saved from {path.name}"})
     for part in range(3):
         for name in dict.fromkeys(name for row in rows for name in row[part]):
             values = [row[part].get(name) for row in rows]
             table[name] = [np.nan if v is None else v for v in values]
-    write_bytes(out, _encoded(table, kind, out))
+    write_table(out, table)
     return len(rows)
-
-
-def _format(path: Path) -> str:
-    if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"expected a file that ends in {', '.join(FORMATS)}", file=path)
-    return FORMATS[path.suffix.lower()]
 
 
 def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
@@ -146,22 +135,3 @@ def _plain(values: np.ndarray) -> np.ndarray:
 def _unit(name: str) -> str:
     ending = name.rpartition("_")[2]
     return ending if "_" in name and ending in _UNITS else ""
-
-
-def _encoded(table: Table, kind: str, path: Path) -> bytes:
-    if kind.startswith("ascii"):
-        text = io.StringIO()
-        table.write(text, format=kind)
-        return text.getvalue().encode()
-    data = io.BytesIO()
-    if kind == "fits":
-        table.write(data, format="fits")
-        return data.getvalue()
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        raise ConfigError("Parquet needs the package pyarrow: pip install 'pachon[parquet]'", file=path) from None
-    arrays = {name: pyarrow.array(np.asarray(table[name]).tolist()) for name in table.colnames}
-    parquet.write_table(pyarrow.table(arrays), data)
-    return data.getvalue()

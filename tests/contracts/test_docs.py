@@ -48,7 +48,7 @@ def test_the_zemax_page_runs_on_a_lens(tmp_path, monkeypatch):
     assert (tmp_path / "again.zmx").stat().st_size > 500
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_page_of_the_focal_plane_model_runs_on_a_run(tmp_path, monkeypatch, capsys, focal_plane_config):
     monkeypatch.chdir(tmp_path)
     pachon.run(focal_plane_config(reconstruction__model="ccd"), tmp_path / "my_run")

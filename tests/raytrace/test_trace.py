@@ -285,3 +285,16 @@ def test_unknown_choice_of_surfaces(lsst_r):
     rays = pachon.launch_rays(lsst_r, (0, 0), 620e-9, ([3.0], [0.0]))
     with pytest.raises(ConfigError, match="'last' or 'all'"):
         pachon.trace(lsst_r, rays, surfaces="first")
+
+
+@pytest.mark.parametrize(
+    ("shapes", "named"),
+    [
+        (((64, 3), (64, 3), (640,)), r"position of rays has shape \(64, 3\): expected \[640, 3\]"),
+        (((640, 3), (64, 3), (640,)), r"direction of rays has shape \(64, 3\): expected \[640, 3\]"),
+        (((3,), (3,), ()), r"position of rays has shape \(3,\): expected \[n, 3\]"),
+    ],
+)
+def test_rays_of_different_lengths_are_refused(shapes, named):
+    with pytest.raises(DomainError, match=named):
+        Rays(*(np.zeros(shape) for shape in shapes), 500e-9)

@@ -228,6 +228,15 @@ def test_mosaics_without_objects_or_images(mosaic, tmp_path):
         GalaxyStamps.from_mosaic(few)
 
 
+def test_images_in_extensions(mosaic, stamps, tmp_path):
+    image = fits.ImageHDU(mosaic.image.astype(np.float32), mosaic.header)
+    table = fits.BinTableHDU.from_columns([fits.Column("a", "D", array=[1.0])])
+    fits.HDUList([fits.PrimaryHDU(), table, image]).writeto(tmp_path / "extension.fits")
+    again = GalaxyStamps.from_mosaic(tmp_path / "extension.fits")
+    assert np.array_equal(again.magnitude, stamps.magnitude)
+    assert all(np.array_equal(a, b) for a, b in zip(again.images, stamps.images, strict=True))
+
+
 def test_zero_points_of_the_hst_header(mosaic, tmp_path):
     header = mosaic.header.copy()
     # F775W of the Ultra Deep Field: the zero point of its catalogue is 25.654 (Beckwith et al. 2006).

@@ -10,7 +10,6 @@ from astropy.table import Table
 from pachon.commands.cli import main
 from pachon.core.progress import Reporter
 from pachon.pipeline import focal_plane_stage
-from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
 from pachon.studies.psf_choice.focal_plane import fit_focal_plane
 from pachon.studies.psf_choice.plan import FOCAL_PLANE, NOISE_FREE, Case, Plan, make_plan
 from pachon.studies.psf_choice.product import write_study
@@ -125,11 +124,12 @@ def test_stated_noise_is_the_scatter_of_the_draws(focal_plane_config):
     experiment = study_experiment(config, make_plan(config, stars=(40,)))
     ccds, case = simulate(experiment, 1, Reporter(quiet=True)), Case(40, 60.0, interpolation="no_telescope").settled()
     draws = [[observe(experiment, ccd, 60.0, k) for ccd in ccds] for k in range(20)]
-    stated = []
+    stated, names = [], [ccd.exposure.name for ccd in ccds]
 
-    def keep(_, products, *, telescope, threads):
+    def keep(_, stars, *, telescope, ccds, threads):
         assert not telescope
-        stated.append(FocalPlaneStars.from_products(products, experiment.weight_fwhm))
+        assert ccds == names
+        stated.append(stars)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pachon.studies.psf_choice.focal_plane.fit_focal_plane_model", keep)

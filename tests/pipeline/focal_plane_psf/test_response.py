@@ -7,13 +7,13 @@ from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope
 from pachon.pipeline.focal_plane_psf import response
+from pachon.pipeline.focal_plane_psf.height_series import HeightSeries, level_plane
 from pachon.pipeline.focal_plane_psf.response import (
     NOLL,
     ExposureResponse,
-    HeightResponse,
     Instrument,
     field_terms,
-    level_plane,
+    height_response,
     wavefront,
 )
 from pachon.wavefront.aberration import ResidualWavefront
@@ -41,7 +41,7 @@ def stars(plane, n, seed):
 @pytest.mark.long
 def test_shapes_at_heights_are_those_of_the_engine(instrument, plane):
     fields = instrument.fields(stars(plane, 16, 1))
-    found = HeightResponse.of(instrument, fields, plane, None)
+    found = height_response(instrument, fields, plane, None)
     worst = np.zeros((16, 3))
     for height in np.random.default_rng(2).uniform(-20.0, 20.0, 5) * UM:
         truth = instrument.shapes(fields, level_plane(plane, height), None)
@@ -63,7 +63,7 @@ def test_shapes_at_heights_are_those_of_the_engine(instrument, plane):
 
 def test_slopes_are_those_of_differences():
     # Any coefficients will do: the derivative of the polynomial is exact.
-    found = HeightResponse(np.random.default_rng(4).normal(0.0, 0.01, (5, 9, 3)), 7 * UM)
+    found = HeightSeries(np.random.default_rng(4).normal(0.0, 0.01, (5, 9, 3)), 25 * UM, 7 * UM)
     heights = np.random.default_rng(5).uniform(-13.0, 27.0, 9) * UM
     step = 0.01 * UM
     near, far = ((found.at(heights + k * step) - found.at(heights - k * step)) / (2 * k * step) for k in (1, 2))
@@ -75,11 +75,11 @@ def test_slopes_are_those_of_differences():
 @pytest.mark.long
 def test_heights_far_from_zero_have_a_range_of_their_own(instrument, plane):
     fields = instrument.fields(stars(plane, 8, 9))
-    found = HeightResponse.of(instrument, fields, plane, None, center=30 * UM)
+    found = height_response(instrument, fields, plane, None, center=30 * UM)
     truth = instrument.shapes(fields, level_plane(plane, 41 * UM), None)
     # 16 um beyond the range about zero; the bound is that of the nodes, as above.
     np.testing.assert_allclose(found.at(np.full(8, 41 * UM)), truth, atol=2e-4)
-    about_zero = HeightResponse.of(instrument, fields, plane, None)
+    about_zero = height_response(instrument, fields, plane, None)
     assert np.abs(about_zero.at(np.full(8, 41 * UM)) - truth).max() > 2e-3
 
 
@@ -194,7 +194,7 @@ def test_shapes_at_heights_in_silicon(plane):
     # Silicon puts the focus 12 um to one side, so the polynomial of the heights reaches farther out of it.
     instrument = Instrument.of(load_telescope("lsst_v3.3_y"), [970e-9], silicon=Silicon())
     fields = instrument.fields(stars(plane, 16, 1))
-    found = HeightResponse.of(instrument, fields, plane, None)
+    found = height_response(instrument, fields, plane, None)
     for height in np.array([-18.0, -7.0, 3.0, 16.0]) * UM:
         truth = instrument.shapes(fields, level_plane(plane, height), None)
         np.testing.assert_allclose(found.at(np.full(16, height)), truth, atol=2e-4)

@@ -51,7 +51,7 @@ def error(heights, truth):
     return np.sqrt(np.mean((left - left.mean()) ** 2))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_exposures_tell_the_heights_better_than_one(exposures, fit, both):
     truth = exposures[0].plane
     one = [fit([i]) for i in range(2)]

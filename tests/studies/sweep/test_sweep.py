@@ -168,6 +168,7 @@ def cluster():
         process.wait()
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_its_driver_and_its_scheduler(folder, reference, cluster, capsys):
     command = ("sweep", "small.yaml", "--scheduler", cluster["address"])
     driver = start(*command)

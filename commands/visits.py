@@ -1,0 +1,139 @@
+"""The command ``pachon visits``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from .interrupt import interruptible
+from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
+from .tables import Rows, print_json
+
+app = typer.Typer()
+
+_CAPTION = (
+    "Stacks of PSFs on the sky; rms of |e|. Residual: true PSF minus the mean of the models of the visits, at the "
+    "stars and at places where no star is. Mean xi+ from 10' to 3 deg."
+)
+
+_NULL_CAPTION = (
+    "Usable galaxies; mean |ξ+| over all separations; ξ+ of the difference of ellipticities by the PSF of the models "
+    "and by the true PSF, beyond 10'; biases of the shear with either."
+)
+
+
+@app.command("visits")
+def visits_command(
+    config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    ccds: Ccds = None,
+    raft: Raft = None,
+    all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
+    count: Annotated[int | None, Option("--count", "-n", min=1, help="Visits; 10 by default.")] = None,
+    dither_deg: Annotated[float | None, Option(help="Radius of the disc of the pointings [deg].")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder of the stacks.")] = Path("pachon_visits"),
+    seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Go on after the visits that are stacked already.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Visit a field many times, each time rolled at random, and stack the PSFs: true ones and models (Figs. 15, 16).
+
+    Telescope and CCD heights stay; turbulence, noise and roll change from visit to visit. A PSF model is fitted to the
+    stars of each visit, and resampled onto the common axes as the images would be. The folder has the stacks of 1, 10,
+    100 and all visits (FITS: PSFs and their shapes at every star and place), summary.json and two pictures.
+
+    Without a configuration: r band of the LSST, the nine CCDs of the central raft.
+
+    **Examples**
+
+    - `pachon visits --raft R22`: ten visits of the central raft, a minute on two cores
+    - `pachon visits --all -n 100 -o full`: 100 visits of 189 CCDs, two hours
+    - `pachon visits --all -n 200 -o full --resume`: a hundred more
+    - `pachon visits my_visits.yaml`, where my_visits.yaml may read
+
+        run: {band: i, active_optics: {residual_um: 0.2}, reconstruction: {model: focal_plane}}
+        visits: {count: 30, dither_deg: 0.3}
+    """
+    from ..pipeline.config import with_options
+    from ..studies.visits.config import VisitsConfig, load_visits_configuration
+    from ..studies.visits.visits import stack_visits
+
+    names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
+    if config is None and names is None:
+        names = ("R22",)
+    base = VisitsConfig() if config is None else load_visits_configuration(config)
+    settings = with_options(base, run__ccds=names, run__seed=seed, visits__count=count, visits__dither_deg=dither_deg)
+    with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
+        result = stack_visits(settings, out, resume=resume, threads=threads, reporter=reporter)
+    if as_json:
+        print_json(result.summary)
+    elif not quiet:
+        _show(result.summary["stacks"])
+        print(f"visits: {out.resolve()}")
+
+
+def _show(stacks: dict[str, dict[str, Any]]) -> None:
+    headings = ("visits", "points", "e of the PSF", "residual, stars", "residual, places", "xi+ of the PSF", "residual")
+    keys = ("rms_e", "rms_residual_e_stars", "rms_residual_e_places")
+    rows = [
+        (
+            visits,
+            str(found["points"]),
+            *(f"{found[key]:.1e}" for key in keys),
+            *(f"{found[f'xi_plus_{k}_long']:.1e}" for k in ("psf", "residual_places")),
+        )
+        for visits, found in stacks.items()
+    ]
+    Rows(headings, rows, _CAPTION).show()
+
+
+@app.command("null-test")
+def null_test_command(
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder of pachon visits.")],
+    tiles: Annotated[int | None, Option(min=1, help="Most tiles of the sky, from the pointing outwards.")] = None,
+    rings: Annotated[int, Option(min=10, help="Rings of galaxies for the calibration of the shear.")] = 2000,
+    resume: Annotated[bool, Option("--resume", help="Keep the tiles that are finished.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Measure galaxies in stacks of visits, and correlate ellipticities that no shear has touched (Figs. 17, 18).
+
+    Galaxies like those of the Hubble Ultra Deep Field are drawn under the true PSF of the stack and measured twice,
+    with the PSF of the models and with the true one: the difference is what the PSF models do to the shear. Rings of
+    galaxies under a shear of 0.02 give the multiplicative and the additive bias of both. Each galaxy has a stamp of its
+    own; neighbours are left out.
+
+    Tables of galaxies, null_test.json and two pictures go into the folder of the visits.
+
+    **Examples**
+
+    - `pachon null-test pachon_visits`: all stacks that the folder has
+    - `pachon null-test full --tiles 20 --resume`
+    """
+    from ..studies.visits.null_result import null_metrics
+    from ..studies.visits.null_test import null_test
+
+    hint = f"finished tiles are in {folder}, and --resume goes on from there"
+    with interruptible(quiet, hint) as reporter:
+        results = null_test(folder, tiles=tiles, rings=rings, resume=resume, threads=threads, reporter=reporter)
+    found = {str(visits): null_metrics(result) for visits, result in results.items()}
+    if as_json:
+        print_json({"stacks": found})
+    elif not quiet:
+        keys = ("mean_abs_xi_plus", "shot_noise_xi_plus", "xi_plus_difference_long")
+        rows = []
+        for visits, metrics in found.items():
+            biases = [
+                f"{metrics[name]:.4f} ± {metrics[f'{name}_error']:.4f}"
+                for name in ("m1_model", "c1_model", "m1_true", "c1_true")
+            ]
+            density = f"{metrics['usable_per_arcmin2']:.1f}"
+            rows.append((visits, density, *(f"{metrics[key]:.1e}" for key in keys), *biases))
+        headings = ("visits", "per arcmin²", "|ξ+|", "shot noise", "difference", "m1", "c1", "m1 true", "c1 true")
+        Rows(headings, rows, _NULL_CAPTION).show()
+        print(f"null test: {folder.resolve()}")

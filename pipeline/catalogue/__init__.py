@@ -1,0 +1,1 @@
+"""Catalogues of objects on images: detection, stars, fits of galaxies, shear calibration."""

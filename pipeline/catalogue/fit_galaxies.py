@@ -1,0 +1,327 @@
+"""Maximum-likelihood fits of PSF-convolved elliptical Gaussians to galaxies (Jee et al. 2009; Jee & Tyson 2011)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError
+from ...core.threads import one_blas_thread
+from ...core.units import real_array, require_positive
+from .cutouts import cut_out, first_pixel
+from .galaxy_fits import GalaxyFits, GalaxyFlag, joined
+from .gaussian_model import PARAMETERS, SIDE_STEP, GaussianStamps
+from .levenberg_marquardt import Bounds, minimize
+from .pixel_checks import check_pixels
+
+#: Sides of the stamps of galaxies in images [pixel]; a galaxy gets the smallest that reaches over
+#: :data:`STAMP_RADII` half-light radii to either side, at least the first.
+STAMP_SIDES = (32, 48, 64, 96, 128)
+STAMP_RADII = 4.0
+#: A fit is flagged where a larger fraction of the pixels in the inner half of its stamp is masked.
+MOST_MASKED = 0.25
+# Least eigenvalue of the covariance over the variance of the PSF: the image of a point may be that much sharper.
+_LEAST_MOMENT = -0.25
+# The largest width, and the largest shift, over the side of the stamp.
+_MOST_WIDTH, _REACH = 0.5, 0.25
+# Numbers of stamps, weights and transforms held at a time: 64 MB.
+_BATCH_NUMBERS = 1 << 23
+_PSF_SUM_TOLERANCE = 1e-4
+
+
+def fit_galaxies(
+    image: ArrayLike,
+    variance: ArrayLike,
+    x: ArrayLike,
+    y: ArrayLike,
+    psf_images: ArrayLike,
+    *,
+    half_light_radius: ArrayLike,
+    mask: ArrayLike | None = None,
+    segmentation: ArrayLike | None = None,
+    max_evaluations: int = 30,
+    tolerance: float = 1e-5,
+    threads: int | None = None,
+) -> GalaxyFits:
+    r"""Fit PSF-convolved elliptical Gaussians to the galaxies of an image by maximum likelihood.
+
+    Minimizes the sum over pixels of (data - model)^2 / variance by Levenberg-Marquardt, without priors, with analytic
+    derivatives. The parameters are flux, centre and the covariance matrix of the Gaussian *before* the PSF:
+    the model is smooth where that goes through zero, so the fit of a point-like galaxy stays regular and its
+    errors Gaussian, where the logarithm of the size runs away and the ellipticity has no meaning.
+
+    Every galaxy is fitted on its own: the same bytes on any number of threads and from any part of the catalogue.
+
+    Parameters
+    ----------
+    image : array
+        [ny, nx], background subtracted, in any unit.
+    variance : array
+        Of the pixels, in the square of that unit, [ny, nx].
+    x, y : array
+        Approximate centres, pixel centres at integers [pixel], [n].
+    psf_images : array
+        PSF at each galaxy, [n, m, m], or one for all, [m, m]: unit sum, m odd, centred on a pixel, pixel included.
+    half_light_radius : float or array
+        Of the galaxies on the image [pixel], which determines their stamps: :data:`STAMP_RADII` of them to either side.
+        NaN, as of an object without flux, for the smallest stamp.
+    mask : array, optional
+        [ny, nx], not zero for pixels to ignore.
+    segmentation : array of int, optional
+        [ny, nx], 0 for sky, otherwise the number of an object: pixels of objects other than the one at (x, y) are
+        ignored.
+    max_evaluations : int
+        Most models computed for a galaxy.
+    tolerance : float
+        Largest change of the model by the last step, relative to the data, as the root of the weighted sum of squares.
+    threads : int, optional
+        All processors by default.
+
+    Returns
+    -------
+    GalaxyFits
+        In the order of x and y.
+
+    Raises
+    ------
+    DomainError
+        If shapes differ, a pixel that is not masked is not finite or has no positive variance, a position lies outside
+        the image, or a PSF has an even side or no unit sum.
+    """
+    options = _options(max_evaluations, tolerance, threads)
+    pixels, variances, ignored = check_pixels(image, variance, mask)
+    places = _positions(x, y, pixels.shape)
+    count = len(places)
+    try:
+        radius = np.broadcast_to(np.asarray(half_light_radius, dtype=np.float64), (count,))
+    except (TypeError, ValueError) as error:
+        raise DomainError(f"half_light_radius: expected one number or {count}") from error
+    radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)
+    if not (np.isfinite(radius).all() and (radius > 0.0).all()):
+        raise DomainError("half_light_radius: expected positive, finite numbers of pixels")
+    psfs, templates = _psfs(psf_images, count)
+    labels = None if segmentation is None else np.asarray(segmentation)
+    if labels is not None and (labels.shape != pixels.shape or labels.dtype.kind not in "iub"):
+        raise DomainError(
+            f"segmentation has shape {labels.shape} and type {labels.dtype}: expected integers {pixels.shape}"
+        )
+    weight = np.where(ignored, 0.0, 1.0 / np.where(ignored, 1.0, variances))
+    data = np.where(ignored, 0.0, pixels)
+    wanted = np.searchsorted(STAMP_SIDES, 2.0 * STAMP_RADII * radius)
+    choice = np.minimum(wanted, len(STAMP_SIDES) - 1)
+    parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
+    for k, side in enumerate(STAMP_SIDES):
+        batch = _batch(side, psfs.shape[-1])
+        for group in _split(np.flatnonzero(choice == k), batch):
+            px, py = places[group].T
+            corner = np.stack([first_pixel(px, side), first_pixel(py, side)], axis=1)
+            stamps, weights = (cut_out(values, px, py, side, 0.0) for values in (data, weight))
+            if labels is not None:
+                found = cut_out(labels, px, py, side, 0)
+                own = labels[np.rint(py).astype(np.int64), np.rint(px).astype(np.int64)]
+                weights[(found != 0) & (found != own[:, None, None])] = 0.0
+            middle = corner + 0.5 * (side - 1)
+            beyond = (corner < 0).any(axis=1) | (corner + side > np.array(pixels.shape[::-1])).any(axis=1)
+            flags = np.where(beyond, GalaxyFlag.EDGE, 0)
+            flags[wanted[group] == len(STAMP_SIDES)] |= GalaxyFlag.CUT_OFF
+            parts.append(_fit(stamps, weights, middle, places[group], psfs, templates[group], flags, **options))
+            members.append(group)
+    return joined(parts, members)
+
+
+def fit_galaxy_stamps(
+    stamps: ArrayLike,
+    variance: ArrayLike,
+    psf_images: ArrayLike,
+    *,
+    mask: ArrayLike | None = None,
+    max_evaluations: int = 30,
+    tolerance: float = 1e-5,
+    threads: int | None = None,
+) -> GalaxyFits:
+    """Fit galaxies on stamps of their own; everything else as :func:`fit_galaxies`.
+
+    Parameters
+    ----------
+    stamps, variance : array
+        [n, ny, nx] pixels, background subtracted, and their variance; one variance may stand for all.
+    psf_images : array
+        [n, m, m], or one for all, [m, m].
+    mask : array, optional
+        [n, ny, nx], not zero for pixels to ignore.
+
+    Returns
+    -------
+    GalaxyFits
+        Centres from the centre of the stamp, ``((ny - 1)/2, (nx - 1)/2)``.
+
+    Raises
+    ------
+    DomainError
+        As of :func:`fit_galaxies`.
+    """
+    options = _options(max_evaluations, tolerance, threads)
+    pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]")
+    count, ny, nx = pixels.shape
+    psfs, templates = _psfs(psf_images, count)
+    side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
+    below, left = (side - ny) // 2, (side - nx) // 2
+    parts, members = [_no_fits()], [np.empty(0, dtype=np.int64)]
+    for group in _split(np.arange(count), _batch(side, psfs.shape[-1])):
+        data, weights = np.zeros((2, len(group), side, side))
+        inside = np.s_[:, below : below + ny, left : left + nx]
+        good = ~ignored[group]
+        data[inside][good] = pixels[group][good]
+        weights[inside][good] = 1.0 / variances[group][good]
+        # The centre of a stamp of an odd side is half a pixel from that of an even one.
+        offset = np.array([left + 0.5 * (nx - 1), below + 0.5 * (ny - 1)]) - 0.5 * (side - 1)
+        middle, start = np.broadcast_to(-offset, (len(group), 2)), np.zeros((len(group), 2))
+        flags = np.zeros(len(group), dtype=np.int32)
+        parts.append(_fit(data, weights, middle, start, psfs, templates[group], flags, **options))
+        members.append(group)
+    return joined(parts, members)
+
+
+def _fit(
+    data: np.ndarray,
+    weight: np.ndarray,
+    middle: np.ndarray,
+    place: np.ndarray,
+    psfs: np.ndarray,
+    templates: np.ndarray,
+    flags: np.ndarray,
+    *,
+    max_evaluations: int,
+    tolerance: float,
+    threads: int | None,
+) -> GalaxyFits:
+    """Fit stamps [n, side, side] with middles at `middle` and galaxies near `place`, both [n, 2], and add to flags."""
+    center = place - middle
+    side = data.shape[-1]
+    used, own = np.unique(templates, return_inverse=True)
+    # Of round Gaussians with the same peaks: the scale of the start and of the bounds, no more.
+    psf_variance = (0.5 / (np.pi * psfs[used].max(axis=(1, 2))))[own]
+    fitter = GaussianStamps(psfs[used], own, data, weight, threads)
+    bounds = Bounds(center, _REACH * side, _LEAST_MOMENT * psf_variance, (_MOST_WIDTH * side) ** 2)
+    # Steps are solved by LAPACK, whose result must not depend on its threads.
+    with one_blas_thread():
+        found = minimize(
+            fitter,
+            _start(data, weight, center, psf_variance),
+            bounds,
+            max_evaluations=max_evaluations,
+            tolerance=tolerance,
+        )
+        covariance = _inverse(found.equations.matrix)
+    inner = np.s_[:, side // 4 : side - side // 4, side // 4 : side - side // 4]
+    n_pixels = (weight > 0.0).sum(axis=(1, 2))
+    flags = flags.astype(np.int32)
+    flags[~found.converged | ~np.isfinite(covariance).all(axis=(1, 2))] |= GalaxyFlag.NOT_CONVERGED
+    flags[found.at_bounds] |= GalaxyFlag.AT_BOUNDS
+    flags[(weight[inner] == 0.0).mean(axis=(1, 2)) > MOST_MASKED] |= GalaxyFlag.MASKED
+    xx, xy, yy = found.params[:, 3:].T
+    flags[(xx * yy <= xy**2) | (xx <= 0.0)] |= GalaxyFlag.UNRESOLVED
+    flags[found.params[:, 0] <= 0.0] |= GalaxyFlag.NO_FLUX
+    return GalaxyFits(
+        flux=found.params[:, 0],
+        x=found.params[:, 1] + middle[:, 0],
+        y=found.params[:, 2] + middle[:, 1],
+        moments=found.params[:, 3:],
+        covariance=covariance,
+        chi2=found.equations.chi2,
+        pixels=n_pixels.astype(np.int32),
+        evaluations=found.evaluations,
+        flags=flags,
+    )
+
+
+def _start(data: np.ndarray, weight: np.ndarray, center: np.ndarray, psf_variance: np.ndarray) -> np.ndarray:
+    """Return approximate parameters [n, 6] from moments under a round Gaussian twice as wide as the PSF."""
+    side = data.shape[-1]
+    width = 4.0 * psf_variance
+    x, y = (np.arange(side) - 0.5 * (side - 1) - center[:, k, None] for k in range(2))
+    window_x, window_y = (np.exp(-0.5 * v**2 / width[:, None]) for v in (x, y))
+    light = np.where(weight > 0.0, data, 0.0) * window_y[:, :, None] * window_x[:, None, :]
+    along_x, along_y = light.sum(axis=1), light.sum(axis=2)
+    total = along_x.sum(axis=1)
+    positive = total > 0.0
+    safe = np.where(positive, total, 1.0)
+    spread = 0.5 * ((along_x * x**2).sum(axis=1) + (along_y * y**2).sum(axis=1)) / safe
+    # The inverse variances of a Gaussian and of its window add up.
+    seen = np.clip(spread, 0.25 * width, 0.9 * width)
+    variance = 1.0 / (1.0 / seen - 1.0 / width)
+    own = np.maximum(np.where(positive, variance, 2.0 * psf_variance) - psf_variance, 0.3 * psf_variance)
+    flux = np.where(positive, total, np.abs(light).sum(axis=(1, 2))) * (1.0 + variance / width)
+    return np.stack([flux, center[:, 0], center[:, 1], own, np.zeros(len(data)), own], axis=1)
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverses of Fisher matrices [n, 6, 6]; NaN for a singular one."""
+    scale = np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
+    known = (scale > 0.0).all(axis=1)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    scaled = matrix / (scale[:, :, None] * scale[:, None, :])
+    # Six parameters of fewer pixels: the smallest eigenvalue is rounding.
+    known &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    result = np.full(matrix.shape, np.nan)
+    result[known] = np.linalg.inv(scaled[known]) / (scale[known, :, None] * scale[known, None, :])
+    return result
+
+
+def _psfs(psf_images: ArrayLike, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the PSFs [m, side, side] and the index [n] of each galaxy's."""
+    psfs = real_array(psf_images, "psf_images: expected real numbers [n, m, m] or [m, m]")
+    shared = psfs.ndim == 2
+    psfs = psfs[None] if shared else psfs
+    if psfs.ndim != 3 or psfs.shape[1] != psfs.shape[2] or psfs.shape[1] % 2 == 0:
+        raise DomainError(f"psf_images have shape {psfs.shape}: expected [n, m, m] or [m, m] with an odd m")
+    if not shared and len(psfs) != count:
+        raise DomainError(f"psf_images: {len(psfs)} for {count} galaxies")
+    sums = psfs.sum(axis=(1, 2))
+    wrong = ~(np.abs(sums - 1.0) < _PSF_SUM_TOLERANCE)
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise DomainError(f"psf_images[{i}] has a sum of {sums[i]:.6g}: expected 1 within {_PSF_SUM_TOLERANCE:g}")
+    return psfs, np.zeros(count, dtype=np.int64) if shared else np.arange(count)
+
+
+def _options(max_evaluations: int, tolerance: float, threads: int | None) -> dict[str, Any]:
+    """Return the options of the fits."""
+    if max_evaluations < 1:
+        raise DomainError(f"max_evaluations = {max_evaluations}: expected at least 1")
+    return {
+        "max_evaluations": max_evaluations,
+        "tolerance": require_positive(tolerance, "tolerance"),
+        "threads": threads,
+    }
+
+
+def _positions(x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the positions [n, 2]."""
+    px, py = (real_array(v, f"{name}: expected real numbers [n]") for v, name in ((x, "x"), (y, "y")))
+    if px.ndim != 1 or px.shape != py.shape:
+        raise DomainError(f"x and y have shapes {px.shape} and {py.shape}: expected [n] twice")
+    inside = (px >= -0.5) & (px < shape[1] - 0.5) & (py >= -0.5) & (py < shape[0] - 0.5)
+    if not inside.all():
+        i = int(np.argmin(inside))
+        raise DomainError(f"x, y [{i}] = ({px[i]:.6g}, {py[i]:.6g}): expected a position in the image of {shape[::-1]}")
+    return np.stack([px, py], axis=1)
+
+
+def _batch(side: int, psf_side: int) -> int:
+    """Return how many galaxies are held at a time."""
+    return max(1, _BATCH_NUMBERS // (4 * side**2 + (side + psf_side) ** 2))
+
+
+def _split(indices: np.ndarray, size: int) -> list[np.ndarray]:
+    """Return indices in parts of a size."""
+    return [indices[i : i + size] for i in range(0, len(indices), size)]
+
+
+def _no_fits() -> GalaxyFits:
+    """Return the fits of no galaxies."""
+    none, count = np.empty(0), len(PARAMETERS)
+    whole = np.empty(0, dtype=np.int32)
+    return GalaxyFits(none, none, none, np.empty((0, 3)), np.empty((0, count, count)), none, whole, whole, whole)

@@ -1,0 +1,122 @@
+"""Levenberg-Marquardt fits of many galaxies at once, each on its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .gaussian_model import GaussianStamps, NormalEquations
+
+# Damping (Marquardt 1963, scaled by the diagonal): where it begins, its factor, where it hardly shortens a step, and
+# where it ends.
+_DAMPING, _FACTOR, _WEAK_DAMPING, _MOST_DAMPING = 1e-3, 10.0, 0.1, 1e10
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Domain of the parameters of n galaxies.
+
+    Parameters
+    ----------
+    center : array
+        Centres from which the fitted ones stay within `reach`, [n, 2] pixel.
+    reach : float
+        Largest distance along x and along y [pixel].
+    least : array
+        Smallest eigenvalue of the covariance, [n] pixel^2; negative where noise may make a point-like galaxy so.
+    most : float
+        Largest eigenvalue [pixel^2].
+    """
+
+    center: np.ndarray
+    reach: float
+    least: np.ndarray
+    most: float
+
+    def project(self, params: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Return the nearest parameters [k, 6] in the domain of the galaxies `which` [k]."""
+        inside = params.copy()
+        center = self.center[which]
+        inside[:, 1:3] = np.clip(params[:, 1:3], center - self.reach, center + self.reach)
+        mean, half = 0.5 * (params[:, 3] + params[:, 5]), 0.5 * (params[:, 3] - params[:, 5])
+        radius = np.hypot(half, params[:, 4])
+        low, high = (np.clip(v, self.least[which], self.most) for v in (mean - radius, mean + radius))
+        beyond = (low != mean - radius) | (high != mean + radius)
+        scale = 0.5 * (high - low) / np.where(radius > 0.0, radius, 1.0)
+        clipped = np.stack([0.5 * (low + high) + scale * half, scale * params[:, 4], 0.5 * (low + high) - scale * half])
+        inside[beyond, 3:] = clipped.T[beyond]
+        return inside
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Minima of chi-square of n galaxies.
+
+    Parameters
+    ----------
+    params : array
+        [n, 6].
+    equations : NormalEquations
+        At the minima.
+    converged, at_bounds : array of bool
+        [n]; the last step fell below the tolerance, and would have left the domain.
+    evaluations : array of int
+        Models computed for each, [n].
+    """
+
+    params: np.ndarray
+    equations: NormalEquations
+    converged: np.ndarray
+    at_bounds: np.ndarray
+    evaluations: np.ndarray
+
+
+def minimize(
+    stamps: GaussianStamps, start: np.ndarray, bounds: Bounds, *, max_evaluations: int, tolerance: float
+) -> Minimum:
+    """Minimize chi-square of every galaxy.
+
+    A galaxy has converged once a step changes the model by less than the tolerance times the data, each measured by
+    the root of its weighted sum of squares: independent of the unit of the image and of the scale of the weights.
+    Every galaxy has its own damping and its own end, so splitting a batch changes no byte.
+    """
+    count = len(start)
+    everything = np.arange(count)
+    params = bounds.project(start, everything)
+    first = stamps.normal_equations(params, everything)
+    chi2, right, matrix = first.chi2, first.right, first.matrix
+    damping = np.full(count, _DAMPING)
+    converged, at_bounds = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    evaluations = np.ones(count, dtype=np.int32)
+    active = everything
+    for _ in range(max_evaluations - 1):
+        if not len(active):
+            break
+        wanted = params[active] + _step(matrix[active], right[active], damping[active])
+        trial = bounds.project(wanted, active)
+        step = trial - params[active]
+        at_bounds[active] = (trial != wanted).any(axis=1)
+        change = ((matrix[active] * step[:, None, :]).sum(axis=2) * step).sum(axis=1)
+        signal = params[active, 0] ** 2 * matrix[active, 0, 0] + chi2[active]
+        found = stamps.normal_equations(trial, active)
+        evaluations[active] += 1
+        better = found.chi2 <= chi2[active]
+        kept = active[better]
+        params[kept], chi2[kept] = trial[better], found.chi2[better]
+        right[kept], matrix[kept] = found.right[better], found.matrix[better]
+        # A strongly damped step is short without being near the minimum; a short one that is rejected is rounding.
+        done = (change <= tolerance**2 * signal) & (damping[active] <= _WEAK_DAMPING)
+        damping[active] *= np.where(better, 1.0 / _FACTOR, _FACTOR)
+        converged[active] = done
+        active = active[~done & (damping[active] < _MOST_DAMPING)]
+    return Minimum(params, NormalEquations(chi2, right, matrix), converged, at_bounds, evaluations)
+
+
+def _step(matrix: np.ndarray, right: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return the damped steps [n, 6]; parameters that change nothing stay."""
+    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = matrix / (scale[:, :, None] * scale[:, None, :])
+    scaled += np.eye(matrix.shape[1]) * np.where(diagonal > 0.0, damping[:, None], 1.0)[:, None, :]
+    return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale

@@ -1,0 +1,134 @@
+"""Matching of a catalogue to the truth: completeness and purity against magnitude."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from ...core.errors import DomainError
+from ...core.units import real_array, require_positive
+
+
+def match_positions(x: ArrayLike, y: ArrayLike, true_x: ArrayLike, true_y: ArrayLike, radius: float) -> np.ndarray:
+    """Match positions to true ones that are mutually nearest.
+
+    Parameters
+    ----------
+    x, y : array
+        Positions, [n].
+    true_x, true_y : array
+        True positions, [m], in the same unit.
+    radius : float
+        Largest distance of a pair.
+
+    Returns
+    -------
+    array of int
+        Index of the true position of each one, -1 where there is none, [n]. No true one occurs twice.
+
+    Raises
+    ------
+    DomainError
+        If shapes differ, a position is not finite or the radius not positive.
+    """
+    found, true = (
+        np.stack([real_array(v, f"{name}: expected real numbers [n]").ravel() for v in pair], axis=1)
+        if np.shape(pair[0]) == np.shape(pair[1]) and np.ndim(pair[0]) == 1
+        else _differ(name, pair)
+        for name, pair in (("x, y", (x, y)), ("true_x, true_y", (true_x, true_y)))
+    )
+    for name, places in (("x, y", found), ("true_x, true_y", true)):
+        if not np.isfinite(places).all():
+            raise DomainError(f"{name}: expected finite positions")
+    radius = require_positive(radius, "radius")
+    if not len(found) or not len(true):
+        return np.full(len(found), -1)
+    distance, nearest = KDTree(true).query(found, distance_upper_bound=radius)
+    _, back = KDTree(found).query(true)
+    near = np.isfinite(distance)
+    mutual = near.copy()
+    mutual[near] = back[nearest[near]] == np.flatnonzero(near)
+    return np.where(mutual, nearest, -1)
+
+
+def _differ(name: str, pair: tuple[ArrayLike, ArrayLike]) -> np.ndarray:
+    raise DomainError(f"{name} have shapes {np.shape(pair[0])} and {np.shape(pair[1])}: expected one length")
+
+
+@dataclass(frozen=True)
+class DetectionRates:
+    """Completeness and purity of a catalogue in bins of magnitude.
+
+    Parameters
+    ----------
+    edges : array
+        Of the bins [mag], [n_bins + 1].
+    n_true, n_found : array of int
+        True objects of each bin of true magnitude, and those of them that have a match, [n_bins].
+    n_detected, n_real : array of int
+        Detected objects of each bin of measured magnitude, and those of them that have a match, [n_bins].
+    """
+
+    edges: np.ndarray
+    n_true: np.ndarray
+    n_found: np.ndarray
+    n_detected: np.ndarray
+    n_real: np.ndarray
+
+    @property
+    def completeness(self) -> np.ndarray:
+        """Fraction of the true objects that were detected; NaN where there are none."""
+        return _fraction(self.n_found, self.n_true)
+
+    @property
+    def purity(self) -> np.ndarray:
+        """Fraction of the detected objects that are true ones; NaN where there are none."""
+        return _fraction(self.n_real, self.n_detected)
+
+
+def detection_rates(
+    magnitude: ArrayLike, match: ArrayLike, true_magnitude: ArrayLike, edges: ArrayLike
+) -> DetectionRates:
+    """Count matched objects in bins of magnitude.
+
+    Parameters
+    ----------
+    magnitude : array
+        Measured [mag], [n]; NaN belongs to no bin.
+    match : array of int
+        As of :func:`match_positions`, [n].
+    true_magnitude : array
+        [m].
+    edges : array
+        Rising edges of the bins [mag].
+
+    Returns
+    -------
+    DetectionRates
+        Counts, from which completeness and purity follow.
+
+    Raises
+    ------
+    DomainError
+        If shapes differ, edges do not rise, or a match is no true object.
+    """
+    measured = real_array(magnitude, "magnitude: expected real numbers [n]")
+    true = real_array(true_magnitude, "true_magnitude: expected real numbers [m]")
+    bins = real_array(edges, "edges: expected real numbers")
+    index = np.asarray(match)
+    if index.shape != measured.shape or measured.ndim != 1 or true.ndim != 1:
+        raise DomainError(f"magnitude has shape {measured.shape} and match {index.shape}: expected [n] twice")
+    if bins.ndim != 1 or len(bins) < 2 or not (np.diff(bins) > 0.0).all():
+        raise DomainError("edges: expected at least two rising magnitudes")
+    if index.size and (index.dtype.kind not in "iu" or index.max() >= len(true)):
+        raise DomainError(f"match: expected integers below {len(true)}, the number of true objects")
+    real = index >= 0
+    counts = [np.histogram(v, bins)[0] for v in (true, true[index[real]], measured, measured[real])]
+    return DetectionRates(bins, *counts)
+
+
+def _fraction(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)

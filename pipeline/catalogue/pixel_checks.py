@@ -1,0 +1,42 @@
+"""Checks of images, their variance and their mask."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import DomainError
+from ...core.units import real_array
+
+
+def check_pixels(
+    image: ArrayLike, variance: ArrayLike, mask: ArrayLike | None, *, axes: str = "[ny, nx]"
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return image and variance as float64, and the masked pixels as bool, all of one shape.
+
+    Raises
+    ------
+    DomainError
+        If shapes differ, or a pixel that is not masked is not finite or has no positive variance.
+    """
+    pixels = real_array(image, f"image: expected real numbers {axes}")
+    variances = real_array(variance, f"variance: expected real numbers {axes}")
+    ignored = np.zeros(pixels.shape, dtype=bool) if mask is None else np.asarray(mask) != 0
+    if pixels.ndim != axes.count(",") + 1 or 0 in pixels.shape[-2:]:
+        raise DomainError(f"image has shape {pixels.shape}: expected {axes}")
+    if variances.ndim == 0:
+        variances = np.broadcast_to(variances, pixels.shape)
+    for name, other in (("variance", variances), ("mask", ignored)):
+        if other.shape != pixels.shape:
+            raise DomainError(f"{name} has shape {other.shape}: expected {pixels.shape}, that of the image")
+    _require(np.isfinite(pixels) | ignored, "image", pixels, "finite")
+    _require((np.isfinite(variances) & (variances > 0.0)) | ignored, "variance", variances, "positive and finite")
+    return pixels, variances, ignored
+
+
+def _require(good: np.ndarray, name: str, values: np.ndarray, expected: str) -> None:
+    if not good.all():
+        at = tuple(int(i) for i in np.unravel_index(np.argmin(good), good.shape))
+        raise DomainError(
+            f"{name}[{', '.join(map(str, at))}] = {values[at]:.6g}: expected {expected} where the mask is zero"
+        )

@@ -1,0 +1,86 @@
+"""Configuration of visits: a run, how often and how its field is visited, and the galaxies of the null test.
+
+::
+
+    run: {band: r, seed: 3, active_optics: {residual_um: 0.2}}     # a run's configuration, or the path of its file
+    visits: {count: 100, dither_deg: 0.2}
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BeforeValidator, Field
+
+from ...core.errors import ConfigError, error_context
+from ...core.schema import Count, Section, Whole, plain_number, validated
+from ...core.yaml_reader import read_mapping
+from ...pipeline.config import Configuration, configuration_of, digest, with_options
+from ...pipeline.experiment import Experiment
+
+#: Pixels along a side of the stamps of the stack, and of those of a visit, of which turned axes cut the corners.
+STACK_STAMP, VISIT_STAMP = 31, 49
+
+
+class VisitsSection(Section):
+    """How the field is visited, and what is looked at."""
+
+    count: Count = Field(10, description="number of visits")
+    dither_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=5)] = Field(
+        0.0, description="radius of the disc over which pointings are spread [deg]"
+    )
+    stars: Count = Field(40, description="stars on the sky per area of a CCD, to which PSF models are fitted")
+    places: Count = Field(20, description="places per area of a CCD where no star is and models are checked")
+    snapshots: tuple[Count, ...] = Field((1, 10, 100), description="numbers of visits whose stacks are kept")
+    first_epoch: Whole = Field(0, description="epoch of the first visit")
+
+
+class VisitsConfig(Section):
+    """All that decides a stack of visits."""
+
+    run: Configuration = Configuration()
+    visits: VisitsSection = VisitsSection()
+
+    def experiment(self, folder: Path | None = None) -> Experiment:
+        """Return the experiment of all visits; relative paths in its configuration start from `folder`."""
+        run = self.run if self.run.psf.stamp is not None else with_options(self.run, psf__stamp=VISIT_STAMP)
+        with error_context(key="run"):
+            return Experiment.from_config(run, folder)
+
+    def resolved(self, experiment: Experiment) -> VisitsConfig:
+        """Return the configuration with every default of the run filled in."""
+        return self.model_copy(update={"run": experiment.config})
+
+    def digest(self, experiment: Experiment) -> str:
+        """SHA-256 of all settings that affect a visit; their number does not, nor which stacks are kept."""
+        visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
+        return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
+
+    @property
+    def kept(self) -> tuple[int, ...]:
+        """Numbers of visits whose stacks are kept, the last one among them."""
+        count = self.visits.count
+        return tuple(sorted({n for n in self.visits.snapshots if n < count} | {count}))
+
+    def to_yaml(self) -> str:
+        """Return the configuration as a YAML file."""
+        content = self.model_dump(mode="json", by_alias=True)
+        return "# All that decides these visits.\n" + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def load_visits_configuration(path: Path) -> VisitsConfig:
+    """Read a configuration of visits, and that of the run that it names.
+
+    Raises
+    ------
+    ConfigError
+        If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
+    """
+    content = read_mapping(path, ConfigError)
+    run: Any = content.get("run")
+    if isinstance(run, str):
+        base = path.parent / run
+        content["run"] = configuration_of(read_mapping(base, ConfigError), str(base)).model_dump(by_alias=True)
+    return validated(VisitsConfig, content, str(path))

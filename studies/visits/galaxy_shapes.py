@@ -1,0 +1,176 @@
+"""Shapes of galaxies under the PSF of a stack, measured with the true PSF and with that of the models.
+
+Each galaxy stands on a stamp of its own, with the true PSF of the nearest place where no star is, and the noise of the
+stack; neighbours are left out. It is measured twice, with the true PSF and with that of the models at that place: the
+difference is the systematic error of the PSF models, without the noise of galaxies and pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy import fft
+from scipy.spatial import cKDTree
+
+from ...core.random_streams import stream
+from ...imaging.exposure import Exposure
+from ...pipeline.catalogue.fit_galaxies import fit_galaxy_stamps
+from ...pipeline.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
+from ...sky.galaxies import Galaxies
+from .stack import PsfStack
+
+#: Sides of stamps [pixel], each drawn on a grid of twice the side, and the half-light radii on the image over which a
+#: stamp of the first side is too small [pixel].
+_SIDES, _LARGE = (32, 64), 5.0
+_BLOCK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class GalaxyShapes:
+    """Galaxies of a part of the sky, and their shapes along the axes of the stack.
+
+    Attributes
+    ----------
+    index : ndarray of int, shape [n]
+        Number of each galaxy among those given.
+    x, y : ndarray, shape [n]
+        Position along the axes of the stack [rad].
+    magnitude : ndarray, shape [n]
+        AB.
+    e1, e2, error : ndarray, shape [n]
+        Ellipticity measured with the PSF of the models, and standard error of a component.
+    usable : ndarray of bool, shape [n]
+        Whether it is fit for shear.
+    true_e1, true_e2, true_usable : ndarray, shape [n]
+        The same, measured with the true PSF.
+    """
+
+    index: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    magnitude: np.ndarray
+    e1: np.ndarray
+    e2: np.ndarray
+    error: np.ndarray
+    usable: np.ndarray
+    true_e1: np.ndarray
+    true_e2: np.ndarray
+    true_usable: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @classmethod
+    def joined(cls, parts: list[GalaxyShapes]) -> GalaxyShapes:
+        """Return the galaxies of several parts."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+
+def measure_galaxies(
+    stack: PsfStack,
+    axes: np.ndarray,
+    galaxies: Galaxies,
+    exposure: Exposure,
+    seed: int,
+    *key: str | int,
+    reach: float,
+    threads: int | None = None,
+) -> GalaxyShapes:
+    """Draw galaxies, each on a stamp of its own, and measure them twice.
+
+    Parameters
+    ----------
+    stack : PsfStack
+        PSFs.
+    axes : ndarray, shape [2, 2]
+        d(x, y of the stack [pixel])/d(xi, eta).
+    galaxies : Galaxies
+        Galaxies about the common pointing.
+    exposure : Exposure
+        Depth and noise of the stack.
+    seed, *key
+        Random stream of the noise.
+    reach : float
+        Galaxies farther from every place where the PSF is known are left out [rad].
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    """
+    places = np.flatnonzero(~stack.star)
+    tree = cKDTree(np.stack([stack.x, stack.y], axis=1)[places])
+    pixels = np.stack([galaxies.xi, galaxies.eta], axis=1) @ axes.T
+    distance, nearest = tree.query(pixels * exposure.pixel_scale, distance_upper_bound=reach)
+    near = np.flatnonzero(np.isfinite(distance))
+    psf = places[nearest[near]]
+    widths = _half_light(stack.true[places])
+    width = widths[nearest[near]]
+    on_image = np.hypot(galaxies.radius[near] / exposure.pixel_scale, width)
+    electrons = exposure.electrons(galaxies.magnitude[near])
+    # Between pixels, as the sky is to the pixels of the stack.
+    offset = pixels[near] - np.rint(pixels[near])
+    found: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]] = []
+    rng = stream(seed, *key)
+    for side, rows in zip(_SIDES, (on_image <= _LARGE, on_image > _LARGE), strict=True):
+        for own in _blocks(np.flatnonzero(rows)):
+            size = 2 * side
+            spectra = galaxies.transform(
+                near[own], np.broadcast_to(axes, (len(own), 2, 2)), offset[own], size, threads=threads
+            )
+            spectra *= _transforms(stack.true[psf[own]], size)
+            images = fft.irfft2(spectra, s=(size, size), workers=1)[:, side // 2 : -side // 2, side // 2 : -side // 2]
+            images *= electrons[own, None, None].astype(np.float32)
+            variance = exposure.noise_rms**2
+            if exposure.noise:
+                images += np.sqrt(variance + np.maximum(images, 0.0)) * rng.standard_normal(images.shape, np.float32)
+            fits = [
+                fit_galaxy_stamps(images, np.full(images.shape, variance), psfs[psf[own]], threads=threads)
+                for psfs in (stack.model, stack.true)
+            ]
+            found.append((own, *fits))
+    return _shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
+
+
+def _blocks(rows: np.ndarray) -> Iterator[np.ndarray]:
+    return (rows[i : i + _BLOCK] for i in range(0, len(rows), _BLOCK))
+
+
+def _transforms(psfs: np.ndarray, size: int) -> np.ndarray:
+    """Return the transforms of PSFs [n, m, m] centred on pixel ``size // 2``, complex64 [n, size, size // 2 + 1]."""
+    wide = np.zeros((len(psfs), size, size), dtype=np.float32)
+    first = size // 2 - psfs.shape[1] // 2
+    wide[:, first : first + psfs.shape[1], first : first + psfs.shape[2]] = psfs
+    return fft.rfft2(wide, workers=1)
+
+
+def _half_light(psfs: np.ndarray) -> np.ndarray:
+    """Return half-light radii of PSFs of unit sum from their growth curves [pixel]."""
+    half = psfs.shape[1] // 2
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    order = np.argsort(np.hypot(x, y), axis=None, kind="stable")
+    # A pixel more of area, a little more of radius: the radius of the disc that n pixels fill.
+    radius = np.sqrt(np.arange(1, order.size + 1) / np.pi)
+    growth = np.cumsum(psfs.reshape(len(psfs), -1)[:, order], axis=1)
+    return np.array([np.interp(0.5, curve, radius) for curve in np.maximum.accumulate(growth, axis=1)])
+
+
+def _shapes(
+    galaxies: Galaxies,
+    near: np.ndarray,
+    positions: np.ndarray,
+    width: np.ndarray,
+    found: list[tuple[np.ndarray, GalaxyFits, GalaxyFits]],
+) -> GalaxyShapes:
+    """Return the shapes of the fits of blocks of galaxies, in the order of the galaxies."""
+    columns = {name: np.full(len(near), np.nan) for name in ("e1", "e2", "error", "true_e1", "true_e2")}
+    usable = {name: np.zeros(len(near), dtype=bool) for name in ("usable", "true_usable")}
+    for own, *both in found:
+        for fits, prefix in zip(both, ("", "true_"), strict=True):
+            columns[f"{prefix}e1"][own], columns[f"{prefix}e2"][own] = fits.e1, fits.e2
+            # Half-light radius on the image, of the fitted Gaussian under the PSF.
+            on_image = np.hypot(fits.half_light_radius, width[own])
+            usable[f"{prefix}usable"][own] = usable_galaxies(fits, on_image, width)
+            if not prefix:
+                columns["error"][own] = fits.ellipticity_error
+    x, y = positions[near].T
+    return GalaxyShapes(index=near, x=x, y=y, magnitude=galaxies.magnitude[near], **columns, **usable)

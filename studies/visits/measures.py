@@ -1,0 +1,71 @@
+"""Ellipticity correlations and figures of a stack of visits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...core.units import ARCMIN, ARCSEC
+from ...pipeline.measure.correlation import SEPARATION_RANGES, Correlation, shear_correlation
+from .stack import PsfStack
+
+#: Correlations of a stack: of the true PSFs at all points, and of true minus model at stars and where no star is.
+KINDS = ("psf", "residual_stars", "residual_places")
+Correlated = dict[str, Correlation]
+# Smallest separation [arcmin], bins, and side of a patch of the jackknife over that of a CCD.
+_LEAST, _BINS, _PATCH = 1.0, 15, 3.0
+
+
+def correlated(stack: PsfStack, cell: float) -> Correlated:
+    """Return the correlations of a stack by kind; `cell` is the angle of the side of a CCD [rad].
+
+    Errors are those of a jackknife over squares of three CCDs.
+    """
+    extent = float(np.hypot(np.ptp(stack.x), np.ptp(stack.y)))
+    limits = {"min_sep": _LEAST * ARCMIN, "max_sep": max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN)}
+    corner = [np.floor(v / (_PATCH * cell) + 0.5).astype(int) for v in (stack.x, stack.y)]
+    patch = corner[0] - corner[0].min() + (np.ptp(corner[0]) + 1) * (corner[1] - corner[1].min())
+    values = {
+        "psf": (stack.e1, stack.e2, np.ones(len(stack), dtype=bool)),
+        "residual_stars": (stack.residual_e1, stack.residual_e2, stack.star),
+        "residual_places": (stack.residual_e1, stack.residual_e2, ~stack.star),
+    }
+    found = {}
+    for kind, (e1, e2, rows) in values.items():
+        several = len(np.unique(patch[rows])) > 1
+        found[kind] = shear_correlation(
+            stack.x[rows],
+            stack.y[rows],
+            e1[rows],
+            e2[rows],
+            n_bins=_BINS,
+            patch=patch[rows] if several else None,
+            **limits,
+        )
+    return found
+
+
+def stack_metrics(stack: PsfStack, found: Correlated) -> dict[str, Any]:
+    """Return the figures of a stack: ellipticities, sizes and mean correlations."""
+    stars, places = stack.star, ~stack.star
+    e, left = (stack.e1, stack.e2), (stack.residual_e1, stack.residual_e2)
+    size = (stack.size - stack.model_size) / stack.size
+    metrics: dict[str, Any] = {
+        "points": len(stack),
+        "rms_e": _rms(*e),
+        "rms_residual_e_stars": _rms(*(v[stars] for v in left)),
+        "rms_residual_e_places": _rms(*(v[places] for v in left)),
+        "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
+        "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
+    }
+    for kind, correlation in found.items():
+        for span in SEPARATION_RANGES:
+            metrics[f"xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
+            metrics[f"xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)
+    return metrics
+
+
+def _rms(e1: np.ndarray, e2: np.ndarray) -> float:
+    """Return the rms of the absolute value of an ellipticity."""
+    return float(np.sqrt(np.nanmean(e1**2 + e2**2)))

@@ -1,0 +1,137 @@
+"""Result of a null test: shear correlations, densities, biases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...pipeline.measure.correlation import Correlation
+from .galaxy_shapes import GalaxyShapes
+
+
+@dataclass(frozen=True)
+class ShearBias:
+    """Measured shear as a function of the true one, (1 + m) g + c, of both components.
+
+    Attributes
+    ----------
+    m, m_error : ndarray, shape [2]
+        Multiplicative bias of g1 and g2 and its standard error.
+    c, c_error : ndarray, shape [2]
+        Additive bias and its standard error.
+    n_rings : int
+        Rings of galaxies used.
+    """
+
+    m: np.ndarray
+    m_error: np.ndarray
+    c: np.ndarray
+    c_error: np.ndarray
+    n_rings: int
+
+
+def shear_bias(e: np.ndarray, shear: np.ndarray) -> ShearBias:
+    """Return the bias from galaxies under a shear and its opposite, with the same noise (Pujol et al. 2019).
+
+    Shapes and noise cancel in the difference of the two, and so hardly add to the error of m.
+
+    Parameters
+    ----------
+    e : ndarray of complex, shape [2, n, k]
+        Ellipticities e1 + i e2 of n rings of k galaxies, under the shear and its opposite. A ring with a NaN is left
+        out.
+    shear : ndarray of complex, shape [n]
+        g1 + i g2 of each ring, along one of the two axes.
+    """
+    whole = np.isfinite(e).all(axis=(0, 2))
+    mean = e[:, whole].mean(axis=2)
+    level, change = 0.5 * (mean[0] + mean[1]), 0.5 * (mean[0] - mean[1])
+    biases = []
+    for part in (np.real, np.imag):
+        g = part(shear[whole])
+        along = np.abs(g) > 0.5 * np.abs(shear[whole])
+        response = part(change)[along] / g[along]
+        c = part(level)
+        ends = [(v.mean(), v.std(ddof=1) / np.sqrt(len(v))) if len(v) > 1 else (np.nan, np.nan) for v in (response, c)]
+        biases.append((ends[0][0] - 1.0, ends[0][1], *ends[1]))
+    m, m_error, c, c_error = np.array(biases).T
+    return ShearBias(m, m_error, c, c_error, int(whole.sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class NullTest:
+    """Shear correlations of galaxies in a stack of a number of visits.
+
+    Attributes
+    ----------
+    visits : int
+        Visits in the stack.
+    galaxies : GalaxyShapes
+        All galaxies.
+    density : float
+        Usable ones per square arcminute.
+    correlations : dict of str to Correlation
+        ``model``: ellipticities measured with the PSF of the models; ``true``: with the true PSF; ``difference``: of
+        the two, of galaxies that are usable with either.
+    calibration : dict of str to ShearBias
+        Biases of the shear with the PSF of the models and the true one.
+    """
+
+    visits: int
+    galaxies: GalaxyShapes
+    density: float
+    correlations: dict[str, Correlation]
+    calibration: dict[str, ShearBias]
+
+
+def null_metrics(result: NullTest) -> dict[str, Any]:
+    """Return the figures of a null test; keys end in their unit."""
+    galaxies = result.galaxies
+    usable, both = galaxies.usable, galaxies.usable & galaxies.true_usable
+    shift = np.stack([galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2])[:, both]
+    metrics: dict[str, Any] = {
+        "galaxies": len(galaxies),
+        "usable": int(usable.sum()),
+        "usable_per_arcmin2": result.density,
+        "rms_e_component": float(np.sqrt(0.5 * np.mean(galaxies.e1[usable] ** 2 + galaxies.e2[usable] ** 2))),
+        "mean_e1_difference": float(shift[0].mean()),
+        "mean_e2_difference": float(shift[1].mean()),
+        "mean_abs_xi_plus": amplitude(result),
+        "shot_noise_xi_plus": shot_noise(result),
+    }
+    for kind, correlation in result.correlations.items():
+        for span in ("short", "long"):
+            metrics[f"xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
+            metrics[f"xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)
+    for kind, found in result.calibration.items():
+        for name in ("m", "c"):
+            for k in range(2):
+                metrics[f"{name}{k + 1}_{kind}"] = float(getattr(found, name)[k])
+                metrics[f"{name}{k + 1}_{kind}_error"] = float(getattr(found, f"{name}_error")[k])
+    return metrics
+
+
+def amplitude(result: NullTest) -> float:
+    """Return the mean absolute value of xi+ over the bins with pairs."""
+    return float(np.nanmean(np.abs(result.correlations["model"].xi_plus)))
+
+
+def shot_noise(result: NullTest) -> float:
+    """Return the mean absolute value of xi+ that unrelated ellipticities would have in the same bins.
+
+    The standard deviation of xi+ in a bin of N pairs is sqrt(2) sigma^2 / sqrt(2 N) = sigma^2 / sqrt(N), with the rms
+    sigma of a component.
+    """
+    galaxies, xi = result.galaxies, result.correlations["model"]
+    square = 0.5 * float(np.mean(galaxies.e1[galaxies.usable] ** 2 + galaxies.e2[galaxies.usable] ** 2))
+    pairs = xi.n_pairs[xi.n_pairs > 0]
+    return float(np.sqrt(2.0 / np.pi) * np.mean(np.sqrt(2.0) * square / np.sqrt(pairs)))
+
+
+def density_slope(density: np.ndarray, values: np.ndarray) -> float | None:
+    """Return the slope of log amplitude against log density; None of less than two stacks."""
+    if len(density) < 2:
+        return None
+    return float(np.polyfit(np.log(density), np.log(values), 1)[0])

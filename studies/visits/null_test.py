@@ -1,0 +1,246 @@
+"""Null test: shear correlation of galaxies that no shear has touched, after any number of visits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ...core.errors import DomainError, ProductError
+from ...core.files import make_folder, write_bytes, write_json
+from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
+from ...core.progress import Reporter
+from ...core.units import ARCMIN, ARCSEC
+from ...imaging.exposure import Exposure
+from ...pipeline.config import digest
+from ...pipeline.measure.correlation import Correlation, shear_correlation
+from ...pipeline.run_folder import CONFIG_NAME
+from ...pipeline.simulate.photometry import limiting_magnitude
+from ...sky.galaxies import Galaxies
+from ...sky.population import GalaxyPopulation
+from .config import STACK_STAMP, load_visits_configuration
+from .galaxy_shapes import GalaxyShapes, measure_galaxies
+from .null_result import NullTest, ShearBias, null_metrics, shear_bias
+from .plots import density_picture, null_test_picture
+from .psf_visit import StackFrame
+from .stack import PsfStack
+from .visits import cell_of, pixel_scale_of, stack_path
+
+#: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
+_FAINTEST_SNR = 8.0
+# FWHM of that star.
+_FWHM = 0.7 * ARCSEC
+# Galaxies farther from all places with a known PSF than this are left out, over the mean distance of the places.
+_REACH = 2.0
+#: Shear of the calibration.
+SHEAR = 0.02
+# Orientations of a ring.
+_ORIENTATIONS = 4
+# Separations [arcmin] and bins, as of the PSFs.
+_LEAST, _BINS = 1.0, 15
+
+
+def null_test(
+    folder: Path,
+    *,
+    tiles: int | None = None,
+    rings: int = 2000,
+    resume: bool = False,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> dict[int, NullTest]:
+    """Measure galaxies in the stacks of a folder of visits, and correlate their ellipticities.
+
+    The sky is cut into tiles of the size of a CCD; each leaves a table of its galaxies. Products are these tables,
+    ``null_test.json`` and two pictures; they have the same bytes on any number of threads.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of :func:`.stack_visits`.
+    tiles : int, optional
+        Most tiles, those nearest to the pointing; all by default.
+    rings : int
+        Rings of galaxies for the calibration of the shear.
+    resume : bool
+        Keep the tiles that are finished.
+    threads : int, optional
+        Number of threads; all processors by default.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    PachonError
+        If the folder holds no stacks, or a product cannot be written.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    if not (folder / CONFIG_NAME).exists():
+        raise ProductError(f"{folder}: no visits (no {CONFIG_NAME}); expected the folder of pachon visits")
+    config = load_visits_configuration(folder / CONFIG_NAME)
+    experiment = config.experiment()
+    frame = StackFrame.of(experiment, STACK_STAMP)
+    cell, scale = cell_of(experiment, frame), pixel_scale_of(frame)
+    settings, seed = experiment.config, experiment.config.seed
+    band, seconds = settings.band or "r", settings.atmosphere.exposure_s
+    reach = _REACH * float(cell / np.sqrt(config.visits.places))
+    make_folder(folder / "galaxies")
+    results = {}
+    for visits in config.kept:
+        stamp = Stamp(digest({"visits": config.digest(experiment), "stack": visits}), seed)
+        stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
+        exposure = Exposure(band=band, time=seconds, exposures=visits, pixel_scale=scale)
+        faintest = limiting_magnitude(_FAINTEST_SNR, band, seconds, _FWHM) + 1.25 * np.log10(visits)
+        population = GalaxyPopulation(faintest, seed)
+        chosen = _tiles(stack, cell, config.visits.places)[:tiles]
+        if not chosen:
+            raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
+        parts = []
+        with reporter.stage(f"galaxies in {visits} visits", total=len(chosen)) as stage:
+            for number, (i, j) in enumerate(chosen, start=1):
+                path = folder / "galaxies" / f"visits_{visits:04d}_tile_{i:+03d}_{j:+03d}.fits"
+                if not (resume and _finished(path, stamp)):
+                    measured = measure_galaxies(
+                        stack,
+                        frame.matrix,
+                        population.galaxies_in(*_ranges((i, j), cell)),
+                        exposure,
+                        seed,
+                        "null test",
+                        visits,
+                        *(2 * abs(k) + (k < 0) for k in (i, j)),
+                        reach=reach,
+                        threads=threads,
+                    )
+                    _write(path, measured, stamp)
+                # What a resumed test reads, so that both have the same numbers.
+                parts.append(_read(path, stamp))
+                stage.advance()
+                stage.step(path.stem, number, len(chosen))
+        galaxies = GalaxyShapes.joined(parts)
+        patch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        with reporter.stage(f"correlations and shear calibration in {visits} visits"):
+            area = len(chosen) * (cell / ARCMIN) ** 2
+            some = population.galaxies_in(*_ranges(chosen[0], cell))
+            some = some.take(np.arange(min(rings, len(some))))
+            results[visits] = NullTest(
+                visits,
+                galaxies,
+                float(galaxies.usable.sum() / area),
+                _correlations(galaxies, patch),
+                _calibration(stack, frame.matrix, some, exposure, seed, reach, threads),
+            )
+    write_json(folder / "null_test.json", {"stacks": {str(n): null_metrics(r) for n, r in results.items()}})
+    write_bytes(folder / "null_test.png", null_test_picture(results))
+    write_bytes(folder / "null_test_density.png", density_picture(results))
+    return results
+
+
+def _tiles(stack: PsfStack, cell: float, places: int) -> list[tuple[int, int]]:
+    """Return the tiles in which at least three quarters of the places are known, from the pointing outwards."""
+    own = ~stack.star
+    corner = np.floor(np.stack([stack.xi, stack.eta], axis=1)[own] / cell + 0.5).astype(int)
+    tiles, count = np.unique(corner, axis=0, return_counts=True)
+    known = [(int(i), int(j)) for (i, j), n in zip(tiles, count, strict=True) if n >= 0.75 * places]
+    return sorted(known, key=lambda tile: (tile[0] ** 2 + tile[1] ** 2, tile))
+
+
+def _ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
+    """Return the ranges of xi and eta of a tile [rad]."""
+    return [(cell * (k - 0.5), cell * (k + 0.5)) for k in tile]
+
+
+def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
+    extent = float(np.hypot(np.ptp(galaxies.x), np.ptp(galaxies.y)))
+    both = galaxies.usable & galaxies.true_usable
+    kinds = {
+        "model": (galaxies.e1, galaxies.e2, galaxies.usable),
+        "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
+        "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
+    }
+    found = {}
+    for kind, (e1, e2, rows) in kinds.items():
+        found[kind] = shear_correlation(
+            galaxies.x[rows],
+            galaxies.y[rows],
+            e1[rows],
+            e2[rows],
+            min_sep=_LEAST * ARCMIN,
+            max_sep=max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN),
+            n_bins=_BINS,
+            patch=patch[rows] if len(np.unique(patch[rows])) > 1 else None,
+        )
+    return found
+
+
+def _calibration(
+    stack: PsfStack,
+    axes: np.ndarray,
+    galaxies: Galaxies,
+    exposure: Exposure,
+    seed: int,
+    reach: float,
+    threads: int | None,
+) -> dict[str, ShearBias]:
+    """Return the biases of the shear from rings of galaxies, each under a shear and its opposite, with one noise."""
+    n = len(galaxies)
+    first = np.arange(n) % 2 == 0
+    shear = SHEAR * np.where(first, 1.0, 1j)
+    along = {kind: np.full((2, n, _ORIENTATIONS), np.nan + 0j) for kind in ("model", "true")}
+    for k in range(_ORIENTATIONS):
+        rotated = galaxies.rotated(np.pi * k / _ORIENTATIONS)
+        for row, sign in enumerate((1.0, -1.0)):
+            sheared = rotated.sheared(sign * shear.real, sign * shear.imag)
+            key = ("shear", exposure.exposures, k)
+            found = measure_galaxies(stack, axes, sheared, exposure, seed, *key, reach=reach, threads=threads)
+            for kind, prefix in (("model", ""), ("true", "true_")):
+                e1, e2, usable = (getattr(found, prefix + name) for name in ("e1", "e2", "usable"))
+                along[kind][row, found.index[usable], k] = (e1 + 1j * e2)[usable]
+    # Ellipticities are along the axes of the stack, the shear along those of the sky.
+    return {kind: shear_bias(e, ellipticity_along(axes, shear)) for kind, e in along.items()}
+
+
+def ellipticity_along(axes: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Return ellipticities e1 + i e2 along xi, eta in the axes of the stack, rotated or mirrored by a matrix."""
+    seen = e if np.linalg.det(axes) > 0.0 else np.conj(e)
+    return np.asarray(seen * np.exp(2j * np.arctan2(axes[1, 0], axes[0, 0])))
+
+
+_COLUMNS = {
+    "index": (1.0, "", "among the galaxies of the tile"),
+    "x": (ARCMIN, "arcmin", "along x of the stack"),
+    "y": (ARCMIN, "arcmin", "along y of the stack"),
+    "magnitude": (1.0, "mag", "AB magnitude"),
+    "e1": (1.0, "", "(a-b)/(a+b) along x, PSF of models"),
+    "e2": (1.0, "", "along x = y, PSF of the models"),
+    "error": (1.0, "", "standard error of a component"),
+    "usable": (1.0, "", "whether it is fit for shear"),
+    "true_e1": (1.0, "", "ellipticity with the true PSF"),
+    "true_e2": (1.0, "", "ellipticity with the true PSF"),
+    "true_usable": (1.0, "", "whether it is fit for shear with it"),
+}
+
+
+def _write(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
+    columns = {
+        name.upper(): (getattr(galaxies, name) / unit if unit != 1.0 else getattr(galaxies, name), text, description)
+        for name, (unit, text, description) in _COLUMNS.items()
+    }
+    write_fits(path, [table_hdu("GALAXIES", columns)], stamp, [])
+
+
+def _read(path: Path, stamp: Stamp) -> GalaxyShapes:
+    """Return the galaxies of a finished tile; ProductError for a damaged one or one of another configuration."""
+    hdus = read_fits(path)
+    if not stamp.matches(hdus[0].header):
+        raise ProductError("was made with another version, configuration or seed", file=path)
+    found = {name: column(hdus["GALAXIES"], name.upper()) for name in _COLUMNS}
+    return GalaxyShapes(**{n: v * _COLUMNS[n][0] if _COLUMNS[n][0] != 1.0 else v for n, v in found.items()})
+
+
+def _finished(path: Path, stamp: Stamp) -> bool:
+    try:
+        _read(path, stamp)
+    except ProductError:
+        return False
+    return True

@@ -1,0 +1,113 @@
+"""Visits to one patch of sky: pointing, roll and epoch of each, and where the sky falls on the detector.
+
+Positions on the sky are gnomonic: xi towards east and eta towards north of the common pointing, tangents of angles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...core.random_streams import stream
+from ...models.telescope import Telescope
+from ...wavefront.chief_rays import chief_rays, image_jacobians
+
+
+@dataclass(frozen=True)
+class Visit:
+    """One visit.
+
+    Attributes
+    ----------
+    number : int
+        Number of the visit, from 0.
+    epoch : int
+        Epoch of turbulence, residual aberration and noise.
+    roll : float
+        Position angle of the telescope's +y, from north through east [rad].
+    pointing : tuple of float
+        xi, eta of the pointing.
+    """
+
+    number: int
+    epoch: int
+    roll: float = 0.0
+    pointing: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Rotation of vectors (east, north, towards the common pointing) into (X, Y, towards the visit's), [3, 3].
+
+        X and Y are the axes of the telescope.
+        """
+        ahead = np.array([*self.pointing, 1.0])
+        ahead /= np.linalg.norm(ahead)
+        # The shortest rotation that carries the pointing to the axis turns no field about itself.
+        x, y, z = ahead
+        to_axis = np.array(
+            [[1 - x * x / (1 + z), -x * y / (1 + z), -x], [-x * y / (1 + z), 1 - y * y / (1 + z), -y], ahead]
+        )
+        c, s = np.cos(self.roll), np.sin(self.roll)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ to_axis
+
+    def directions(self, sky: np.ndarray) -> np.ndarray:
+        """Return the unit vectors along which light of sky positions [n, 2] enters the telescope, shape [n, 3]."""
+        source = np.column_stack([sky, np.ones(len(sky))]) @ self.matrix.T
+        return -source / np.linalg.norm(source, axis=1)[:, None]
+
+    def on_detector(
+        self, telescope: Telescope, sky: np.ndarray, wavelength: float, threads: int | None = None
+    ) -> np.ndarray:
+        """Return where the chief rays of sky positions [n, 2] meet the nominal detector [m], shape [n, 2].
+
+        NaN where they do not.
+        """
+        end = chief_rays(telescope, self.directions(sky), wavelength, threads=threads)
+        return telescope.surfaces[-1].to_local(end.position)[:, :2]
+
+    def jacobians(
+        self, telescope: Telescope, sky: np.ndarray, wavelength: float, threads: int | None = None
+    ) -> np.ndarray:
+        """Return d(position on the detector [m])/d(xi, eta), shape [n, 2, 2]."""
+        source = np.column_stack([sky, np.ones(len(sky))]) @ self.matrix.T
+        norm = np.linalg.norm(source, axis=1)[:, None, None]
+        along = (source / norm[:, 0])[:, :, None]
+        # The derivative of a unit vector is that of the vector across it.
+        change = self.matrix[None, :, :2]
+        cosines = -(change - along * (along.transpose(0, 2, 1) @ change)) / norm
+        return image_jacobians(telescope, self.directions(sky), wavelength, threads) @ cosines[:, :2]
+
+
+def plan_visits(count: int, seed: int, *, dither: float = 0.0, first_epoch: int = 0) -> tuple[Visit, ...]:
+    """Return visits with random rolls about the common pointing, the first without.
+
+    Parameters
+    ----------
+    count : int
+        Number of visits.
+    seed : int
+        Seed; a visit does not depend on the number of visits.
+    dither : float
+        Radius of the disc over which the pointings of all but the first visit are spread [rad].
+    first_epoch : int
+        Epoch of the first visit; those of the others follow.
+
+    Raises
+    ------
+    DomainError
+        If there is no visit, or the radius is negative or beyond 5 degrees.
+    """
+    if count < 1:
+        raise DomainError(f"visits = {count}: expected at least 1")
+    if not 0.0 <= dither <= np.deg2rad(5.0):
+        raise DomainError(f"dither = {np.rad2deg(dither):g} deg: expected 0 to 5")
+    visits = [Visit(0, first_epoch)]
+    for number in range(1, count):
+        rng = stream(seed, "visit", number)
+        roll = rng.uniform(0.0, 2.0 * np.pi)
+        radius, angle = dither * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)
+        pointing = (float(radius * np.cos(angle)), float(radius * np.sin(angle)))
+        visits.append(Visit(number, first_epoch + number, float(roll), pointing))
+    return tuple(visits)

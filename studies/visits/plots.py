@@ -1,0 +1,107 @@
+"""Pictures of a stack of visits: ellipticities over the sky, and their correlations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ...core.plotting import BLUE, GREY, ORANGE, new_figure, png_bytes, styled
+from ...core.units import ARCMIN
+from ...pipeline.report.focal_plane_axes import draw_key_whisker, draw_whiskers, key_ellipticity, whiskers
+from ...pipeline.report.statistics_plots import draw_correlation, log_axes
+from .measures import Correlated
+from .null_result import NullTest, amplitude, density_slope, shot_noise
+from .stack import PsfStack
+
+_STYLES = {
+    "psf": (BLUE, "o", "PSF"),
+    "residual_stars": (GREY, "s", "PSF - model, at the stars"),
+    "residual_places": (ORANGE, "^", "PSF - model, where no star is"),
+}
+_GALAXY_STYLES = {
+    "model": (BLUE, "o", "galaxies, PSF of the models"),
+    "true": (GREY, "s", "galaxies, true PSF"),
+    "difference": (ORANGE, "^", "difference of the two"),
+}
+#: Most whiskers of a panel.
+_MOST = 2500
+
+
+def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
+    """Draw whiskers of the PSF of the first and the last stack, and of what the model leaves of the last (Fig. 15)."""
+    first, last = stacks[min(stacks)], stacks[max(stacks)]
+    panels = [(first, "PSF", first.e1, first.e2)] if first is not last else []
+    panels += [(last, "PSF", last.e1, last.e2), (last, "PSF - model", last.residual_e1, last.residual_e2)]
+    key = key_ellipticity(np.concatenate([np.hypot(panels[0][2], panels[0][3])]))
+    with styled():
+        figure = new_figure(5.0 * len(panels), 5.3, "compressed")
+        for axes, (stack, what, e1, e2) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+            x, y = stack.x / ARCMIN, stack.y / ARCMIN
+            edge = 1.05 * float(max(np.abs(x).max(), np.abs(y).max()))
+            step = max(1, len(stack) // _MOST)
+            scale = 0.06 * edge / key
+            ends = whiskers(*(v[::step] for v in (x, y, e1, e2)), scale)
+            draw_whiskers(axes, ends, "black", 0.6)
+            axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", xlabel="x of the stack [arcmin]")
+            rms = np.sqrt(np.nanmean(e1**2 + e2**2))
+            axes.set_title(f"{what}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
+            draw_key_whisker(axes, key, scale, 1.0)
+        figure.axes[0].set_ylabel("y of the stack [arcmin]")
+        return png_bytes(figure)
+
+
+def correlation_picture(found: Mapping[int, Correlated]) -> bytes:
+    """Draw xi+ of each stack: of the PSF, and of what the model leaves at stars and where no star is (Fig. 16)."""
+    with styled():
+        figure = new_figure(4.2 * len(found) + 1.0, 4.8)
+        panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, (visits, correlations) in zip(panels, found.items(), strict=True):
+            for kind, style in _STYLES.items():
+                draw_correlation(axes, correlations[kind], "plus", *style)
+            log_axes(axes, _visits(visits))
+            axes.set_xlabel("separation [arcmin]")
+        panels[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
+        low, high = panels[0].get_ylim()
+        panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
+        panels[0].legend(loc="best")
+        return png_bytes(figure)
+
+
+def null_test_picture(results: Mapping[int, NullTest]) -> bytes:
+    """Draw xi+ of galaxies that are not sheared, and what the PSF models add to it (Fig. 17)."""
+    with styled():
+        figure = new_figure(4.2 * len(results) + 1.0, 4.8)
+        panels = figure.subplots(1, len(results), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, result in zip(panels, results.values(), strict=True):
+            for kind, style in _GALAXY_STYLES.items():
+                draw_correlation(axes, result.correlations[kind], "plus", *style)
+            log_axes(axes, f"{_visits(result.visits)}: {result.density:.0f} galaxies per arcmin²")
+            axes.set_xlabel("separation [arcmin]")
+        panels[0].set_ylabel("$|\\xi_+|$: filled positive, open negative")
+        low, high = panels[0].get_ylim()
+        panels[0].set_ylim(max(low, 1e-10), 2.0 * high)
+        panels[0].legend(loc="best")
+        return png_bytes(figure)
+
+
+def density_picture(results: Mapping[int, NullTest]) -> bytes:
+    """Draw the mean amplitude of xi+ against the density of usable galaxies, with the shot noise (Fig. 18)."""
+    density = np.array([r.density for r in results.values()])
+    found, noise = (np.array([of(r) for r in results.values()]) for of in (amplitude, shot_noise))
+    with styled():
+        figure = new_figure(5.6, 4.6)
+        axes = figure.subplots()
+        axes.plot(density, noise, "-", color="0.5", label="shot noise")
+        axes.plot(density, found, "o", color=BLUE, label="mean $|\\xi_+|$ of the galaxies")
+        for result, x, y in zip(results.values(), density, found, strict=True):
+            axes.annotate(_visits(result.visits), (x, y), xytext=(6, 4), textcoords="offset points", fontsize=8)
+        slope = density_slope(density, found)
+        log_axes(axes, "" if slope is None else f"slope {slope:.2f}; paper: -0.97 ± 0.06")
+        axes.set(xlabel="usable galaxies per arcmin²", ylabel="amplitude")
+        axes.legend(loc="best")
+        return png_bytes(figure)
+
+
+def _visits(count: int) -> str:
+    return "1 visit" if count == 1 else f"{count} visits"

@@ -1,0 +1,215 @@
+"""PSFs of one visit, true and from a model of its stars, at points of the sky and along the axes of the stack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.progress import Reporter
+from ...core.units import ARCSEC
+from ...pipeline.config import with_options
+from ...pipeline.experiment import Experiment
+from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
+from ...pipeline.focal_plane_stage import fit_focal_plane_model
+from ...pipeline.simulate.ccd_exposure import CcdExposure, ccd_bounds
+from ...pipeline.simulate.ccd_loop import simulate_ccds
+from ...pipeline.simulate.ccd_model import fit_ccd_model
+from ...pipeline.simulate.ccd_observation import Observation, collected_images, observe_ccd
+from ...pipeline.simulate.photometry import (
+    effective_fwhm,
+    electrons,
+    limiting_magnitude,
+    saturation_magnitude,
+    signal_to_noise,
+)
+from ...pipeline.simulate.star_field import StarField, magnitudes_at
+from .plan import Visit
+from .resample import resample_stamps
+from .sky_points import SkyPoints
+
+# FWHM of the magnitude limits of the stars, which are the same in every visit, good or bad.
+_NOMINAL_FWHM = 0.7 * ARCSEC
+# Least distance of stars and of places from the edge of a CCD [pixel].
+_STAR_MARGIN, _PLACE_MARGIN = 20, 2
+
+
+@dataclass(frozen=True, eq=False)
+class StackFrame:
+    """Axes and pixels of the stack: those of the detector in the middle of the field, without a roll.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape [2, 2]
+        d(x, y of the stack [pixel])/d(xi, eta).
+    size : int
+        Pixels on a side of a stamp.
+    """
+
+    matrix: np.ndarray
+    size: int
+
+    @classmethod
+    def of(cls, experiment: Experiment, size: int) -> StackFrame:
+        """Return the frame of an experiment."""
+        center = Visit(0, 0).jacobians(experiment.telescope, np.zeros((1, 2)), _wavelength(experiment))[0]
+        left, scale, right = np.linalg.svd(center)
+        return cls(left @ right * scale.mean() / experiment.pixel_size, size)
+
+    def to_stamp(self, experiment: Experiment, visit: Visit, sky: np.ndarray, threads: int | None = None) -> np.ndarray:
+        """Return d(x, y of a stamp of the visit)/d(x, y of the stack) at positions of the sky, shape [n, 2, 2]."""
+        on_detector = visit.jacobians(experiment.telescope, sky, _wavelength(experiment), threads)
+        return on_detector / experiment.pixel_size @ np.linalg.inv(self.matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class VisitPsfs:
+    """PSFs of a visit at those points of the sky that fall on its CCDs, along the axes of the stack, of unit sum."""
+
+    index: np.ndarray  #: of the points, [n]
+    true: np.ndarray  #: noise-free PSFs, [n, size, size]
+    model: np.ndarray  #: those of the model, likewise
+    left_out: dict[str, str]  #: CCDs that could not be modelled, and the reasons
+
+
+class _CcdResult(NamedTuple):
+    exposure: CcdExposure
+    observation: Observation
+    electrons: np.ndarray
+    true: np.ndarray
+    model: np.ndarray
+
+
+def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
+    """Return the experiment of a visit: telescope and heights of all; own turbulence, residual aberration and noise."""
+    return Experiment.from_config(with_options(experiment.config, atmosphere__epoch=visit.epoch))
+
+
+def visit_psfs(
+    experiment: Experiment,
+    visit: Visit,
+    points: SkyPoints,
+    frame: StackFrame,
+    *,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> VisitPsfs:
+    """Make the PSFs of a visit, and the model of its stars on each CCD, or on all of them together.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment of the visit, see :func:`visit_experiment`. Its configuration says how stars are modelled.
+    visit : Visit
+        Pointing and roll.
+    points : SkyPoints
+        Stars, to which the model is fitted, and places, where it is only compared.
+    frame : StackFrame
+        Axes of the result.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    PachonError
+        If a CCD cannot be exposed.
+    """
+    config = experiment.config
+    fields, index = _star_fields(experiment, visit, points, threads)
+
+    def modelled(exposure: CcdExposure) -> _CcdResult:
+        stars, seen = exposure.positions, exposure.observed
+        counts = stars.electrons * seen.lit_fraction
+        images = collected_images(experiment, seen.image, seen.pixel_scale, counts)
+        observation = observe_ccd(experiment, exposure.name, images, seen.pixel_scale, counts, noisy=True)
+        width = effective_fwhm(exposure.holdout.image, exposure.holdout.pixel_scale)
+        dimmed = stars.magnitude - 2.5 * np.log10(seen.lit_fraction)
+        snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
+        model = fit_ccd_model(experiment, observation, stars, snr)
+        return _CcdResult(exposure, observation, counts, exposure.holdout.image, model.at(stars.holdout))
+
+    with experiment.screens(threads, reporter):
+        simulated = simulate_ccds(
+            experiment, modelled, list(fields), fields=fields, strict=False, threads=threads, reporter=reporter
+        )
+    found = simulated.results
+    true = [result.true for result in found.values()]
+    if config.reconstruction.model == "focal_plane":
+        model = [_focal_plane_images(experiment, found, threads, reporter)]
+    else:
+        model = [result.model for result in found.values()]
+    rows = np.concatenate([index[name] for name in found])
+    matrix = frame.to_stamp(experiment, visit, points.sky[rows], threads)
+    turned = []
+    for images in (true, model):
+        stamps = resample_stamps(np.concatenate(images), matrix, frame.size, threads=threads)
+        turned.append(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
+    return VisitPsfs(rows, *turned, simulated.not_modelled)
+
+
+def _star_fields(
+    experiment: Experiment, visit: Visit, points: SkyPoints, threads: int | None
+) -> tuple[dict[str, StarField], dict[str, np.ndarray]]:
+    """Return the stars of each CCD and, as its holdout positions, all points on it; and the indices of the latter."""
+    camera, config = experiment.camera, experiment.config
+    xy = visit.on_detector(experiment.telescope, points.sky, _wavelength(experiment), threads)
+    band, seconds = config.band or "r", config.atmosphere.exposure_s
+    bright = saturation_magnitude(band, seconds, _NOMINAL_FWHM)
+    faint = limiting_magnitude(config.stars.snr_min, band, seconds, _NOMINAL_FWHM)
+    fields, index = {}, {}
+    for name in config.ccds or ():
+        depth = camera.half_size - np.abs(xy - camera.centers[camera.ccd_index(name)]).max(axis=1)
+        stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star)
+        margin = np.where(points.star, _STAR_MARGIN, _PLACE_MARGIN) * camera.pixel_size
+        here = np.flatnonzero(depth >= margin)
+        if not len(here):
+            continue
+        magnitude = magnitudes_at(points.quantile[stars], bright, faint)
+        fields[name] = StarField(
+            ccd_name=name,
+            bounds=ccd_bounds(camera, name),
+            pixel_size=camera.pixel_size,
+            holdout=xy[here],
+            observed=xy[stars],
+            magnitude=magnitude,
+            electrons=electrons(magnitude, band, seconds),
+            band=band,
+            exposure=seconds,
+            bright=bright,
+            faint=faint,
+        )
+        index[name] = here
+    return fields, index
+
+
+def _focal_plane_images(
+    experiment: Experiment, found: dict[str, _CcdResult], threads: int | None, reporter: Reporter | None
+) -> np.ndarray:
+    """Return the PSFs of one model of all CCDs at the points."""
+    stars = FocalPlaneStars.of_ccds(
+        [
+            CcdStars(
+                name,
+                *result.exposure.positions.observed.T,
+                result.observation.shapes,
+                result.electrons,
+                result.observation.noise,
+                result.observation.images,
+                result.observation.used,
+            )
+            for name, result in found.items()
+        ],
+        next(iter(found.values())).exposure.observed.pixel_scale,
+        experiment.weight_fwhm,
+    )
+    model = fit_focal_plane_model(experiment, stars, ccds=list(found), threads=threads, reporter=reporter)
+    places = {name: result.exposure.positions.holdout for name, result in found.items()}
+    names = [name for name, xy in places.items() for _ in range(len(xy))]
+    return model.draw(names, *np.concatenate(list(places.values())).T, threads=threads)
+
+
+def _wavelength(experiment: Experiment) -> float:
+    return float(experiment.wavelengths[len(experiment.wavelengths) // 2])

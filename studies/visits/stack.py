@@ -1,0 +1,186 @@
+"""Stacks of the PSFs of visits, true ones and models, at points of the sky."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from ...core.errors import ProductError
+from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from ...core.units import ARCMIN, ARCSEC
+from ...pipeline.measure.shapes import Shapes, measure_shapes
+from .psf_visit import VisitPsfs
+
+#: Card of the number of visits.
+VISITS_CARD = "VISITS"
+
+
+@dataclass(eq=False)
+class PsfSums:
+    """Sums of the PSFs of visits, all of one weight.
+
+    Attributes
+    ----------
+    visits : int
+        Number of visits.
+    count : ndarray of int, shape [n]
+        Visits that saw each point.
+    true, model : ndarray of float32, shape [n, size, size]
+        Sums of PSFs of unit sum.
+    """
+
+    visits: int
+    count: np.ndarray
+    true: np.ndarray
+    model: np.ndarray
+
+    @classmethod
+    def empty(cls, n: int, size: int) -> PsfSums:
+        """Return the sums of no visit."""
+        return cls(0, np.zeros(n, dtype=np.int32), *np.zeros((2, n, size, size), dtype=np.float32))
+
+    def add(self, seen: VisitPsfs) -> None:
+        """Add one visit."""
+        self.true[seen.index] += seen.true
+        self.model[seen.index] += seen.model
+        self.count[seen.index] += 1
+        self.visits += 1
+
+    def write(self, path: Path, stamp: Stamp) -> None:
+        """Write the sums, exactly as they are."""
+        hdus = [fits.ImageHDU(self.count, name="COUNT"), image_hdu("TRUE", self.true, "sums of the true PSFs")]
+        hdus.append(image_hdu("MODEL", self.model, "sums of the PSFs of the models"))
+        write_fits(path, hdus, stamp, [(VISITS_CARD, self.visits, "in the sums")])
+
+    @classmethod
+    def read(cls, path: Path, stamp: Stamp) -> PsfSums:
+        """Read sums; ProductError for those of another configuration, and for a damaged file."""
+        hdus = _read(path, stamp)
+        count = np.array(hdus["COUNT"].data, dtype=np.int32)
+        return cls(hdus[0].header[VISITS_CARD], count, _image(hdus["TRUE"]), _image(hdus["MODEL"]))
+
+
+@dataclass(frozen=True, eq=False)
+class PsfStack:
+    """PSFs of the stack of a number of visits at the points that at least half of them saw.
+
+    Attributes
+    ----------
+    visits : int
+        Visits in the stack.
+    xi, eta : ndarray, shape [n]
+        Position on the sky, gnomonic about the common pointing [rad].
+    x, y : ndarray, shape [n]
+        Position along the axes of the stack [rad].
+    star : ndarray of bool, shape [n]
+        Whether models are fitted to the point; elsewhere they are only compared.
+    count : ndarray of int, shape [n]
+        Visits that saw the point.
+    true, model : ndarray of float32, shape [n, size, size]
+        Mean PSFs along the axes of the stack, of unit sum.
+    e1, e2, size : ndarray, shape [n]
+        Ellipticity and weighted rms size [rad] of the true PSF, along the axes of the stack.
+    model_e1, model_e2, model_size : ndarray, shape [n]
+        Those of the model.
+    """
+
+    visits: int
+    xi: np.ndarray
+    eta: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    star: np.ndarray
+    count: np.ndarray
+    true: np.ndarray
+    model: np.ndarray
+    e1: np.ndarray
+    e2: np.ndarray
+    size: np.ndarray
+    model_e1: np.ndarray
+    model_e2: np.ndarray
+    model_size: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        sums: PsfSums,
+        sky: np.ndarray,
+        star: np.ndarray,
+        axes: np.ndarray,
+        pixel_scale: float,
+        weight_fwhm: float,
+    ) -> PsfStack:
+        """Measure the PSFs of sums at points of the sky [n, 2]; `axes` are d(x, y of the stack [pixel])/d(xi, eta)."""
+        rows = np.flatnonzero((sums.count > 0) & (2 * sums.count >= sums.visits))
+        count = sums.count[rows]
+        true, model = (v[rows] / count[:, None, None].astype(np.float32) for v in (sums.true, sums.model))
+        shapes: list[Shapes] = [measure_shapes(images, pixel_scale, weight_fwhm) for images in (true, model)]
+        x, y = (sky[rows] @ axes.T * pixel_scale).T
+        columns = [getattr(s, key) for s in shapes for key in ("e1", "e2", "size")]
+        return cls(sums.visits, *sky[rows].T, x, y, star[rows], count, true, model, *columns)
+
+    @property
+    def residual_e1(self) -> np.ndarray:
+        """True minus model ellipticity, first component."""
+        return self.e1 - self.model_e1
+
+    @property
+    def residual_e2(self) -> np.ndarray:
+        """True minus model ellipticity, second component."""
+        return self.e2 - self.model_e2
+
+    def __len__(self) -> int:
+        return len(self.xi)
+
+    def write(self, path: Path, stamp: Stamp) -> None:
+        """Write the stack as a FITS table of points and two cubes of images."""
+        table = table_hdu(
+            "POINTS",
+            {
+                name.upper(): (getattr(self, name) / scale if scale != 1.0 else getattr(self, name), unit, description)
+                for name, (scale, unit, description) in _COLUMNS.items()
+            },
+        )
+        images = [image_hdu("TRUE", self.true, "true PSFs"), image_hdu("MODEL", self.model, "PSFs of the models")]
+        write_fits(path, [table, *images], stamp, [(VISITS_CARD, self.visits, "in the stack")])
+
+    @classmethod
+    def read(cls, path: Path, stamp: Stamp | None = None) -> PsfStack:
+        """Read a stack; ProductError for a damaged file and, with a stamp, for one of another configuration."""
+        hdus = _read(path, stamp)
+        found = {name: column(hdus["POINTS"], name.upper()) for name in _COLUMNS}
+        found = {name: found[name] * scale if scale != 1.0 else found[name] for name, (scale, _, _) in _COLUMNS.items()}
+        images = {"true": _image(hdus["TRUE"]), "model": _image(hdus["MODEL"])}
+        return cls(**{"visits": hdus[0].header[VISITS_CARD], **found, **images})
+
+
+_COLUMNS = {
+    "xi": (ARCMIN, "arcmin", "towards east, gnomonic"),
+    "eta": (ARCMIN, "arcmin", "towards north, gnomonic"),
+    "x": (ARCMIN, "arcmin", "along x of the stack"),
+    "y": (ARCMIN, "arcmin", "along y of the stack"),
+    "star": (1.0, "", "whether models are fitted to the point"),
+    "count": (1.0, "", "visits that saw the point"),
+    "e1": (1.0, "", "ellipticity (a-b)/(a+b) along x of the stack"),
+    "e2": (1.0, "", "ellipticity along x = y"),
+    "size": (ARCSEC, "arcsec", "weighted rms size"),
+    "model_e1": (1.0, "", "of the mean of the models"),
+    "model_e2": (1.0, "", "of the mean of the models"),
+    "model_size": (ARCSEC, "arcsec", "of the mean of the models"),
+}
+
+
+def _read(path: Path, stamp: Stamp | None) -> fits.HDUList:
+    hdus = read_fits(path)
+    if stamp is not None and not stamp.matches(hdus[0].header):
+        raise ProductError("was made with another version, configuration or seed", file=path)
+    if VISITS_CARD not in hdus[0].header:
+        raise ProductError("no stack of visits", file=path)
+    return hdus
+
+
+def _image(hdu: fits.ImageHDU) -> np.ndarray:
+    return np.array(hdu.data, dtype=np.float32)

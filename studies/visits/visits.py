@@ -1,0 +1,220 @@
+"""Stack of the PSFs of many visits: the loop over the visits, and its products."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import DomainError, PachonError, ProductError
+from ...core.files import make_folder, write_bytes, write_json
+from ...core.memory import readable
+from ...core.products import Stamp, write_ecsv
+from ...core.progress import Reporter
+from ...core.units import ARCSEC
+from ...pipeline.config import differences
+from ...pipeline.experiment import Experiment
+from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
+from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
+from .measures import Correlated, correlated, stack_metrics
+from .plan import Visit, plan_visits
+from .plots import correlation_picture, ellipticity_picture
+from .psf_visit import StackFrame, visit_experiment, visit_psfs
+from .sky_points import SkyPoints, draw_points
+from .stack import PsfStack, PsfSums
+
+#: Sums of the visits so far, from which the stack goes on.
+SUMS_NAME = "sums.fits"
+
+
+@dataclass(frozen=True, eq=False)
+class StackResult:
+    """What :func:`stack_visits` leaves.
+
+    Attributes
+    ----------
+    folder : Path
+        Its products.
+    stacks : dict of int to PsfStack
+        Stacks by number of visits.
+    correlations : dict of int to Correlated
+        Their correlations.
+    summary : dict
+        Content of ``summary.json``.
+    """
+
+    folder: Path
+    stacks: dict[int, PsfStack]
+    correlations: dict[int, Correlated]
+    summary: dict[str, Any]
+
+
+def stack_path(folder: Path, visits: int) -> Path:
+    """Return the path of the stack of a number of visits."""
+    return folder / f"stack_{visits:04d}.fits"
+
+
+def stack_visits(
+    config: VisitsConfig,
+    folder: Path,
+    *,
+    resume: bool = False,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> StackResult:
+    """Visit a field many times, and stack true PSFs and those of the models of each visit's stars.
+
+    Telescope, camera and heights stay; turbulence, residual aberration, noise and roll are each visit's own, and the
+    stars of the sky fall where the roll puts them (Jee & Tyson 2011, sec. 6.1). Models are resampled onto the axes of
+    the stack as the true PSFs are. Every product has the same bytes on any number of threads, and after any number of
+    interruptions.
+
+    Parameters
+    ----------
+    config : VisitsConfig
+        Configuration.
+    folder : Path
+        Folder of the products, made where missing.
+    resume : bool
+        Go on after the visits that the folder has, with more of them than asked for before too.
+    threads : int, optional
+        Number of threads; all processors by default.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    PachonError
+        If the configuration does not hold together, the folder holds other visits or has no room, or a visit fails.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    experiment = config.experiment()
+    config = config.resolved(experiment)
+    stamp = Stamp(config.digest(experiment), experiment.config.seed)
+    settings, frame = config.visits, StackFrame.of(experiment, STACK_STAMP)
+    points = _points(experiment, config, frame)
+    visits = plan_visits(
+        settings.count,
+        experiment.config.seed,
+        dither=np.deg2rad(settings.dither_deg),
+        first_epoch=settings.first_epoch,
+    )
+    _claim(folder, config, resume)
+    sums = _sums_so_far(folder, stamp, len(points), resume)
+    if sums.visits > len(visits):
+        raise ProductError(f"{folder} holds {sums.visits} visits: expected at most {len(visits)}; choose another --out")
+    if sums.visits:
+        reporter.line(f"{sums.visits} of {len(visits)} visits are stacked already")
+    _check_room(folder, points, len(config.kept))
+    scale = pixel_scale_of(frame)
+    for visit in visits[sums.visits :]:
+        reporter.line(f"visit {visit.number + 1} of {len(visits)}, roll {np.rad2deg(visit.roll):.0f} deg")
+        try:
+            seen = visit_psfs(
+                visit_experiment(experiment, visit), visit, points, frame, threads=threads, reporter=reporter
+            )
+        except PachonError as error:
+            raise error.within(subject=f"visit {visit.number}") from None
+        for name, reason in seen.left_out.items():
+            reporter.line(f"visit {visit.number}: CCD {name} is left out, it cannot be modelled: {reason}")
+        sums.add(seen)
+        if sums.visits in config.kept:
+            stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
+            stack.write(stack_path(folder, sums.visits), stamp)
+        # Written last: visits that it counts have left their stack.
+        sums.write(folder / SUMS_NAME, stamp)
+    stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}
+    with reporter.stage("correlations"):
+        found = {n: correlated(stack, cell_of(experiment, frame)) for n, stack in stacks.items()}
+    summary = _write_products(folder, config, stamp, visits, stacks, found)
+    return StackResult(folder, stacks, found, summary)
+
+
+def pixel_scale_of(frame: StackFrame) -> float:
+    """Return the angle of a pixel of the stack [rad]."""
+    return float(1.0 / np.sqrt(abs(np.linalg.det(frame.matrix))))
+
+
+def cell_of(experiment: Experiment, frame: StackFrame) -> float:
+    """Return the angle that the side of a CCD has in the middle of the field [rad]."""
+    return float(experiment.camera.ccd_size / experiment.pixel_size * pixel_scale_of(frame))
+
+
+def _points(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
+    """Return stars and places of the sky that the CCDs of a visit can see."""
+    camera, names = experiment.camera, experiment.config.ccds or ()
+    centers = camera.centers[[camera.ccd_index(name) for name in names]]
+    corner = (np.abs(centers) + camera.half_size).T
+    reach = min(float(np.hypot(*corner).max()), experiment.field_radius_on_detector)
+    radius = reach / experiment.pixel_size * pixel_scale_of(frame) + np.deg2rad(config.visits.dither_deg)
+    settings = config.visits
+    return draw_points(experiment.config.seed, radius, cell_of(experiment, frame), settings.stars, settings.places)
+
+
+def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
+    """Make the folder, or check that its visits are of the same configuration, but for their number."""
+    make_folder(folder)
+    path = folder / CONFIG_NAME
+    if path.exists():
+        try:
+            before = load_visits_configuration(path)
+        except PachonError as error:
+            raise ProductError(f"{folder} holds visits that cannot be read ({error}); choose another --out") from None
+        if not resume:
+            raise ProductError(f"{folder} holds visits already; go on with --resume, or choose another --out")
+        old, new = ({**c.model_dump(mode="json", by_alias=True)} for c in (before, config))
+        for each in (old, new):
+            for key in ("count", "snapshots"):
+                del each["visits"][key]
+        found = differences(old, new)
+        if found:
+            raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])})")
+    write_bytes(path, config.to_yaml().encode())
+
+
+def _sums_so_far(folder: Path, stamp: Stamp, n: int, resume: bool) -> PsfSums:
+    path = folder / SUMS_NAME
+    if resume and path.exists():
+        return PsfSums.read(path, stamp)
+    return PsfSums.empty(n, STACK_STAMP)
+
+
+def _check_room(folder: Path, points: SkyPoints, stacks: int) -> None:
+    """Raise DomainError where the disk cannot hold the sums, twice while they are replaced, and the stacks."""
+    needed = 2 * 4 * STACK_STAMP**2 * len(points) * (2 + stacks)
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise DomainError(f"{folder}: the stacks need {readable(needed)} of disk, {readable(free)} are free")
+
+
+def _write_products(
+    folder: Path,
+    config: VisitsConfig,
+    stamp: Stamp,
+    visits: tuple[Visit, ...],
+    stacks: dict[int, PsfStack],
+    found: dict[int, Correlated],
+) -> dict[str, Any]:
+    write_ecsv(
+        folder / "visits.ecsv",
+        {
+            "visit": (np.array([v.number for v in visits]), "", "number of the visit"),
+            "epoch": (np.array([v.epoch for v in visits]), "", "of turbulence, residual aberration and noise"),
+            "roll": (np.rad2deg([v.roll for v in visits]), "deg", "position angle of the telescope's +y"),
+            "xi": (np.array([v.pointing[0] for v in visits]) / ARCSEC, "arcsec", "pointing towards east, gnomonic"),
+            "eta": (np.array([v.pointing[1] for v in visits]) / ARCSEC, "arcsec", "pointing towards north"),
+        },
+        {"what": "visits in the order of the stack", **stamp.meta()},
+    )
+    summary = {
+        **stamp.meta(),
+        "configuration": config.model_dump(mode="json", by_alias=True),
+        "stacks": {str(n): stack_metrics(stacks[n], found[n]) for n in stacks},
+    }
+    write_json(folder / SUMMARY_NAME, summary)
+    write_bytes(folder / "ellipticity.png", ellipticity_picture(stacks))
+    write_bytes(folder / "correlation.png", correlation_picture(found))
+    return summary
