@@ -51,6 +51,11 @@ TINY = Scale(
     truth=24,
     observed=24,
     time_step=1.0,
+    visits=2,
+    visit_ccds=("R22_S11",),
+    visit_points=(24, 6),
+    tiles=1,
+    rings=12,
 )
 
 
