@@ -130,8 +130,8 @@ class PipelineRun:
 class Bench:
     """Settings of the figures, and objects that they share, each made at its first use.
 
-    The run of the pipeline is in the sub-folder ``run`` of that of the figures, the visits are in ``visits``. Results do
-    not depend on `threads`.
+    The run of the pipeline is in the sub-folder ``run`` of that of the figures, the visits are in ``visits``. Results
+    do not depend on `threads`.
     """
 
     scale: Scale
@@ -172,8 +172,14 @@ class Bench:
     @cached_property
     def galaxies(self) -> dict[int, NullTest]:
         """Null tests of the stacks, in the same folder."""
-        scale, options = self.scale, {"resume": True, "threads": self.threads, "reporter": self.reporter}
-        return null_test(self.stack.folder, tiles=scale.tiles, rings=scale.rings, **options)
+        return null_test(
+            self.stack.folder,
+            tiles=self.scale.tiles,
+            rings=self.scale.rings,
+            resume=True,
+            threads=self.threads,
+            reporter=self.reporter,
+        )
 
     @cached_property
     def pipeline(self) -> PipelineRun:

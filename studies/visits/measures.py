@@ -23,7 +23,6 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
     Errors are those of a jackknife over squares of three CCDs.
     """
     extent = float(np.hypot(np.ptp(stack.x), np.ptp(stack.y)))
-    limits = {"min_sep": _LEAST * ARCMIN, "max_sep": max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN)}
     corner = [np.floor(v / (_PATCH * cell) + 0.5).astype(int) for v in (stack.x, stack.y)]
     patch = corner[0] - corner[0].min() + (np.ptp(corner[0]) + 1) * (corner[1] - corner[1].min())
     values = {
@@ -39,9 +38,10 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
             stack.y[rows],
             e1[rows],
             e2[rows],
+            min_sep=_LEAST * ARCMIN,
+            max_sep=max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN),
             n_bins=_BINS,
             patch=patch[rows] if several else None,
-            **limits,
         )
     return found
 

@@ -44,10 +44,9 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
         every = figure.subplots(rows, len(panels) // rows, squeeze=False, sharex=True, sharey=True)
         edge = 1.05 / ARCMIN * max(float(np.abs([s.x, s.y]).max()) for s in (first, last))
         for axes, (stack, what, e1, e2) in zip(every.flat, panels, strict=True):
-            x, y = stack.x / ARCMIN, stack.y / ARCMIN
-            step = max(1, len(stack) // _MOST)
+            some = np.s_[:: max(1, len(stack) // _MOST)]
             scale = 0.06 * edge / key
-            ends = whiskers(*(v[::step] for v in (x, y, e1, e2)), scale)
+            ends = whiskers(stack.x[some] / ARCMIN, stack.y[some] / ARCMIN, e1[some], e2[some], scale)
             draw_whiskers(axes, ends, "black", 0.6)
             axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
             rms = np.sqrt(np.nanmean(e1**2 + e2**2))

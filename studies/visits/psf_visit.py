@@ -143,11 +143,12 @@ def visit_psfs(
         model = [result.model for result in found.values()]
     rows = np.concatenate([index[name] for name in found])
     matrix = frame.to_stamp(experiment, visit, points.sky[rows], threads)
-    turned = []
-    for images in (true, model):
+
+    def turned(images: list[np.ndarray]) -> np.ndarray:
         stamps = resample_stamps(np.concatenate(images), matrix, frame.size, threads=threads)
-        turned.append(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
-    return VisitPsfs(rows, *turned, simulated.not_modelled)
+        return np.asarray(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
+
+    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled)
 
 
 def _star_fields(
@@ -195,7 +196,8 @@ def _focal_plane_images(
         [
             CcdStars(
                 name,
-                *result.exposure.positions.observed.T,
+                result.exposure.positions.observed[:, 0],
+                result.exposure.positions.observed[:, 1],
                 result.observation.shapes,
                 result.electrons,
                 result.observation.noise,
