@@ -61,6 +61,7 @@ def stack_visits(
     config: VisitsConfig,
     folder: Path,
     *,
+    experiment: Experiment | None = None,
     resume: bool = False,
     threads: int | None = None,
     reporter: Reporter | None = None,
@@ -78,6 +79,8 @@ def stack_visits(
         Configuration.
     folder : Path
         Folder of the products, made where missing.
+    experiment : Experiment, optional
+        Experiment of the configuration, where it is made already.
     resume : bool
         Go on after the visits that the folder has, with more of them than asked for before too.
     threads : int, optional
@@ -91,7 +94,7 @@ def stack_visits(
         If the configuration does not hold together, the folder holds other visits or has no room, or a visit fails.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    experiment = config.experiment()
+    experiment = config.experiment() if experiment is None else experiment
     config = config.resolved(experiment)
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
     settings, frame = config.visits, StackFrame.of(experiment, STACK_STAMP)
