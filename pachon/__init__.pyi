@@ -56,6 +56,8 @@ from .imaging.config import load_images_configuration as load_images_configurati
 from .imaging.draw import Window as Window
 from .imaging.exposure import Exposure as Exposure
 from .imaging.image_file import CcdImage as CcdImage
+from .imaging.measure import ImageCatalogue as ImageCatalogue
+from .imaging.measure import measure_image as measure_image
 from .imaging.psf_field import PsfField as PsfField
 from .imaging.scene import CcdScene as CcdScene
 from .imaging.scene import draw_ccd as draw_ccd
