@@ -78,7 +78,7 @@ class ImageCatalogue:
             "usable": (self.usable, "", "larger than stars, error of e below 0.2"),
         }
         # Names that fit FITS cards as well.
-        meta = {"CCD": self.image.name, "CREATOR": f"pachon {VERSION}"}
+        meta: dict[str, Any] = {"CCD": self.image.name, "CREATOR": f"pachon {VERSION}"}
         if self.image.stamp is not None:
             meta |= {"CONFHASH": self.image.stamp.config_hash, "SEED": self.image.stamp.seed}
         return described_table(columns, meta)

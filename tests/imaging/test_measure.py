@@ -27,7 +27,8 @@ def gaussian_galaxies(xi, eta):
     places = [np.arange(low, high, 22.0 * ARCSEC) for low, high in (xi, eta)]
     x, y = (v.ravel() for v in np.meshgrid(*places))
     rng = np.random.default_rng(5)
-    e, magnitude, radius = rng.uniform(-0.3, 0.3, x.size), rng.uniform(20.5, 22.0, x.size), rng.uniform(0.5, 1.2, x.size)
+    e, magnitude = rng.uniform(-0.3, 0.3, x.size), rng.uniform(20.5, 22.0, x.size)
+    radius = rng.uniform(0.5, 1.2, x.size)
     # Half-light radii of many values: stars alone have one.
     return Galaxies.single(x, y, magnitude, radius * ARCSEC, e1=e, e2=0.1, sersic=0.5)
 
