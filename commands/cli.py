@@ -19,7 +19,21 @@ from typer import Option
 
 from ..core.errors import PachonError
 from ..core.version import VERSION
-from . import baseline, camera, design, diagnostics, images, reproduce, run, shim, study, sweep, telescope, visits
+from . import (
+    baseline,
+    camera,
+    design,
+    diagnostics,
+    images,
+    reproduce,
+    run,
+    shim,
+    stack_images,
+    study,
+    sweep,
+    telescope,
+    visits,
+)
 from .interrupt import InterruptedRunError
 
 # The error of bad arguments is a class of typer or of click, depending on the version of typer.
@@ -83,7 +97,21 @@ def _common(
 
 
 # In the order of the help.
-for _group in (run, images, visits, reproduce, diagnostics, study, sweep, baseline, design, camera, shim, telescope):
+for _group in (
+    run,
+    images,
+    visits,
+    stack_images,
+    reproduce,
+    diagnostics,
+    study,
+    sweep,
+    baseline,
+    design,
+    camera,
+    shim,
+    telescope,
+):
     app.add_typer(_group.app)
 
 
