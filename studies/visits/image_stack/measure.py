@@ -26,12 +26,16 @@ from ..null_test import REACH, write_shapes
 from ..stack import PsfStack
 from ..visits import cell_of, pixel_scale_of, stack_path
 from .picture import stacks_png
-from .resample import CORRELATED
 from .stack_images import ImageStack, galaxies_on
 from .tiles import Tile
+from .transfer import broadened, mean_transfer
+from .visit_wcs import VisitWcs
 
 #: Largest distance of a detected object from a true one [pixel].
 MATCH_RADIUS = 3.0
+
+#: S/N in one visit of the objects that determine the locus of stars.
+_BRIGHT_SNR = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +46,10 @@ class MeasuredTile:
     ----------
     galaxies : GalaxyShapes
         Detected objects that are not selected stars; their index is that of the true galaxy, -1 where there is none.
-    stamps, noise_free : GalaxyShapes
-        True galaxies, each on a stamp of its own, with the noise of the stack and without.
+    stamps : GalaxyShapes
+        True galaxies, each on a stamp of its own, with the noise of the stack.
+    noise_free : GalaxyShapes
+        Those without noise that are usable on the image and on their stamp.
     area : float
         Pixels with data [arcmin^2].
     stars : dict of str to float
@@ -121,28 +127,34 @@ def measure_tile(
     DomainError
         If nothing is detected, or there is no locus of stars.
     """
+    exposure = stack.exposure(psfs.visits)
     # White noise that is as strong in averages over several pixels as the correlated noise of the stack.
-    variance = image.variance / np.float32(CORRELATED)
+    variance = image.variance * np.float32(exposure.noise_rms**2 / np.median(image.variance[image.mask == 0]))
     objects = detect_objects(image.image, variance, image.mask, background_size=None)
-    stars = select_stars(objects, image.image, mask=image.mask)
+    # The stars are those of one visit. Fainter objects, which deeper stacks are full of, would hide their locus.
+    depth = float(np.sqrt(psfs.visits))
+    limits = {"min_snr": stack.experiment.config.stars.snr_min * depth, "bright_snr": _BRIGHT_SNR * depth}
+    stars = select_stars(objects, image.image, mask=image.mask, **limits)
     truth = image.objects
-    scale, axes, first = pixel_scale_of(stack.frame), stack.frame.matrix, np.array(tile.first)
+    scale = pixel_scale_of(stack.frame)
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
     places = np.flatnonzero(~psfs.star)
-    at = np.stack([objects.x, objects.y], axis=1) + first
+    at = np.stack([objects.x, objects.y], axis=1) + tile.first
+    ccds = stack.wcs(threads).values()
+    images = [VisitWcs(ccd, visit) for visit in stack.plan[: psfs.visits] for ccd in ccds]
+    transfer = mean_transfer(tile, stack.frame, images)
     tree = cKDTree(np.stack([psfs.x, psfs.y], axis=1)[places])
     distance, nearest = tree.query(at * scale, distance_upper_bound=reach)
     ours = np.isfinite(distance)
     ours[stars.index] = False
     rows = np.flatnonzero(ours)
-    psf = places[nearest[rows]]
     fits = [
         fit_galaxies(
             image.image,
             np.where(image.mask == 0, variance, 1.0),
             objects.x[rows],
             objects.y[rows],
-            known[psf],
+            broadened(known[places], transfer)[nearest[rows]],
             half_light_radius=objects.half_light_radius[rows],
             mask=image.mask,
             segmentation=objects.segmentation,
@@ -168,42 +180,33 @@ def measure_tile(
         true_e2=fits[1].e2,
         true_usable=usable[1],
     )
-    true, exposure = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.exposure(psfs.visits)
-    seed = stack.stamp.seed
-    stamps, noise_free = (
-        measure_galaxies(
-            psfs,
-            axes,
-            true,
-            replace(exposure, noise=noise),
-            seed,
-            "images",
-            psfs.visits,
-            *(2 * abs(k) + (k < 0) for k in (tile.column, tile.row)),
-            reach=reach,
-            threads=threads,
-        )
-        for noise in (True, False)
-    )
+    true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
+    key = ("images", psfs.visits, *(2 * abs(k) + (k < 0) for k in (tile.column, tile.row)))
+    options: dict[str, Any] = {"reach": reach, "threads": threads}
+    stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
+    both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
+    silent = replace(exposure, noise=False)
+    noise_free = measure_galaxies(psfs, axes, true.take(both), silent, stack.stamp.seed, *key, **options)
+    noise_free = replace(noise_free, index=both[noise_free.index])
     area = float((image.mask == 0).sum()) * (scale / ARCMIN) ** 2
-    return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, stack, first))
+    return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
 
 
-def _star_metrics(stars: StarSelection, psfs: PsfStack, stack: ImageStack, first: np.ndarray) -> dict[str, float]:
+def _star_metrics(
+    stars: StarSelection, psfs: PsfStack, transfer: np.ndarray, stack: ImageStack, tile: Tile
+) -> dict[str, float]:
     """Return how the selected stars differ from the true PSFs of the stack at them."""
     scale = pixel_scale_of(stack.frame)
     known = np.flatnonzero(psfs.star)
-    places = np.stack([psfs.x, psfs.y], axis=1)[known] / scale - first
+    places = np.stack([psfs.x, psfs.y], axis=1)[known] / scale - tile.first
     match = match_positions(*stars.positions.T, *places.T, MATCH_RADIUS)
     real = match >= 0
     rows = known[match[real]]
-    shapes = measure_shapes(stars.stamps[real], scale, stack.experiment.weight_fwhm)
-    with np.errstate(invalid="ignore"):
-        changes = {
-            "e1": shapes.e1 - psfs.e1[rows],
-            "e2": shapes.e2 - psfs.e2[rows],
-            "size": shapes.size / psfs.size[rows] - 1.0,
-        }
+    shapes, true = (
+        measure_shapes(stamps, scale, stack.experiment.weight_fwhm)
+        for stamps in (stars.stamps[real], broadened(psfs.true[rows], transfer))
+    )
+    changes = {"e1": shapes.e1 - true.e1, "e2": shapes.e2 - true.e2, "size": shapes.size / true.size - 1.0}
     figures = {f"{key}_difference": float(np.nanmean(v)) for key, v in changes.items()} if len(rows) else {}
     return {"selected": float(len(stars)), "true": float(real.sum()), **figures}
 

@@ -124,6 +124,21 @@ class ImageStack:
             noise=self.settings.noise,
         )
 
+    @property
+    def plan(self) -> tuple[Visit, ...]:
+        """The visits."""
+        config, dither = self.visits.visits, float(np.deg2rad(self.visits.visits.dither_deg))
+        return plan_visits(config.count, self.experiment.config.seed, dither=dither, first_epoch=config.first_epoch)
+
+    def wcs(self, threads: int | None = None) -> dict[str, CcdWcs]:
+        """Return the world coordinates of the CCDs about the pointing of a visit, at a position angle of 0."""
+        telescope, camera = self.experiment.telescope, self.experiment.camera
+        wavelength = middle_wavelength(self.experiment)
+        return {
+            name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
+            for name in given(self.experiment.config.ccds)
+        }
+
     def path(self, visits: int, tile: Tile) -> Path:
         """Return the path of the image of a tile in the stack of a number of visits."""
         return self.folder / f"stack_{visits:04d}_tile_{tile.name}.fits"
@@ -177,22 +192,14 @@ def stack_images(
     stack = ImageStack.of(folder, settings)
     _claim(stack, resume)
     _check_room(stack, threads)
-    config, experiment = stack.visits.visits, stack.experiment
-    plan = plan_visits(
-        config.count, experiment.config.seed, dither=np.deg2rad(config.dither_deg), first_epoch=config.first_epoch
-    )
+    plan = stack.plan
     sums = {tile: _sums_so_far(stack, tile, resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
     if max(s.visits for s in sums.values()) > len(plan):
         raise ProductError(f"{stack.folder} holds more than the {len(plan)} visits of {folder}; remove one of them")
     if done:
         reporter.line(f"images of {done} of {len(plan)} visits are stacked already")
-    names = experiment.config.ccds or ()
-    wavelength = middle_wavelength(experiment)
-    wcs = {
-        name: ccd_wcs(experiment.telescope, experiment.camera, name, wavelength=wavelength, threads=threads)
-        for name in names
-    }
+    wcs = stack.wcs(threads)
     for visit in plan[done:]:
         # Tiles written before an interruption may be ahead by a visit.
         due = {tile: s for tile, s in sums.items() if s.visits == visit.number}

@@ -32,7 +32,7 @@ _VISITS, _POINTS = 10, 5
 class Tile:
     """Square of `side` x `side` pixels of the frame; tile (0, 0) has the common pointing in its middle.
 
-    Pixels of the frame (x, y) are d(x, y)/d(xi, eta) times (xi, eta); the first pixel of a tile is `first`.
+    Places in the frame (x, y) are d(x, y)/d(xi, eta) times (xi, eta); the first pixel of a tile is at `first`.
     """
 
     column: int
@@ -45,14 +45,9 @@ class Tile:
         return f"{self.column:+03d}_{self.row:+03d}"
 
     @property
-    def first(self) -> tuple[int, int]:
-        """First pixel (x, y) in the frame."""
-        return self.column * self.side - self.side // 2, self.row * self.side - self.side // 2
-
-    @property
-    def window(self) -> Window:
-        """Pixels in the frame."""
-        return Window(*self.first, self.side, self.side)
+    def first(self) -> np.ndarray:
+        """Place (x, y) of the first pixel in the frame, so that pixels coincide with those of a CCD in the middle."""
+        return np.array([self.column, self.row]) * self.side - 0.5 * (self.side - 1)
 
     @property
     def inside(self) -> Window:
@@ -65,7 +60,7 @@ class Tile:
         return CcdWcs(
             pointing=(0.0, 0.0),
             shape=(self.side, self.side),
-            reference_pixel=-np.array(self.first, dtype=np.float64),
+            reference_pixel=-self.first,
             cd=np.linalg.inv(frame.matrix),
             distortion=nothing,
             inverse=nothing,
@@ -186,7 +181,9 @@ def window_on(tiles: Sequence[Tile], pixels: int, frame_at: np.ndarray, nodes: n
     step = float(nodes[1] - nodes[0])
     places = frame_at.reshape(-1, 2)
     # Nodes are less than a step and a half from any pixel between them, along each axis of a rolled frame.
-    near = np.any([tile.window.contains(places, 1.5 * step) for tile in tiles], axis=0).reshape(frame_at.shape[:2])
+    near = np.any([tile.inside.contains(places - tile.first, 1.5 * step) for tile in tiles], axis=0).reshape(
+        frame_at.shape[:2]
+    )
     if not near.any():
         return None
     ends = []
