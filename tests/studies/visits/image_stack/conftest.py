@@ -8,7 +8,8 @@ from pachon.studies.visits.config import VisitsConfig, VisitsSection
 from pachon.studies.visits.image_stack import stack_images as stack_images_module
 from pachon.studies.visits.image_stack.config import ImageStackConfig
 from pachon.studies.visits.image_stack.stack_images import stack_images
-from pachon.studies.visits.visits import stack_visits
+from pachon.studies.visits.stack import PsfStack
+from pachon.studies.visits.visits import stack_path, stack_visits
 
 
 class RoundGalaxies:
@@ -25,9 +26,9 @@ class RoundGalaxies:
 
 @pytest.fixture(scope="package")
 def small_visits(tiny):
-    """Configuration of visits of one CCD with 300 stars, in the mean over all turbulence."""
+    """Configuration of visits of one CCD with 450 stars, in the mean over all turbulence."""
     run = tiny(ccds=("R22_S11",), psf__engine="long_exposure", psf__n_pupil=200, psf__stamp=49)
-    return VisitsConfig(run=run, visits=VisitsSection(count=2, stars=300, places=60, snapshots=(1,)))
+    return VisitsConfig(run=run, visits=VisitsSection(count=2, stars=450, places=60, snapshots=(1,)))
 
 
 @pytest.fixture
@@ -39,10 +40,19 @@ def visits_folder(small_visits, tmp_path):
 
 
 @pytest.fixture(scope="package")
-def noise_free(small_visits, tmp_path_factory):
-    """Stack of two visits without noise, with round galaxies, beside that of the PSFs."""
+def visit_products(small_visits, tmp_path_factory):
+    """Folder of two visits, with the stacks of their PSFs."""
     folder = tmp_path_factory.mktemp("visits")
-    psfs = stack_visits(small_visits, folder)
+    stack_visits(small_visits, folder)
+    return folder
+
+
+@pytest.fixture(scope="package")
+def noise_free(visit_products, tmp_path_factory):
+    """Stack of two visits without noise, with round galaxies, beside that of the PSFs."""
+    folder = tmp_path_factory.mktemp("noise_free")
+    (folder / CONFIG_NAME).write_bytes((visit_products / CONFIG_NAME).read_bytes())
+    psfs = {visits: PsfStack.read(stack_path(visit_products, visits)) for visits in (1, 2)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stack_images_module, "GalaxyPopulation", RoundGalaxies)
-        return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs.stacks
+        return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs
