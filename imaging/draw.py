@@ -14,12 +14,12 @@ from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import fft
 
 from ..core.errors import check_choice
 from ..core.threads import one_blas_thread, thread_count
 from .psf_field import PsfField
-from .wcs import CcdWcs
 
 WAYS = ("direct", "eigen")
 #: Pixels along a side of the grid of a galaxy.
@@ -67,6 +67,23 @@ class Sources(Protocol):
         """Return the Fourier transforms of galaxies of unit flux, complex64 [k, size, size // 2 + 1]."""
 
 
+class SkyPixels(Protocol):
+    """World coordinates of a CCD, such as :class:`pachon.CcdWcs`."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the CCD."""
+
+    def to_sky(self, pixels: ArrayLike) -> np.ndarray:
+        """Return (xi, eta) [rad], shape [n, 2], of pixels (x, y), shape [n, 2]."""
+
+    def to_pixel(self, sky: ArrayLike) -> np.ndarray:
+        """Return pixels (x, y), shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
+
+    def jacobians(self, pixels: ArrayLike) -> np.ndarray:
+        """Return d(x, y)/d(xi, eta) [pixel/rad] at pixels, shape [n, 2, 2]."""
+
+
 @dataclass(frozen=True)
 class Window:
     """Rectangle of pixels of a CCD; the first one is (x, y)."""
@@ -96,7 +113,7 @@ def draw_galaxies(
     galaxies: Sources,
     electrons: np.ndarray,
     psf: PsfField,
-    wcs: CcdWcs,
+    wcs: SkyPixels,
     *,
     window: Window | None = None,
     noise: float = 1.0,
@@ -114,7 +131,7 @@ def draw_galaxies(
         Electrons of each in the image.
     psf : PsfField
         PSF of the CCD.
-    wcs : CcdWcs
+    wcs : SkyPixels
         World coordinates of the CCD.
     window : Window, optional
         Part of the CCD to draw; all of it by default.
@@ -190,7 +207,7 @@ def _direct(
     galaxies: Sources,
     electrons: np.ndarray,
     psf: PsfField | None,
-    wcs: CcdWcs,
+    wcs: SkyPixels,
     window: Window,
     noise: float,
     threads: int | None,

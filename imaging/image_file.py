@@ -52,6 +52,8 @@ class CcdImage:
         Columns of :data:`OBJECT_COLUMNS`.
     stamp : Stamp or None
         Origin.
+    mask_bits : dict of int to str
+        Names of the bits of the mask.
     """
 
     name: str
@@ -61,6 +63,7 @@ class CcdImage:
     header: fits.Header
     objects: dict[str, np.ndarray] = field(default_factory=dict)
     stamp: Stamp | None = None
+    mask_bits: dict[int, str] = field(default_factory=MASK_BITS.copy)
 
     @property
     def wcs(self) -> WCS:
@@ -78,7 +81,7 @@ class CcdImage:
         variance.header["BUNIT"] = ("adu2", "expected variance")
         variance.header["UTYPE"] = "VarianceUncertainty"
         mask = fits.ImageHDU(np.asarray(self.mask, dtype=np.int16), name="MASK")
-        for bit, name in MASK_BITS.items():
+        for bit, name in self.mask_bits.items():
             mask.header[f"MP_{name[:5]}"] = (bit.bit_length() - 1, f"number of the bit {name}")
         columns: Columns = {key: (self.objects[key], *OBJECT_COLUMNS[key]) for key in OBJECT_COLUMNS}
         cards = [("CCD", self.name, "name of the CCD")]

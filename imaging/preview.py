@@ -30,8 +30,8 @@ def preview_png(image: CcdImage) -> bytes:
     with styled():
         figure = new_figure(7.0, 6.6)
         axes = figure.subplots()
-        _show(axes, binned, noise, _scale(image) * step)
-        _compass(axes, image)
+        show_stretched(axes, binned, noise, pixel_scale_of(image) * step)
+        draw_compass(axes, image)
         header = image.header
         axes.set_title(f"{image.name}, {header['FILTER']} band, {header['EXPTIME']:g} s", loc="left")
         return png_bytes(figure)
@@ -51,10 +51,12 @@ def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
         figure = new_figure(10.5, 3.9)
         for axes, (title, exposure) in zip(figure.subplots(1, 3), panels, strict=True):
             image = part.exposed(exposure, threads=threads)
-            _show(axes, image.image - _level(image), float(np.sqrt(np.median(image.variance))), _scale(image))
+            show_stretched(
+                axes, image.image - _level(image), float(np.sqrt(np.median(image.variance))), pixel_scale_of(image)
+            )
             axes.set_title(f"{scene.name}, {exposure.band} band, {title}", loc="left")
             if axes.get_subplotspec().is_first_col():
-                _compass(axes, image)
+                draw_compass(axes, image)
             else:
                 axes.set_ylabel("")
         return png_bytes(figure)
@@ -74,7 +76,7 @@ def _level(image: CcdImage) -> float:
     return 0.0 if image.header["SKYSUB"] else float(image.header["SKY"])
 
 
-def _scale(image: CcdImage) -> float:
+def pixel_scale_of(image: CcdImage) -> float:
     """Return the side of a pixel at the reference point [arcsec]."""
     return float(np.sqrt(abs(np.linalg.det(_cd(image))))) * 3600.0
 
@@ -83,7 +85,7 @@ def _cd(image: CcdImage) -> np.ndarray:
     return np.array([[image.header[f"CD{i}_{j}"] for j in (1, 2)] for i in (1, 2)])
 
 
-def _show(axes: Axes, data: np.ndarray, noise: float, scale: float) -> None:
+def show_stretched(axes: Axes, data: np.ndarray, noise: float, scale: float) -> None:
     """Draw an image with an asinh stretch in units of its noise; pixels of `scale` arcsec."""
     height, width = (0.5 * scale * n for n in data.shape)
     stretched = np.arcsinh(data / (_SOFT * noise)) / np.arcsinh(_TOP / _SOFT)
@@ -92,7 +94,7 @@ def _show(axes: Axes, data: np.ndarray, noise: float, scale: float) -> None:
     axes.set_ylabel("y [arcsec]")
 
 
-def _compass(axes: Axes, image: CcdImage) -> None:
+def draw_compass(axes: Axes, image: CcdImage) -> None:
     """Draw arrows towards north and east in a corner."""
     # Columns of the inverse of CD are the steps in pixels for a step in xi (east) and in eta (north).
     steps = np.linalg.inv(_cd(image))

@@ -15,7 +15,7 @@ from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
-from .draw import SIZES, Sources, Window, add_stamps, draw_galaxies
+from .draw import SIZES, SkyPixels, Sources, Window, add_stamps, draw_galaxies
 from .exposure import Exposure, expose
 from .image_file import CcdImage
 from .psf_field import PsfField, to_pixel
@@ -184,7 +184,7 @@ def draw_ccd(
     return CcdScene(
         ccd,
         image,
-        _objects({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs),
+        object_columns({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs),
         wcs,
         part,
         exposure,
@@ -258,16 +258,16 @@ def check_density(electrons: float, exposure: Exposure, start: str = "") -> None
         )
 
 
-def galaxies_near(galaxies: Sources | GalaxiesIn, wcs: CcdWcs, window: Window) -> Sources:
+def galaxies_near(galaxies: Sources | GalaxiesIn, wcs: SkyPixels, window: Window) -> Sources:
     """Return the galaxies on a window and so near that their light may reach it."""
-    xi, eta = _sky_ranges(wcs, window.grown(SIZES[-1] // 2))
+    xi, eta = sky_ranges(wcs, window.grown(SIZES[-1] // 2))
     if callable(galaxies):
         return galaxies(xi, eta)
     near = (xi[0] <= galaxies.xi) & (galaxies.xi <= xi[1]) & (eta[0] <= galaxies.eta) & (galaxies.eta <= eta[1])
     return galaxies.take(np.flatnonzero(near))
 
 
-def _sky_ranges(wcs: CcdWcs, window: Window) -> tuple[tuple[float, float], tuple[float, float]]:
+def sky_ranges(wcs: SkyPixels, window: Window) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the ranges of xi and eta of a window."""
     x, y = np.linspace(0.0, window.width, 9) + window.x, np.linspace(0.0, window.height, 9) + window.y
     sky = wcs.to_sky(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
@@ -275,7 +275,7 @@ def _sky_ranges(wcs: CcdWcs, window: Window) -> tuple[tuple[float, float], tuple
     return (float(xi0), float(xi1)), (float(eta0), float(eta1))
 
 
-def _objects(table: dict[str, np.ndarray], wcs: CcdWcs) -> dict[str, np.ndarray]:
+def object_columns(table: dict[str, np.ndarray], wcs: CcdWcs) -> dict[str, np.ndarray]:
     """Return the columns of the table of objects."""
     celestial = np.rad2deg(wcs.to_celestial(table["SKY"]))
     return {

@@ -34,7 +34,7 @@ from .scene import check_density, draw_ccd, stamped
 _MAGNITUDES = 200
 CONFIG_NAME = "images.yaml"
 #: Copies of a CCD's pixels that are held at once, in bytes a pixel: scene, image, variance, mask, and the file twice.
-_BYTES = 40
+BYTES_PER_PIXEL = 40
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def simulate_images(
     resolved = config.resolved(experiment)
     window, exposure = _window(config, experiment), _exposure(config, experiment)
     galaxies = _galaxies(config, experiment, exposure)
-    require_bytes(needed_bytes(experiment, threads) + _BYTES * window.width * window.height, "images")
+    require_bytes(needed_bytes(experiment, threads) + BYTES_PER_PIXEL * window.width * window.height, "images")
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
     _claim(folder, resolved, resume=resume)
     names = given(experiment.config.ccds)

@@ -42,6 +42,7 @@ class NoiseFreeStars:
     pixel_scale: float  #: angle of a pixel [rad]
     fields: np.ndarray  #: field angles [rad], [n, 2]
     lit_fraction: np.ndarray  #: part of the entrance pupil whose light arrives, mean over wavelengths, [n]
+    offset: np.ndarray  #: place of the reference point from the centre of the middle pixel [pixel], [n, 2]
 
 
 @dataclass(frozen=True)
@@ -90,19 +91,29 @@ def expose_ccd(
     `stars` are by default drawn over the CCD. No byte depends on the number of threads; `progress` is called with the
     number of PSFs made since the last call.
     """
+    positions = ccd_stars(experiment, name, _PROVISIONAL_FWHM) if stars is None else stars
+    holdout = expose_centered(experiment, positions.holdout, threads, progress)
+    pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
+    offsets, room = pixel - np.rint(pixel), _SHIFT_ROOM
+    observed = _lit(_expose(experiment, positions.observed, threads, progress, offsets=offsets, room=room))
+    return CcdExposure(name, positions, holdout, observed)
+
+
+def expose_centered(
+    experiment: Experiment,
+    positions: np.ndarray,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> NoiseFreeStars:
+    """Make noise-free PSFs at positions on the detector [m], shape [n, 2], their centroids at the centre of a pixel."""
 
     def centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
         shapes = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
         return np.nan_to_num(np.stack([shapes.x, shapes.y], axis=1))
 
-    positions = ccd_stars(experiment, name, _PROVISIONAL_FWHM) if stars is None else stars
     # The engine draws them at the position that compensates their shift by the atmosphere. Resampling, as of observed
     # stars, would leave ringing along rows and columns where an image is not quite band-limited.
-    holdout = _expose(experiment, positions.holdout, threads, progress, recenter=centroid)
-    pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
-    offsets, room = pixel - np.rint(pixel), _SHIFT_ROOM
-    observed = _lit(_expose(experiment, positions.observed, threads, progress, offsets=offsets, room=room))
-    return CcdExposure(name, positions, holdout, observed)
+    return _expose(experiment, positions, threads, progress, recenter=centroid)
 
 
 def _lit(stars: NoiseFreeStars) -> NoiseFreeStars:
@@ -151,7 +162,7 @@ def _expose(
         progress=progress,
     )
     image = _displaced(experiment, positions - psfs.offset * experiment.pixel_size, psfs.image)
-    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1))
+    return NoiseFreeStars(image, float(psfs.pixel_scale), fields, psfs.lit_fraction.mean(axis=1), psfs.offset)
 
 
 def _displaced(experiment: Experiment, middles: np.ndarray, images: np.ndarray) -> np.ndarray:

@@ -30,8 +30,8 @@ from .visits import cell_of, pixel_scale_of, stack_path
 _FAINTEST_SNR = 8.0
 # FWHM of that star.
 _FWHM = 0.7 * ARCSEC
-# Galaxies farther from all places with a known PSF than this are left out, over the mean distance of the places.
-_REACH = 2.0
+#: Galaxies farther from all places with a known PSF than this are left out, over the mean distance of the places.
+REACH = 2.0
 #: Shear of the calibration.
 SHEAR = 0.02
 # Orientations of a ring.
@@ -83,7 +83,7 @@ def null_test(
     cell, scale = cell_of(experiment, frame), pixel_scale_of(frame)
     settings, seed = experiment.config, experiment.config.seed
     band, seconds = settings.band or "r", settings.atmosphere.exposure_s
-    reach = _REACH * float(cell / np.sqrt(config.visits.places))
+    reach = REACH * float(cell / np.sqrt(config.visits.places))
     make_folder(folder / "galaxies")
     results = {}
     for visits in config.kept:
@@ -112,7 +112,7 @@ def null_test(
                         reach=reach,
                         threads=threads,
                     )
-                    _write(path, measured, stamp)
+                    write_shapes(path, measured, stamp)
                 # What a resumed test reads, so that both have the same numbers.
                 parts.append(_read(path, stamp))
                 stage.advance()
@@ -221,7 +221,8 @@ _COLUMNS = {
 }
 
 
-def _write(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
+def write_shapes(path: Path, galaxies: GalaxyShapes, stamp: Stamp) -> None:
+    """Write galaxies as a FITS table."""
     columns = {
         name.upper(): (getattr(galaxies, name) / unit if unit != 1.0 else getattr(galaxies, name), text, description)
         for name, (unit, text, description) in _COLUMNS.items()

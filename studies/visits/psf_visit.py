@@ -53,13 +53,13 @@ class StackFrame:
     @classmethod
     def of(cls, experiment: Experiment, size: int) -> StackFrame:
         """Return the frame of an experiment."""
-        center = Visit(0, 0).jacobians(experiment.telescope, np.zeros((1, 2)), _wavelength(experiment))[0]
+        center = Visit(0, 0).jacobians(experiment.telescope, np.zeros((1, 2)), middle_wavelength(experiment))[0]
         left, scale, right = np.linalg.svd(center)
         return cls(left @ right * scale.mean() / experiment.pixel_size, size)
 
     def to_stamp(self, experiment: Experiment, visit: Visit, sky: np.ndarray, threads: int | None = None) -> np.ndarray:
         """Return d(x, y of a stamp of the visit)/d(x, y of the stack) at positions of the sky, shape [n, 2, 2]."""
-        on_detector = visit.jacobians(experiment.telescope, sky, _wavelength(experiment), threads)
+        on_detector = visit.jacobians(experiment.telescope, sky, middle_wavelength(experiment), threads)
         return on_detector / experiment.pixel_size @ np.linalg.inv(self.matrix)
 
 
@@ -156,10 +156,9 @@ def _star_fields(
 ) -> tuple[dict[str, StarField], dict[str, np.ndarray]]:
     """Return the stars of each CCD and, as its holdout positions, all points on it; and the indices of the latter."""
     camera, config = experiment.camera, experiment.config
-    xy = visit.on_detector(experiment.telescope, points.sky, _wavelength(experiment), threads)
+    xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     band, seconds = config.band or "r", config.atmosphere.exposure_s
-    bright = saturation_magnitude(band, seconds, _NOMINAL_FWHM)
-    faint = limiting_magnitude(config.stars.snr_min, band, seconds, _NOMINAL_FWHM)
+    bright, faint = magnitude_limits(experiment)
     fields, index = {}, {}
     # Beyond its field of view a telescope may have no light, and is not asked for.
     lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
@@ -186,6 +185,14 @@ def _star_fields(
         )
         index[name] = here
     return fields, index
+
+
+def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
+    """Return the magnitude limits of the stars, bright and faint, which are the same in every visit."""
+    config = experiment.config
+    band, seconds = config.band or "r", config.atmosphere.exposure_s
+    bright = saturation_magnitude(band, seconds, _NOMINAL_FWHM)
+    return bright, limiting_magnitude(config.stars.snr_min, band, seconds, _NOMINAL_FWHM)
 
 
 def _focal_plane_images(
@@ -215,5 +222,6 @@ def _focal_plane_images(
     return model.draw(names, *np.concatenate(list(places.values())).T, threads=threads)
 
 
-def _wavelength(experiment: Experiment) -> float:
+def middle_wavelength(experiment: Experiment) -> float:
+    """Return the vacuum wavelength that positions are those of [m]."""
     return float(experiment.wavelengths[len(experiment.wavelengths) // 2])

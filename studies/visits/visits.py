@@ -98,7 +98,7 @@ def stack_visits(
     config = config.resolved(experiment)
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
     settings, frame = config.visits, StackFrame.of(experiment, STACK_STAMP)
-    points = _points(experiment, config, frame)
+    points = sky_points_of(experiment, config, frame)
     visits = plan_visits(
         settings.count,
         experiment.config.seed,
@@ -150,7 +150,7 @@ def cell_of(experiment: Experiment, frame: StackFrame) -> float:
     return float(experiment.camera.ccd_size / experiment.pixel_size * pixel_scale_of(frame))
 
 
-def _points(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
+def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
     """Return stars and places of the sky that the CCDs of a visit can see."""
     camera, names = experiment.camera, experiment.config.ccds or ()
     centers = camera.centers[[camera.ccd_index(name) for name in names]]

@@ -47,7 +47,9 @@ def _planted(name, degree, n_stars, n_holdout, half=0.02):
         return round_psf + np.einsum("kn,kyx->nyx", a, shapes)
 
     def exposed(positions, size):
-        return NoiseFreeStars(images(positions, size), SCALE, positions * 0.01, np.ones(len(positions)))
+        return NoiseFreeStars(
+            images(positions, size), SCALE, positions * 0.01, np.ones(len(positions)), np.zeros((len(positions), 2))
+        )
 
     exposure = CcdExposure(name, places, exposed(places.holdout, 31), exposed(places.observed, 41))
     stamps, nothing = images(places.observed, 31), np.zeros(n_stars, dtype=int)

@@ -1,0 +1,85 @@
+"""The command ``pachon stack-images``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from .interrupt import interruptible
+from .options import Json, Quiet, Threads
+from .tables import Rows, print_json
+
+app = typer.Typer()
+
+_CAPTION = (
+    "Per square arcminute: detected objects that are no stars, galaxies usable for shear on the images, and on stamps "
+    "of their own; mean difference of the ellipticities of those usable on both, and of their responses."
+)
+
+
+@app.command("stack-images")
+def stack_images_command(
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder of pachon visits.")],
+    tiles: Annotated[int | None, Option(min=1, help="Most tiles of the sky, from the pointing outwards; 1.")] = None,
+    faintest: Annotated[
+        float | None, Option(help="Faintest galaxy [AB mag]; by default that of S/N 4 in the stack of all visits.")
+    ] = None,
+    side: Annotated[int | None, Option(min=64, help="Pixels along a side of a tile; those of a CCD.")] = None,
+    noise: Annotated[bool | None, Option("--noise/--no-noise", help="With noise, or expected images.")] = None,
+    measure: Annotated[bool, Option("--measure/--no-measure", help="Measure the galaxies of the stacks.")] = True,
+    resume: Annotated[bool, Option("--resume", help="Go on after the visits that are stacked already.")] = False,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Draw the images of visits and stack them: galaxies and stars, resampled onto common pixels, and measured.
+
+    The CCDs of every visit that see the tiles are drawn with the stars of `pachon visits` and galaxies like those of
+    the Hubble Ultra Deep Field, at the roll and the pointing of the visit, with noise. Their images are resampled as
+    the PSFs of the visits are. The stacks of 1, 10, 100 and all visits become FITS images; on them galaxies are
+    detected and measured with the PSF of the models of the visits, beside the same galaxies on stamps of their own.
+
+    Images, tables of galaxies, images.json and images.png go into the folder images of the visits.
+
+    **Examples**
+
+    - `pachon visits -o deep -n 10`, then `pachon stack-images deep`: the size of one CCD, ten minutes on two cores
+    - `pachon stack-images deep --side 1024`: only 3.4 arcminutes, a few minutes
+    - `pachon stack-images deep --resume`: go on where it was stopped, or with the visits added since
+    """
+    from ..studies.visits.image_stack.config import ImageStackConfig
+    from ..studies.visits.image_stack.measure import measure_stack
+    from ..studies.visits.image_stack.stack_images import stack_images
+
+    wanted = {"tiles": tiles, "faintest": faintest, "side": side, "noise": noise}
+    settings = ImageStackConfig(**{key: value for key, value in wanted.items() if value is not None})
+    with interruptible(quiet, f"finished visits are in {folder}, and --resume goes on from there") as reporter:
+        stack = stack_images(folder, settings, resume=resume, threads=threads, reporter=reporter)
+        found = measure_stack(folder, threads=threads, reporter=reporter) if measure else {}
+    metrics = {str(visits): figures for visits, figures in found.items()}
+    if as_json:
+        print_json({"folder": str(stack.folder.resolve()), "stacks": metrics})
+    elif not quiet:
+        if metrics:
+            _show(metrics)
+        print(f"images: {stack.folder.resolve()}")
+
+
+def _show(metrics: dict[str, dict[str, Any]]) -> None:
+    rows = []
+    for visits, found in metrics.items():
+        densities = [
+            f"{found[key]:.1f}" for key in ("detected_per_arcmin2", "usable_per_arcmin2", "usable_per_arcmin2_stamps")
+        ]
+        if found["pairs"]:
+            error = found["mean_difference_error"]
+            shifts = [f"{found[f'mean_difference_{e}']:.4f} ± {error:.4f}" for e in ("e1", "e2")]
+            response = f"{found['response_difference']:.3f} ± {found['response_difference_error']:.3f}"
+        else:
+            shifts, response = ["", ""], ""
+        rows.append((visits, *densities, *shifts, response))
+    headings = ("visits", "detected", "usable", "on stamps", "e1 difference", "e2 difference", "response")
+    Rows(headings, rows, _CAPTION).show()

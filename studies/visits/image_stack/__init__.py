@@ -1,0 +1,1 @@
+"""Stacks of the images of visits: drawing, resampling onto tiles of the sky, measurement."""

@@ -1,0 +1,285 @@
+"""Galaxies measured on stacked images, beside the same galaxies each on a stamp of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ....core.errors import PachonError
+from ....core.files import write_bytes, write_json
+from ....core.products import Stamp
+from ....core.progress import Reporter
+from ....core.units import ARCMIN
+from ....imaging.image_file import CcdImage
+from ....pipeline.catalogue.detect import detect_objects
+from ....pipeline.catalogue.fit_galaxies import fit_galaxies
+from ....pipeline.catalogue.galaxy_fits import usable_galaxies
+from ....pipeline.catalogue.matching import match_positions
+from ....pipeline.catalogue.star_locus import StarSelection, select_stars
+from ....pipeline.measure.shapes import measure_shapes
+from ..galaxy_shapes import GalaxyShapes, measure_galaxies
+from ..null_test import REACH, write_shapes
+from ..stack import PsfStack
+from ..visits import cell_of, pixel_scale_of, stack_path
+from .picture import stacks_png
+from .stack_images import ImageStack, galaxies_on
+from .tiles import Tile
+from .transfer import broadened, mean_transfer
+from .visit_wcs import VisitWcs
+
+#: Largest distance of a detected object from a true one [pixel].
+MATCH_RADIUS = 3.0
+
+#: Of the pixels of an object [standard deviations]: at 3, one in six of the galaxies that are usable on stamps of their
+#: own has no five pixels above it. Detected noise has no ellipticity that is known well enough to be used.
+_THRESHOLD = 1.5
+#: S/N in one visit of the objects that determine the locus of stars.
+_BRIGHT_SNR = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredTile:
+    """Objects of one tile.
+
+    Attributes
+    ----------
+    galaxies : GalaxyShapes
+        Detected objects that are not selected stars; their index is that of the true galaxy, -1 where there is none.
+    stamps : GalaxyShapes
+        True galaxies, each on a stamp of its own, with the noise of the stack.
+    noise_free : GalaxyShapes
+        Those without noise that are usable on the image and on their stamp.
+    area : float
+        Pixels with data [arcmin^2].
+    stars : dict of str to float
+        Selected stars against the true PSFs of the stack.
+    """
+
+    galaxies: GalaxyShapes
+    stamps: GalaxyShapes
+    noise_free: GalaxyShapes
+    area: float
+    stars: dict[str, float]
+
+
+def measure_stack(
+    folder: Path, *, threads: int | None = None, reporter: Reporter | None = None
+) -> dict[int, dict[str, Any]]:
+    """Detect, select and fit what the stacked images of a folder of visits show.
+
+    Every galaxy is fitted with the PSF of the models of the visits, and with the true one, of the nearest place without
+    a star. Products are tables of galaxies, ``images.json`` and ``images.png``.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of :func:`~..visits.stack_visits` and of :func:`.stack_images`.
+    threads : int, optional
+        Number of threads; all processors by default.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Returns
+    -------
+    dict of int to dict
+        Figures by number of visits, as in ``images.json``.
+
+    Raises
+    ------
+    PachonError
+        If the folder holds no stacks of PSFs or images, or a tile has no stars.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    stack = ImageStack.of(folder)
+    origin = Stamp(stack.visits.digest(stack.experiment), stack.experiment.config.seed)
+    found = {}
+    for visits in stack.visits.kept:
+        psfs = PsfStack.read(stack_path(folder, visits), origin)
+        tiles = []
+        with reporter.stage(f"galaxies in the images of {visits} visits", total=len(stack.tiles)) as stage:
+            for number, tile in enumerate(stack.tiles, start=1):
+                image = stack.image(visits, tile)
+                try:
+                    measured = measure_tile(stack, tile, image, psfs, threads=threads)
+                except PachonError as error:
+                    raise error.within(subject=f"{visits} visits, tile {tile.name}") from None
+                write_shapes(
+                    stack.folder / f"galaxies_{visits:04d}_tile_{tile.name}.fits", measured.galaxies, stack.stamp
+                )
+                tiles.append(measured)
+                stage.advance()
+                stage.step(tile.name, number, len(stack.tiles))
+        found[visits] = tile_metrics(tiles)
+    write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in found.items()}})
+    images = {visits: stack.image(visits, stack.tiles[0]) for visits in stack.visits.kept}
+    write_bytes(stack.folder / "images.png", stacks_png(images))
+    return found
+
+
+def measure_tile(
+    stack: ImageStack, tile: Tile, image: CcdImage, psfs: PsfStack, *, threads: int | None = None
+) -> MeasuredTile:
+    """Measure the objects of a tile, and its true galaxies on stamps of their own.
+
+    Raises
+    ------
+    DomainError
+        If nothing is detected, or there is no locus of stars.
+    """
+    exposure = stack.exposure(psfs.visits)
+    # White noise that is as strong in averages over several pixels as the correlated noise of the stack.
+    variance = image.variance * np.float32(exposure.noise_rms**2 / np.median(image.variance[image.mask == 0]))
+    objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
+    # The stars are those of one visit. Fainter objects, which deeper stacks are full of, would hide their locus.
+    depth = float(np.sqrt(psfs.visits))
+    limits = {"min_snr": stack.experiment.config.stars.snr_min * depth, "bright_snr": _BRIGHT_SNR * depth}
+    stars = select_stars(objects, image.image, mask=image.mask, **limits)
+    truth = image.objects
+    scale = pixel_scale_of(stack.frame)
+    reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
+    places = np.flatnonzero(~psfs.star)
+    at = np.stack([objects.x, objects.y], axis=1) + tile.first
+    ccds = stack.wcs(threads).values()
+    images = [VisitWcs(ccd, visit) for visit in stack.plan[: psfs.visits] for ccd in ccds]
+    transfer = mean_transfer(tile, stack.frame, images)
+    tree = cKDTree(np.stack([psfs.x, psfs.y], axis=1)[places])
+    distance, nearest = tree.query(at * scale, distance_upper_bound=reach)
+    ours = np.isfinite(distance)
+    ours[stars.index] = False
+    rows = np.flatnonzero(ours)
+    fits = [
+        fit_galaxies(
+            image.image,
+            np.where(image.mask == 0, variance, 1.0),
+            objects.x[rows],
+            objects.y[rows],
+            broadened(known[places], transfer)[nearest[rows]],
+            half_light_radius=objects.half_light_radius[rows],
+            mask=image.mask,
+            segmentation=objects.segmentation,
+            threads=threads,
+        )
+        for known in (psfs.model, psfs.true)
+    ]
+    usable = [usable_galaxies(fit, objects.half_light_radius[rows], stars.half_light_radius) for fit in fits]
+    match = match_positions(objects.x, objects.y, truth["X"], truth["Y"], MATCH_RADIUS)[rows]
+    # True galaxies follow the stars of the table, in the order of the galaxies on the tile.
+    index = np.where(match >= 0, match - int(truth["STAR"].sum()), -1)
+    x, y = (at[rows] * scale).T
+    galaxies = GalaxyShapes(
+        index=np.maximum(index, -1),
+        x=x,
+        y=y,
+        magnitude=objects.magnitude(image.header["ZEROPNT"])[rows],
+        e1=fits[0].e1,
+        e2=fits[0].e2,
+        error=fits[0].ellipticity_error,
+        usable=usable[0],
+        true_e1=fits[1].e1,
+        true_e2=fits[1].e2,
+        true_usable=usable[1],
+    )
+    true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
+    key = ("images", psfs.visits, *(2 * abs(k) + (k < 0) for k in (tile.column, tile.row)))
+    options: dict[str, Any] = {"reach": reach, "threads": threads}
+    stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
+    both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
+    silent = replace(exposure, noise=False)
+    noise_free = measure_galaxies(psfs, axes, true.take(both), silent, stack.stamp.seed, *key, **options)
+    noise_free = replace(noise_free, index=both[noise_free.index])
+    area = float((image.mask == 0).sum()) * (scale / ARCMIN) ** 2
+    return MeasuredTile(galaxies, stamps, noise_free, area, _star_metrics(stars, psfs, transfer, stack, tile))
+
+
+def _star_metrics(
+    stars: StarSelection, psfs: PsfStack, transfer: np.ndarray, stack: ImageStack, tile: Tile
+) -> dict[str, float]:
+    """Return how the selected stars differ from the true PSFs of the stack at them."""
+    scale = pixel_scale_of(stack.frame)
+    known = np.flatnonzero(psfs.star)
+    places = np.stack([psfs.x, psfs.y], axis=1)[known] / scale - tile.first
+    match = match_positions(*stars.positions.T, *places.T, MATCH_RADIUS)
+    real = match >= 0
+    rows = known[match[real]]
+    shapes, true = (
+        measure_shapes(stamps, scale, stack.experiment.weight_fwhm)
+        for stamps in (stars.stamps[real], broadened(psfs.true[rows], transfer))
+    )
+    changes = {"e1": shapes.e1 - true.e1, "e2": shapes.e2 - true.e2, "size": shapes.size / true.size - 1.0}
+    figures = {f"{key}_difference": float(np.nanmean(v)) for key, v in changes.items()} if len(rows) else {}
+    return {"selected": float(len(stars)), "true": float(real.sum()), **figures}
+
+
+def tile_metrics(tiles: list[MeasuredTile]) -> dict[str, Any]:
+    """Return the figures of the tiles of one stack.
+
+    Densities are usable galaxies per square arcminute. Responses are slopes of measured against noise-free
+    ellipticities, of galaxies usable on the image and on the stamp; differences are image minus stamp.
+    """
+    area = sum(tile.area for tile in tiles)
+    pairs = [_pairs(tile) for tile in tiles]
+    image, stamp, reference = (np.concatenate([pair[k] for pair in pairs]) for k in range(3))
+    difference = image - stamp
+    slopes = [_slope(e, reference) for e in (image, stamp, difference)]
+    lost, faint = (sum(int(_fate(tile)[k]) for tile in tiles) for k in range(2))
+
+    def density(name: str, flag: str) -> float:
+        return sum(int(getattr(getattr(tile, name), flag).sum()) for tile in tiles) / area
+
+    count = max(len(image), 1)
+    return {
+        "area_arcmin2": area,
+        "detected_per_arcmin2": sum(len(tile.galaxies) for tile in tiles) / area,
+        "usable_per_arcmin2": density("galaxies", "usable"),
+        "usable_per_arcmin2_true_psf": density("galaxies", "true_usable"),
+        "usable_per_arcmin2_stamps": density("stamps", "usable"),
+        "usable_without_match": sum(int((t.galaxies.usable & (t.galaxies.index < 0)).sum()) for t in tiles) / area,
+        "stamps_not_detected": lost / area,
+        "stamps_detected_not_usable": faint / area,
+        "pairs": len(image),
+        "mean_difference_e1": float(difference.real.mean()) if len(image) else None,
+        "mean_difference_e2": float(difference.imag.mean()) if len(image) else None,
+        "mean_difference_error": float(np.sqrt(0.5 * (abs(difference - difference.mean()) ** 2).mean() / count))
+        if len(image)
+        else None,
+        "response_images": slopes[0][0],
+        "response_stamps": slopes[1][0],
+        "response_difference": slopes[2][0],
+        "response_difference_error": slopes[2][1],
+        "stars": [tile.stars for tile in tiles],
+    }
+
+
+def _pairs(tile: MeasuredTile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return complex ellipticities on image and stamp, and without noise, of galaxies that are usable on all."""
+    n = 1 + max((int(s.index.max(initial=-1)) for s in (tile.stamps, tile.noise_free, tile.galaxies)), default=-1)
+    found = []
+    for shapes, prefix in ((tile.galaxies, ""), (tile.stamps, ""), (tile.noise_free, "true_")):
+        e = np.full(n, np.nan + 0j)
+        rows = getattr(shapes, f"{prefix}usable") & (shapes.index >= 0)
+        e[shapes.index[rows]] = (getattr(shapes, f"{prefix}e1") + 1j * getattr(shapes, f"{prefix}e2"))[rows]
+        found.append(e)
+    own = np.isfinite(np.sum(found, axis=0))
+    image, stamp, reference = (e[own] for e in found)
+    return image, stamp, reference
+
+
+def _fate(tile: MeasuredTile) -> tuple[int, int]:
+    """Return how many galaxies usable on stamps have no object on the image, or one that is not usable."""
+    wanted = tile.stamps.index[tile.stamps.usable]
+    there = np.isin(wanted, tile.galaxies.index)
+    good = np.isin(wanted, tile.galaxies.index[tile.galaxies.usable])
+    return int((~there).sum()), int((there & ~good).sum())
+
+
+def _slope(e: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
+    """Return the slope of ellipticities against reference ones, both components together, and its standard error."""
+    if len(e) < 2:
+        return None, None
+    x, y = (np.concatenate([v.real, v.imag]) for v in (reference, e))
+    slope = float((x * y).sum() / (x * x).sum())
+    return slope, float(np.sqrt((x**2 * (y - slope * x) ** 2).sum()) / (x * x).sum())

@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+
+from pachon.core.units import ARCSEC
+from pachon.pipeline.run_folder import CONFIG_NAME
+from pachon.sky.galaxies import Galaxies
+from pachon.studies.visits.config import VisitsConfig, VisitsSection
+from pachon.studies.visits.image_stack import stack_images as stack_images_module
+from pachon.studies.visits.image_stack.config import ImageStackConfig
+from pachon.studies.visits.image_stack.stack_images import stack_images
+from pachon.studies.visits.stack import PsfStack
+from pachon.studies.visits.visits import stack_path, stack_visits
+
+
+class RoundGalaxies:
+    """Stand-in for the population: 40 round galaxies on the tile."""
+
+    def __init__(self, *_):
+        places = np.random.default_rng(8).uniform(-90.0, 90.0, (2, 40)) * ARCSEC
+        self.all = Galaxies.single(*places, np.full(40, 21.0), np.full(40, 0.4 * ARCSEC))
+
+    def galaxies_in(self, xi, eta):
+        own = (xi[0] <= self.all.xi) & (self.all.xi <= xi[1]) & (eta[0] <= self.all.eta) & (self.all.eta <= eta[1])
+        return self.all.take(np.flatnonzero(own))
+
+
+@pytest.fixture(scope="package")
+def small_visits(tiny):
+    """Configuration of visits of one CCD with 450 stars, in the mean over all turbulence."""
+    run = tiny(ccds=("R22_S11",), psf__engine="long_exposure", psf__n_pupil=200, psf__stamp=49)
+    return VisitsConfig(run=run, visits=VisitsSection(count=2, stars=450, places=60, snapshots=(1,)))
+
+
+@pytest.fixture
+def visits_folder(small_visits, tmp_path):
+    """Folder with the configuration of visits alone, which is all that images need."""
+    experiment = small_visits.experiment()
+    (tmp_path / CONFIG_NAME).write_text(small_visits.resolved(experiment).to_yaml())
+    return tmp_path
+
+
+@pytest.fixture(scope="package")
+def visit_products(small_visits, tmp_path_factory):
+    """Folder of two visits, with the stacks of their PSFs."""
+    folder = tmp_path_factory.mktemp("visits")
+    stack_visits(small_visits, folder)
+    return folder
+
+
+@pytest.fixture(scope="package")
+def noise_free(visit_products, tmp_path_factory):
+    """Stack of two visits without noise, with round galaxies, beside that of the PSFs."""
+    folder = tmp_path_factory.mktemp("noise_free")
+    (folder / CONFIG_NAME).write_bytes((visit_products / CONFIG_NAME).read_bytes())
+    psfs = {visits: PsfStack.read(stack_path(visit_products, visits)) for visits in (1, 2)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stack_images_module, "GalaxyPopulation", RoundGalaxies)
+        return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs

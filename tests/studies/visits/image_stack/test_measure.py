@@ -1,0 +1,73 @@
+"""Figures of tiles: counts and slopes known beforehand, and a small stack with noise."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pachon.commands.cli import main
+from pachon.studies.visits.galaxy_shapes import GalaxyShapes
+from pachon.studies.visits.image_stack.measure import MeasuredTile, tile_metrics
+
+RNG = np.random.default_rng(4)
+
+
+def shapes(index, e, usable):
+    n = len(index)
+    e = np.asarray(e)
+    nothing = np.zeros(n)
+    flags = np.asarray(usable, dtype=bool)
+    return GalaxyShapes(
+        np.asarray(index), nothing, nothing, nothing, e.real, e.imag, nothing, flags, e.real, e.imag, flags
+    )
+
+
+def test_figures_of_known_galaxies():
+    n = 4000
+    reference = RNG.normal(0.0, 0.2, n) + 1j * RNG.normal(0.0, 0.2, n)
+    noise = [0.05 * (RNG.normal(size=n) + 1j * RNG.normal(size=n)) for _ in range(2)]
+    # Of 4000 galaxies the last 100 are not detected, the 200 before not usable; 50 objects are no galaxies.
+    index = np.concatenate([np.arange(n - 100), np.full(50, -1)])
+    usable = np.ones(len(index), dtype=bool)
+    usable[n - 300 : n - 100] = False
+    measured = 0.9 * reference + 0.01 - 0.02j + noise[0]
+    image = shapes(index, np.concatenate([measured[: n - 100], np.zeros(50)]), usable)
+    stamps = shapes(np.arange(n), reference + noise[1], np.ones(n))
+    tile = MeasuredTile(image, stamps, shapes(np.arange(n), reference, np.ones(n)), 100.0, {})
+    found = tile_metrics([tile, tile])
+    assert found["usable_per_arcmin2"] == pytest.approx(37.5)
+    assert found["usable_per_arcmin2_stamps"] == pytest.approx(40.0)
+    assert found["usable_without_match"] == pytest.approx(0.5)
+    assert found["stamps_not_detected"] == pytest.approx(1.0)
+    assert found["stamps_detected_not_usable"] == pytest.approx(2.0)
+    assert found["pairs"] == 2 * 3700
+    # Noise of 0.05 and 0.05, and the ellipticities that a response of 0.9 leaves, 0.02, of 3700 galaxies twice.
+    error = np.sqrt(2.0 * 0.05**2 + 0.02**2) / np.sqrt(2 * 3700)
+    assert found["mean_difference_error"] == pytest.approx(error, rel=0.03)
+    assert found["mean_difference_e1"] == pytest.approx(0.01, abs=5.0 * error)
+    assert found["mean_difference_e2"] == pytest.approx(-0.02, abs=5.0 * error)
+    # Both components of 3700 galaxies, known to 0.07 of a spread of 0.2.
+    assert found["response_difference"] == pytest.approx(-0.1, abs=5.0 * 0.07 / 0.2 / np.sqrt(2 * 3700))
+    assert found["response_difference_error"] == pytest.approx(0.0707 / 0.2 / np.sqrt(4 * 3700), rel=0.05)
+
+
+def test_no_galaxies_have_no_figures():
+    nothing = shapes(np.zeros(0, dtype=int), np.zeros(0, dtype=complex), [])
+    found = tile_metrics([MeasuredTile(nothing, nothing, nothing, 1.0, {})])
+    assert found["usable_per_arcmin2"] == 0.0
+    assert found["mean_difference_e1"] is None
+    assert found["response_difference"] is None
+
+
+@pytest.mark.long
+def test_a_small_stack_is_measured(visit_products, capsys):
+    command = ["stack-images", str(visit_products), "--side", "1280", "--faintest", "22", "--json", "--quiet"]
+    assert main(command) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["stacks"] == json.loads((visit_products / "images" / "images.json").read_text())["stacks"]
+    for figures in printed["stacks"].values():
+        assert figures["stars"][0]["true"] >= 10
+        # PSFs and stars of one image: sizes agree to their noise.
+        assert abs(figures["stars"][0]["size_difference"]) < 0.03
+        assert 0.5 < figures["usable_per_arcmin2"] / figures["usable_per_arcmin2_stamps"] < 1.5
+    assert (visit_products / "images" / "images.png").stat().st_size > 10000
