@@ -19,19 +19,22 @@ app = typer.Typer()
 @app.command("reproduce")
 def reproduce_command(
     figures: Annotated[
-        list[str] | None, Argument(metavar="fig1 ... fig14 | table1 | all", help="Figures; all by default.")
+        list[str] | None, Argument(metavar="fig1 ... fig18 | table1 | all", help="Figures; all by default.")
     ] = None,
-    scale: Annotated[str, Option(help="small (a minute or two) or paper (189 CCDs, about an hour).")] = "small",
+    scale: Annotated[
+        str, Option(help="small (two minutes) or paper (189 CCDs: an hour; with 100 visits, half a day).")
+    ] = "small",
     out: Annotated[Path, Option(help="Folder of the figures.")] = Path("pachon_figures"),
     seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 1,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Reproduce the figures of Jee & Tyson (2011) that need no galaxies, with the paper's values beside ours.
+    """Reproduce the figures of Jee & Tyson (2011), with the paper's values beside ours.
 
     Each gives plots (PNG), their data (ECSV or FITS) and a verdict; `all` writes summary.json too.
-    Figures 9 and 11 to 14 show one run of the pipeline, in the sub-folder run: it is kept, and used again.
+    Figures 9 and 11 to 14 show one run of the pipeline, in the sub-folder run, 15 to 18 stacks of visits, in the
+    sub-folder visits: both are kept, go on where they were stopped, and are used again.
 
     **Examples**
 

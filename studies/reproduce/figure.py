@@ -74,10 +74,11 @@ class Figure:
     minutes: tuple[float, float]
     of_run: bool = False  #: needs the run of the pipeline
     of_visits: bool = False  #: needs the stacks of visits
+    of_galaxies: bool = False  #: needs the galaxies in them
 
 
 def figure(
-    name: str, title: str, paper: str, *, minutes: tuple[float, float], of_run: bool = False, of_visits: bool = False
+    name: str, title: str, paper: str, *, minutes: tuple[float, float], **needs: bool
 ) -> Callable[[Callable[[Bench], Reproduced]], Figure]:
-    """Return a decorator that makes a :class:`Figure` of a function."""
-    return lambda make: Figure(name, title, paper, make, minutes, of_run, of_visits)
+    """Return a decorator that makes a :class:`Figure` of a function; `needs` are its ``of_...``."""
+    return lambda make: Figure(name, title, paper, make, minutes, **needs)

@@ -28,7 +28,8 @@ _FOUND = [
 ]
 #: Figures and tables in the order of the paper.
 FIGURES = {each.name: each for each in sorted(_FOUND, key=_number)}
-_RUN_MINUTES = (0.5, 24.0)
+# Approximate time of the run, of the visits and of their galaxies, at the scales `small` and `paper` [min].
+_SHARED_MINUTES = {"of_run": (0.5, 24.0), "of_visits": (0.4, 200.0), "of_galaxies": (0.6, 600.0)}
 _ALL = "all"
 
 
@@ -49,7 +50,8 @@ def expected_minutes(names: Iterable[str], scale: Scale) -> float:
     """Return the approximate time of figures on two cores [min]."""
     column = list(SCALES).index(scale.name) if scale.name in SCALES else 0
     figures = [FIGURES[name] for name in names]
-    return sum(f.minutes[column] for f in figures) + _RUN_MINUTES[column] * any(f.of_run for f in figures)
+    shared = sum(m[column] for need, m in _SHARED_MINUTES.items() if any(getattr(f, need) for f in figures))
+    return sum(f.minutes[column] for f in figures) + shared
 
 
 def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
@@ -68,7 +70,7 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
             # The run has progress bars of its own, which end before that of the figure.
             _ = bench.pipeline
         if figure.of_visits:
-            _ = bench.stack if figure.name in ("fig15", "fig16") else bench.galaxies
+            _ = bench.galaxies if figure.of_galaxies else bench.stack
         with bench.reporter.stage(f"{name}: {figure.title}"):
             result = figure.make(bench)
             files = result.write(name, bench)

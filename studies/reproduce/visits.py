@@ -155,6 +155,7 @@ def stacked_correlations(bench: Bench) -> Reproduced:
     "10, 24 and 42 usable galaxies per square arcminute in 1, 10 and 100 visits; xi+ is that of shot noise",
     minutes=(0.6, 1.0),
     of_visits=True,
+    of_galaxies=True,
 )
 def galaxy_correlations(bench: Bench) -> Reproduced:
     """Show xi+ of galaxies without shear (Fig. 17)."""
@@ -195,6 +196,7 @@ _NULL_KEYS = (
     "the amplitude of xi+ goes as the density to the power -0.97 +- 0.06: shot noise",
     minutes=(0.1, 0.1),
     of_visits=True,
+    of_galaxies=True,
 )
 def noise_against_density(bench: Bench) -> Reproduced:
     """Show the amplitude of xi+ against the density of usable galaxies (Fig. 18)."""
