@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ....imaging.draw import Window, add_stamps, draw_galaxies
 from ....imaging.exposure import ExposedImage, Exposure, expose
 from ....imaging.psf_field import PsfField, to_pixel
-from ....imaging.scene import STAR_ROOM, GalaxiesIn, galaxies_near
+from ....imaging.scene import STAR_ROOM, galaxies_near
 from ....pipeline.defaults import noise_free_components
 from ....pipeline.experiment import Experiment
 from ....pipeline.simulate.ccd_exposure import expose_centered, expose_positions
@@ -41,7 +43,7 @@ class Sky:
     """
 
     points: SkyPoints
-    galaxies: GalaxiesIn
+    galaxies: Callable[[Any, Any], Any]
 
 
 def visit_image(
