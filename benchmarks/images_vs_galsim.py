@@ -3,10 +3,10 @@
 Run: python benchmarks/images_vs_galsim.py [--galaxies N] [--stars N] [--rounds N] [--whole]
 
 Galaxies of the random population to magnitude 29 and stars on one CCD, in turns in one process, on one thread each.
-GalSim convolves sums of galsim.Sersic with a galsim.InterpolatedImage of the PSF at the galaxy's place and draws them on
-stamps of the same size, with its default accuracy. Both have the PSF of each galaxy from the same model of components.
-Stars are images of the PSF engine, made beforehand, at their places between pixels: pachon adds them as they are, GalSim
-draws InterpolatedImage. ``--whole`` also times a whole CCD with all galaxies on all processors, both ways.
+GalSim convolves sums of galsim.Sersic with a galsim.InterpolatedImage of the PSF at the galaxy's place and draws them
+on stamps of the same size, with its default accuracy. Both have the PSF of each galaxy from the same components. Stars
+are images of the PSF engine, made beforehand, at their places between pixels: pachon adds them as they are, GalSim
+draws an InterpolatedImage. ``--whole`` also times a whole CCD with all galaxies on all processors, both ways.
 """
 
 import argparse
@@ -18,8 +18,9 @@ import numpy as np
 
 import pachon
 from pachon.core.units import ARCSEC
-from pachon.imaging.draw import Window, draw_galaxies, grid_sizes
+from pachon.imaging.draw import Window, add_stamps, draw_galaxies, grid_sizes
 from pachon.imaging.scene import galaxies_near
+from pachon.pipeline.simulate.ccd_exposure import expose_positions
 
 CCD = "R22_S11"
 RUN = {
@@ -68,9 +69,21 @@ def galsim_image(galaxies, electrons, psf, wcs, sizes, pixels) -> np.ndarray:
     return image.array
 
 
+def galsim_stars(image, stamps, pixels) -> np.ndarray:
+    """Draw stars with GalSim: stamps that hold them at their places between pixels, on the same number of pixels."""
+    drawn = galsim.ImageF(image.shape[1], image.shape[0], xmin=0, ymin=0)
+    half = stamps.shape[1] // 2
+    for stamp, (x, y) in zip(stamps, np.rint(pixels).astype(int), strict=True):
+        bounds = galsim.BoundsI(x - half, x + half, y - half, y + half) & drawn.bounds
+        star = galsim.InterpolatedImage(galsim.Image(stamp, scale=1.0), normalization="flux")
+        star.drawImage(drawn[bounds], center=galsim.PositionD(x, y), method="no_pixel", add_to_image=True)
+    return drawn.array
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Galaxies on a CCD, against GalSim.")
     parser.add_argument("--galaxies", type=int, default=300)
+    parser.add_argument("--stars", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--whole", action="store_true", help="also time a whole CCD on all processors")
     arguments = parser.parse_args()
@@ -78,6 +91,10 @@ def main() -> None:
     experiment = pachon.Experiment.from_config(pachon.Configuration(**RUN))
     with experiment.screens():
         psf = pachon.PsfField.of_run(experiment, CCD)
+        places = np.random.default_rng(2).uniform(100.0, 3990.0, (arguments.stars, 2))
+        camera = experiment.camera
+        positions = (places - 2047.5) * camera.pixel_size + camera.centers[camera.ccd_index(CCD)]
+        stamps = expose_positions(experiment, positions, room=64, offsets=places - np.rint(places)).image
     wcs = pachon.ccd_wcs(experiment.telescope, experiment.camera, CCD)
     exposure = pachon.Exposure("r", 15.0)
     everything = Window(0, 0, *wcs.shape)
@@ -108,10 +125,21 @@ def main() -> None:
             f"{b * 1e3 / arguments.galaxies:.2f} ms, ratio {b / a:.1f}"
         )
     worst = np.abs(image - other).max()
-    print(
-        f"largest difference of the images {worst / image.max():.1e} of the peak, {worst / exposure.noise_rms:.1e} of the noise"
-    )
+    difference = (worst / image.max(), worst / exposure.noise_rms)
+    print("largest difference {:.1e} of the peak, {:.1e} of the noise".format(*difference))
     print(f"ratio {np.median(ratios):.1f} (from {min(ratios):.1f} to {max(ratios):.1f})")
+    ratios = []
+    blank = np.zeros(wcs.shape, dtype=np.float32)
+    corners = np.rint(places).astype(np.int64) - stamps.shape[1] // 2
+    for _ in range(arguments.rounds):
+        (a, _), (b, other) = (
+            timed(lambda: add_stamps(blank, stamps, corners)),
+            timed(lambda: galsim_stars(blank, stamps, places)),
+        )
+        ratios.append(b / a)
+    ours_ms, theirs_ms = (t * 1e3 / len(stamps) for t in (a, b))
+    print(f"{len(stamps)} stars: pachon {ours_ms:.3f} ms a star, GalSim {theirs_ms:.2f} ms")
+    print(f"ratio {np.median(ratios):.0f} (from {min(ratios):.0f} to {max(ratios):.0f})")
     if arguments.whole:
         light = exposure.electrons(galaxies.magnitude)
         for way in ("direct", "eigen"):

@@ -25,6 +25,7 @@ from . import (
     design,
     diagnostics,
     images,
+    measure,
     reproduce,
     run,
     shim,
@@ -100,6 +101,7 @@ def _common(
 for _group in (
     run,
     images,
+    measure,
     visits,
     stack_images,
     reproduce,

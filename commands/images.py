@@ -56,9 +56,9 @@ def images_command(
 
     my_images.yaml may read
 
-        run: {band: i, ccds: [R22], seed: 7}     # or the path of a run's configuration
+        run: {band: i, ccds: [R22], seed: 7}   # or the path of its file
         pointing: {ra_deg: 53.1, dec_deg: -27.8, position_angle_deg: 30}
-        galaxies: {faintest: 27}                 # or {catalogue: galaxies.ecsv}, {mosaic: udf.fits}
+        galaxies: {faintest: 27}               # or {catalogue: galaxies.ecsv}
         image: {exposures: 100, gain: 1.6, sky_mag: 20.8}
     """
     from ..imaging.config import ImagesConfig, load_images_configuration

@@ -46,7 +46,7 @@ def visits_command(
     stars of each visit, and resampled onto the common axes as the images would be. The folder has the stacks of 1, 10,
     100 and all visits (FITS: PSFs and their shapes at every star and place), summary.json and two pictures.
 
-    Without a configuration: r band of the LSST, the nine CCDs of the central raft.
+    Where the configuration leaves them open: r band of the LSST, the nine CCDs of the central raft.
 
     **Examples**
 
@@ -63,12 +63,11 @@ def visits_command(
     from ..studies.visits.visits import stack_visits
 
     names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
-    if config is None and names is None:
-        names = ("R22",)
     base = VisitsConfig() if config is None else load_visits_configuration(config)
     settings = with_options(base, run__ccds=names, run__seed=seed, visits__count=count, visits__dither_deg=dither_deg)
+    experiment = settings.experiment(None if config is None else config.parent)
     with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
-        result = stack_visits(settings, out, resume=resume, threads=threads, reporter=reporter)
+        result = stack_visits(settings, out, experiment=experiment, resume=resume, threads=threads, reporter=reporter)
     if as_json:
         print_json(result.summary)
     elif not quiet:

@@ -20,7 +20,7 @@ from pydantic import BeforeValidator, Field
 from ..core.errors import ConfigError, error_context
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
-from ..pipeline.config import Configuration, configuration_of, digest, with_options
+from ..pipeline.config import Configuration, digest, with_options
 from ..pipeline.experiment import Experiment
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
@@ -51,6 +51,9 @@ class GalaxiesConfig(Section):
     mosaic: str | None = Field(None, description="path of a FITS mosaic, whose galaxies are planted at random places")
     mosaic_zero_point: Real | None = Field(
         None, description="AB magnitude of one unit of the mosaic; by default that of its header"
+    )
+    mosaic_psf_arcsec: Positive | None = Field(
+        None, description="half-light radius of the mosaic's PSF [arcsec]; by default that of its stars"
     )
 
 
@@ -86,7 +89,7 @@ class ImagesConfig(Section):
         run = self.run
         if run.psf.stamp is None:
             run = with_options(run, psf__stamp=PSF_STAMP)
-        with error_context(key="run"):
+        with error_context(subject="run"):
             return Experiment.from_config(run, folder)
 
     def resolved(self, experiment: Experiment) -> ImagesConfig:
@@ -113,19 +116,20 @@ class ImagesConfig(Section):
 def load_images_configuration(path: Path) -> ImagesConfig:
     """Read a configuration of images, and that of the run that it names.
 
+    Relative paths in both start from the folder of the first.
+
     Raises
     ------
     ConfigError
         If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
     content = read_mapping(path, ConfigError)
-    run: Any = content.get("run")
+    run: Any = content.get("run", {})
     if isinstance(run, str):
-        content = {**content, "run": read_mapping(path.parent / run, ConfigError)}
-    elif isinstance(run, dict):
-        configuration_of(run, f"{path}, run")
-        content = {**content, "run": {**run, "ccds": [run["ccds"]]}} if isinstance(run.get("ccds"), str) else content
-    config = validated(ImagesConfig, content, str(path))
+        run = read_mapping(path.parent / run, ConfigError)
+    if isinstance(run, dict) and isinstance(run.get("ccds"), str):
+        run = {**run, "ccds": [run["ccds"]]}
+    config = validated(ImagesConfig, {**content, "run": run}, str(path))
     with error_context(file=path):
         return with_files(config, path.parent)
 

@@ -40,10 +40,21 @@ _NODES = 7
 class Sources(Protocol):
     """Galaxies that can be drawn, such as :class:`pachon.Galaxies`."""
 
-    xi: np.ndarray
-    eta: np.ndarray
-    magnitude: np.ndarray
-    radius: np.ndarray
+    @property
+    def xi(self) -> np.ndarray:
+        """Position about the pointing, towards east [rad]."""
+
+    @property
+    def eta(self) -> np.ndarray:
+        """Position about the pointing, towards north [rad]."""
+
+    @property
+    def magnitude(self) -> np.ndarray:
+        """AB magnitudes."""
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Half-light radii [rad]."""
 
     def __len__(self) -> int: ...
 

@@ -15,7 +15,7 @@ from ..core.files import make_folder, write_bytes
 from ..core.memory import require_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
-from ..core.units import ARCMIN
+from ..core.units import ARCMIN, ARCSEC
 from ..pipeline.config import differences
 from ..pipeline.defaults import given
 from ..pipeline.experiment import Experiment
@@ -181,7 +181,11 @@ def _galaxies(config: ImagesConfig, experiment: Experiment, exposure: Exposure) 
     if wanted.mosaic is not None:
         seed = experiment.config.seed
         stamps = GalaxyStamps.from_mosaic(
-            wanted.mosaic, zero_point=wanted.mosaic_zero_point, finest_pixel=exposure.pixel_scale, seed=seed
+            wanted.mosaic,
+            zero_point=wanted.mosaic_zero_point,
+            psf_radius=None if wanted.mosaic_psf_arcsec is None else wanted.mosaic_psf_arcsec * ARCSEC,
+            finest_pixel=exposure.pixel_scale,
+            seed=seed,
         )
         with error_context(key="galaxies"):
             planted = wanted.density * stamps.surface_density

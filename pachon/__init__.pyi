@@ -56,6 +56,8 @@ from .imaging.config import load_images_configuration as load_images_configurati
 from .imaging.draw import Window as Window
 from .imaging.exposure import Exposure as Exposure
 from .imaging.image_file import CcdImage as CcdImage
+from .imaging.measure import ImageCatalogue as ImageCatalogue
+from .imaging.measure import measure_image as measure_image
 from .imaging.psf_field import PsfField as PsfField
 from .imaging.scene import CcdScene as CcdScene
 from .imaging.scene import draw_ccd as draw_ccd
@@ -182,6 +184,11 @@ from .studies.sweep.file import load_sweep as load_sweep
 from .studies.sweep.sweep import run_sweep as run_sweep
 from .studies.sweep.table import SweepTable as SweepTable
 from .studies.sweep.table import load_sweep_table as load_sweep_table
+from .studies.visits.config import VisitsConfig as VisitsConfig
+from .studies.visits.config import load_visits_configuration as load_visits_configuration
+from .studies.visits.null_test import null_test as null_test
+from .studies.visits.stack import PsfStack as PsfStack
+from .studies.visits.visits import stack_visits as stack_visits
 from .testing import assert_matches_baseline as assert_matches_baseline
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere

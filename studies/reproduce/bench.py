@@ -16,6 +16,10 @@ from ...pipeline.measure.correlation import Correlation
 from ...pipeline.measure.summary import correlations, run_metrics
 from ...pipeline.run import run
 from ...pipeline.run_folder import finished_ccds, stamp_of
+from ..visits.config import VisitsConfig
+from ..visits.null_result import NullTest
+from ..visits.null_test import null_test
+from ..visits.visits import StackResult, stack_visits
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,13 @@ class Scale:
     observed: int
     #: Time step of that run, and of Fig. 6 [s].
     time_step: float
+    #: Visits of Figs. 15 to 18 and their CCDs, and stars and places per area of a CCD.
+    visits: int
+    visit_ccds: tuple[str, ...]
+    visit_points: tuple[int, int]
+    #: Tiles of the sky, of the size of a CCD, whose galaxies are measured, and rings of the shear calibration.
+    tiles: int | None
+    rings: int
 
 
 #: The middle CCD of each raft, and its right-hand neighbour in the middle row: pairs from within a CCD to 3 degrees.
@@ -73,6 +84,11 @@ SMALL = Scale(
     truth=60,
     observed=40,
     time_step=0.1,
+    visits=3,
+    visit_ccds=("R22",),
+    visit_points=(40, 12),
+    tiles=1,
+    rings=300,
 )
 PAPER = Scale(
     name="paper",
@@ -91,6 +107,11 @@ PAPER = Scale(
     truth=800,
     observed=40,
     time_step=0.05,
+    visits=100,
+    visit_ccds=("all",),
+    visit_points=(40, 20),
+    tiles=None,
+    rings=5000,
 )
 SCALES = {"small": SMALL, "paper": PAPER}
 
@@ -109,7 +130,8 @@ class PipelineRun:
 class Bench:
     """Settings of the figures, and objects that they share, each made at its first use.
 
-    The run of the pipeline is in the sub-folder ``run`` of that of the figures. Results do not depend on `threads`.
+    The run of the pipeline is in the sub-folder ``run`` of that of the figures, the visits are in ``visits``. Results
+    do not depend on `threads`.
     """
 
     scale: Scale
@@ -130,6 +152,34 @@ class Bench:
             Configuration(), ccds=("all",), seed=self.seed, atmosphere__enabled=False, wavelengths_nm=[624.0]
         )
         return Experiment.from_config(quiet)
+
+    @cached_property
+    def stack(self) -> StackResult:
+        """Stacks of visits, in the sub-folder ``visits``: those that are there already are used."""
+        stars, places = self.scale.visit_points
+        options = {
+            "run__ccds": self.scale.visit_ccds,
+            "run__seed": self.seed,
+            "run__atmosphere__screen_size": self.scale.screen_size,
+            "run__atmosphere__time_step_s": self.scale.time_step,
+            "visits__count": self.scale.visits,
+            "visits__stars": stars,
+            "visits__places": places,
+        }
+        config = with_options(VisitsConfig(), **options)
+        return stack_visits(config, self.folder / "visits", resume=True, threads=self.threads, reporter=self.reporter)
+
+    @cached_property
+    def galaxies(self) -> dict[int, NullTest]:
+        """Null tests of the stacks, in the same folder."""
+        return null_test(
+            self.stack.folder,
+            tiles=self.scale.tiles,
+            rings=self.scale.rings,
+            resume=True,
+            threads=self.threads,
+            reporter=self.reporter,
+        )
 
     @cached_property
     def pipeline(self) -> PipelineRun:

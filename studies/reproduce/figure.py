@@ -73,10 +73,11 @@ class Figure:
     #: Approximate time on two cores at the scales ``small`` and ``paper``, without the run of the pipeline.
     minutes: tuple[float, float]
     of_run: bool = False  #: needs the run of the pipeline
+    of_visits: bool = False  #: needs the stacks of visits
 
 
 def figure(
-    name: str, title: str, paper: str, *, minutes: tuple[float, float], of_run: bool = False
+    name: str, title: str, paper: str, *, minutes: tuple[float, float], of_run: bool = False, of_visits: bool = False
 ) -> Callable[[Callable[[Bench], Reproduced]], Figure]:
     """Return a decorator that makes a :class:`Figure` of a function."""
-    return lambda make: Figure(name, title, paper, make, minutes, of_run)
+    return lambda make: Figure(name, title, paper, make, minutes, of_run, of_visits)

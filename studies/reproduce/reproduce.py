@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import ConfigError, unknown_name
+from ...core.errors import unknown_name
 from ...core.files import make_folder, write_json
 from ...core.progress import Reporter
 from ...core.version import VERSION
-from . import atmosphere, focal_plane, optics, reconstruction, screens
+from . import atmosphere, focal_plane, optics, reconstruction, screens, visits
 from .bench import SCALES, Bench, Scale
 from .figure import Figure
 
@@ -22,14 +22,12 @@ def _number(figure: Figure) -> tuple[str, int]:
 
 _FOUND = [
     each
-    for module in (optics, screens, atmosphere, focal_plane, reconstruction)
+    for module in (optics, screens, atmosphere, focal_plane, reconstruction, visits)
     for each in vars(module).values()
     if isinstance(each, Figure)
 ]
 #: Figures and tables in the order of the paper.
 FIGURES = {each.name: each for each in sorted(_FOUND, key=_number)}
-#: Figures of the paper that are not offered, and their requirements.
-_NOT_OFFERED = {"fig10": "galaxies", **dict.fromkeys(("fig15", "fig16", "fig17", "fig18"), "galaxies or many visits")}
 _RUN_MINUTES = (0.5, 24.0)
 _ALL = "all"
 
@@ -38,11 +36,6 @@ def chosen_figures(names: Iterable[str]) -> tuple[str, ...]:
     """Return figures by name, each once, in the order of the paper; ``all`` stands for every one."""
     wanted = set()
     for name in names:
-        if name in _NOT_OFFERED:
-            raise ConfigError(
-                f"{name}: not offered, since it needs {_NOT_OFFERED[name]}; expected {_ALL} or some of"
-                f" {', '.join(FIGURES)}"
-            )
         if name == _ALL:
             wanted |= set(FIGURES)
         elif name in FIGURES:
@@ -74,6 +67,8 @@ def reproduce(names: Iterable[str], bench: Bench) -> dict[str, Any]:
         if figure.of_run:
             # The run has progress bars of its own, which end before that of the figure.
             _ = bench.pipeline
+        if figure.of_visits:
+            _ = bench.stack if figure.name in ("fig15", "fig16") else bench.galaxies
         with bench.reporter.stage(f"{name}: {figure.title}"):
             result = figure.make(bench)
             files = result.write(name, bench)

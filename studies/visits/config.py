@@ -22,6 +22,7 @@ from ...pipeline.experiment import Experiment
 
 #: Pixels along a side of the stamps of the stack, and of those of a visit, of which turned axes cut the corners.
 STACK_STAMP, VISIT_STAMP = 31, 49
+CENTRAL_RAFT = "R22"
 
 
 class VisitsSection(Section):
@@ -44,8 +45,15 @@ class VisitsConfig(Section):
     visits: VisitsSection = VisitsSection()
 
     def experiment(self, folder: Path | None = None) -> Experiment:
-        """Return the experiment of all visits; relative paths in its configuration start from `folder`."""
-        run = self.run if self.run.psf.stamp is not None else with_options(self.run, psf__stamp=VISIT_STAMP)
+        """Return the experiment of all visits; relative paths in its configuration start from `folder`.
+
+        Where the run leaves them open, CCDs are those of the central raft: CCDs across the field share no sky.
+        """
+        run = self.run
+        if run.psf.stamp is None:
+            run = with_options(run, psf__stamp=VISIT_STAMP)
+        if run.ccds is None:
+            run = with_options(run, ccds=(CENTRAL_RAFT,))
         with error_context(key="run"):
             return Experiment.from_config(run, folder)
 

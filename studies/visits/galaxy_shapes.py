@@ -123,11 +123,10 @@ def measure_galaxies(
             variance = exposure.noise_rms**2
             if exposure.noise:
                 images += np.sqrt(variance + np.maximum(images, 0.0)) * rng.standard_normal(images.shape, np.float32)
-            fits = [
-                fit_galaxy_stamps(images, np.full(images.shape, variance), psfs[psf[own]], threads=threads)
-                for psfs in (stack.model, stack.true)
-            ]
-            found.append((own, *fits))
+            every = np.full(images.shape, variance)
+            by_model = fit_galaxy_stamps(images, every, stack.model[psf[own]], threads=threads)
+            by_true = fit_galaxy_stamps(images, every, stack.true[psf[own]], threads=threads)
+            found.append((own, by_model, by_true))
     return _shapes(galaxies, near, pixels * exposure.pixel_scale, width, found)
 
 

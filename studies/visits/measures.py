@@ -23,7 +23,6 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
     Errors are those of a jackknife over squares of three CCDs.
     """
     extent = float(np.hypot(np.ptp(stack.x), np.ptp(stack.y)))
-    limits = {"min_sep": _LEAST * ARCMIN, "max_sep": max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN)}
     corner = [np.floor(v / (_PATCH * cell) + 0.5).astype(int) for v in (stack.x, stack.y)]
     patch = corner[0] - corner[0].min() + (np.ptp(corner[0]) + 1) * (corner[1] - corner[1].min())
     values = {
@@ -39,9 +38,10 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
             stack.y[rows],
             e1[rows],
             e2[rows],
+            min_sep=_LEAST * ARCMIN,
+            max_sep=max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN),
             n_bins=_BINS,
             patch=patch[rows] if several else None,
-            **limits,
         )
     return found
 
@@ -56,6 +56,9 @@ def stack_metrics(stack: PsfStack, found: Correlated) -> dict[str, Any]:
         "rms_e": _rms(*e),
         "rms_residual_e_stars": _rms(*(v[stars] for v in left)),
         "rms_residual_e_places": _rms(*(v[places] for v in left)),
+        # Medians beside the rms: a polynomial fitted to few stars goes far astray at a few places.
+        "median_residual_e_stars": _median(*(v[stars] for v in left)),
+        "median_residual_e_places": _median(*(v[places] for v in left)),
         "median_size_arcsec": float(np.nanmedian(stack.size) / ARCSEC),
         "rms_relative_residual_size_places": float(np.sqrt(np.nanmean(size[places] ** 2))),
     }
@@ -64,6 +67,11 @@ def stack_metrics(stack: PsfStack, found: Correlated) -> dict[str, Any]:
             metrics[f"xi_plus_{kind}_{span}"] = correlation.mean_xi_plus(span)
             metrics[f"xi_plus_{kind}_{span}_error"] = correlation.error_mean_xi_plus(span)
     return metrics
+
+
+def _median(e1: np.ndarray, e2: np.ndarray) -> float:
+    """Return the median of the absolute value of an ellipticity."""
+    return float(np.nanmedian(np.hypot(e1, e2)))
 
 
 def _rms(e1: np.ndarray, e2: np.ndarray) -> float:

@@ -32,22 +32,30 @@ def ellipticity_picture(stacks: Mapping[int, PsfStack]) -> bytes:
     """Draw whiskers of the PSF of the first and the last stack, and of what the model leaves of the last (Fig. 15)."""
     first, last = stacks[min(stacks)], stacks[max(stacks)]
     panels = [(first, "PSF", first.e1, first.e2)] if first is not last else []
-    panels += [(last, "PSF", last.e1, last.e2), (last, "PSF - model", last.residual_e1, last.residual_e2)]
+    panels += [
+        (last, "PSF", last.e1, last.e2),
+        (last, "mean of the models", last.model_e1, last.model_e2),
+        (last, "PSF - model", last.residual_e1, last.residual_e2),
+    ]
     key = key_ellipticity(np.concatenate([np.hypot(panels[0][2], panels[0][3])]))
     with styled():
-        figure = new_figure(5.0 * len(panels), 5.3, "compressed")
-        for axes, (stack, what, e1, e2) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-            x, y = stack.x / ARCMIN, stack.y / ARCMIN
-            edge = 1.05 * float(max(np.abs(x).max(), np.abs(y).max()))
-            step = max(1, len(stack) // _MOST)
+        rows = len(panels) // 2 if len(panels) > 3 else 1
+        figure = new_figure(5.2 * len(panels) / rows, 5.4 * rows, "compressed")
+        every = figure.subplots(rows, len(panels) // rows, squeeze=False, sharex=True, sharey=True)
+        edge = 1.05 / ARCMIN * max(float(np.abs([s.x, s.y]).max()) for s in (first, last))
+        for axes, (stack, what, e1, e2) in zip(every.flat, panels, strict=True):
+            some = np.s_[:: max(1, len(stack) // _MOST)]
             scale = 0.06 * edge / key
-            ends = whiskers(*(v[::step] for v in (x, y, e1, e2)), scale)
+            ends = whiskers(stack.x[some] / ARCMIN, stack.y[some] / ARCMIN, e1[some], e2[some], scale)
             draw_whiskers(axes, ends, "black", 0.6)
-            axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", xlabel="x of the stack [arcmin]")
+            axes.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
             rms = np.sqrt(np.nanmean(e1**2 + e2**2))
             axes.set_title(f"{what}, {_visits(stack.visits)}: rms |e| {rms:.1e}", loc="left")
             draw_key_whisker(axes, key, scale, 1.0)
-        figure.axes[0].set_ylabel("y of the stack [arcmin]")
+        for axes in every[-1]:
+            axes.set_xlabel("x of the stack [arcmin]")
+        for axes in every[:, 0]:
+            axes.set_ylabel("y of the stack [arcmin]")
         return png_bytes(figure)
 
 

@@ -143,11 +143,12 @@ def visit_psfs(
         model = [result.model for result in found.values()]
     rows = np.concatenate([index[name] for name in found])
     matrix = frame.to_stamp(experiment, visit, points.sky[rows], threads)
-    turned = []
-    for images in (true, model):
+
+    def turned(images: list[np.ndarray]) -> np.ndarray:
         stamps = resample_stamps(np.concatenate(images), matrix, frame.size, threads=threads)
-        turned.append(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
-    return VisitPsfs(rows, *turned, simulated.not_modelled)
+        return np.asarray(stamps / stamps.sum(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32))
+
+    return VisitPsfs(rows, turned(true), turned(model), simulated.not_modelled)
 
 
 def _star_fields(
@@ -159,12 +160,14 @@ def _star_fields(
     band, seconds = config.band or "r", config.atmosphere.exposure_s
     bright, faint = magnitude_limits(experiment)
     fields, index = {}, {}
+    # Beyond its field of view a telescope may have no light, and is not asked for.
+    lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
     for name in config.ccds or ():
         depth = camera.half_size - np.abs(xy - camera.centers[camera.ccd_index(name)]).max(axis=1)
-        stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star)
+        stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star & lit)
         margin = np.where(points.star, _STAR_MARGIN, _PLACE_MARGIN) * camera.pixel_size
-        here = np.flatnonzero(depth >= margin)
-        if not len(here):
+        here = np.flatnonzero((depth >= margin) & lit)
+        if not len(stars):
             continue
         magnitude = magnitudes_at(points.quantile[stars], bright, faint)
         fields[name] = StarField(
@@ -200,7 +203,8 @@ def _focal_plane_images(
         [
             CcdStars(
                 name,
-                *result.exposure.positions.observed.T,
+                result.exposure.positions.observed[:, 0],
+                result.exposure.positions.observed[:, 1],
                 result.observation.shapes,
                 result.electrons,
                 result.observation.noise,

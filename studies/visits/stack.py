@@ -118,9 +118,24 @@ class PsfStack:
         count = sums.count[rows]
         true, model = (v[rows] / count[:, None, None].astype(np.float32) for v in (sums.true, sums.model))
         shapes: list[Shapes] = [measure_shapes(images, pixel_scale, weight_fwhm) for images in (true, model)]
-        x, y = (sky[rows] @ axes.T * pixel_scale).T
-        columns = [getattr(s, key) for s in shapes for key in ("e1", "e2", "size")]
-        return cls(sums.visits, *sky[rows].T, x, y, star[rows], count, true, model, *columns)
+        places = sky[rows], sky[rows] @ axes.T * pixel_scale
+        columns = {
+            f"{name}{key}": getattr(s, key)
+            for s, name in zip(shapes, ("", "model_"), strict=True)
+            for key in ("e1", "e2", "size")
+        }
+        return cls(
+            visits=sums.visits,
+            xi=places[0][:, 0],
+            eta=places[0][:, 1],
+            x=places[1][:, 0],
+            y=places[1][:, 1],
+            star=star[rows],
+            count=count,
+            true=true,
+            model=model,
+            **columns,
+        )
 
     @property
     def residual_e1(self) -> np.ndarray:

@@ -61,6 +61,7 @@ def stack_visits(
     config: VisitsConfig,
     folder: Path,
     *,
+    experiment: Experiment | None = None,
     resume: bool = False,
     threads: int | None = None,
     reporter: Reporter | None = None,
@@ -78,6 +79,8 @@ def stack_visits(
         Configuration.
     folder : Path
         Folder of the products, made where missing.
+    experiment : Experiment, optional
+        Experiment of the configuration, where it is made already.
     resume : bool
         Go on after the visits that the folder has, with more of them than asked for before too.
     threads : int, optional
@@ -91,7 +94,7 @@ def stack_visits(
         If the configuration does not hold together, the folder holds other visits or has no room, or a visit fails.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    experiment = config.experiment()
+    experiment = config.experiment() if experiment is None else experiment
     config = config.resolved(experiment)
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
     settings, frame = config.visits, StackFrame.of(experiment, STACK_STAMP)
@@ -102,10 +105,14 @@ def stack_visits(
         dither=np.deg2rad(settings.dither_deg),
         first_epoch=settings.first_epoch,
     )
-    _claim(folder, config, resume)
+    _check_folder(folder, config, resume)
     sums = _sums_so_far(folder, stamp, len(points), resume)
     if sums.visits > len(visits):
         raise ProductError(f"{folder} holds {sums.visits} visits: expected at most {len(visits)}; choose another --out")
+    gone = [n for n in config.kept if n <= sums.visits and not stack_path(folder, n).exists()]
+    if gone:
+        raise ProductError(f"{folder} kept no stack of {gone[0]} visits, and has gone on; choose another --out")
+    write_bytes(folder / CONFIG_NAME, config.to_yaml().encode())
     if sums.visits:
         reporter.line(f"{sums.visits} of {len(visits)} visits are stacked already")
     _check_room(folder, points, len(config.kept))
@@ -154,7 +161,7 @@ def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFram
     return draw_points(experiment.config.seed, radius, cell_of(experiment, frame), settings.stars, settings.places)
 
 
-def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
+def _check_folder(folder: Path, config: VisitsConfig, resume: bool) -> None:
     """Make the folder, or check that its visits are of the same configuration, but for their number."""
     make_folder(folder)
     path = folder / CONFIG_NAME
@@ -172,7 +179,6 @@ def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
         found = differences(old, new)
         if found:
             raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])})")
-    write_bytes(path, config.to_yaml().encode())
 
 
 def _sums_so_far(folder: Path, stamp: Stamp, n: int, resume: bool) -> PsfSums:

@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 import yaml
+from astropy.io import fits
+from astropy.table import Table
 from PIL import Image
 
 from pachon.commands.cli import main
@@ -94,6 +96,66 @@ def test_both_ways_and_no_noise_from_options(settings, tmp_path):
     # A hundredth of the noise of a pixel is left out where a galaxy's grid ends, on four sides at most.
     noise = np.sqrt(np.median(images[0].variance))
     assert 0.0 < np.abs(images[0].image - images[1].image).max() < 0.04 * noise
+
+
+@pytest.mark.long
+def test_galaxies_of_a_catalogue_stand_where_it_says(settings, tmp_path):
+    # Three on the image, by celestial coordinates, and one on the other side of the field.
+    pointing = {"ra_deg": 150.0, "dec_deg": 2.0}
+    offsets = np.array([[5.0, 3.0], [-8.0, 10.0], [0.0, -12.0], [5000.0, 0.0]]) / 3600.0
+    table = Table(
+        {
+            "ra": 150.0 + offsets[:, 0] / np.cos(np.deg2rad(2.0)),
+            "dec": 2.0 + offsets[:, 1],
+            "mag": [20.0, 21.0, 22.0, 18.0],
+            "half_light_radius": [0.5, 0.4, 0.3, 1.0],
+        }
+    )
+    table.write(tmp_path / "galaxies.ecsv", format="ascii.ecsv")
+    config = settings(galaxies__catalogue="galaxies.ecsv", run__ccds="R22_S11", image__noise=False)
+    content = yaml.safe_load((tmp_path / "images.yaml").read_text()) | {"pointing": pointing}
+    (tmp_path / "images.yaml").write_text(yaml.safe_dump(content))
+    assert run(config, "-o", str(tmp_path / "out"), "--quiet") == 0
+    image = CcdImage.read(tmp_path / "out" / "image_R22_S11.fits")
+    galaxies = ~image.objects["STAR"]
+    assert image.objects["MAG"][galaxies].tolist() == [20.0, 21.0, 22.0]
+    celestial = np.stack([image.objects["RA"], image.objects["DEC"]], axis=1)[galaxies]
+    assert np.allclose(celestial, np.stack([table["ra"], table["dec"]], axis=1)[:3], rtol=0, atol=1e-8)
+    for x, y in image.wcs.all_world2pix(celestial[:2], 0):
+        stamp = image.image[round(y) - 7 : round(y) + 8, round(x) - 7 : round(x) + 8]
+        row, column = np.unravel_index(stamp.argmax(), stamp.shape)
+        assert abs(row - 7) <= 1
+        assert abs(column - 7) <= 1
+
+
+@pytest.mark.long
+def test_galaxies_of_a_mosaic_are_planted(settings, tmp_path, capsys):
+    rng = np.random.default_rng(4)
+    y, x = np.indices((400, 400))
+    image = rng.normal(0.0, 0.01, (400, 400))
+    for cx, cy in rng.uniform(40, 360, (12, 2)):
+        image += 2.0 * np.exp(-np.hypot(x - cx, y - cy) / 5.0)
+    header = fits.Header(
+        {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 0.0, "CRVAL2": 0.0, "CRPIX1": 200.0, "CRPIX2": 200.0}
+        | {"CD1_1": -0.05 / 3600, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 0.05 / 3600, "MAGZPT": 28.0}
+    )
+    fits.PrimaryHDU(image.astype(np.float32), header).writeto(tmp_path / "mosaic.fits")
+    config = settings(
+        galaxies__mosaic="mosaic.fits",
+        galaxies__mosaic_psf_arcsec=0.05,
+        galaxies__density=0.2,
+        run__ccds="R22_S11",
+        image__preview=False,
+    )
+    assert run(config, "-o", str(tmp_path / "out"), "--quiet") == 0
+    objects = CcdImage.read(tmp_path / "out" / "image_R22_S11.fits").objects
+    # Twelve galaxies in 400 arcsec^2, a fifth of that on 51.2^2 arcsec^2: sixteen, five standard deviations of them.
+    assert abs((~objects["STAR"]).sum() - 12 / 400 * 0.2 * 51.2**2) < 5.0 * 4.0
+    assert np.isnan(objects["E1"][~objects["STAR"]]).all()
+    crowded = settings(galaxies__mosaic="mosaic.fits", galaxies__mosaic_psf_arcsec=0.05, galaxies__density=300.0)
+    capsys.readouterr()
+    assert run(crowded, "-o", str(tmp_path / "crowd"), "--quiet") == 2
+    assert "density = 300" in capsys.readouterr().err
 
 
 def test_the_run_may_be_a_file(settings, tmp_path, capsys):

@@ -29,6 +29,7 @@ def cut(image, pixel, window=PART, size=63):
     return image[rows, columns], np.asarray(pixel) - (x, y)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["direct", "eigen"])
 def test_gaussian_galaxies_under_gaussian_psfs_have_the_sum_of_the_covariances(wcs, psf, way, gaussian, psf_covariance):
     pixels = np.array([[1080.3, 2101.8], [1290.0, 2090.45]])
@@ -61,6 +62,7 @@ def test_no_light_is_lost_or_gained(wcs, psf):
     assert image.dtype == np.float32
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["direct", "eigen"])
 def test_no_byte_depends_on_threads_and_no_pixel_on_the_window(wcs, psf, way):
     pixels = np.random.default_rng(1).uniform([900, 1900], [1500, 2400], (60, 2))
@@ -150,6 +152,7 @@ def test_psf_and_lit_fraction_are_those_of_the_place(psf, gaussian, psf_covarian
     assert np.allclose(psf.lit_fraction(place), 1.0 - 0.1 * place[:, 0] / 4096)
 
 
+@pytest.mark.long
 def test_gaussian_processes_interpolate_too(gaussian, psf_covariance):
     places = np.random.default_rng(3).uniform(0, 4096, (40, 2))
     stamps = np.stack([gaussian(21, psf_covariance(place)) for place in places])
@@ -165,6 +168,7 @@ def test_an_unknown_way_is_named(wcs, psf):
         draw_galaxies(placed(wcs, np.array([[10.0, 10.0]])), np.ones(1), psf, wcs, way="fast")
 
 
+@pytest.mark.long
 def test_galsim_draws_the_same_galaxies(wcs, psf):
     galsim = pytest.importorskip("galsim")
     pixel, electrons = np.array([1200.3, 2150.2]), 1e5

@@ -70,7 +70,7 @@ def test_screens_are_as_strong_as_galsims_screens(study):
             assert ratio[0] / ratio[1] == pytest.approx(1.0, abs=luck), (layer, lag)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stars_through_galsims_own_screens(study):
     """Light through the same air at the same time: any slip of sign, axis, wind or height would show."""
     options = {"screen_size": 1024, "screen_length": 162.5, "exposure": 5.0, "time_step": 0.01}

@@ -323,7 +323,7 @@ def test_the_report_of_models_of_single_ccds_has_no_such_section(finished_run):
     assert not [name for name, _ in headline(summary) if "own model" in name]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_diagnostics_have_both_models(whole_run, ccd_run, tmp_path, capsys):
     now, before = (diagnose(folder, tmp_path / folder.parent.name) for folder in (whole_run, ccd_run))
     assert tuple(now.correlations) == (*KINDS, *CCD_KINDS)

@@ -134,7 +134,7 @@ def test_bright_galaxies_are_more_regular():
 def test_half_of_the_light_lies_within_the_half_light_radius(wide):
     rng = np.random.default_rng(0)
     ratio = []
-    for i in range(300):
+    for i in range(150):
         z = photons(wide, i, 2000, rng)
         # The centroid of a galaxy is its position, without the far photons of bulges.
         near = np.abs(z) < 5.0 * wide.radius[i]

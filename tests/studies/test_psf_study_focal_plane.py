@@ -147,6 +147,7 @@ def test_stated_noise_is_the_scatter_of_the_draws(focal_plane_config):
     assert noise_free.noise.max() < 1e-4
 
 
+@pytest.mark.slow
 def test_optics_leave_less_than_polynomials(focal_plane_config):
     # No turbulence but its mean: what is left of a PSF is the optics, which the model has.
     config = focal_plane_config(active_optics__residual_um=0.3)

@@ -100,6 +100,9 @@ def test_flags_and_neighbours():
     assert flags[1] & flags[2] & ObjectFlag.BLENDED
     assert flags[3] == ObjectFlag.SATURATED
     assert flags[4] == ObjectFlag.MASKED
+    # The neighbour's light is none of the width: with it, the area above half the peak would be twice as large.
+    pair = pachon.match_positions(*places[1:3].T, found.x, found.y, 2.0)
+    np.testing.assert_allclose(found.fwhm[pair], np.sqrt(8.0 * np.log(2.0)) * SIGMA, rtol=0.05)
     near = found.neighbour_distance[pachon.match_positions([80.0, 120.0], [80.0, 40.0], found.x, found.y, 2.0)]
     # Each piece of a blend has some of the other's light.
     assert near[0] == pytest.approx(8.0, abs=0.4)

@@ -82,7 +82,6 @@ def test_shear_of_gaussian_galaxies_is_recovered(render, psf):
     assert 0.02 * ratio == pytest.approx(0.02, abs=2e-5)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("profile", "bias"), [(galsim.Exponential, (-0.07, -0.05)), (galsim.DeVaucouleurs, (-0.27, -0.2))]
 )

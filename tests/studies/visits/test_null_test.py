@@ -1,0 +1,188 @@
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtri
+
+from pachon.commands.cli import main
+from pachon.core.errors import PachonError
+from pachon.core.units import ARCMIN, ARCSEC
+from pachon.imaging.exposure import Exposure
+from pachon.sky.galaxies import Galaxies
+from pachon.studies.visits import null_test as module
+from pachon.studies.visits.galaxy_shapes import measure_galaxies
+from pachon.studies.visits.null_result import density_slope, shear_bias
+from pachon.studies.visits.null_test import ellipticity_along, null_test
+from pachon.studies.visits.stack import PsfStack
+from pachon.studies.visits.visits import stack_visits
+
+PIXEL = 0.2 * ARCSEC
+AXES = np.array([[np.cos(0.3), np.sin(0.3)], [np.sin(0.3), -np.cos(0.3)]]) / PIXEL
+
+
+def gaussian(e, sigma):
+    """PSF of unit sum with an ellipticity e1 + i e2 and a determinant of the covariance of sigma^4 [pixel^4]."""
+    y, x = np.mgrid[-15:16, -15:16]
+    q = (1 + abs(e) ** 2, 2 * e.real, 2 * e.imag)
+    scale = sigma**2 / (1 - abs(e) ** 2)
+    xx, yy, xy = scale * (q[0] + q[1]), scale * (q[0] - q[1]), scale * q[2]
+    image = np.exp(-0.5 * (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2))
+    return (image / image.sum()).astype(np.float32)
+
+
+def stack_of(true, model, places=9):
+    """Return a stack with one true PSF and one model everywhere."""
+    x, y = (ARCMIN * v.ravel() for v in np.meshgrid(*2 * [np.linspace(-3.0, 3.0, places)]))
+    sky = np.stack([x, y], axis=1) @ np.linalg.inv(AXES * PIXEL).T
+    zero = np.zeros(len(x))
+    return PsfStack(
+        visits=1,
+        xi=sky[:, 0],
+        eta=sky[:, 1],
+        x=x,
+        y=y,
+        star=zero > 0,
+        count=np.ones(len(x), dtype=int),
+        true=np.repeat(true[None], len(x), axis=0),
+        model=np.repeat(model[None], len(x), axis=0),
+        e1=zero,
+        e2=zero,
+        size=zero,
+        model_e1=zero,
+        model_e2=zero,
+        model_size=zero,
+    )
+
+
+def galaxies(count, seed=1, sersic=0.5):
+    rng = np.random.default_rng(seed)
+    e = 0.2 * ndtri(rng.uniform(0.05, 0.95, (2, count)))
+    position = rng.uniform(-1.0, 1.0, (2, count)) * ARCMIN
+    return Galaxies.single(
+        xi=position[0],
+        eta=position[1],
+        magnitude=rng.uniform(20.0, 22.0, count),
+        radius=rng.uniform(0.5, 0.8, count) * ARCSEC,
+        e1=e[0],
+        e2=e[1],
+        sersic=np.full(count, sersic),
+    )
+
+
+def test_gaussian_galaxies_come_back_along_the_axes_of_the_stack():
+    psf, many = gaussian(0.03 - 0.02j, 1.6), galaxies(60)
+    found = measure_galaxies(stack_of(psf, psf), AXES, many, Exposure(noise=False), 1, reach=ARCMIN)
+    # The axes are a mirror image of the sky, turned.
+    e = ellipticity_along(AXES, many.e1 + 1j * many.e2)
+    np.testing.assert_allclose(found.e1 + 1j * found.e2, e, atol=2e-3)
+    np.testing.assert_array_equal(found.e1, found.true_e1)
+    assert found.usable.all()
+    np.testing.assert_allclose(
+        np.stack([found.x, found.y], axis=1), np.stack([many.xi, many.eta], axis=1) @ AXES.T * PIXEL
+    )
+
+
+def test_a_wrong_psf_moves_ellipticities_and_the_true_one_does_not():
+    many = galaxies(300, seed=2)
+    stack = stack_of(gaussian(0.03 + 0j, 1.6), gaussian(0.0 + 0j, 1.6))
+    found = measure_galaxies(stack, AXES, many, Exposure(exposures=100), 1, "noise", reach=ARCMIN)
+    both = found.usable & found.true_usable
+    shift = (found.e1 - found.true_e1)[both]
+    # The covariance before the PSF gets the difference of those of the two PSFs: e (T_psf / T_galaxy) for small e,
+    # where T of a round Gaussian is twice the square of its size.
+    sigma = many.radius[both] / PIXEL / np.sqrt(2.0 * np.log(2.0))
+    assert shift.mean() == pytest.approx(np.mean(0.03 * 1.6**2 / sigma**2), rel=0.1)
+    # Each galaxy has the same noise twice: the shift is known far better than the ellipticities.
+    assert shift.std() < 0.3 * found.e1[both].std()
+    assert abs((found.e2 - found.true_e2)[both].mean()) < 2e-3
+
+
+def test_small_galaxies_and_those_far_from_a_known_psf_are_left_out():
+    psf, many = gaussian(0j, 1.6), galaxies(20)
+    tiny = Galaxies.single(many.xi, many.eta, many.magnitude, 0.2 * many.radius)
+    found = measure_galaxies(stack_of(psf, psf), AXES, tiny, Exposure(noise=False), 1, reach=ARCMIN)
+    # 1.2 times the half-light radius of the PSF needs 0.66 of it before the PSF.
+    assert not found.usable.any()
+    few = measure_galaxies(stack_of(psf, psf, places=2), AXES, many, Exposure(noise=False), 1, reach=3.5 * ARCMIN)
+    assert 0 < len(few) < 20
+    assert (np.hypot(3.0 - np.abs(few.x) / ARCMIN, 3.0 - np.abs(few.y) / ARCMIN) < 3.5).all()
+
+
+def test_no_byte_depends_on_the_threads():
+    psf, many = gaussian(0.02j, 1.6), galaxies(40)
+    one, two = (
+        measure_galaxies(stack_of(psf, psf), AXES, many, Exposure(), 3, reach=ARCMIN, threads=n) for n in (1, 2)
+    )
+    np.testing.assert_array_equal(one.e1, two.e1)
+    np.testing.assert_array_equal(one.error, two.error)
+
+
+def test_shear_bias_is_that_of_the_measurement():
+    rng = np.random.default_rng(3)
+    shear = 0.02 * np.where(np.arange(400) % 2 == 0, 1.0, 1j)
+    shapes = 0.1 * (rng.standard_normal((400, 4)) + 1j * rng.standard_normal((400, 4)))
+    measured = [
+        0.93 * sign * shear.real[:, None] + 0.9j * sign * shear.imag[:, None] + shapes + 0.001j for sign in (1, -1)
+    ]
+    measured[0][7, 2] = np.nan
+    found = shear_bias(np.array(measured), shear)
+    np.testing.assert_allclose(found.m, [-0.07, -0.1], atol=1e-12)
+    assert found.n_rings == 399
+    # Shapes cancel in m alone: c has the error of their mean.
+    np.testing.assert_allclose(found.c_error, 0.1 / np.sqrt(4 * 399), rtol=0.1)
+    assert np.abs(found.c - [0.0, 0.001]).max() < 4 * found.c_error.max()
+
+
+def test_slope_of_a_power_law():
+    density = np.array([10.0, 24.0, 42.0])
+    assert density_slope(density, 3.0 * density**-0.97) == pytest.approx(-0.97)
+    assert density_slope(density[:1], density[:1]) is None
+
+
+@pytest.fixture(scope="module")
+def tested(visits_config, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("null")
+    stack_visits(visits_config(places=12), folder, threads=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_FAINTEST_SNR", 60.0)
+        return null_test(folder, tiles=1, rings=40, threads=1), folder
+
+
+@pytest.mark.long
+def test_the_null_test_of_a_folder(tested):
+    results, folder = tested
+    assert set(results) == {1, 2}
+    written = json.loads((folder / "null_test.json").read_text())["stacks"]
+    for visits, result in results.items():
+        metrics = written[str(visits)]
+        galaxies = result.galaxies
+        area = (4096 * 0.2 / 60.0) ** 2
+        assert metrics["usable_per_arcmin2"] == pytest.approx(galaxies.usable.sum() / area, rel=2e-3)
+        assert 0.15 < metrics["rms_e_component"] < 0.35
+        # Elliptical Gaussians under-fit discs and spheroids by some per cent.
+        assert -0.2 < metrics["m1_true"] < 0.05
+        assert metrics["m1_true_error"] < 0.03
+    assert results[2].density > results[1].density
+    assert (folder / "null_test.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.long
+def test_a_null_test_goes_on_to_the_same_bytes(tested, monkeypatch):
+    _, folder = tested
+    monkeypatch.setattr(module, "_FAINTEST_SNR", 60.0)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    gone = sorted((folder / "galaxies").iterdir())[0]
+    gone.unlink()
+    damaged = sorted((folder / "galaxies").iterdir())[0]
+    damaged.write_bytes(damaged.read_bytes()[:4000])
+    null_test(folder, tiles=1, rings=40, resume=True, threads=2)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_folder_without_visits(tmp_path, capsys):
+    with pytest.raises(PachonError, match="no visits"):
+        null_test(tmp_path)
+    assert main(["null-test", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "expected the folder of pachon visits" in error

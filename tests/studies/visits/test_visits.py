@@ -1,0 +1,157 @@
+import json
+
+import numpy as np
+import pytest
+
+from pachon.commands.cli import main
+from pachon.core.errors import PachonError
+from pachon.core.progress import Reporter
+from pachon.core.units import ARCSEC
+from pachon.pipeline.measure.shapes import measure_shapes
+from pachon.pipeline.simulate.ccd_exposure import expose_positions
+from pachon.studies.visits.config import load_visits_configuration
+from pachon.studies.visits.plan import Visit
+from pachon.studies.visits.psf_visit import StackFrame, visit_experiment, visit_psfs
+from pachon.studies.visits.sky_points import draw_points
+from pachon.studies.visits.stack import PsfStack
+from pachon.studies.visits.visits import SUMS_NAME, cell_of, stack_path, stack_visits
+
+pytestmark = pytest.mark.long
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def stacked(visits_config, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("visits")
+    return stack_visits(visits_config(), folder, threads=1), folder
+
+
+def test_psfs_are_those_of_the_detector_turned_with_the_sky(visits_config):
+    config = visits_config()
+    experiment = config.experiment()
+    frame, visit = StackFrame.of(experiment, 31), Visit(1, 1, roll=0.9)
+    points = draw_points(1, 0.003, cell_of(experiment, frame), 20, 8)
+    seen = visit_psfs(visit_experiment(experiment, visit), visit, points, frame)
+    xy = visit.on_detector(experiment.telescope, points.sky[seen.index], 620e-9)
+    stamps = expose_positions(visit_experiment(experiment, visit), xy).image
+    weight = experiment.weight_fwhm
+    there, here = (measure_shapes(images, 0.2 * ARCSEC, weight) for images in (stamps, seen.true))
+    # A telescope that is rolled from north to east sees the sky turned the other way; x and y of the stack are those
+    # of the detector without a roll, turned as the sky is.
+    angle = np.arctan2(
+        *(visit.jacobians(experiment.telescope, np.zeros((1, 2)), 620e-9)[0] @ np.linalg.inv(frame.matrix))[::-1, 0]
+    )
+    expected = (there.e1 + 1j * there.e2) * np.exp(-2j * angle)
+    assert abs(angle) == pytest.approx(0.9, abs=1e-6)
+    # Bicubic resampling of a PSF of 3.5 pixels changes e by up to 1e-3.
+    np.testing.assert_allclose(here.e1 + 1j * here.e2, expected, atol=1e-3)
+    assert np.abs(expected).max() > 5e-3
+    np.testing.assert_allclose(seen.true.sum(axis=(1, 2)), 1.0, rtol=1e-5)
+
+
+def test_models_follow_the_psf(stacked):
+    result, _ = stacked
+    for stack in result.stacks.values():
+        # CCD heights make the PSF vary; its mean is known to the noise of 20 stars of S/N 30 and more.
+        left = np.hypot(stack.residual_e1, stack.residual_e2)
+        assert np.nanmedian(left) < 5e-3
+        assert abs(np.nanmean(stack.residual_e1)) < 2e-3
+    assert set(result.stacks) == {1, 2}
+    assert result.stacks[2].count.max() == 2
+
+
+def test_the_stack_is_the_mean_of_its_visits(stacked, visits_config):
+    result, _ = stacked
+    config = visits_config()
+    experiment = config.experiment()
+    frame = StackFrame.of(experiment, 31)
+    one, two = result.stacks[1], result.stacks[2]
+    # Points that both visits saw: the mean without the first is the second.
+    whole = two.count == 2
+    place = {xy: i for i, xy in enumerate(zip(one.xi, one.eta, strict=True))}
+    rows = [place[xy] for xy in zip(two.xi[whole], two.eta[whole], strict=True)]
+    second = 2.0 * two.true[whole] - one.true[rows]
+    np.testing.assert_allclose(second.sum(axis=(1, 2)), 1.0, atol=1e-5)
+    # Turbulence is its mean in all visits, and the residual aberration small.
+    shapes = measure_shapes(second, 1.0 / np.sqrt(abs(np.linalg.det(frame.matrix))), experiment.weight_fwhm)
+    assert np.median(shapes.size) == pytest.approx(np.median(one.size), rel=0.02)
+
+
+def test_an_interrupted_stack_goes_on_to_the_same_bytes(stacked, visits_config, tmp_path):
+    _, folder = stacked
+
+    def stop_at(count):
+        lines = []
+
+        def check():
+            lines.append(None)
+            if len(lines) > count:
+                raise KeyboardInterrupt
+
+        return Reporter(quiet=True, check=check)
+
+    with pytest.raises(KeyboardInterrupt):
+        stack_visits(visits_config(), tmp_path, reporter=stop_at(3), threads=1)
+    assert (tmp_path / SUMS_NAME).exists() is False or len(content(tmp_path)) < len(content(folder))
+    stack_visits(visits_config(), tmp_path, resume=True, threads=2)
+    assert content(tmp_path) == content(folder)
+
+
+def test_more_visits_join_a_finished_stack(stacked, visits_config, tmp_path):
+    _, folder = stacked
+    stack_visits(visits_config(count=1), tmp_path, threads=1)
+    stack_visits(visits_config(count=2), tmp_path, resume=True, threads=1)
+    assert content(tmp_path) == content(folder)
+
+
+def test_other_visits_are_refused(stacked, visits_config):
+    _, folder = stacked
+    before = content(folder)
+    with pytest.raises(PachonError, match="holds visits already; go on with --resume"):
+        stack_visits(visits_config(), folder)
+    with pytest.raises(PachonError, match=r"visits\.places: 8 -> 9"):
+        stack_visits(visits_config(places=9), folder, resume=True)
+    with pytest.raises(PachonError, match="holds 2 visits: expected at most 1"):
+        stack_visits(visits_config(count=1), folder, resume=True)
+    (folder / "stack_0002.fits").rename(folder / "elsewhere.fits")
+    with pytest.raises(PachonError, match="kept no stack of 2 visits"):
+        stack_visits(visits_config(), folder, resume=True)
+    (folder / "elsewhere.fits").rename(folder / "stack_0002.fits")
+    assert content(folder) == before
+
+
+def test_files_come_back_as_they_were(stacked):
+    result, folder = stacked
+    again = PsfStack.read(stack_path(folder, 2))
+    for name in ("xi", "x", "e1", "model_size", "true"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(result.stacks[2], name))
+    assert load_visits_configuration(folder / "config.yaml").visits.count == 2
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["stacks"]["2"]["rms_e"] == pytest.approx(
+        float(np.sqrt(np.nanmean(again.e1**2 + again.e2**2))), rel=1e-8
+    )
+
+
+def test_a_full_disk_is_noticed_before_the_first_visit(visits_config, tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000})())
+    with pytest.raises(PachonError, match=r"the stacks need .* of disk, 1000 B are free|the stacks need"):
+        stack_visits(visits_config(), tmp_path / "full")
+
+
+def test_bad_files_end_in_one_line(tmp_path, capsys):
+    for text, expected in (
+        ("visits: {count: 0}", "visits.count"),
+        ("visits: {dither_deg: 9}", "visits.dither_deg"),
+        ("run: {psf: {engine: slow}}", "run.psf.engine"),
+        ("visit: {count: 3}", "visit"),
+    ):
+        path = tmp_path / "bad.yaml"
+        path.write_text(text)
+        assert main(["visits", str(path), "-o", str(tmp_path / "out")]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert expected in error
+        assert "bad.yaml" in error
