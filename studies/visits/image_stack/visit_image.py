@@ -93,7 +93,8 @@ def visit_image(
     config, points, pixels = experiment.config, sky.points, experiment.camera.pixels
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     at = to_pixel(experiment, name, xy)
-    rows = np.flatnonzero((np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1))
+    inside = (np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1)
+    rows = np.flatnonzero(inside & (np.hypot(xy[:, 0], xy[:, 1]) <= experiment.field_radius_on_detector))
     psfs = expose_centered(experiment, xy[rows], threads)
     field = PsfField.fit(
         psfs.image.astype(np.float64),
