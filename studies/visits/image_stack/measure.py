@@ -136,8 +136,8 @@ def measure_tile(
     objects = detect_objects(image.image, variance, image.mask, threshold=_THRESHOLD, background_size=None)
     # The stars are those of one visit. Fainter objects, which deeper stacks are full of, would hide their locus.
     depth = float(np.sqrt(psfs.visits))
-    limits = {"min_snr": stack.experiment.config.stars.snr_min * depth, "bright_snr": _BRIGHT_SNR * depth}
-    stars = select_stars(objects, image.image, mask=image.mask, **limits)
+    least = stack.experiment.config.stars.snr_min
+    stars = select_stars(objects, image.image, mask=image.mask, min_snr=least * depth, bright_snr=_BRIGHT_SNR * depth)
     truth = image.objects
     scale = pixel_scale_of(stack.frame)
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
@@ -184,7 +184,7 @@ def measure_tile(
         true_usable=usable[1],
     )
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
-    key = ("images", psfs.visits, *(2 * abs(k) + (k < 0) for k in (tile.column, tile.row)))
+    key: tuple[str | int, ...] = ("images", psfs.visits, *(2 * abs(k) + (k < 0) for k in (tile.column, tile.row)))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
     stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
     both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])
@@ -202,7 +202,7 @@ def _star_metrics(
     scale = pixel_scale_of(stack.frame)
     known = np.flatnonzero(psfs.star)
     places = np.stack([psfs.x, psfs.y], axis=1)[known] / scale - tile.first
-    match = match_positions(*stars.positions.T, *places.T, MATCH_RADIUS)
+    match = match_positions(stars.positions[:, 0], stars.positions[:, 1], places[:, 0], places[:, 1], MATCH_RADIUS)
     real = match >= 0
     rows = known[match[real]]
     shapes, true = (

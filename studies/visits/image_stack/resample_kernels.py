@@ -18,7 +18,8 @@ def add_rows(
     mask: wp.array2d(dtype=wp.int16),
     nodes: wp.array3d(dtype=wp.float64),
     step: wp.int32,
-    corner: wp.vec2i,
+    corner_x: wp.int32,
+    corner_y: wp.int32,
     width: wp.int32,
     data_sum: wp.array2d(dtype=wp.float32),
     variance_sum: wp.array2d(dtype=wp.float32),
@@ -27,7 +28,7 @@ def add_rows(
     """One row of a part of a tile; pixels that need one that is masked or beyond the rim of the image are left out.
 
     `nodes` are x and y in the image, and the area of a pixel of the tile in pixels of the image, at every `step`-th
-    pixel of the part of `width` pixels whose first one in the sums is `corner`.
+    pixel of the part of `width` pixels whose first one in the sums is (corner_x, corner_y).
     """
     row = first + wp.tid()
     cell_y = row / step
@@ -73,8 +74,8 @@ def add_rows(
                 spread += w * w * line_spread
             if bad == 0:
                 factor = wp.float32(area)
-                at_y = corner[1] + row
-                at_x = corner[0] + column
+                at_y = corner_y + row
+                at_x = corner_x + column
                 data_sum[at_y, at_x] = data_sum[at_y, at_x] + factor * value
                 variance_sum[at_y, at_x] = variance_sum[at_y, at_x] + factor * factor * spread
                 count[at_y, at_x] = count[at_y, at_x] + wp.int16(1)

@@ -197,6 +197,11 @@ def stack_images(
     done = min(s.visits for s in sums.values())
     if max(s.visits for s in sums.values()) > len(plan):
         raise ProductError(f"{stack.folder} holds more than the {len(plan)} visits of {folder}; remove one of them")
+    for tile, own in sums.items():
+        gone = [n for n in stack.visits.kept if n <= own.visits and not is_whole(stack.path(n, tile), stack.stamp)]
+        if gone:
+            text = f"has no image of {gone[0]} visits of tile {tile.name}, and has gone on; remove it"
+            raise ProductError(f"{stack.folder} {text}")
     if done:
         reporter.line(f"images of {done} of {len(plan)} visits are stacked already")
     wcs = stack.wcs(threads)
@@ -211,10 +216,6 @@ def stack_images(
                 _write_image(stack, tile, own)
             # Written last: visits that it counts have left their image.
             own.write(stack.sums_path(tile), stack.stamp)
-    for visits in stack.visits.kept:
-        for tile in stack.tiles:
-            if not is_whole(stack.path(visits, tile), stack.stamp):
-                raise ProductError(f"{stack.path(visits, tile)}: expected the stack of {visits} visits; start anew")
     return stack
 
 

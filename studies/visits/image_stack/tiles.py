@@ -145,7 +145,8 @@ class TileSums:
     @classmethod
     def empty(cls, side: int) -> TileSums:
         """Return the sums of no visit."""
-        return cls(0, *np.zeros((2, side, side), dtype=np.float32), np.zeros((side, side), dtype=np.int16))
+        data, variance = np.zeros((2, side, side), dtype=np.float32)
+        return cls(0, data, variance, np.zeros((side, side), dtype=np.int16))
 
     def stacked(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return image, variance and mask of the mean of the visits times their number, as of one long exposure."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ....imaging.draw import Window, add_stamps, draw_galaxies
 from ....imaging.exposure import ExposedImage, Exposure, expose
 from ....imaging.psf_field import PsfField, to_pixel
-from ....imaging.scene import STAR_ROOM, GalaxiesIn, galaxies_near
+from ....imaging.scene import STAR_ROOM, galaxies_near
 from ....pipeline.defaults import noise_free_components
 from ....pipeline.experiment import Experiment
 from ....pipeline.simulate.ccd_exposure import expose_centered, expose_positions
@@ -41,7 +43,7 @@ class Sky:
     """
 
     points: SkyPoints
-    galaxies: GalaxiesIn
+    galaxies: Callable[[Any, Any], Any]
 
 
 def visit_image(
@@ -91,7 +93,8 @@ def visit_image(
     config, points, pixels = experiment.config, sky.points, experiment.camera.pixels
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     at = to_pixel(experiment, name, xy)
-    rows = np.flatnonzero((np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1))
+    inside = (np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1)
+    rows = np.flatnonzero(inside & (np.hypot(xy[:, 0], xy[:, 1]) <= experiment.field_radius_on_detector))
     psfs = expose_centered(experiment, xy[rows], threads)
     field = PsfField.fit(
         psfs.image.astype(np.float64),

@@ -122,6 +122,9 @@ def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, monkeypatc
     stack_images(visits_folder, settings, resume=True, threads=2)
     assert files(visits_folder) == files(whole)
     assert len(files(whole)) == 6
+    (whole / "images" / "stack_0001_tile_+00_+00.fits").unlink()
+    with pytest.raises(ProductError, match=r"no image of 1 visits of tile \+00_\+00, and has gone on"):
+        stack_images(whole, settings, resume=True)
 
 
 @pytest.mark.long
