@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.errors import DomainError
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...pipeline.config import with_options
@@ -115,7 +116,7 @@ def visit_psfs(
     Raises
     ------
     PachonError
-        If a CCD cannot be exposed.
+        If a CCD cannot be exposed, or none can be modelled.
     """
     config = experiment.config
     fields, index = _star_fields(experiment, visit, points, threads)
@@ -136,6 +137,9 @@ def visit_psfs(
             experiment, modelled, list(fields), fields=fields, strict=False, threads=threads, reporter=reporter
         )
     found = simulated.results
+    if not found:
+        reasons = [f"CCD {name}: {reason}" for name, reason in simulated.not_modelled.items()]
+        raise DomainError("; ".join(reasons[:1]) or "no star falls on a CCD")
     true = [result.true for result in found.values()]
     if config.reconstruction.model == "focal_plane":
         model = [_focal_plane_images(experiment, found, threads, reporter)]

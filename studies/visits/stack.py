@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from ...core.errors import ProductError
+from ...core.errors import DomainError, ProductError
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from ...core.units import ARCMIN, ARCSEC
 from ...pipeline.measure.shapes import Shapes, measure_shapes
@@ -113,8 +113,16 @@ class PsfStack:
         pixel_scale: float,
         weight_fwhm: float,
     ) -> PsfStack:
-        """Measure the PSFs of sums at points of the sky [n, 2]; `axes` are d(x, y of the stack [pixel])/d(xi, eta)."""
+        """Measure the PSFs of sums at points of the sky [n, 2]; `axes` are d(x, y of the stack [pixel])/d(xi, eta).
+
+        DomainError if there are less than two stars or two places.
+        """
         rows = np.flatnonzero((sums.count > 0) & (2 * sums.count >= sums.visits))
+        if (~star[rows]).sum() < 2 or star[rows].sum() < 2:
+            raise DomainError(
+                f"{len(rows)} stars and places were seen by half of {sums.visits} visits: expected more of them, or CCDs "
+                "around the middle of the field, which all rolls see"
+            )
         count = sums.count[rows]
         true, model = (v[rows] / count[:, None, None].astype(np.float32) for v in (sums.true, sums.model))
         shapes: list[Shapes] = [measure_shapes(images, pixel_scale, weight_fwhm) for images in (true, model)]

@@ -141,6 +141,17 @@ def test_a_full_disk_is_noticed_before_the_first_visit(visits_config, tmp_path, 
         stack_visits(visits_config(), tmp_path / "full")
 
 
+def test_visits_that_see_too_little_end_in_one_line(visits_config, tmp_path):
+    with pytest.raises(PachonError, match="visit 0: CCD R22_S11: 2 of 2 stars left"):
+        stack_visits(visits_config(stars=2), tmp_path / "few")
+    config = visits_config(snapshots=(), count=3)
+    away = config.model_copy(update={"run": config.run.model_copy(update={"ccds": ("R01_S11",)})})
+    with pytest.raises(PachonError, match="were seen by half of 3 visits: expected more of them, or CCDs around"):
+        stack_visits(
+            away.model_copy(update={"visits": config.visits.model_copy(update={"count": 3})}), tmp_path / "away"
+        )
+
+
 def test_bad_files_end_in_one_line(tmp_path, capsys):
     for text, expected in (
         ("visits: {count: 0}", "visits.count"),
