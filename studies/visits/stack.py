@@ -120,8 +120,8 @@ class PsfStack:
         rows = np.flatnonzero((sums.count > 0) & (2 * sums.count >= sums.visits))
         if (~star[rows]).sum() < 2 or star[rows].sum() < 2:
             raise DomainError(
-                f"{len(rows)} stars and places were seen by half of {sums.visits} visits: expected more of them, or CCDs "
-                "around the middle of the field, which all rolls see"
+                f"{len(rows)} stars and places were seen by half of {sums.visits} visits: expected more of them, or "
+                "CCDs around the middle of the field, which all rolls see"
             )
         count = sums.count[rows]
         true, model = (v[rows] / count[:, None, None].astype(np.float32) for v in (sums.true, sums.model))
