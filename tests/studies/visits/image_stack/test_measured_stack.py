@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from pachon.commands.cli import main
+from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.galaxy_shapes import GalaxyShapes
 from pachon.studies.visits.image_stack.measure import MeasuredTile, tile_metrics
+from pachon.studies.visits.visits import stack_path
 
 RNG = np.random.default_rng(4)
 
@@ -60,14 +62,19 @@ def test_no_galaxies_have_no_figures():
 
 
 @pytest.mark.long
-def test_a_small_stack_is_measured(visit_products, capsys):
-    command = ["stack-images", str(visit_products), "--side", "1280", "--faintest", "22", "--json", "--quiet"]
+def test_a_small_stack_is_measured(visit_products, small_visits, tmp_path, capsys):
+    section = small_visits.visits.model_copy(update={"snapshots": (2,)})
+    last = small_visits.model_copy(update={"visits": section})
+    (tmp_path / CONFIG_NAME).write_text(last.resolved(last.experiment()).to_yaml())
+    stack_path(tmp_path, 2).write_bytes(stack_path(visit_products, 2).read_bytes())
+    command = ["stack-images", str(tmp_path), "--side", "1280", "--faintest", "22", "--json", "--quiet"]
     assert main(command) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["stacks"] == json.loads((visit_products / "images" / "images.json").read_text())["stacks"]
+    assert printed["stacks"] == json.loads((tmp_path / "images" / "images.json").read_text())["stacks"]
+    assert list(printed["stacks"]) == ["2"]
     for figures in printed["stacks"].values():
         assert figures["stars"][0]["true"] >= 10
         # PSFs and stars of one image: sizes agree to their noise.
         assert abs(figures["stars"][0]["size_difference"]) < 0.03
         assert 0.5 < figures["usable_per_arcmin2"] / figures["usable_per_arcmin2_stamps"] < 1.5
-    assert (visit_products / "images" / "images.png").stat().st_size > 10000
+    assert (tmp_path / "images" / "images.png").stat().st_size > 10000
