@@ -13,10 +13,6 @@ from ..psf_visit import StackFrame
 from .resample_kernels import add_rows
 from .tiles import Tile, TileSums
 
-#: Variance of a resampled pixel over that of the image, mean over the places between pixels, in white noise: the
-#: square of the integral of the squared kernel of Keys 1981 with a = -1/2, 57/70. What is missing is in the
-#: correlations of neighbouring pixels: averages over several pixels are as noisy as before.
-CORRELATED = (57.0 / 70.0) ** 2
 #: Pixels between nodes of the mapping. It is linear between them to 1e-4 pixel, as the scale of the LSST changes by
 #: 1e-7 of itself from pixel to pixel.
 _STEP = 64

@@ -61,7 +61,7 @@ def test_no_galaxies_have_no_figures():
     assert found["response_difference"] is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_small_stack_is_measured(visit_products, small_visits, tmp_path, capsys):
     section = small_visits.visits.model_copy(update={"snapshots": (2,)})
     last = small_visits.model_copy(update={"visits": section})

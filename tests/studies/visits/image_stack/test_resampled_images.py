@@ -9,12 +9,16 @@ import pachon
 from pachon.imaging.draw import Window
 from pachon.imaging.exposure import ExposedImage
 from pachon.imaging.wcs import ccd_wcs
-from pachon.studies.visits.image_stack.resample import CORRELATED, add_resampled
+from pachon.studies.visits.image_stack.resample import add_resampled
 from pachon.studies.visits.image_stack.tiles import Tile, TileSums
 from pachon.studies.visits.image_stack.visit_wcs import VisitWcs
 from pachon.studies.visits.plan import Visit
 from pachon.studies.visits.psf_visit import StackFrame
 
+# Variance of a resampled pixel over that of the image, mean over the places between pixels, in white noise: the
+# square of the integral of the squared kernel of Keys 1981 with a = -1/2, 57/70. What is missing is in the
+# correlations of neighbouring pixels: averages over several pixels are as noisy as before.
+CORRELATED = (57.0 / 70.0) ** 2
 WAVELENGTH = 620e-9
 #: One pixel of 10 um of the frame on the axis [rad], by the focal length of 10.3 m.
 FRAME = StackFrame(-1.03e6 * np.eye(2), 31)
