@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,14 +36,30 @@ def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError
         raise error(f"cannot write {path}: {problem.strerror or problem}") from None
 
 
-def read_bytes(path: Path, error: type[PachonError]) -> bytes:
-    """Return the content of a file, or raise `error` where it cannot be read."""
+def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = None) -> bytes:
+    """Return the content of a file, or raise `error` where it cannot be read or has more than `max_bytes` [byte]."""
+    require_file(path, error)
     try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise error("no such file", file=path) from None
+        with open(path, "rb") as file:
+            data = file.read(-1 if max_bytes is None else max_bytes + 1)
     except OSError as problem:
         raise error(f"cannot be read ({problem.strerror})", file=path) from None
+    if max_bytes is not None and len(data) > max_bytes:
+        raise error(f"expected a file of at most {max_bytes} bytes", file=path)
+    return data
+
+
+def require_file(path: Path, error: type[PachonError]) -> None:
+    """Raise `error` where a path is not that of a regular file: a pipe or device would be read without end."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise error("no such file", file=path) from None
+    except (OSError, ValueError) as problem:
+        raise error(f"cannot be read ({getattr(problem, 'strerror', None) or problem})", file=path) from None
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe, device or socket"
+        raise error(f"cannot be read (it is {kind}; expected a file)", file=path)
 
 
 def make_folder(folder: Path) -> None:

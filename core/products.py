@@ -15,7 +15,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
 from .errors import ProductError
-from .files import write_bytes
+from .files import read_bytes, write_bytes
 from .version import VERSION
 
 #: Comment of CHECKSUM and DATASUM. astropy's default is the time of day, with which no two runs have the same bytes.
@@ -77,10 +77,7 @@ def read_fits(path: Path) -> fits.HDUList:
 
     Raises ProductError if there is no such file, or it is no product of this program as it was written.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ProductError(f"cannot read {path}: {error.strerror}") from None
+    data = read_bytes(path, ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)
         try:
