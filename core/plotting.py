@@ -74,7 +74,7 @@ def png_bytes(figure: Figure) -> bytes:
 
 
 def plain_text(name: str) -> str:
-    """Return a name as pictures draw it letter by letter: matplotlib takes what stands between dollar signs for maths."""
+    """Return a name as pictures draw it letter by letter; matplotlib takes text between dollar signs for maths."""
     return name.replace("$", r"\$")
 
 

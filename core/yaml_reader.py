@@ -16,9 +16,11 @@ import yaml
 from .errors import PachonError, PrescriptionError
 from .files import read_bytes
 
-#: Longest file [byte], and largest sum of the characters of all values with every alias written out.
+#: Longest file [byte] of a configuration; files with numbers of their own, such as prescriptions, may be longer.
 MAX_BYTES = 1_000_000
-#: Characters that each value, list and mapping counts more, for the time it takes: 50 000 empty ones are at the limit.
+#: Most characters that aliases stand for.
+MAX_ALIASED = 1_000_000
+#: Characters that each value, list and mapping counts more, for the time it takes.
 _NODE = 20
 #: Most levels of lists and mappings, far below Python's limit of recursion.
 MAX_DEPTH = 50
@@ -31,10 +33,12 @@ _MAX_REASON = 200
 class _StrictLoader(yaml.SafeLoader):
     """Safe loader of bounded content, checked before any value is made."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, max_size: int) -> None:
         super().__init__(text)
+        self._max_size = max_size
         self._depth = 0
         self._size = 0
+        self._aliased = 0
         # Size with every alias written out, by the identity of the node.
         self._sizes: dict[int, int] = {}
 
@@ -53,11 +57,15 @@ class _StrictLoader(yaml.SafeLoader):
             if id(node) not in self._sizes:
                 raise yaml.composer.ComposerError(None, None, f"alias *{cut_short(event.anchor)} within itself", mark)
             self._size += self._sizes[id(node)]
+            self._aliased += self._sizes[id(node)]
         else:
             self._size += _NODE + (len(node.value) if isinstance(node, yaml.ScalarNode) else 0)
             self._sizes[id(node)] = self._size - before
-        if self._size > MAX_BYTES:
-            text = f"more than {MAX_BYTES // _NODE} values, or {MAX_BYTES} characters, with every alias written out"
+        if self._aliased > MAX_ALIASED:
+            text = f"aliases for more than {MAX_ALIASED} characters, {_NODE} of them for each value"
+            raise yaml.composer.ComposerError(None, None, text, mark)
+        if self._size > self._max_size:
+            text = f"more than {self._max_size} characters, {_NODE} of them for each value"
             raise yaml.composer.ComposerError(None, None, text, mark)
         return node
 
@@ -87,14 +95,16 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping_without_repeats)
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _short_integer)
 
 
-def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> dict[str, Any]:
-    """Return the top level of a YAML file in UTF-8.
+def read_mapping(
+    path: Path, error: type[PachonError] = PrescriptionError, *, max_bytes: int = MAX_BYTES
+) -> dict[str, Any]:
+    """Return the top level of a YAML file in UTF-8 of at most `max_bytes` [byte].
 
-    Raises `error` if the file cannot be read, is larger or deeper than a configuration (:data:`MAX_BYTES`,
-    :data:`MAX_DEPTH`), is not YAML, or is not a mapping.
+    Raises `error` if the file cannot be read, is longer, deeper (:data:`MAX_DEPTH`) or has more values and aliases than
+    a file of that length, is not YAML, or is not a mapping.
     """
     try:
-        content = yaml.load(read_bytes(path, error, max_bytes=MAX_BYTES).decode(), Loader=_StrictLoader)
+        content = _StrictLoader(read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes).get_single_data()
     except UnicodeDecodeError:
         raise error("not a UTF-8 text file", file=path) from None
     except yaml.MarkedYAMLError as problem:

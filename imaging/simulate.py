@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import ConfigError, PachonError, ProductError, error_context
-from ..core.files import make_folder, write_bytes
+from ..core.files import make_folder, remove_leftovers, write_bytes, write_new_bytes
 from ..core.memory import require_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
@@ -205,7 +205,10 @@ def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
     """Make the folder, or check that its images are of the same configuration, and write images.yaml."""
     make_folder(folder)
     path, now = folder / CONFIG_NAME, config.model_dump(mode="json", by_alias=True)
-    if path.exists():
+    if not path.exists() and (left := sorted(folder.glob("image_*.fits"))):
+        raise ProductError(f"{folder} holds {left[0].name} but no {CONFIG_NAME}; choose another --out")
+    # Of runs that start together, one makes the file, and the others compare theirs with it.
+    if not write_new_bytes(path, config.to_yaml().encode()):
         try:
             before = read_mapping(path, ProductError)
         except ProductError as error:
@@ -217,8 +220,5 @@ def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
         if found:
             text = "; ".join(found[:3])
             raise ProductError(f"{folder} holds images of another configuration ({text}); choose another --out")
-    elif left := sorted(folder.glob("image_*.fits")):
-        raise ProductError(f"{folder} holds {left[0].name} but no {CONFIG_NAME}; choose another --out")
-    for left_over in folder.glob(".*.partial"):
-        left_over.unlink(missing_ok=True)
-    write_bytes(path, config.to_yaml().encode())
+        write_bytes(path, config.to_yaml().encode())
+    remove_leftovers(folder)

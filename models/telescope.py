@@ -45,8 +45,9 @@ class Telescope:
     Parameters
     ----------
     name, source, version, description : str
-        Name, source, version and description of the prescription. Names, those of surfaces too, are printable characters
-        of any script; FITS products have them as ASCII with escapes such as ``\xfc``, and pictures letter by letter.
+        Name, source, version and description of the prescription. Names, those of surfaces too, are printable
+        characters of any script; FITS products have them as ASCII with escapes such as ``\xfc``, and pictures letter
+        by letter.
     surfaces : tuple of Surface
         Surfaces in the order of the light.
     stop_z : float

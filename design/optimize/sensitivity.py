@@ -102,7 +102,7 @@ class Sensitivity(FieldResult):
         size = np.sqrt((self.matrix[:, first - 1 :] ** 2).mean(axis=0))
         largest = size.max(axis=0)
         with styled():
-            names = self.parameters.names
+            names = [plain_text(name) for name in self.parameters.names]
             figure = new_figure(min(14.0, 4.5 + 0.22 * len(names)), 4.6)
             axes, modes = figure.subplots(1, 2, width_ratios=[2.2, 1.0])
             shown = np.log10(np.maximum(size / np.where(largest > 0, largest, 1.0), 1e-4))

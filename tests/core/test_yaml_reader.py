@@ -3,13 +3,17 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError, PachonError
 from pachon.core.products import read_fits
 from pachon.core.yaml_reader import MAX_BYTES, read_mapping
 from pachon.models.io.grid_file import read_grid
+from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.mesh_file import load_mesh
+from pachon.models.shapes.grid import GridSag
+from pachon.models.shapes.shape import Sum
 from pachon.pipeline.config import load_configuration
 from pachon.pipeline.measure.star_catalogue import load_stars
 
@@ -24,8 +28,11 @@ def _aliases(levels):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (_aliases(30), "with every alias written out"),
-        ("a: &a " + "x" * 10_000 + "\nb: [" + ", ".join(["*a"] * 10_000) + "]", "with every alias written out"),
+        (_aliases(30), "aliases for more than 1000000 characters"),
+        (
+            "a: &a " + "x" * 10_000 + "\nb: [" + ", ".join(["*a"] * 10_000) + "]",
+            "more than 1000000 characters",
+        ),
         ("a: &a [*a]", r"alias \*a within itself"),
         ("a: " + "[" * 2000 + "]" * 2000, "more than 50 levels of nesting"),
         ("a: " + "[" * 2000, "more than 50 levels of nesting"),
@@ -37,7 +44,7 @@ def _aliases(levels):
         ("a: !!bool x", "not valid YAML"),
         ("a: !!timestamp x", "not valid YAML"),
         ("a: !!int ''", "not valid YAML"),
-        ("a: [" + ("x" * 1000 + ",") * 990 + "]", "more than 50000 values"),
+        ("a: [" + ("x" * 1000 + ",") * 990 + "]", "more than 1000000 characters"),
         ("a: " + "x" * MAX_BYTES, f"expected a file of at most {MAX_BYTES} bytes"),
     ],
     ids=[
@@ -66,6 +73,15 @@ def test_content_without_bound_is_refused_at_once_in_one_line(tmp_path, text, re
         read(path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400 + len(str(path))
+
+
+@pytest.mark.long
+def test_a_saved_telescope_with_a_grid_of_many_nodes_is_read_again(tmp_path):
+    nodes = np.linspace(-1.0, 1.0, 240)
+    plain = load_telescope("paul_baker")
+    shape = Sum((plain.surfaces[0].shape, GridSag(nodes, nodes, np.zeros((240, 240)))))
+    save_telescope(plain.with_shape(plain.surfaces[0].name, shape), tmp_path / "grid.yaml")
+    assert load_telescope(tmp_path / "grid.yaml").surfaces[0].shape == shape
 
 
 def test_aliases_and_nesting_within_the_limits_keep_their_values(tmp_path):
