@@ -111,9 +111,9 @@ class Telescope:
         names = [s.name for s in self.surfaces]
         if not names:
             raise PrescriptionError("surfaces = []: expected at least one surface")
-        for kind, name in (("name", self.name), *(("surface name", n) for n in names)):
-            if not name.isprintable():
-                raise PrescriptionError(f"{kind} = {name!r}: expected letters, signs and spaces, no control characters")
+        for key, text in (("name", self.name), *(("surface name", n) for n in names)):
+            if not text.isprintable():
+                raise PrescriptionError(f"{key} = {text!r}: expected letters, signs and spaces, no control characters")
         for repeated in {n for n in names if names.count(n) > 1}:
             raise PrescriptionError(f"surface name {repeated!r} occurs more than once: expected unique names")
         medium = self.medium_before
