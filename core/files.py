@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import stat
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,30 +22,103 @@ from .errors import PachonError, ProductError
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
     """Write a file whole, or raise `error` with the path and the system's reason and leave nothing behind."""
-    partial = path.with_name(f".{path.name}.partial")
+    _write(path, data, error, os.replace)
+
+
+def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> bool:
+    """Write a file whole as :func:`write_bytes` does, and return True; or return False where there is one already.
+
+    Of several processes that write the same file at the same time, one gets True.
+    """
+    try:
+        _write(path, data, error, _publish_new)
+    except FileExistsError:
+        return False
+    return True
+
+
+def _write(path: Path, data: bytes, error: type[PachonError], publish: Callable[[Path, Path], None]) -> None:
+    """Write a temporary file, give it its final name by a function, and leave no temporary file behind."""
+    partial = path.with_name(f".{path.name}.{_owner(os.getpid())}.partial")
     try:
         try:
             with open(partial, "wb") as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(partial, path)
-        except BaseException:
+            publish(partial, path)
+        finally:
             with suppress(OSError):
                 partial.unlink()
-            raise
+    except FileExistsError:
+        raise
     except OSError as problem:
         raise error(f"cannot write {path}: {problem.strerror or problem}") from None
 
 
-def read_bytes(path: Path, error: type[PachonError]) -> bytes:
-    """Return the content of a file, or raise `error` where it cannot be read."""
+def _publish_new(partial: Path, path: Path) -> None:
     try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise error("no such file", file=path) from None
+        os.link(partial, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        # File systems without hard links, such as FAT.
+        with open(path, "xb") as file:
+            file.write(partial.read_bytes())
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of processes that ended; those of live ones, and of other machines, stay."""
+    for left_over in folder.glob(".*.partial"):
+        owner = left_over.name.removesuffix(".partial")
+        process = owner.rpartition("-")[2]
+        if owner.endswith(f".{_owner(process)}") and process.isdecimal() and not _alive(int(process)):
+            left_over.unlink(missing_ok=True)
+
+
+def _owner(process: int | str) -> str:
+    """Return the part of the name of temporary files that tells machine and process."""
+    return f"{platform.node()}-{process}"
+
+
+def _alive(process: int) -> bool:
+    if os.name == "nt":
+        # There, signal 0 would end the process.
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        # A process of another user.
+        return True
+    return True
+
+
+def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = None) -> bytes:
+    """Return the content of a file, or raise `error` where it cannot be read or has more than `max_bytes` [byte]."""
+    require_file(path, error)
+    try:
+        with open(path, "rb") as file:
+            data = file.read(-1 if max_bytes is None else max_bytes + 1)
     except OSError as problem:
         raise error(f"cannot be read ({problem.strerror})", file=path) from None
+    if max_bytes is not None and len(data) > max_bytes:
+        raise error(f"expected a file of at most {max_bytes} bytes", file=path)
+    return data
+
+
+def require_file(path: Path, error: type[PachonError]) -> None:
+    """Raise `error` where a path is not that of a regular file: a pipe or device would be read without end."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise error("no such file", file=path) from None
+    except (OSError, ValueError) as problem:
+        raise error(f"cannot be read ({getattr(problem, 'strerror', None) or problem})", file=path) from None
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe, device or socket"
+        raise error(f"cannot be read (it is {kind}; expected a file)", file=path)
 
 
 def make_folder(folder: Path) -> None:

@@ -73,6 +73,11 @@ def png_bytes(figure: Figure) -> bytes:
     return picture_bytes(figure, "png")
 
 
+def plain_text(name: str) -> str:
+    """Return a name as pictures draw it letter by letter; matplotlib takes text between dollar signs for maths."""
+    return name.replace("$", r"\$")
+
+
 def figure_of(axes: Axes) -> Figure:
     """Return the figure that axes belong to."""
     return cast("Figure", axes.get_figure(root=True))

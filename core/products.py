@@ -15,7 +15,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
 from .errors import ProductError
-from .files import write_bytes
+from .files import read_bytes, write_bytes
 from .version import VERSION
 
 #: Comment of CHECKSUM and DATASUM. astropy's default is the time of day, with which no two runs have the same bytes.
@@ -51,15 +51,21 @@ class Stamp:
         return all(header.get(key) == value for key, value, _ in self.cards())
 
 
+def card_text(text: str) -> str:
+    r"""Return a text as a FITS card or column holds it: ASCII, other characters as Python escapes such as ``\xfc``."""
+    return text.encode("ascii", "backslashreplace").decode()
+
+
 def write_fits(path: Path, hdus: list[Any], stamp: Stamp | None, cards: list[tuple[str, Any, str]]) -> None:
     """Write named extensions as a FITS product with checksums.
 
     The primary header has the stamp, which is None for a product of no run, and `cards`: (keyword, value, comment).
+    Texts are ASCII there, by :func:`card_text`.
     """
     primary = fits.PrimaryHDU()
     parts = ("NPARTS", 1 + len(hdus), "header and extensions of this file")
     for keyword, value, comment in [*(stamp.cards() if stamp else []), parts, *cards]:
-        primary.header[keyword] = (value, comment)
+        primary.header[keyword] = (card_text(value) if isinstance(value, str) else value, comment)
     write_hdus(path, fits.HDUList([primary, *hdus]))
 
 
@@ -77,10 +83,7 @@ def read_fits(path: Path) -> fits.HDUList:
 
     Raises ProductError if there is no such file, or it is no product of this program as it was written.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ProductError(f"cannot read {path}: {error.strerror}") from None
+    data = read_bytes(path, ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)
         try:

@@ -1,6 +1,7 @@
 """Strict reading of YAML files; each problem is an error of one line.
 
-The loader is YAML's safe one; a repeated key, of which YAML takes the last, is an error.
+The loader is YAML's safe one; a repeated key, of which YAML takes the last, is an error. So is content too large to be
+a configuration: files of many bytes, deep nesting, aliases that multiply, integers of hundreds of digits.
 """
 
 from __future__ import annotations
@@ -15,9 +16,65 @@ import yaml
 from .errors import PachonError, PrescriptionError
 from .files import read_bytes
 
+#: Longest file [byte] of a configuration; files with numbers of their own, such as prescriptions, may be longer.
+MAX_BYTES = 1_000_000
+#: Most characters that aliases stand for.
+MAX_ALIASED = 1_000_000
+#: Characters that each value, list and mapping counts more, for the time it takes.
+_NODE = 20
+#: Most levels of lists and mappings, far below Python's limit of recursion.
+MAX_DEPTH = 50
+#: Longest text of an integer: YAML's base 60 takes a time that grows with its square.
+MAX_DIGITS = 100
+#: Longest reason of a problem in an error message: some hold a name of the file's.
+_MAX_REASON = 200
+
 
 class _StrictLoader(yaml.SafeLoader):
-    pass
+    """Safe loader of bounded content, checked before any value is made."""
+
+    def __init__(self, text: str, max_size: int) -> None:
+        super().__init__(text)
+        self._max_size = max_size
+        self._depth = 0
+        self._size = 0
+        self._aliased = 0
+        # Size with every alias written out, by the identity of the node.
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Return the next node; a ComposerError where depth or size exceed their limits."""
+        event = self.peek_event()
+        is_alias, mark = isinstance(event, yaml.AliasEvent), event.start_mark
+        if self._depth == MAX_DEPTH:
+            raise yaml.composer.ComposerError(None, None, f"more than {MAX_DEPTH} levels of nesting", mark)
+        before = self._size
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if is_alias:
+            # A node within itself has no size yet.
+            if id(node) not in self._sizes:
+                raise yaml.composer.ComposerError(None, None, f"alias *{cut_short(event.anchor)} within itself", mark)
+            self._size += self._sizes[id(node)]
+            self._aliased += self._sizes[id(node)]
+        else:
+            self._size += _NODE + (len(node.value) if isinstance(node, yaml.ScalarNode) else 0)
+            self._sizes[id(node)] = self._size - before
+        if self._aliased > MAX_ALIASED:
+            text = f"aliases for more than {MAX_ALIASED} characters, {_NODE} of them for each value"
+            raise yaml.composer.ComposerError(None, None, text, mark)
+        if self._size > self._max_size:
+            text = f"more than {self._max_size} characters, {_NODE} of them for each value"
+            raise yaml.composer.ComposerError(None, None, text, mark)
+        return node
+
+
+def _short_integer(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
+    if len(node.value) > MAX_DIGITS:
+        text = f"integer of {len(node.value)} characters: expected at most {MAX_DIGITS}"
+        raise yaml.constructor.ConstructorError(None, None, text, node.start_mark)
+    return int(loader.construct_yaml_int(node))
 
 
 def _mapping_without_repeats(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Hashable, Any]:
@@ -25,31 +82,38 @@ def _mapping_without_repeats(loader: _StrictLoader, node: yaml.MappingNode) -> d
     for key_node, _ in node.value:
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(None, None, f"key {key!r}: expected a name", key_node.start_mark)
+            text = f"key {cut_short(repr(key))}: expected a name"
+            raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
         if key in seen:
-            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} occurs twice", key_node.start_mark)
+            text = f"key {cut_short(repr(key))} occurs twice"
+            raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
         seen.add(key)
     return loader.construct_mapping(node, deep=True)
 
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping_without_repeats)
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _short_integer)
 
 
-def read_mapping(path: Path, error: type[PachonError] = PrescriptionError) -> dict[str, Any]:
-    """Return the top level of a YAML file in UTF-8.
+def read_mapping(
+    path: Path, error: type[PachonError] = PrescriptionError, *, max_bytes: int = MAX_BYTES
+) -> dict[str, Any]:
+    """Return the top level of a YAML file in UTF-8 of at most `max_bytes` [byte].
 
-    Raises `error` if the file cannot be read, is not YAML, or is not a mapping.
+    Raises `error` if the file cannot be read, is longer, deeper (:data:`MAX_DEPTH`) or has more values and aliases than
+    a file of that length, is not YAML, or is not a mapping.
     """
     try:
-        content = yaml.load(read_bytes(path, error).decode(), Loader=_StrictLoader)
+        content = _StrictLoader(read_bytes(path, error, max_bytes=max_bytes).decode(), max_bytes).get_single_data()
     except UnicodeDecodeError:
         raise error("not a UTF-8 text file", file=path) from None
     except yaml.MarkedYAMLError as problem:
         mark = problem.problem_mark or problem.context_mark
         place = f"line {mark.line + 1}" if mark else None
-        raise error(f"not valid YAML: {problem.problem or problem.context}", file=path, place=place) from None
-    except (yaml.YAMLError, ValueError) as problem:
-        raise error(f"not valid YAML: {' '.join(str(problem).split())}", file=path) from None
+        raise error(f"not valid YAML: {_reason(problem.problem or problem.context)}", file=path, place=place) from None
+    except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, AttributeError) as problem:
+        # PyYAML raises the others for values that do not fit their tags.
+        raise error(f"not valid YAML: {_reason(problem)}", file=path) from None
     if not isinstance(content, dict):
         raise error(f"expected a mapping of keys to values, not {cut_short(repr(content))}", file=path)
     return content
@@ -68,6 +132,10 @@ def as_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def cut_short(text: str) -> str:
-    """Return a text of at most 60 characters."""
-    return text if len(text) <= 60 else text[:57] + "..."
+def cut_short(text: str, length: int = 60) -> str:
+    """Return a text of at most `length` characters."""
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def _reason(problem: object) -> str:
+    return cut_short(" ".join(str(problem).split()), _MAX_REASON)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..core.plotting import plain_text
 from ..wavefront.request import Request
 
 if TYPE_CHECKING:
@@ -50,5 +51,5 @@ class FieldResult:
 
     def _titled(self, figure: Figure, text: str) -> Figure:
         """Return a figure with a title that begins with the name of the telescope."""
-        figure.suptitle(f"{self.telescope}: {text}", fontsize=11)
+        figure.suptitle(f"{plain_text(self.telescope)}: {text}", fontsize=11)
         return figure

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.errors import ConfigError, DomainError
-from ..core.products import Stamp
+from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
@@ -53,7 +53,7 @@ class CcdScene:
         header = self.wcs.to_header((self.window.x, self.window.y))
         for key, value, comment in (
             ("BUNIT", "adu", ""),
-            ("TELESCOP", self.telescope, "prescription"),
+            ("TELESCOP", card_text(self.telescope), "prescription"),
             ("FILTER", settings.band, "band"),
             ("EXPTIME", settings.total_time, "[s] all exposures together"),
             ("NEXP", settings.exposures, "number of exposures"),

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ..core.errors import ConfigError, PachonError, ProductError, error_context
-from ..core.files import make_folder, write_bytes
+from ..core.files import make_folder, remove_leftovers, write_bytes, write_new_bytes
 from ..core.memory import require_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
 from ..core.units import ARCMIN, ARCSEC
+from ..core.yaml_reader import read_mapping
 from ..pipeline.config import differences
 from ..pipeline.defaults import given
 from ..pipeline.experiment import Experiment
@@ -205,20 +205,20 @@ def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
     """Make the folder, or check that its images are of the same configuration, and write images.yaml."""
     make_folder(folder)
     path, now = folder / CONFIG_NAME, config.model_dump(mode="json", by_alias=True)
-    if path.exists():
+    if not path.exists() and (left := sorted(folder.glob("image_*.fits"))):
+        raise ProductError(f"{folder} holds {left[0].name} but no {CONFIG_NAME}; choose another --out")
+    # Of runs that start together, one makes the file, and the others compare theirs with it.
+    if not write_new_bytes(path, config.to_yaml().encode()):
         try:
-            before = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, yaml.YAMLError, UnicodeDecodeError):
-            raise ProductError(f"{folder} holds a {CONFIG_NAME} that cannot be read; choose another --out") from None
+            before = read_mapping(path, ProductError)
+        except ProductError as error:
+            raise ProductError(f"{folder} holds images that cannot be read ({error}); choose another --out") from None
         # No CCD depends on the others.
-        if resume and isinstance(before, dict) and isinstance(before.get("run"), dict):
+        if resume and isinstance(before.get("run"), dict):
             before["run"]["ccds"] = now["run"]["ccds"]
-        found = differences(before, now) if isinstance(before, dict) else ["all"]
+        found = differences(before, now)
         if found:
             text = "; ".join(found[:3])
             raise ProductError(f"{folder} holds images of another configuration ({text}); choose another --out")
-    elif left := sorted(folder.glob("image_*.fits")):
-        raise ProductError(f"{folder} holds {left[0].name} but no {CONFIG_NAME}; choose another --out")
-    for left_over in folder.glob(".*.partial"):
-        left_over.unlink(missing_ok=True)
-    write_bytes(path, config.to_yaml().encode())
+        write_bytes(path, config.to_yaml().encode())
+    remove_leftovers(folder)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from ..core.errors import PrescriptionError
+from ..core.files import require_file
 
 if TYPE_CHECKING:
     import trimesh
@@ -27,8 +28,7 @@ def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh:
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise PrescriptionError(f"expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}", file=path)
-    if not path.is_file():
-        raise PrescriptionError("no such file", file=path)
+    require_file(path, PrescriptionError)
     try:
         # Unless merged, unprocessed: processing drops vertices that are not finite and joins corners.
         mesh = trimesh.load(path, force="mesh") if merged else trimesh.load_scene(path, process=False)

@@ -40,12 +40,14 @@ def rotation_matrix(tilt: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Telescope:
-    """An unfolded optical prescription.
+    r"""An unfolded optical prescription.
 
     Parameters
     ----------
     name, source, version, description : str
-        Name, source, version and description of the prescription.
+        Name, source, version and description of the prescription. Names, those of surfaces too, are printable
+        characters of any script; FITS products have them as ASCII with escapes such as ``\xfc``, and pictures letter
+        by letter.
     surfaces : tuple of Surface
         Surfaces in the order of the light.
     stop_z : float
@@ -109,6 +111,9 @@ class Telescope:
         names = [s.name for s in self.surfaces]
         if not names:
             raise PrescriptionError("surfaces = []: expected at least one surface")
+        for key, text in (("name", self.name), *(("surface name", n) for n in names)):
+            if not text.isprintable():
+                raise PrescriptionError(f"{key} = {text!r}: expected letters, signs and spaces, no control characters")
         for repeated in {n for n in names if names.count(n) > 1}:
             raise PrescriptionError(f"surface name {repeated!r} occurs more than once: expected unique names")
         medium = self.medium_before

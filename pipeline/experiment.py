@@ -24,7 +24,7 @@ from ..models.camera.height_budget import load_budget
 from ..models.camera.silicon import Silicon
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
-from ..models.io.prescription import ENDINGS, bundled_names
+from ..models.io.prescription import ENDINGS, bundled_names, prescription_digest
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
@@ -213,14 +213,15 @@ class Experiment:
         """SHA-256 of all settings that affect the product of a CCD.
 
         The list of CCDs is left out, since no CCD depends on the others. A file named in the configuration counts by
-        its content, not by its path.
+        its content, not by its path, and so do the files that a prescription names.
         """
         content = self.config.as_dict()
         del content["ccds"]
         if not self.config.detector.silicon:
             # Nothing is made of it.
             del content["detector"]
-        content["telescope"] = _name_or_content(given(self.config.telescope), bundled_names())
+        name = given(self.config.telescope)
+        content["telescope"] = name if name in bundled_names() else prescription_digest(name)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())
         return digest(content)

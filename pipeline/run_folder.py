@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..core.errors import PachonError, ProductError
-from ..core.files import write_bytes
+from ..core.files import remove_leftovers, write_bytes, write_new_bytes
 from ..core.products import Stamp
 from ..core.version import VERSION
 from .ccd_product import product_path, read_product
@@ -24,26 +24,25 @@ def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     path = folder / CONFIG_NAME
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        exists = path.exists()
+        finished = sorted(folder.glob("ccd_*.fits"))
+        if finished and not path.exists():
+            raise ProductError(f"{folder} holds {finished[0].name} but no {CONFIG_NAME}; choose another --out")
     except OSError as error:
         raise ProductError(f"cannot make the folder {folder}: {error.strerror}") from None
-    if exists:
+    heading = (
+        f"pachon {VERSION}: all that decides this run.",
+        "The same bytes again: pachon run config.yaml --out OTHER",
+    )
+    content = to_yaml(experiment.config, heading).encode()
+    # Of runs that start together, one makes the file, and the others compare theirs with it.
+    if not write_new_bytes(path, content):
         try:
             before = load_configuration(path)
         except PachonError as error:
             raise ProductError(f"{folder} holds a run that cannot be read ({error}); choose another --out") from None
         _refuse_other(folder, before, experiment.config, resume)
-    else:
-        finished = sorted(folder.glob("ccd_*.fits"))
-        if finished:
-            raise ProductError(f"{folder} holds {finished[0].name} but no {CONFIG_NAME}; choose another --out")
-    for left_over in folder.glob(".*.partial"):
-        left_over.unlink(missing_ok=True)
-    heading = (
-        f"pachon {VERSION}: all that decides this run.",
-        "The same bytes again: pachon run config.yaml --out OTHER",
-    )
-    write_bytes(path, to_yaml(experiment.config, heading).encode())
+        write_bytes(path, content)
+    remove_leftovers(folder)
 
 
 def _refuse_other(folder: Path, before: Configuration, now: Configuration, resume: bool) -> None:

@@ -13,6 +13,7 @@ from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
 from ..core.errors import ProductError
+from ..core.files import require_file
 from ..core.memory import require_bytes
 from ..core.random_streams import stream
 from ..core.units import ARCMIN
@@ -74,6 +75,7 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
     ProductError
         If the file cannot be read, or has no image, celestial coordinates or zero point.
     """
+    require_file(Path(path), ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
         try:

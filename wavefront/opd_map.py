@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.errors import DomainError
-from ..core.plotting import BLUE, figure_of, new_figure, styled
+from ..core.plotting import BLUE, figure_of, new_figure, plain_text, styled
 from ..models.zernike_polynomials import NOLL_NAMES
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class OpdMap(_PupilMaps):
             _draw_map(panels["rest"], self, self.without_tilt, "piston and tilt removed")
             if zernikes is not None:
                 _draw_bars(panels["bars"], zernikes)
-            subject = f"{name}: optical" if name else "Optical"
+            subject = f"{plain_text(name)}: optical" if name else "Optical"
             title = f"{subject} path difference at field ({tx:g}, {ty:g}) deg, {self.wavelength * 1e9:g} nm"
             figure.suptitle(title, fontsize=11)
             return figure

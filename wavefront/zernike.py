@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..core.errors import DomainError
+from ..core.units import require_positive
 from ..models.zernike_polynomials import annular_zernikes
 from .opd_map import OpdMap, ZernikeFit
 
@@ -27,11 +28,15 @@ def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int
     Raises
     ------
     DomainError
-        If fewer points are lit than there are terms.
+        If fewer points are lit than there are terms, or the radius is not about that of the lit points: a tenth of the
+        farthest to ten times.
     """
-    lit = opd.lit
+    pupil_radius, lit = require_positive(pupil_radius, "pupil_radius", "metres"), opd.lit
     if lit.sum() < jmax:
         raise DomainError(f"jmax = {jmax}: only {int(lit.sum())} pupil points are lit; expected at least as many")
+    farthest = float(np.hypot(opd.x[lit], opd.y[lit]).max())
+    if not 0.1 * pupil_radius <= farthest <= 10.0 * pupil_radius:
+        raise DomainError(f"pupil_radius = {pupil_radius:g} m: expected about that of the lit points, {farthest:.4g} m")
     terms = annular_zernikes(jmax, opd.x[lit] / pupil_radius, opd.y[lit] / pupil_radius, obscuration)
     coefficients, *_ = np.linalg.lstsq(terms.T, opd.value[lit], rcond=None)
     residual = opd.value[lit] - coefficients @ terms

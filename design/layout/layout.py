@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, plain_text, styled
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
@@ -113,7 +113,7 @@ class Layout:
                 _draw(left, drawing, whole, set(names), beams=True)
             legend_below(figure, left, 8)
             figure.suptitle(
-                f"{self.telescope.name}: section x = 0, rays of {self.wavelength * 1e9:.4g} nm; "
+                f"{plain_text(self.telescope.name)}: section x = 0, rays of {self.wavelength * 1e9:.4g} nm; "
                 f"light comes from {'the left' if drawing.lying else 'above'}",
                 fontsize=11,
             )
@@ -295,7 +295,7 @@ def _write_names(axes: Axes, labels: list[tuple[str, np.ndarray]], lying: bool) 
     for (name, rim), place in zip(labels, places, strict=True):
         end: Any = (place, edge) if lying else (edge, place)
         axes.annotate(
-            name,
+            plain_text(name),
             xy=(rim[0], rim[1]),
             xytext=end,
             rotation=60 if lying else 0,

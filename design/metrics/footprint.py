@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.plotting import RED, styled
+from ...core.plotting import RED, plain_text, styled
 from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
@@ -187,7 +187,7 @@ def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Any], na
     known = footprint.arriving_points().reshape(-1, 2)
     known = known[np.isfinite(known).all(axis=-1)]
     if not len(known):
-        axes.set_title(f"{surface.name}: no ray arrives", loc="left")
+        axes.set_title(f"{plain_text(surface.name)}: no ray arrives", loc="left")
         axes.set_axis_off()
         return
     middle, half = _frame(known)
@@ -212,4 +212,4 @@ def _draw_surface(axes: Axes, footprint: SurfaceFootprint, colors: list[Any], na
     worst = float(footprint.blocked_fraction.max())
     if worst > 0:
         axes.set_xlabel(f"blocks up to {100 * worst:.2g} %", fontsize=8, color=RED)
-    axes.set_title(surface.name, loc="left", fontsize=9)
+    axes.set_title(plain_text(surface.name), loc="left", fontsize=9)

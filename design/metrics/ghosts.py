@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from ...core.errors import DomainError
-from ...core.plotting import RED, new_figure, styled
+from ...core.plotting import RED, new_figure, plain_text, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
@@ -309,7 +309,7 @@ def _draw_ghost(axes: Axes, ghost: Ghost, magnitude: float) -> None:
     axes.set(facecolor="black", aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color("0.8")
-    axes.set_title(f"{ghost.first}\n{ghost.second}", fontsize=8, color=RED)
+    axes.set_title(f"{plain_text(ghost.first)}\n{plain_text(ghost.second)}", fontsize=8, color=RED)
     axes.set_xlabel(
         f"⌀ {ghost.diameter * 1e3:.3g} mm\nflux {ghost.flux:.2g}\n"
         f"peak {ghost.peak * 1e-6:.2g}/mm²\n{magnitude:.1f} mag/arcsec²",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError, PachonError, check_choice
-from ...core.plotting import BLUE, GREY, RED, new_figure, styled
+from ...core.plotting import BLUE, GREY, RED, new_figure, plain_text, styled
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ..parameters.degrees_of_freedom import DegreesOfFreedom
@@ -121,13 +121,13 @@ class MonteCarlo:
             left.legend(loc="lower right")
             left.set_title(f"{len(self.merit)} draws, {self.method}")
             right.barh(np.arange(len(shown)), self.contribution[shown] * scale, color=BLUE, height=0.7)
-            right.set_yticks(np.arange(len(shown)), [self.tolerances[i].name for i in shown])
+            right.set_yticks(np.arange(len(shown)), [plain_text(self.tolerances[i].name) for i in shown])
             right.invert_yaxis()
             right.set_xlabel(f"contribution, added in squares [{unit}]")
             compensated = f", compensated by {', '.join(self.compensators)}" if self.compensators else ""
             more = f" (largest {_BARS} of {len(self.contribution)})" if len(self.contribution) > _BARS else ""
             right.set_title(f"each tolerance alone{more}")
-            figure.suptitle(f"{self.telescope}: within tolerances{compensated}", fontsize=11)
+            figure.suptitle(f"{plain_text(self.telescope)}: within tolerances{compensated}", fontsize=11)
             return figure
 
 

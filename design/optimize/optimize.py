@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from ...core.errors import ConfigError, DomainError, PachonError
-from ...core.plotting import BLUE, GREY, new_figure, styled
+from ...core.plotting import BLUE, GREY, new_figure, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
@@ -108,10 +108,10 @@ class Optimum:
             steps.semilogy(range(len(self.history)), self.history * 1e6, "o-", color=BLUE, markersize=4)
             steps.xaxis.set_major_locator(MaxNLocator(integer=True))
             steps.grid(True, which="major", linewidth=0.3)
-            steps.set(xlabel="step", ylabel=f"rms of {self.merit_name} [µm]", title=self.telescope.name)
+            steps.set(xlabel="step", ylabel=f"rms of {self.merit_name} [µm]", title=plain_text(self.telescope.name))
             places = np.arange(len(names))
             bars.barh(places, np.abs(self.changes) * self.effect * 1e6, color=GREY, height=0.7)
-            bars.set_yticks(places, names)
+            bars.set_yticks(places, [plain_text(name) for name in names])
             bars.invert_yaxis()
             bars.set_xlabel("change of each times its effect, rms [µm]")
             return figure

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, new_figure, styled
+from ...core.plotting import BLUE, new_figure, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label
 from ...models.telescope import Telescope
@@ -102,7 +102,7 @@ class Sensitivity(FieldResult):
         size = np.sqrt((self.matrix[:, first - 1 :] ** 2).mean(axis=0))
         largest = size.max(axis=0)
         with styled():
-            names = self.parameters.names
+            names = [plain_text(name) for name in self.parameters.names]
             figure = new_figure(min(14.0, 4.5 + 0.22 * len(names)), 4.6)
             axes, modes = figure.subplots(1, 2, width_ratios=[2.2, 1.0])
             shown = np.log10(np.maximum(size / np.where(largest > 0, largest, 1.0), 1e-4))
@@ -111,10 +111,17 @@ class Sensitivity(FieldResult):
             image = axes.imshow(shown, extent=box, cmap="viridis", aspect="auto", vmin=-4.0, vmax=0.0)
             bar = figure.colorbar(image, ax=axes, label="of the largest term of each", ticks=range(-4, 1))
             bar.ax.set_yticklabels([f"$10^{{{k}}}$" if k else "1" for k in range(-4, 1)])
-            axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8 if len(names) <= 24 else 5)
+            axes.set_xticks(
+                range(len(names)),
+                [plain_text(name) for name in names],
+                rotation=90,
+                fontsize=8 if len(names) <= 24 else 5,
+            )
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_ylabel("Noll index")
-            axes.set_title(f"{self.telescope}, {self.wavelength * 1e9:g} nm: rms over {len(self.fields)} fields")
+            axes.set_title(
+                f"{plain_text(self.telescope)}, {self.wavelength * 1e9:g} nm: rms over {len(self.fields)} fields"
+            )
             values, _ = self.modes()
             modes.semilogy(np.arange(1, len(values) + 1), values, "o-", color=BLUE, markersize=3.5, linewidth=0.9)
             modes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.io import fits
 
 from ...core.errors import ConfigError
-from ...core.products import table_hdu, write_ecsv, write_fits
+from ...core.products import card_text, table_hdu, write_ecsv, write_fits
 from ...core.version import CREATOR, VERSION
 from .sensitivity import Sensitivity
 
@@ -43,9 +43,10 @@ def write_sensitivity(path: Path, result: Sensitivity) -> None:
     if path.suffix != ".fits":
         raise ConfigError(f"--out {path}: expected a name that ends in .fits or .ecsv")
     fields = {"X": (x, "deg", "field angle"), "Y": (y, "deg", "field angle")}
+    addresses = [card_text(name) for name in names]
     listed = fits.BinTableHDU.from_columns(
         [
-            fits.Column(name="ADDRESS", array=list(names), format=f"{max(map(len, names))}A"),
+            fits.Column(name="ADDRESS", array=addresses, format=f"{max(map(len, addresses))}A"),
             fits.Column(name="UNIT", array=units, format="8A"),
         ],
         name="PARAMETERS",

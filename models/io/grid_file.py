@@ -17,7 +17,7 @@ from astropy import units as u
 from astropy.io import fits
 
 from ...core.errors import PrescriptionError, error_context
-from ...core.files import write_bytes
+from ...core.files import require_file, write_bytes
 from ..shapes.grid import GridSag
 
 
@@ -35,11 +35,12 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
         If the file cannot be read, has no image of two dimensions, a unit that is no length, or is no valid grid.
     """
     path = Path(path)
+    require_file(path, PrescriptionError)
     try:
         with fits.open(path, memmap=False) as hdus:
             images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
+        reason = " ".join(str(error).split())
         raise PrescriptionError(f"cannot be read as FITS ({reason[:120]})", file=path) from None
     if not images:
         raise PrescriptionError("expected a FITS image of two dimensions", file=path)

@@ -26,17 +26,20 @@ Telescope frame: origin at the primary's vertex, +z towards the sky; a positive 
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from ...core.errors import PrescriptionError, unknown_name
-from ...core.files import write_bytes
+from ...core.files import read_bytes, write_bytes
+from ...core.yaml_reader import read_mapping
 from ..telescope import Telescope
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
-from .yaml.reader import read_telescope
+from .yaml.reader import MAX_BYTES, read_telescope
 from .yaml.writer import telescope_to_yaml
 from .zemax.file import read_zemax_file
 from .zemax.reader import read_lens
@@ -110,6 +113,39 @@ def load_telescope(
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError("expected a prescription file that ends in .yaml, .zmx or .seq", file=path)
     raise unknown_name("telescope", text, BUNDLED)
+
+
+def prescription_digest(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a prescription file and of the files that it names: grids, meshes, glass catalogues.
+
+    That of a file that names no other is the SHA-256 of its bytes.
+
+    Raises
+    ------
+    PrescriptionError
+        If a file cannot be read.
+    """
+    path = Path(path)
+    own = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
+    if path.suffix.lower() in _LENS_FILES:
+        named = [path.with_suffix(".agf").name]
+    else:
+        named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
+    # os.path takes every text, also such as are too long for a name.
+    files = [name for name in named if os.path.isfile(path.parent / name)]
+    if not files:
+        return own
+    contents = [own, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
+    return hashlib.sha256("".join(contents).encode()).hexdigest()
+
+
+def _texts(content: Any) -> Iterator[str]:
+    """Yield all values of plain mappings and lists that are texts."""
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, (dict, list)):
+        for part in content.values() if isinstance(content, dict) else content:
+            yield from _texts(part)
 
 
 @cache

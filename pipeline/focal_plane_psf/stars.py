@@ -13,6 +13,7 @@ from astropy.io.registry import IORegistryError
 from astropy.table import Table
 
 from ...core.errors import DomainError, ProductError
+from ...core.files import require_file
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from ..measure.shapes import Shapes, measure_shapes
@@ -183,6 +184,7 @@ class FocalPlaneStars:
             if not files:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
             return cls.from_products([read_product(f, holdout_images=False) for f in files], **options)
+        require_file(place, ProductError)
         try:
             table = (
                 Table.read(place)

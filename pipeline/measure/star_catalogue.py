@@ -14,6 +14,7 @@ from astropy.table import Table
 from astropy.table.meta import YamlParseError
 
 from ...core.errors import ProductError
+from ...core.files import read_bytes
 
 
 class StarCutouts(NamedTuple):
@@ -59,7 +60,7 @@ def load_stars(
         If a file is missing, cut short, of another kind, or lacks a column; one line that names it.
     """
     path = Path(catalogue)
-    data = _bytes(path)
+    data = read_bytes(path, ProductError)
     hdus: fits.HDUList | None = None
     if data.startswith(b"SIMPLE"):
         hdus = _fits(path, data)
@@ -74,7 +75,7 @@ def load_stars(
 
     cube = None
     if images is not None:
-        cube = _first_cube(_fits(Path(images), _bytes(Path(images))))
+        cube = _first_cube(_fits(Path(images), read_bytes(Path(images), ProductError)))
         if cube is None:
             raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
     names = {name.lower(): name for name in columns}
@@ -92,14 +93,6 @@ def load_stars(
     if len(stamps) != len(positions):
         raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
     return StarCutouts(stamps, positions)
-
-
-def _bytes(path: Path) -> bytes:
-    """Return the content of a file."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ProductError(f"cannot read {path}: {error.strerror}") from None
 
 
 def _fits(path: Path, data: bytes) -> fits.HDUList:

@@ -11,6 +11,7 @@ from astropy.table import Table
 from scipy.stats import norm, qmc
 
 from ...core.errors import ConfigError
+from ...core.files import require_file
 from ...core.random_streams import stream
 from .file import Design, SweepFile, SweptParameter
 
@@ -113,10 +114,9 @@ def _quantiles(parameter: SweptParameter, u: np.ndarray) -> list[Any]:
 
 def _from_table(path: Path) -> list[Point]:
     """Return the rows of an ECSV table as points."""
+    require_file(path, ConfigError)
     try:
         table = Table.read(path, format="ascii.ecsv")
-    except FileNotFoundError:
-        raise ConfigError("no such file; expected an ECSV table of points", file=path) from None
     except Exception as error:
         # Readers of astropy raise many kinds of errors for files that are no tables.
         raise ConfigError(f"no ECSV table ({' '.join(str(error).split())[:120]})", file=path) from None

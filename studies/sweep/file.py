@@ -28,6 +28,7 @@ from pydantic import BeforeValidator, Field
 from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
+from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
 
 #: Folder of the bundled sweeps.
@@ -85,13 +86,16 @@ class SweepFile(Section):
     def digest(self) -> str:
         """SHA-256 of the sweep, including the contents of the files that it names."""
         named: list[Any] = [self.design.file]
+        telescope = None
         if isinstance(self.base, dict):
-            named.append(self.base.get("telescope"))
+            telescope = self.base.get("telescope")
             for section, key in _FILES:
                 content = self.base.get(section)
                 named.append(content.get(key) if isinstance(content, dict) else None)
         files = [path for path in named if isinstance(path, str) and Path(path).is_file()]
         contents = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files}
+        if isinstance(telescope, str) and Path(telescope).is_file():
+            contents[telescope] = prescription_digest(telescope)
         return digest({"sweep": self.model_dump(mode="json"), "files": contents})
 
 

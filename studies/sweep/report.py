@@ -78,7 +78,8 @@ def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Cu
             picture = Picture(f"Error budget of {metric}", plots.budget_plot(found), _budget_text(found))
             yield f"budget_{metric}", picture
     if sweep.xi_target is not None:
-        for metric in correlated:
+        # A metric that nothing raises, as xi of a single CCD may be, has no place on logarithmic axes.
+        for metric in (m for m in correlated if any(np.any(curve.change > 0) for curve in drawn[m])):
             allowed = allowances(drawn[metric], sweep.xi_target)
             each = (f"{a.parameter}: {a.alone:.3g} alone, {a.shared:.3g} with an equal share" for a in allowed
                     if np.isfinite(a.alone))  # fmt: skip

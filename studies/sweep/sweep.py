@@ -94,6 +94,8 @@ def run_sweep(
             chosen = workers(PointMeasurement(sweep, str(folder.resolve())))
             with reporter.stage(f"{sweep.name}: {len(missing)} points, {chosen.description}", len(missing)) as stage:
                 for number, result in enumerate(chosen.results(missing), start=1):
+                    # Each point reads the telescope again: one of another telescope is never kept.
+                    check_same_sweep(store, sweep)
                     store.write(result)
                     stage.advance()
                     if result.problem is not None:

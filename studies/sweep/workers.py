@@ -11,6 +11,8 @@ import logging
 import os
 import re
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -33,6 +35,8 @@ Measure = Callable[[SweepPoint, int], PointResult]
 AHEAD = 2
 #: Variables that bound the threads of libraries.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+#: Time between two looks of a worker at whether its driver lives [s].
+PARENT_SECONDS = 0.5
 #: Longest wait for an answer of a scheduler [s].
 CONNECT_SECONDS = 20.0
 
@@ -66,7 +70,7 @@ def process_workers(measure: Measure, count: int, threads: int | None = None) ->
         # A fresh interpreter, not a fork: Warp and OpenMP keep threads that a fork would lose. Variables that bound the
         # threads of libraries must be set before a worker imports them.
         with _environment({name: str(each) for name in _THREAD_VARIABLES}):
-            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_leave_interrupts)
+            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin)
             waiting: set[Future[PointResult]] = set()
             try:
                 for point in points:
@@ -92,9 +96,17 @@ def worker_name() -> str:
     return f"{os.uname().nodename if hasattr(os, 'uname') else 'machine'}:{os.getpid()}"
 
 
-def _leave_interrupts() -> None:
-    """Let Ctrl-C end the process that hands out points, not those that compute them."""
+def _begin() -> None:
+    """Let Ctrl-C end the process that hands out points, not those that compute them; these end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent has gone: one that is killed cannot tell its workers."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_SECONDS)
+    os._exit(1)
 
 
 @contextmanager

@@ -2,12 +2,15 @@
 
 import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, PachonError, ProductError
+from pachon.core.files import _owner
 from pachon.core.progress import Reporter
 from pachon.pipeline import run as run_module
 from pachon.pipeline import run_folder
@@ -27,6 +30,12 @@ CHANGES_EVERY_TIME = "timings.json"
 
 def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.name != CHANGES_EVERY_TIME}
+
+
+def ended_process():
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
 
 
 @pytest.fixture
@@ -73,7 +82,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(finished_run, copied, 
     # As a kill leaves it: one CCD done, a part of the next, nothing after that.
     for name in ("ccd_R24_S12.fits", "summary.json", "report.html"):
         (copied / name).unlink()
-    (copied / ".ccd_R24_S12.fits.partial").write_bytes(b"SIMPLE")
+    (copied / f".ccd_R24_S12.fits.{_owner(ended_process())}.partial").write_bytes(b"SIMPLE")
     done = []
     real = ccd_loop.expose_ccd
     monkeypatch.setattr(ccd_loop, "expose_ccd", lambda e, name, **k: done.append(name) or real(e, name, **k))

@@ -1,5 +1,7 @@
 """Annular Zernikes against Noll's and Mahajan's closed forms, quadrature and GalSim."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -136,3 +138,15 @@ def test_fits_of_a_map_are_those_of_galsim(lsst_r):
     theirs = np.linalg.lstsq(basis.T, opd.waves[opd.lit], rcond=None)[0]
     # Both are least squares on the same points; GalSim's recursions for annuli keep some ten digits.
     assert np.abs(fit.coefficients / 620e-9 - theirs[1:]).max() < 1e-8
+
+
+@pytest.mark.parametrize("radius", [0.0, -4.18, math.nan, math.inf, "wide", 4180.0, 4.18e-3])
+def test_a_radius_that_is_not_the_pupils_is_refused_in_one_line(radius, capfd):
+    opd = pachon.wavefront_opd(pachon.load_telescope("paul_baker"), field=(0.0, 0.0), wavelength=620e-9, grid=16)
+    own = pachon.load_telescope("paul_baker").pupil_diameter / 2.0
+    fit_zernikes(opd, own, 0.5, jmax=6)
+    wrong = radius * own / 4.18 if isinstance(radius, float) else radius
+    with pytest.raises(DomainError, match=r"^pupil_radius = ") as caught:
+        fit_zernikes(opd, wrong, 0.5, jmax=6)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().out == ""

@@ -18,6 +18,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
 from ....core.errors import HeightWarning, PrescriptionError, error_context
+from ....core.files import require_file
 from ...camera.camera import Camera
 from ...camera.ccd_surfaces import CcdSurfaces
 from ...camera.height_fit import fit_heights
@@ -93,6 +94,7 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
     """Return the table of a file, or the points of its images by name."""
     if path.suffix.lower() not in ENDINGS:
         raise PrescriptionError(f"expected a file of heights that ends in {', '.join(ENDINGS)}", file=path)
+    require_file(path, PrescriptionError)
     try:
         if path.suffix.lower() == ".ecsv":
             return Table.read(path, format="ascii.ecsv")
@@ -103,7 +105,7 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
                 return Table.read(hdus)
             return image_points(images, hdus[0].header, path)
     except _FITS_PROBLEMS as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
+        reason = " ".join(str(error).split())
         raise PrescriptionError(f"cannot be read ({reason[:120]})", file=path) from None
 
 

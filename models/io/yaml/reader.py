@@ -211,9 +211,13 @@ class Prescription(Section):
         )
 
 
+#: Longest prescription [byte]: grids and meshes may be written out in it.
+MAX_BYTES = 64_000_000
+
+
 def read_telescope(path: Path) -> Telescope:
     """Read a prescription file; PrescriptionError of one line with file, key, value and expected value."""
-    content = read_mapping(path)
+    content = read_mapping(path, max_bytes=MAX_BYTES)
     prescription = validated(Prescription, content, str(path), PrescriptionError, {"folder": path.parent})
     with error_context(file=path):
         return prescription.telescope()

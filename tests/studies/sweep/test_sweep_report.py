@@ -42,3 +42,18 @@ def test_effects_budget_and_allowances_are_those_of_a_sum_of_squares(tmp_path):
     pictures = {path.name for path in report.parent.glob("*.png")}
     assert pictures == {f"{kind}xi_raw_short.png" for kind in ("curves_", "budget_", "allowance_")} | {"tornado.png"}
     assert "they add, as far as this tells" in report.read_text()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("slope", [0.0, -1.0, math.nan])
+def test_a_metric_that_nothing_raises_has_a_report_without_allowances(tmp_path, slope):
+    points = numbered_points(SWEEP, Path())
+    create_store(tmp_path / "s.sweep", SWEEP, points, {})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            metrics = {"fwhm": 1.0 + p.parameters["a"], "xi_raw_short": 1e-6 + slope * p.parameters["a"]}
+            store.write(PointResult(p.number, metrics, None, 0.1, "here"))
+        report = write_report(store, tmp_path / "report")
+    pictures = {path.name for path in report.parent.glob("*.png")}
+    assert "curves_fwhm.png" in pictures
+    assert not any(name.startswith("allowance") for name in pictures)

@@ -1,0 +1,126 @@
+"""Products of two telescopes or two configurations never come into one folder."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pachon.core.errors import ConfigError, ProductError
+from pachon.core.files import _owner, remove_leftovers, write_new_bytes
+from pachon.models.io.grid_file import write_grid
+from pachon.models.io.prescription import load_telescope, prescription_digest, save_telescope
+from pachon.models.shapes.grid import GridSag
+from pachon.pipeline import run_folder
+from pachon.pipeline.config import load_configuration
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.run_folder import claim_folder
+from pachon.studies.sweep.file import load_sweep
+from pachon.studies.sweep.store import PointResult, SweepStore
+from pachon.studies.sweep.sweep import run_sweep
+from pachon.studies.sweep.workers import Workers
+
+
+def _grid(path, height):
+    nodes = np.linspace(-6.0, 6.0, 5)
+    write_grid(GridSag(nodes, nodes, np.full((5, 5), height)), path)
+
+
+@pytest.fixture
+def configuration(tmp_path):
+    """Configuration of a telescope that names a FITS file."""
+    _grid(tmp_path / "grid.fits", 0.0)
+    telescope = load_telescope("lsst_v3.3_r")
+    save_telescope(replace(telescope, description="grid.fits"), tmp_path / "mine.yaml")
+    path = tmp_path / "run.yaml"
+    path.write_text("telescope: mine.yaml\nccds: [R22_S11]\n")
+    return path
+
+
+def test_the_hash_of_a_run_is_of_the_files_that_its_prescription_names(configuration):
+    folder = configuration.parent
+
+    def hashed():
+        return Experiment.from_config(load_configuration(configuration), folder).config_hash
+
+    before, content = hashed(), (folder / "grid.fits").read_bytes()
+    _grid(folder / "grid.fits", 1e-6)
+    assert hashed() != before
+    (folder / "grid.fits").write_bytes(content)
+    assert hashed() == before
+    (folder / "grid.fits").unlink()
+    assert hashed() != before
+
+
+def test_a_catalogue_beside_a_lens_file_counts(tmp_path):
+    (tmp_path / "lens.zmx").write_text("VERS\n")
+    before = prescription_digest(tmp_path / "lens.zmx")
+    (tmp_path / "lens.agf").write_text("CC\n")
+    assert prescription_digest(tmp_path / "lens.zmx") != before
+
+
+@pytest.mark.parametrize("edited", ["mine.yaml", "grid.fits"])
+def test_a_sweep_stops_where_its_telescope_is_edited(configuration, edited):
+    folder = configuration.parent
+    path = folder / "sweep.yaml"
+    path.write_text("base: run.yaml\nparameters: {M2.dz_um: {values: [0, 1, 2]}}\ndesign: {kind: grid}\n")
+    sweep = load_sweep(path)
+
+    def results(points):
+        for point in points:
+            if point.number == 1:
+                with open(folder / edited, "ab") as file:
+                    file.write(b"\n")
+            yield PointResult(point.number, {"fwhm": 1.0}, None, 0.0, "here")
+
+    with pytest.raises(ConfigError, match="other file contents") as caught:
+        run_sweep(sweep, folder / "s.db", folder=folder, workers=lambda _: Workers("these", results))
+    assert "\n" not in str(caught.value)
+    with SweepStore(folder / "s.db") as store:
+        assert store.finished() == {0}
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_new_file_is_written_once_and_whole(tmp_path, links, monkeypatch):
+    if not links:
+        # As on a file system without hard links.
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(PermissionError(1, "no links")))
+    assert write_new_bytes(tmp_path / "config.yaml", b"first")
+    assert not write_new_bytes(tmp_path / "config.yaml", b"other")
+    assert (tmp_path / "config.yaml").read_bytes() == b"first"
+    assert [p.name for p in tmp_path.iterdir()] == ["config.yaml"]
+
+
+def test_a_run_that_comes_second_in_a_new_folder_is_refused(tmp_path, configuration, monkeypatch):
+    first, second = (
+        Experiment.from_config(load_configuration(configuration).model_copy(update={"seed": seed}), tmp_path)
+        for seed in (1, 2)
+    )
+    folder = tmp_path / "out"
+    # The first run writes its configuration after the second has found none.
+    real = run_folder.write_new_bytes
+
+    def late(path, content):
+        monkeypatch.setattr(run_folder, "write_new_bytes", real)
+        claim_folder(folder, first, resume=False)
+        return real(path, content)
+
+    monkeypatch.setattr(run_folder, "write_new_bytes", late)
+    with pytest.raises(ProductError, match="another configuration"):
+        claim_folder(folder, second, resume=False)
+    assert load_configuration(folder / "config.yaml").seed == 1
+
+
+def test_temporary_files_of_live_processes_and_other_machines_stay(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    owners = {"live": _owner(os.getpid()), "ended": _owner(ended.pid), "elsewhere": f"another-machine-{ended.pid}"}
+    for owner in owners.values():
+        (tmp_path / f".ccd.fits.{owner}.partial").write_bytes(b"")
+    remove_leftovers(tmp_path)
+    assert {n for n, owner in owners.items() if (tmp_path / f".ccd.fits.{owner}.partial").exists()} == {
+        "live",
+        "elsewhere",
+    }

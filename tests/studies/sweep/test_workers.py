@@ -1,0 +1,50 @@
+"""Workers of a sweep end with the process that hands out its points."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+_DRIVER = """
+import os, time
+from pachon.studies.sweep.workers import process_workers
+
+def wait(point, threads):
+    print(os.getpid(), flush=True)
+    time.sleep(60.0)
+
+if __name__ == "__main__":
+    list(process_workers(wait, 1).results([0]))
+"""
+
+
+def _lives(process):
+    # A process that ended but whose new parent has not taken notice is a zombie, in state Z.
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="processes are looked up in /proc")
+def test_workers_end_after_their_driver_is_killed(tmp_path):
+    (tmp_path / "driver.py").write_text(_DRIVER)
+    driver = subprocess.Popen([sys.executable, "driver.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True,
+                              env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
+    worker = int(driver.stdout.readline())
+    assert _lives(worker)
+    driver.send_signal(signal.SIGKILL)
+    driver.wait()
+    driver.stdout.close()
+    for _ in range(40):
+        if not _lives(worker):
+            break
+        time.sleep(0.1)
+    else:
+        os.kill(worker, signal.SIGKILL)
+        pytest.fail("the worker outlived its driver by 4 s")
