@@ -22,6 +22,14 @@ SETTINGS = {
 }
 
 
+@pytest.fixture(scope="session", autouse=True)
+def coarse_pictures():
+    """Pictures of few pixels: tests look at what is drawn, not at how finely."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pachon.core.plotting._DPI", 60)
+        yield
+
+
 @pytest.fixture(scope="session")
 def lsst_r():
     return pachon.load_telescope("lsst_v3.3_r")

@@ -63,7 +63,7 @@ def simulate_ccds(
         for i, name in enumerate(names, start=1):
             try:
                 stars = None if fields is None else fields[name]
-                exposure = expose_ccd(experiment, name, stars, threads=threads, progress=stage.advance)
+                exposure = expose_ccd(experiment, name, stars=stars, threads=threads, progress=stage.advance)
             except PachonError as error:
                 raise error.within(subject=f"CCD {name}") from None
             due, pending = pending, [(name, modeller.submit(model, exposure))]

@@ -75,7 +75,7 @@ def test_content_without_bound_is_refused_at_once_in_one_line(tmp_path, text, re
     assert len(str(caught.value)) < 400 + len(str(path))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_saved_telescope_with_a_grid_of_many_nodes_is_read_again(tmp_path):
     nodes = np.linspace(-1.0, 1.0, 240)
     plain = load_telescope("paul_baker")

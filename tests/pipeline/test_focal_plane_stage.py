@@ -137,7 +137,7 @@ def test_default_runs_have_no_more_columns(finished_run):
     assert "warnings" not in summary
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_finished_run_resumed_on_two_threads_has_the_same_bytes(whole_run, focal_plane_config, tmp_path, no_report):
     shutil.copytree(whole_run, tmp_path / "copy")
     (tmp_path / "copy" / FOCAL_PLANE_PSF_NAME).unlink()

@@ -71,10 +71,29 @@ def made(tmp_path_factory):
         return bench, reproduce(["all"], bench)
 
 
+@pytest.fixture
+def few_galaxies(monkeypatch):
+    """Some hundred galaxies in place of ten thousand."""
+    monkeypatch.setattr("pachon.studies.visits.null_test._FAINTEST_SNR", 60.0)
+    monkeypatch.setattr("pachon.studies.reproduce.visits._FAINTEST", 25.0)
+
+
+def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
+    bench = Bench(TINY, tmp_path, threads=2)
+    summary = reproduce(["fig10", "fig15", "fig16", "fig17", "fig18"], bench)["figures"]
+    stacks = json.loads((tmp_path / "visits" / "summary.json").read_text())["stacks"]
+    assert summary["fig15"]["measured"]["rms_e_2"] == pytest.approx(stacks["2"]["rms_e"], rel=1e-8)
+    galaxies = json.loads((tmp_path / "visits" / "null_test.json").read_text())["stacks"]
+    assert summary["fig17"]["measured"]["usable_per_arcmin2_1"] == pytest.approx(galaxies["1"]["usable_per_arcmin2"])
+    assert list(table(bench, "fig18.ecsv")["visits"]) == [1, 2]
+    assert summary["fig10"]["measured"]["limit_6000s_mag"] > summary["fig10"]["measured"]["limit_one_exposure_mag"] + 3
+
+
 def table(bench, name):
     return Table.read(bench.folder / name, format="ascii.ecsv")
 
 
+@pytest.mark.slow
 def test_all_figures_leave_pictures_data_and_one_summary(made):
     bench, summary = made
     assert list(summary["figures"]) == list(FIGURES)
@@ -92,6 +111,7 @@ def test_all_figures_leave_pictures_data_and_one_summary(made):
     assert not list(bench.folder.glob(".*.partial"))
 
 
+@pytest.mark.slow
 def test_data_say_where_they_come_from(made):
     bench, _ = made
     meta = table(bench, "fig8.ecsv").meta
@@ -101,6 +121,7 @@ def test_data_say_where_they_come_from(made):
     assert (header["FIGURE"], header["SEED"]) == ("fig4", 1)
 
 
+@pytest.mark.slow
 def test_rays_of_the_layout_meet_where_the_focal_length_says(made):
     rays = table(made[0], "fig1.ecsv")
     last = rays["point"].max()
@@ -141,6 +162,7 @@ def test_encircled_energy_of_an_annular_pupil_is_that_of_theory(lsst_r):
     assert expected[-1] > 0.85
 
 
+@pytest.mark.slow
 def test_radius_of_80_percent_is_near_that_of_the_peers(made):
     over_field = table(made[0], "fig2.ecsv")
     found = np.interp([0.0, 1.0, 1.4, 1.75], over_field["field_deg"], over_field["ee80_arcsec"])
@@ -148,6 +170,7 @@ def test_radius_of_80_percent_is_near_that_of_the_peers(made):
     assert found == pytest.approx([0.091, 0.088, 0.078, 0.091], rel=0.07)
 
 
+@pytest.mark.slow
 def test_dispersion_is_the_difference_of_the_refractive_indices(made):
     found = table(made[0], "fig3.ecsv")
     weather = load_site("cerro_pachon").weather
@@ -157,6 +180,7 @@ def test_dispersion_is_the_difference_of_the_refractive_indices(made):
         assert np.asarray(found[f"{band}_arcsec"]) == pytest.approx(np.asarray(expected), rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_screens_are_as_strong_as_von_karman_says(made):
     with fits.open(made[0].folder / "fig4.fits") as hdus:
         layers, path = hdus["LAYERS"].data, hdus["PATH"].data
@@ -170,6 +194,7 @@ def test_screens_are_as_strong_as_von_karman_says(made):
     assert path.std(axis=(1, 2)) == pytest.approx(rms, rel=0.15)
 
 
+@pytest.mark.slow
 def test_exposures_of_the_speckles_are_nested(made):
     bench, _ = made
     with fits.open(bench.folder / "fig5.fits") as hdus:
@@ -216,6 +241,7 @@ def test_the_beginning_of_an_exposure_looks_through_the_same_air():
     assert np.array_equal(part.pupil_centers(down, 3.0), air.pupil_centers(down, 3.0))
 
 
+@pytest.mark.slow
 def test_correlations_against_exposure_time_are_those_of_the_stars(made):
     curve, stars = table(made[0], "fig6_correlation.ecsv"), table(made[0], "fig6_stars.ecsv")
     assert set(curve.colnames) >= {f"{what}_{t}s" for what in ("xi_plus", "xi_minus", "error") for t in (1, 5, 15, 60)}
@@ -241,6 +267,7 @@ def test_correlations_against_exposure_time_are_those_of_the_stars(made):
     assert np.asarray(curve["error_15s"]) == pytest.approx(scatter, abs=float(size), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_heights_of_the_table_are_those_of_the_focal_plane(made):
     bench, _ = made
     found = table(bench, "fig7.ecsv")[::97]
@@ -252,6 +279,7 @@ def test_heights_of_the_table_are_those_of_the_focal_plane(made):
     assert np.asarray(found["height_um"])[on] == pytest.approx(expected[on], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_whiskers_of_the_optics_are_those_of_a_finer_pupil(made, tmp_path):
     bench, _ = made
     found = table(bench, "fig8.ecsv")
@@ -277,6 +305,7 @@ def test_whiskers_of_the_optics_are_those_of_a_finer_pupil(made, tmp_path):
     assert np.hypot(shape.e1, shape.e2).max() > 0.05
 
 
+@pytest.mark.slow
 def test_eigenvalues_add_up_to_the_variance_of_the_psfs(made):
     bench, _ = made
     with fits.open(bench.folder / "fig9.fits") as hdus:
@@ -294,6 +323,7 @@ def test_eigenvalues_add_up_to_the_variance_of_the_psfs(made):
     assert components @ components.T == pytest.approx(np.eye(20), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_scatter_and_correlation_are_those_of_the_stars(made):
     bench, summary = made
     stars = table(bench, "fig13.ecsv")
@@ -314,6 +344,7 @@ def test_scatter_and_correlation_are_those_of_the_stars(made):
     assert found == pytest.approx(expected, abs=2e-6 * np.mean(np.abs(e[good]) ** 2) + 1e-9)
 
 
+@pytest.mark.slow
 def test_residuals_are_observed_less_model(made):
     bench, _ = made
     residual, observed = table(bench, "fig12.ecsv"), table(bench, "fig13.ecsv")
@@ -324,6 +355,7 @@ def test_residuals_are_observed_less_model(made):
     assert np.asarray(residual["e1"][: TINY.observed]) == pytest.approx(stars.e1 - stars.model_e1, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_heights_keep_to_the_budget(made):
     found = table(made[0], "table1.ecsv")
     expected = {"specification": [10.0, 4.8, 4.0, 2.5, 4.0], "simulated": [10.0, 6.5, 10.0, 2.5, 5.0]}
@@ -336,6 +368,7 @@ def test_heights_keep_to_the_budget(made):
         assert (drawn > 0.75 * np.array(paper)).all()
 
 
+@pytest.mark.slow
 def test_the_run_is_made_once_and_then_kept(made, tmp_path):
     bench, _ = made
     products = sorted((bench.folder / "run").glob("ccd_*.fits"))
@@ -347,6 +380,7 @@ def test_the_run_is_made_once_and_then_kept(made, tmp_path):
     assert (bench.folder / "fig13.ecsv").read_bytes() == data
 
 
+@pytest.mark.slow
 def test_data_have_the_same_bytes_on_any_number_of_threads(made, tmp_path):
     bench, summary = made
     names = ("fig4", "fig6", "table1")

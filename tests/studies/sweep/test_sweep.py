@@ -116,6 +116,7 @@ def test_points_differ_where_their_parameters_do(reference):
     assert len({metrics for _, metrics, _ in reference}) == 14
 
 
+@pytest.mark.slow
 def test_a_sweep_that_is_killed_three_times_ends_with_the_same_bytes(folder, reference):
     command = ("sweep", "small.yaml", "--processes", "2")
     driver = start(*command)

@@ -166,7 +166,7 @@ def test_the_null_test_of_a_folder(tested):
     assert (folder / "null_test.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_null_test_goes_on_to_the_same_bytes(tested, monkeypatch):
     _, folder = tested
     monkeypatch.setattr(module, "_FAINTEST_SNR", 60.0)

@@ -263,6 +263,7 @@ def full_width(image):
 
 @pytest.mark.long
 @pytest.mark.parametrize("cutoff", [6.25, 8.75])
+@pytest.mark.slow
 def test_mean_of_many_exposures_has_the_long_exposure_width(polynomial_pupil, cutoff):
     telescope = polynomial_pupil()
     plane = ImagePlane(41, 6e-6, 2e-6)

@@ -120,7 +120,7 @@ def engines_apart(telescope, stars, *, wavelengths, threads, focal_plane=None, *
     return apart, ratio
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_engines_agree_through_the_same_screens(lsst_r):
     rng = np.random.default_rng(3)
     apart, ratio = engines_apart(
