@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 import pytest
 
+from pachon.core import plotting
 from pachon.core.plotting import new_figure, png_bytes
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.experiment import Experiment
@@ -71,7 +72,7 @@ def test_every_picture_is_a_png_without_date_or_software(page):
         data = base64.b64decode(image.partition(",")[2])
         assert data.startswith(PNG)
         width, height = struct.unpack(">II", data[16:24])
-        assert min(width, height) >= 300
+        assert min(width, height) >= 2 * plotting._DPI  # two inches
         assert b"Software" not in data
         assert b"tIME" not in data
 
