@@ -17,3 +17,8 @@ def stream(seed: int, *key: str | int) -> np.random.Generator:
     # CRC-32 and not hash(): Python's own hash of a string changes from process to process.
     words = tuple(zlib.crc32(part.encode()) if isinstance(part, str) else int(part) for part in key)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(int(seed), spawn_key=words)))
+
+
+def natural(number: int) -> int:
+    """Return a number of its own, not negative, for each integer, as keys of streams must be."""
+    return 2 * abs(number) + (number < 0)

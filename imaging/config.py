@@ -12,15 +12,14 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import yaml
 from pydantic import BeforeValidator, Field
 
 from ..core.errors import ConfigError, error_context
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
-from ..pipeline.config import Configuration, digest, with_options
+from ..pipeline.config import Configuration, digest, section_yaml, with_options, with_run
 from ..pipeline.experiment import Experiment
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
@@ -109,8 +108,7 @@ class ImagesConfig(Section):
 
     def to_yaml(self) -> str:
         """Return the configuration as a YAML file."""
-        content = self.model_dump(mode="json", by_alias=True)
-        return "# All that decides these images.\n" + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        return section_yaml(self, "All that decides these images.")
 
 
 def load_images_configuration(path: Path) -> ImagesConfig:
@@ -123,13 +121,7 @@ def load_images_configuration(path: Path) -> ImagesConfig:
     ConfigError
         If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    content = read_mapping(path, ConfigError)
-    run: Any = content.get("run", {})
-    if isinstance(run, str):
-        run = read_mapping(path.parent / run, ConfigError)
-    if isinstance(run, dict) and isinstance(run.get("ccds"), str):
-        run = {**run, "ccds": [run["ccds"]]}
-    config = validated(ImagesConfig, {**content, "run": run}, str(path))
+    config = validated(ImagesConfig, with_run(read_mapping(path, ConfigError), path), str(path))
     with error_context(file=path):
         return with_files(config, path.parent)
 

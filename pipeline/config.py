@@ -248,6 +248,25 @@ def load_configuration(path: Path) -> Configuration:
     return configuration_of(read_mapping(path, ConfigError), str(path))
 
 
+def with_run(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the content of a file whose `run` is a run's configuration, or the path of its file, with the former.
+
+    Values are checked with those of the file itself. ConfigError if the file of the run cannot be read as YAML.
+    """
+    run = content.get("run", {})
+    if isinstance(run, str):
+        run = read_mapping(path.parent / run, ConfigError)
+    if isinstance(run, dict) and isinstance(run.get("ccds"), str):
+        run = {**run, "ccds": [run["ccds"]]}
+    return {**content, "run": run}
+
+
+def section_yaml(section: Section, heading: str) -> str:
+    """Return a section as a YAML file with one line of comment."""
+    content = section.model_dump(mode="json", by_alias=True)
+    return f"# {heading}\n" + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
 def with_options(config: _Model, **options: Any) -> _Model:
     """Return the configuration with command line options in place of its values; None leaves a value as it is.
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from ...core.products import image_hdu
+from ...core.products import Columns, image_hdu
 from ...core.units import ARCMIN
 from ...imaging.config import ImagesConfig
 from ...imaging.draw import Window
 from ...imaging.preview import cutouts_png
 from ...imaging.scene import draw_ccd
 from ...pipeline.config import with_options
+from ...pipeline.measure.correlation import Correlation
 from ...pipeline.simulate.ccd_exposure import expose_positions
 from ...pipeline.simulate.photometry import effective_fwhm, limiting_magnitude
 from ...sky.population import GalaxyPopulation
@@ -131,15 +134,10 @@ def stacked_correlations(bench: Bench) -> Reproduced:
         kind: (metrics[f"xi_plus_{kind}_long"], metrics[f"xi_plus_{kind}_long_error"])
         for kind in ("psf", "residual_stars", "residual_places")
     }
-    correlations = result.correlations[last]
-    columns = {"r_arcmin": (correlations["psf"].r_arcmin, "arcmin", "mean separation")}
-    for kind, correlation in correlations.items():
-        columns[f"xi_plus_{kind}"] = (correlation.xi_plus, "", f"xi+, {kind.replace('_', ', ')}")
-        columns[f"error_{kind}"] = (correlation.error_plus, "", "its error")
     stars, star_error = found["residual_stars"]
     return Reproduced(
         {"": correlation_picture(result.correlations)},
-        {"": EcsvData(columns, {"visits": last})},
+        {"": _correlation_data(result.correlations[last], last)},
         f"xi+ beyond 10' in {last} visits: "
         + ", ".join(f"{_NAMES[kind]} {value:.1e} +- {error:.0e}" for kind, (value, error) in found.items()),
         abs(stars) < 1e-7 + 2.0 * star_error if last >= _ENOUGH and np.isfinite(star_error) else None,
@@ -162,18 +160,13 @@ def galaxy_correlations(bench: Bench) -> Reproduced:
     results = bench.galaxies
     metrics = {n: null_metrics(result) for n, result in results.items()}
     last = max(results)
-    correlations = results[last].correlations
-    columns = {"r_arcmin": (correlations["model"].r_arcmin, "arcmin", "mean separation")}
-    for kind, correlation in correlations.items():
-        columns[f"xi_plus_{kind}"] = (correlation.xi_plus, "", f"xi+, {kind}")
-        columns[f"error_{kind}"] = (correlation.error_plus, "", "its error")
     known = {n: results[n].density / PAPER_DENSITY[n] for n in results if n in PAPER_DENSITY}
     near = all(abs(ratio - 1.0) < 0.15 for ratio in known.values())
     density = ", ".join(f"{results[n].density:.1f} in {n}" for n in results)
     apart = metrics[last]["xi_plus_difference_long"], metrics[last]["xi_plus_difference_long_error"]
     return Reproduced(
         {"": null_test_picture(results)},
-        {"": EcsvData(columns, {"visits": last})},
+        {"": _correlation_data(results[last].correlations, last)},
         f"usable per arcmin^2: {density}; PSF models alone add xi+ of {apart[0]:.1e} +- {apart[1]:.0e} beyond 10' in"
         f" {last} visits",
         near if known else None,
@@ -188,6 +181,16 @@ _NULL_KEYS = (
     "shot_noise_xi_plus",
     *(f"{name}_{kind}" for kind in ("model", "true") for name in ("m1", "c1")),
 )
+
+
+def _correlation_data(correlations: Mapping[str, Correlation], visits: int) -> EcsvData:
+    """Return xi+ of each kind in the stack of a number of visits as a table."""
+    separation = next(iter(correlations.values())).r_arcmin
+    columns: Columns = {"r_arcmin": (separation, "arcmin", "mean separation")}
+    for kind, correlation in correlations.items():
+        columns[f"xi_plus_{kind}"] = (correlation.xi_plus, "", f"xi+, {kind.replace('_', ', ')}")
+        columns[f"error_{kind}"] = (correlation.error_plus, "", "its error")
+    return EcsvData(columns, {"visits": visits})
 
 
 @figure(

@@ -9,16 +9,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import yaml
+import numpy as np
 from pydantic import BeforeValidator, Field
 
 from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
-from ...pipeline.config import Configuration, configuration_of, digest, with_options
+from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
 from ...pipeline.experiment import Experiment
+from .plan import Visit, plan_visits
 
 #: Pixels along a side of the stamps of the stack, and of those of a visit, of which turned axes cut the corners.
 STACK_STAMP, VISIT_STAMP = 31, 49
@@ -66,6 +67,12 @@ class VisitsConfig(Section):
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
 
+    def plan(self, seed: int) -> tuple[Visit, ...]:
+        """Return the visits."""
+        visits = self.visits
+        dither = float(np.deg2rad(visits.dither_deg))
+        return plan_visits(visits.count, seed, dither=dither, first_epoch=visits.first_epoch)
+
     @property
     def kept(self) -> tuple[int, ...]:
         """Numbers of visits whose stacks are kept, the last one among them."""
@@ -74,8 +81,7 @@ class VisitsConfig(Section):
 
     def to_yaml(self) -> str:
         """Return the configuration as a YAML file."""
-        content = self.model_dump(mode="json", by_alias=True)
-        return "# All that decides these visits.\n" + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        return section_yaml(self, "All that decides these visits.")
 
 
 def load_visits_configuration(path: Path) -> VisitsConfig:
@@ -86,9 +92,4 @@ def load_visits_configuration(path: Path) -> VisitsConfig:
     ConfigError
         If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    content = read_mapping(path, ConfigError)
-    run: Any = content.get("run")
-    if isinstance(run, str):
-        base = path.parent / run
-        content["run"] = configuration_of(read_mapping(base, ConfigError), str(base)).model_dump(by_alias=True)
-    return validated(VisitsConfig, content, str(path))
+    return validated(VisitsConfig, with_run(read_mapping(path, ConfigError), path), str(path))

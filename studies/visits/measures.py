@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,6 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
 
     Errors are those of a jackknife over squares of three CCDs.
     """
-    extent = float(np.hypot(np.ptp(stack.x), np.ptp(stack.y)))
     corner = [np.floor(v / (_PATCH * cell) + 0.5).astype(int) for v in (stack.x, stack.y)]
     patch = corner[0] - corner[0].min() + (np.ptp(corner[0]) + 1) * (corner[1] - corner[1].min())
     values = {
@@ -30,12 +30,23 @@ def correlated(stack: PsfStack, cell: float) -> Correlated:
         "residual_stars": (stack.residual_e1, stack.residual_e2, stack.star),
         "residual_places": (stack.residual_e1, stack.residual_e2, ~stack.star),
     }
+    return correlations(stack.x, stack.y, values, patch)
+
+
+def correlations(
+    x: np.ndarray, y: np.ndarray, values: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]], patch: np.ndarray
+) -> Correlated:
+    """Return correlations of ellipticities e1, e2 at some of the positions [rad], all in the same bins, by kind.
+
+    Errors are those of a jackknife over patches, where there are several.
+    """
+    extent = float(np.hypot(np.ptp(x), np.ptp(y)))
     found = {}
     for kind, (e1, e2, rows) in values.items():
         several = len(np.unique(patch[rows])) > 1
         found[kind] = shear_correlation(
-            stack.x[rows],
-            stack.y[rows],
+            x[rows],
+            y[rows],
             e1[rows],
             e2[rows],
             min_sep=_LEAST * ARCMIN,

@@ -10,34 +10,31 @@ from ...core.errors import DomainError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
 from ...core.progress import Reporter
-from ...core.units import ARCMIN, ARCSEC
+from ...core.random_streams import natural
+from ...core.units import ARCMIN
 from ...imaging.exposure import Exposure
 from ...pipeline.config import digest
-from ...pipeline.measure.correlation import Correlation, shear_correlation
+from ...pipeline.measure.correlation import Correlation
 from ...pipeline.run_folder import CONFIG_NAME
-from ...pipeline.simulate.photometry import limiting_magnitude
 from ...sky.galaxies import Galaxies
 from ...sky.population import GalaxyPopulation
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
+from .measures import correlations
 from .null_result import NullTest, ShearBias, null_metrics, shear_bias
 from .plots import density_picture, null_test_picture
-from .psf_visit import StackFrame
+from .psf_visit import StackFrame, stack_limit
 from .stack import PsfStack
 from .visits import cell_of, pixel_scale_of, stack_path
 
 #: S/N of a star as faint as the faintest galaxies that are drawn: fainter ones have no useful ellipticity.
 _FAINTEST_SNR = 8.0
-# FWHM of that star.
-_FWHM = 0.7 * ARCSEC
 #: Galaxies farther from all places with a known PSF than this are left out, over the mean distance of the places.
 REACH = 2.0
 #: Shear of the calibration.
 SHEAR = 0.02
 # Orientations of a ring.
 _ORIENTATIONS = 4
-# Separations [arcmin] and bins, as of the PSFs.
-_LEAST, _BINS = 1.0, 15
 
 
 def null_test(
@@ -90,8 +87,7 @@ def null_test(
         stamp = Stamp(digest({"visits": config.digest(experiment), "stack": visits}), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
         exposure = Exposure(band=band, time=seconds, exposures=visits, pixel_scale=scale)
-        faintest = limiting_magnitude(_FAINTEST_SNR, band, seconds, _FWHM) + 1.25 * np.log10(visits)
-        population = GalaxyPopulation(faintest, seed)
+        population = GalaxyPopulation(stack_limit(experiment, _FAINTEST_SNR, visits), seed)
         chosen = _tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
@@ -108,7 +104,7 @@ def null_test(
                         seed,
                         "null test",
                         visits,
-                        *(2 * abs(k) + (k < 0) for k in (i, j)),
+                        *map(natural, (i, j)),
                         reach=reach,
                         threads=threads,
                     )
@@ -151,26 +147,13 @@ def _ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
 
 
 def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
-    extent = float(np.hypot(np.ptp(galaxies.x), np.ptp(galaxies.y)))
     both = galaxies.usable & galaxies.true_usable
     kinds = {
         "model": (galaxies.e1, galaxies.e2, galaxies.usable),
         "true": (galaxies.true_e1, galaxies.true_e2, galaxies.true_usable),
         "difference": (galaxies.e1 - galaxies.true_e1, galaxies.e2 - galaxies.true_e2, both),
     }
-    found = {}
-    for kind, (e1, e2, rows) in kinds.items():
-        found[kind] = shear_correlation(
-            galaxies.x[rows],
-            galaxies.y[rows],
-            e1[rows],
-            e2[rows],
-            min_sep=_LEAST * ARCMIN,
-            max_sep=max(min(extent, 180.0 * ARCMIN), 2.0 * _LEAST * ARCMIN),
-            n_bins=_BINS,
-            patch=patch[rows] if len(np.unique(patch[rows])) > 1 else None,
-        )
-    return found
+    return correlations(galaxies.x, galaxies.y, kinds, patch)
 
 
 def _calibration(

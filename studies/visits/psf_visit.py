@@ -194,9 +194,15 @@ def _star_fields(
 def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
     """Return the magnitude limits of the stars, bright and faint, which are the same in every visit."""
     config = experiment.config
-    band, seconds = config.band or "r", config.atmosphere.exposure_s
-    bright = saturation_magnitude(band, seconds, _NOMINAL_FWHM)
-    return bright, limiting_magnitude(config.stars.snr_min, band, seconds, _NOMINAL_FWHM)
+    bright = saturation_magnitude(config.band or "r", config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    return bright, stack_limit(experiment, config.stars.snr_min, 1)
+
+
+def stack_limit(experiment: Experiment, snr: float, visits: int) -> float:
+    """Return the magnitude of a star of a signal-to-noise ratio in a stack of visits of nominal seeing."""
+    config = experiment.config
+    one = limiting_magnitude(snr, config.band or "r", config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    return float(one + 1.25 * np.log10(visits))
 
 
 def _focal_plane_images(

@@ -20,7 +20,7 @@ from ...pipeline.experiment import Experiment
 from ...pipeline.run_folder import CONFIG_NAME, SUMMARY_NAME
 from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from .measures import Correlated, correlated, stack_metrics
-from .plan import Visit, plan_visits
+from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
 from .psf_visit import StackFrame, visit_experiment, visit_psfs
 from .sky_points import SkyPoints, draw_points
@@ -97,14 +97,9 @@ def stack_visits(
     experiment = config.experiment() if experiment is None else experiment
     config = config.resolved(experiment)
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
-    settings, frame = config.visits, StackFrame.of(experiment, STACK_STAMP)
+    frame = StackFrame.of(experiment, STACK_STAMP)
     points = sky_points_of(experiment, config, frame)
-    visits = plan_visits(
-        settings.count,
-        experiment.config.seed,
-        dither=np.deg2rad(settings.dither_deg),
-        first_epoch=settings.first_epoch,
-    )
+    visits = config.plan(experiment.config.seed)
     _check_folder(folder, config, resume)
     sums = _sums_so_far(folder, stamp, len(points), resume)
     if sums.visits > len(visits):

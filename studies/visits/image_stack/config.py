@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import yaml
 from pydantic import BeforeValidator, Field
 
 from ....core.errors import ConfigError
 from ....core.schema import Count, Section, Switch, plain_number, validated
 from ....core.yaml_reader import read_mapping
+from ....pipeline.config import section_yaml
 
 
 class ImageStackConfig(Section):
@@ -27,9 +27,7 @@ class ImageStackConfig(Section):
 
     def to_yaml(self) -> str:
         """Return the settings as a YAML file."""
-        return "# All that decides these images, beside the visits.\n" + yaml.safe_dump(
-            self.model_dump(mode="json"), sort_keys=False
-        )
+        return section_yaml(self, "All that decides these images, beside the visits.")
 
 
 def load_image_stack_configuration(path: Path) -> ImageStackConfig:

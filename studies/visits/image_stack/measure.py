@@ -13,6 +13,7 @@ from ....core.errors import PachonError
 from ....core.files import write_bytes, write_json
 from ....core.products import Stamp
 from ....core.progress import Reporter
+from ....core.random_streams import natural
 from ....core.units import ARCMIN
 from ....imaging.image_file import CcdImage
 from ....pipeline.catalogue.detect import detect_objects
@@ -184,7 +185,7 @@ def measure_tile(
         true_usable=usable[1],
     )
     true, axes = galaxies_on(stack.sky, tile, tile.wcs(stack.frame)), stack.frame.matrix
-    key: tuple[str | int, ...] = ("images", psfs.visits, *(2 * abs(k) + (k < 0) for k in (tile.column, tile.row)))
+    key: tuple[str | int, ...] = ("images", psfs.visits, natural(tile.column), natural(tile.row))
     options: dict[str, Any] = {"reach": reach, "threads": threads}
     stamps = measure_galaxies(psfs, axes, true, exposure, stack.stamp.seed, *key, **options)
     both = np.intersect1d(galaxies.index[galaxies.usable], stamps.index[stamps.usable])

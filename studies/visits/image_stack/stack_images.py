@@ -25,12 +25,11 @@ from ....pipeline.defaults import given
 from ....pipeline.experiment import Experiment
 from ....pipeline.memory import needed_bytes
 from ....pipeline.run_folder import CONFIG_NAME
-from ....pipeline.simulate.photometry import limiting_magnitude
 from ....pipeline.simulate.star_field import magnitudes_at
 from ....sky.population import GalaxyPopulation
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
-from ..plan import Visit, plan_visits
-from ..psf_visit import StackFrame, magnitude_limits, middle_wavelength, visit_experiment
+from ..plan import Visit
+from ..psf_visit import StackFrame, magnitude_limits, middle_wavelength, stack_limit, visit_experiment
 from ..visits import pixel_scale_of, sky_points_of
 from .config import ImageStackConfig, load_image_stack_configuration
 from .resample import add_resampled
@@ -42,7 +41,7 @@ from .visit_wcs import VisitWcs
 FOLDER_NAME, SETTINGS_NAME = "images", "images.yaml"
 #: S/N of a star as faint as the faintest galaxies in the stack of all visits, and its FWHM: fainter ones are not
 #: detected, and all of those below together are 3 % of its noise in a pixel.
-_FAINTEST_SNR, _FWHM = 4.0, 0.7 * ARCSEC
+_FAINTEST_SNR = 4.0
 #: Nodes along a side of a CCD that tell which part of it touches tiles.
 _NODES = 65
 
@@ -127,8 +126,7 @@ class ImageStack:
     @property
     def plan(self) -> tuple[Visit, ...]:
         """The visits."""
-        config, dither = self.visits.visits, float(np.deg2rad(self.visits.visits.dither_deg))
-        return plan_visits(config.count, self.experiment.config.seed, dither=dither, first_epoch=config.first_epoch)
+        return self.visits.plan(self.experiment.config.seed)
 
     def wcs(self, threads: int | None = None) -> dict[str, CcdWcs]:
         """Return the world coordinates of the CCDs about the pointing of a visit, at a position angle of 0."""
@@ -335,10 +333,7 @@ def _resolved(
     if side is None:
         side = experiment.camera.pixels
     if faintest is None:
-        config = experiment.config
-        band, seconds = config.band or "r", config.atmosphere.exposure_s
-        star = limiting_magnitude(_FAINTEST_SNR, band, seconds, _FWHM)
-        faintest = round(star + 1.25 * np.log10(visits.visits.count), 2)
+        faintest = round(stack_limit(experiment, _FAINTEST_SNR, visits.visits.count), 2)
     camera, config = experiment.camera, experiment.config
     if not np.isclose(experiment.pixel_size, camera.pixel_size) or not config.atmosphere.enabled:
         raise ConfigError(

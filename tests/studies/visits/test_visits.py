@@ -152,6 +152,15 @@ def test_visits_that_see_too_little_end_in_one_line(visits_config, tmp_path):
         )
 
 
+def test_the_run_may_be_a_file_and_its_ccds_one_name(tmp_path):
+    (tmp_path / "run.yaml").write_text("{seed: 3, ccds: R22}")
+    (tmp_path / "of_file.yaml").write_text("run: run.yaml")
+    (tmp_path / "inline.yaml").write_text("run: {seed: 3, ccds: R22}")
+    of_file, inline = (load_visits_configuration(tmp_path / f"{name}.yaml") for name in ("of_file", "inline"))
+    assert of_file == inline
+    assert (of_file.run.seed, of_file.run.ccds) == (3, ("R22",))
+
+
 def test_bad_files_end_in_one_line(tmp_path, capsys):
     for text, expected in (
         ("visits: {count: 0}", "visits.count"),
