@@ -235,6 +235,14 @@ class Atmosphere(LayerScreens):
         heights.setflags(write=False)
         return self._with_shared_screens(altitudes=heights)
 
+    def with_screens_of(self, other: Atmosphere) -> Atmosphere:
+        """Return this atmosphere with the screens of another one, stored for both, where they are the same screens."""
+        if not self.has_screens_of(other):
+            return self
+        shared = replace(self)
+        object.__setattr__(shared, "_cache", other._cache)
+        return shared
+
     def _with_shared_screens(self, **changes: Any) -> Atmosphere:
         """Return a changed atmosphere with shared screens: nothing that determines them may change."""
         other = replace(self, **changes)
