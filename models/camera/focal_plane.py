@@ -10,21 +10,22 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
-from astropy.table import Table
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError, unknown_name
 from ...core.units import metres, radians
-from ..io.heights.file import read_heights
-from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 from .camera import Camera, load_camera
 from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
 from .height_fit import fit_heights, table_column
+
+# Half a second to import: only where a focal plane is read, or made a mesh or a table.
+if TYPE_CHECKING:
+    import trimesh
+    from astropy.table import Table
 
 # Rims of tiles read back from a file land this far [m] outside by rounding (in a float32 STL 0.34 m are good to 15 nm).
 _MESH_MARGIN = 1e-7
@@ -127,6 +128,8 @@ class FocalPlane:
         UnknownNameError
             If there is no such camera.
         """
+        from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
+
         heights = bundled_heights(name)
         camera = load_camera(AS_MEASURED[name][0])
         return cls(camera, *heights.on(camera))
@@ -161,6 +164,8 @@ class FocalPlane:
             If none of it lies on a CCD, or a CCD has too few points.
         """
         camera = load_camera(camera)
+        from ..io.heights.file import read_heights
+
         heights = read_heights(Path(path), camera)
         return cls(camera, heights.surfaces, heights.measured, residual=heights.residual)
 
@@ -333,6 +338,8 @@ class FocalPlane:
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
         tile = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2).reshape(-1, 3)
         faces = tile + (np.arange(len(self.camera)) * index.size)[:, None, None]
+        import trimesh
+
         return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
 
     def facet_error(self, cells_per_ccd: int = 32) -> np.ndarray:
@@ -370,6 +377,8 @@ class FocalPlane:
         """
         # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
         ccd, *points = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
+        from astropy.table import Table
+
         return Table([np.array(self.names)[ccd], *points], names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
 
     def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, ...]:

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
-from astropy.io import fits
 
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import require_file, write_bytes
@@ -34,6 +33,8 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
     PrescriptionError
         If the file cannot be read, has no image of two dimensions, a unit that is no length, or is no valid grid.
     """
+    from astropy.io import fits  # few prescriptions have a grid
+
     path = Path(path)
     require_file(path, PrescriptionError)
     try:
@@ -58,6 +59,8 @@ def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
     PrescriptionError
         If the file cannot be written.
     """
+    from astropy.io import fits
+
     header = fits.Header()
     for number, (first, step) in enumerate(zip((grid.x[0], grid.y[0]), grid.step, strict=True), start=1):
         header[f"CRPIX{number}"] = 1.0
