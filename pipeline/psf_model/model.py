@@ -20,7 +20,7 @@ from ...core.errors import ConfigError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.threads import one_blas_thread
 from ...core.version import CREATOR
-from . import gaussian_process
+from . import gaussian_process, kriging
 from .file import model_fields, model_hdus
 from .fit import fit_fields, weighted
 from .polynomial import Extent, design_matrix, mapped
@@ -64,9 +64,11 @@ class PsfModel:
         rms width of the Gaussian under shapelets [pixel]; NaN else.
     weights : array or None
         Of the stars in the polynomials, [n].
+        Under kriging the inverse variances of their noise, in units of the middle star's.
     kernel : array or None
         Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
-        the noise, [k, 3]. None where there are only polynomials.
+        the noise, [k, 3]; under kriging five columns, see :data:`.kriging.COLUMNS`. None where there are only
+        polynomials.
     alpha : array or None
         Dual coefficients of the Gaussian process: inverse covariance times coefficients less trend, [n, k].
     """
@@ -94,13 +96,14 @@ class PsfModel:
         positions: ArrayLike,
         *,
         basis: Literal["pca", "pixels", "shapelets"] = "pca",
-        interpolation: Literal["polynomial", "gp"] = "polynomial",
+        interpolation: Literal["polynomial", "gp", "kriging"] = "polynomial",
         weights: ArrayLike | None = None,
         masks: ArrayLike | None = None,
         n_components: int | Literal["auto"] | None = None,
         order: int | None = None,
         extent: ArrayLike | None = None,
         scale: float | None = None,
+        gain: float | None = 1.0,
         clip_sigma: float | None = CLIP_SIGMA,
         max_iterations: int = 20,
         replacement: Literal["mean", "polynomial"] = "mean",
@@ -122,7 +125,8 @@ class PsfModel:
             truncate the wings (Jee & Tyson 2011, sec. 3).
         interpolation : str
             ``polynomial``, or ``gp``: a Gaussian process for each component (one for all pixels) over a polynomial
-            trend; needs scikit-learn.
+            trend; needs scikit-learn. ``kriging``: one rule for all pixels, with the noise of each star
+            (:mod:`~.psf_model.kriging`); with ``basis="pixels"`` the best choice where nothing is known.
         weights : array, optional
             [n] of the stars in the polynomials.
         masks : array of bool, optional
@@ -133,12 +137,15 @@ class PsfModel:
             ``auto`` takes :attr:`cross_validated_components` of up to 65; :attr:`elbow` is the alternative. None for
             pixels.
         order : int, optional
-            Largest total degree of the polynomials, 3 where left out; 0 for the trend under a Gaussian process.
+            Largest total degree of the polynomials, 3 where left out; of the trend 0 under a Gaussian process and 2 in
+            kriging, which shrinks it.
         extent : tuple of float, optional
             (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions. Where left out, that of the stars.
         scale : float, optional
             rms width of the Gaussian under the shapelets [pixel]; by default the one with the least residual of the
             stars.
+        gain : float or None
+            Electrons in a unit of the stamps, for the photon noise in kriging; None for none.
         clip_sigma : float or None
             Pixels that deviate by more standard deviations are rejected; None rejects nothing, as befits stars without
             noise.
@@ -168,6 +175,7 @@ class PsfModel:
             order=order,
             extent=extent,
             scale=scale,
+            gain=gain,
             clip_sigma=clip_sigma,
             max_iterations=max_iterations,
             replacement=replacement,
@@ -271,7 +279,10 @@ class PsfModel:
             result += column[:, None] * row
         if self.kernel is not None and self.alpha is not None:
             points, at = (mapped(p, self.extent) for p in (self.positions, positions))
-            result += gaussian_process.predict(points, at, self.kernel, self.alpha)
+            if self._kriged:
+                result += kriging.predict(points, at, self.kernel[0], self.alpha)
+            else:
+                result += gaussian_process.predict(points, at, self.kernel, self.alpha)
         return result
 
     def reconstruct(self) -> np.ndarray:
@@ -368,10 +379,16 @@ class PsfModel:
             points = mapped(self.positions, self.extent)
             terms = design_matrix(self.positions, self.extent, self.order)
             with one_blas_thread():
+                if self._kriged and self.weights is not None:
+                    return kriging.krige(points, self.coefficients, terms, self.kernel[0], 1.0 / self.weights)[2]
                 return gaussian_process.krige(points, self.coefficients, terms, self.kernel)[2]
         room = 1.0 - self.leverage
         room = np.where(room > 1e-10, room, np.nan)
         return (self.coefficients - self.amplitudes(self.positions)) / room[:, None]
+
+    @property
+    def _kriged(self) -> bool:
+        return self.kernel is not None and self.kernel.shape[1] == kriging.COLUMNS
 
     def _combine(self, amplitudes: np.ndarray) -> np.ndarray:
         """Return mean plus amplitudes times components, one component after the other so that no batch size matters."""
