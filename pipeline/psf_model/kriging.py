@@ -46,21 +46,26 @@ _SKY = 0.35
 _FEWEST_ELECTRONS = 100.0
 
 
-def shape_numbers(mean: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return three shape numbers [n, 3] of deviations from a mean PSF [ny, nx], and their filters [3, n_pixels].
+def shape_numbers(
+    mean: np.ndarray, deviations: np.ndarray, variance: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return three shape numbers [n, 3] of deviations [n, n_pixels] from a mean PSF, and their filters [3, n_pixels].
 
-    They are the weighted second moments of eq. 5 of Jee & Tyson 2011, to first order in the deviations [n, n_pixels].
+    They are, to first order in the deviations, twice the changes of e1, of e2 and of the logarithm of the size by the
+    weighted moments of Jee & Tyson 2011, eq. 5. `mean` is [ny, nx]; the weight has a variance along each axis
+    [pixel^2], by default that of the core.
     """
     y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
     square = x * x + y * y
-    # The width of the core; wings and noise of the outer pixels would make it the stamp's.
-    core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
-    width = (core * square).sum() / core.sum()
-    weight = np.exp(-0.5 * square / width)
+    if variance is None:
+        # Wings and noise of the outer pixels would make it that of the stamp.
+        core = np.where(mean > 0.1 * mean.max(), mean, 0.0)
+        variance = (core * square).sum() / core.sum()
+    weight = np.exp(-0.5 * square / variance)
     light = (weight * mean).sum()
     size = (weight * square * mean).sum() / light
     filters = np.stack([x * x - y * y, 2.0 * x * y, square - size]).reshape(3, -1) * (weight.ravel() / (size * light))
-    return stamps @ filters.T, filters
+    return deviations @ filters.T, filters
 
 
 def star_noise(

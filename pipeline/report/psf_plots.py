@@ -33,7 +33,7 @@ def eigen_psf_plot(product: CcdProduct, noise_free: bool) -> bytes:
     with styled():
         figure = new_figure(1.75 * _COLUMNS + 0.6, 1.95 * rows + 0.7)
         axes = figure.subplots()
-        gallery = _Gallery(axes, model.mean.shape[0], product.pixel_scale, shown, room=0.12)
+        gallery = StampGallery(axes, model.mean.shape[0], product.pixel_scale, shown, room=0.12)
         gallery.show(
             np.sqrt(np.maximum(model.mean, 0.0)), 0, 0, "mean (square root)", cmap="viridis", vmin=0.0, vmax=None
         )
@@ -104,7 +104,7 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
     with styled():
         figure = new_figure(1.45 * len(chosen) + 1.3, 5.3)
         axes = figure.subplots()
-        gallery = _Gallery(axes, products[0].observed_images.shape[1], products[0].pixel_scale)
+        gallery = StampGallery(axes, products[0].observed_images.shape[1], products[0].pixel_scale)
         for column, (product, i) in enumerate(chosen):
             stars, position = product.observed, np.array([[product.observed.x[i], product.observed.y[i]]])
             model = product.model.at(position)[0]
@@ -115,7 +115,7 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
             top = model.max()
             title = f"{product.name}\n{stars.magnitude[i]:.1f} mag, S/N {stars.snr[i]:.0f}"
             for row, (image, text) in enumerate(((observed, title), (model, ""))):
-                light = gallery.show(_stretched(image / top), row, column, text, cmap="viridis", vmin=_LOW, vmax=1.0)
+                light = gallery.show(stretched(image / top), row, column, text, cmap="viridis", vmin=_LOW, vmax=1.0)
             residual = SymLogNorm(3.0, vmin=-100.0, vmax=100.0)
             noise = gallery.show(left_over, 2, column, cmap="RdBu_r", norm=residual)
         gallery.finish(3, len(chosen), ("observed", "model", "observed - model"))
@@ -123,7 +123,7 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
         places = [axes.inset_axes((1.005, low, 0.012, high)) for low, high in ((0.42, 0.58), (0.09, 0.28))]
         bar = figure.colorbar(light, cax=places[0], label="over the model's peak (asinh)")
         ticks = np.array([0.0, 0.01, 0.1, 0.5, 1.0])
-        bar.set_ticks(_stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
+        bar.set_ticks(stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
         bar = figure.colorbar(noise, cax=places[1], label="pixel noise σ")
         steps = (-100, -30, -10, -3, 0, 3, 10, 30, 100)
         bar.set_ticks(steps, labels=[f"{t}" for t in steps], minor=False)
@@ -134,11 +134,12 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
 _SOFTENING = 0.02
 
 
-def _stretched(values: np.ndarray) -> np.ndarray:
+def stretched(values: np.ndarray) -> np.ndarray:
+    """Return values over the peak on the asinh scale of pictures, 1 at 1."""
     return np.arcsinh(np.asarray(values) / _SOFTENING) / np.arcsinh(1.0 / _SOFTENING)
 
 
-_LOW = float(_stretched(np.array(-0.02)))
+_LOW = float(stretched(np.array(-0.02)))
 
 
 def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
@@ -149,7 +150,7 @@ def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
     return [int(i) for i in ordered[ranks]]
 
 
-class _Gallery:
+class StampGallery:
     """Stamps in rows and columns within one pair of axes: axes of their own would take most of the time of a report."""
 
     def __init__(self, axes: Axes, size: int, pixel_scale: float, shown: float = math.inf, room: float = 0.0) -> None:
