@@ -35,7 +35,7 @@ def stars():
     rng = np.random.default_rng(4)
     positions = rng.uniform(1.0, 4000.0, (COUNT, 2))
     electrons = 5000.0 * 10.0 ** rng.uniform(0.3, 1.5, COUNT)
-    electrons[5] = 2000.0
+    electrons[5] = 1500.0
     light = electrons[:, None, None] * profiles(positions, *rng.uniform(-0.5, 0.5, (2, COUNT)))
     light[7] += 0.4 * np.roll(light[7], (7, 4), axis=(0, 1))
     stamps = light + rng.normal(size=light.shape) * np.sqrt(SKY**2 + light)
