@@ -37,9 +37,10 @@ from ...core.errors import PrescriptionError, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..telescope import Telescope
+from .batoid.reader import batoid_telescope, is_batoid
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
-from .yaml.reader import MAX_BYTES, read_telescope
+from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 from .yaml.writer import telescope_to_yaml
 from .zemax.file import read_zemax_file
 from .zemax.reader import read_lens
@@ -81,10 +82,10 @@ def load_telescope(
     Parameters
     ----------
     name_or_path : str or path
-        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, or of a ``.zmx`` (Zemax) or ``.seq``
-        (CODE V) file.
+        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, ours or batoid's, or of a ``.zmx``
+        (Zemax) or ``.seq`` (CODE V) file.
     lenient : bool
-        Of a Zemax or CODE V file: warn about lines that are not understood and go on without them.
+        Of a batoid, Zemax or CODE V file: warn about keys or lines that are not understood and go on without them.
     glass_catalogues : iterable of GlassCatalogue or path
         AGF catalogues to look up the glasses of a Zemax or CODE V file in, first of all; then comes one beside the
         file that has its name and ends in .agf, then the bundled one.
@@ -106,7 +107,8 @@ def load_telescope(
         return _bundled(text)
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
-        return read_telescope(path)
+        content = read_mapping(path, max_bytes=MAX_BYTES)
+        return batoid_telescope(content, path, lenient=lenient) if is_batoid(content) else telescope_of(content, path)
     if path.suffix.lower() in _LENS_FILES:
         parts = _LENS_FILES[path.suffix.lower()]
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)

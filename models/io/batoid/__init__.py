@@ -1,0 +1,1 @@
+"""Telescopes of batoid, in its own YAML."""
