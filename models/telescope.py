@@ -38,6 +38,15 @@ def rotation_matrix(tilt: Any) -> np.ndarray:
     return about_x @ about_y @ about_z
 
 
+def rotation_angles(matrix: np.ndarray) -> tuple[float, float, float]:
+    """Return the angles [rad] about x, the new y and the new z of a rotation matrix: the inverse of the above."""
+    about_y = math.asin(max(-1.0, min(1.0, matrix[0, 2])))
+    if abs(matrix[0, 2]) > 1 - 1e-14:
+        # About y by a right angle, x and z turn about the same line: one of them does.
+        return math.atan2(matrix[2, 1], matrix[1, 1]), about_y, 0.0
+    return math.atan2(-matrix[1, 2], matrix[2, 2]), about_y, math.atan2(-matrix[0, 1], matrix[0, 0])
+
+
 @dataclass(frozen=True)
 class Telescope:
     r"""An unfolded optical prescription.

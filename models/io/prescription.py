@@ -33,11 +33,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import PrescriptionError, unknown_name
+from ...core.errors import PrescriptionError, check_choice, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..telescope import Telescope
 from .batoid.reader import batoid_telescope, is_batoid
+from .batoid.writer import telescope_to_batoid
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
@@ -62,6 +63,7 @@ BUNDLED = (
 
 # Readers of the parts of a lens file, by its ending.
 _LENS_FILES = {".zmx": read_zemax_file, ".seq": read_codev_file}
+_YAML_WRITERS = {"pachon": telescope_to_yaml, "batoid": telescope_to_batoid}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
@@ -156,8 +158,8 @@ def _bundled(name: str) -> Telescope:
     return read_telescope(DATA / f"{name}.yaml")
 
 
-def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
-    """Write a prescription file: YAML, or where the name ends in ``.zmx`` a Zemax lens file.
+def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format: str = "") -> None:
+    """Write a prescription file: YAML, ours or batoid's, or a Zemax lens file.
 
     Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
     it.
@@ -168,17 +170,23 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
         Prescription to write.
     path : str or path
         File to write; it is replaced as a whole, or left as it was.
+    format : {"", "pachon", "batoid", "zemax"}
+        Format; by default Zemax's where the name ends in ``.zmx``, else ours.
 
     Raises
     ------
+    ConfigError
+        If there is no such format.
     PrescriptionError
         If the file cannot be written, or cannot hold the telescope.
     """
     target = Path(path)
-    if target.suffix.lower() == ".zmx":
+    format = format or ("zemax" if target.suffix.lower() == ".zmx" else "pachon")
+    check_choice("format", format, ("zemax", *_YAML_WRITERS))
+    if format == "zemax":
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
             write_bytes(catalogue_path(target), glasses.encode(), PrescriptionError)
-        write_bytes(target, lens.encode(), PrescriptionError)
     else:
-        write_bytes(target, telescope_to_yaml(telescope).encode(), PrescriptionError)
+        lens = _YAML_WRITERS[format](telescope)
+    write_bytes(target, lens.encode(), PrescriptionError)

@@ -26,7 +26,7 @@ from ...aperture import Annulus, Circle
 from ...first_order import first_order
 from ...media.medium import Medium
 from ...shapes.shape import Plane
-from ...surface import Interaction, Matrix, Surface, Vector
+from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from ...telescope import VACUUM, Telescope
 from ..zemax.file import Findings
 from .apertures import clear_region
@@ -37,6 +37,10 @@ DEFAULT_WAVELENGTH = 550e-9
 WIDEST_RANGE = (0.1e-6, 20e-6)
 #: Field radius [rad] of a telescope without a focal length or an edge of its detector.
 LEAST_FIELD = math.radians(0.1)
+#: Field radius over the angle of the edge of the detector: apertures are drawn beyond the CCDs, on the LSST by 27 %.
+FIELD_FRACTION = 0.75
+#: Cosine of the largest tilt that counts as a misalignment, 8 degrees, and not as a fold.
+ALMOST_ALIGNED = 0.99
 _INTERACTIONS = {
     "Mirror": Interaction.MIRROR,
     "RefractiveInterface": Interaction.REFRACT,
@@ -209,13 +213,21 @@ def _wavelength_range(first_medium: Medium, surfaces: list[Surface]) -> tuple[fl
 def _completed(telescope: Telescope, system: Compound, extras: Extras) -> Telescope:
     """Return the telescope with field of view and reference sphere by its focal length, where the file has none."""
     try:
-        focal_length = abs(first_order(telescope).focal_length)
+        focal_length = abs(first_order(_straightened(telescope)).focal_length)
     except DomainError:
-        # Decentred or tilted surfaces, or no focus.
+        # Folded, or without a focus.
         return telescope
     radius, edge = telescope.field_radius, _outer_radius(telescope.surfaces[-1])
     if extras.field is None and edge is not None:
-        radius = math.atan(edge / focal_length)
+        radius = FIELD_FRACTION * math.atan(edge / focal_length)
     limit = telescope.field_limit if extras.field else max(telescope.field_limit, 2.0 * radius)
     sphere = system.sphere_radius or focal_length
     return replace(telescope, field_radius=radius, field_limit=limit, reference_sphere_radius=sphere)
+
+
+def _straightened(telescope: Telescope) -> Telescope:
+    """Return the telescope without decentres and tilts, unless these fold it."""
+    if any(s.matrix[2, 2] < ALMOST_ALIGNED for s in telescope.surfaces):
+        return telescope
+    centred = (replace(s, vertex=(0.0, 0.0, s.vertex[2]), rotation=IDENTITY) for s in telescope.surfaces)
+    return replace(telescope, surfaces=tuple(centred))

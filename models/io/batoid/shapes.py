@@ -105,6 +105,9 @@ AnySurface = Annotated[Shape, _SURFACE]
 
 def surface_items(shape: Shape) -> dict[str, Any]:
     """Return the section of a shape; PrescriptionError where batoid has no such surface."""
+    if isinstance(shape, Conic) and shape.conic == -1.0:
+        # Rays do not meet batoid's Quadric of this conic constant.
+        return {"type": "Paraboloid", "R": shape.radius}
     if isinstance(shape, EvenAsphere):
         return _asphere_items(shape, shape.coefficients, 2)
     if isinstance(shape, OddAsphere) and not any(shape.coefficients[::2]):
@@ -122,7 +125,13 @@ def surface_items(shape: Shape) -> dict[str, Any]:
 
 def _asphere_items(shape: EvenAsphere | OddAsphere, coefficients: tuple[float, ...], first: int) -> dict[str, Any]:
     items = {"type": "Asphere", "R": shape.radius, "conic": shape.conic, "coefs": list(coefficients)}
-    return items | ({"imin": first} if first != 2 else {})
+    items |= {"imin": first} if first != 2 else {}
+    flat = math.isinf(shape.radius)
+    if not flat and shape.conic != -1.0:
+        return items
+    # Rays do not meet batoid's aspheres of these two kinds, but they do meet their sum with the base surface.
+    base = {"type": "Plane"} if flat else {"type": "Paraboloid", "R": shape.radius}
+    return {"type": "Sum", "items": [base, items | {"R": math.inf, "conic": 0.0}]}
 
 
 def _zernike_items(coefficients: tuple[float, ...], outer: float, inner: float) -> dict[str, Any]:
