@@ -159,5 +159,3 @@ class BatoidFile(Section):
 
     system: Annotated[Compound, _one_of({"CompoundOptic": Compound})] = Field(alias=ROOT)
     pachon: Extras = Extras.model_construct()
-
-

@@ -160,17 +160,18 @@ def _surface(leaf: _Placed, name: str, behind: Medium) -> Surface:
     interaction = _INTERACTIONS.get(optic.type, Interaction.PASS)
     # In batoid only refraction depends on the media.
     refracts = interaction == Interaction.REFRACT
+    # Its files give an Interface no obscuration.
+    blocked = None if optic.type == "Interface" else optic.obscuration
     if refracts and leaf.before != behind:
-        raise PrescriptionError(
-            f"{ROOT}.{'.'.join(leaf.path)}.inMedium = {leaf.before!r}: expected {behind!r}, the medium of the light there"
-        )
+        place = ".".join((ROOT, *leaf.path, "inMedium"))
+        raise PrescriptionError(f"{place} = {leaf.before!r}: expected the medium of the light there, {behind!r}")
     return Surface(
         name=name,
         interaction=interaction,
         shape=optic.screen if isinstance(optic, Screen) else optic.shape,
         vertex=leaf.vertex,
         medium_after=leaf.after if refracts else behind,
-        aperture=None if optic.obscuration is None else clear_region(optic.obscuration),
+        aperture=None if blocked is None else clear_region(blocked),
         rotation=leaf.axes,
     )
 
