@@ -33,8 +33,8 @@ def land_on_ccds(
     detector was tilted; positions on the CCDs are that frame's x and y. ``position`` [m] and ``direction``, [n, 3], are
     in the telescope frame; ``index`` is the refractive index before the detector.
     """
-    p, d = detector.to_local(position), direction @ detector.matrix
-    t, ccd = _distances(focal_plane, tuple(p.T), tuple(d.T))
+    (x, y, z), (u, v, w) = detector.to_local(position).T, (direction @ detector.matrix).T
+    t, ccd = _distances(focal_plane, (x, y, z), (u, v, w))
     return Landing(position + t[:, None] * direction, index * t, ccd)
 
 

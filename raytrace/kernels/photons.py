@@ -52,7 +52,7 @@ def trace_photons(special: bool, module: wp.Module) -> wp.Kernel:
         px = pupil_x[p]
         py = pupil_y[p]
         back = wp.cw_mul(u, px) + wp.cw_mul(v, py) + pupil_z * w + lanes(distance)
-        x, y, z, u, v, w, path, status = through_telescope(
+        x, y, z, u, v, w, _, status = through_telescope(
             surfaces,
             indices,
             0,

@@ -350,7 +350,7 @@ def through_screen(n: lanes, slope_x: lanes, slope_y: lanes, u: lanes, v: lanes,
 
 @wp.func
 def deflected(p: lanes, q: lanes, w: lanes):
-    """Unit directions of components p and q in a plane, towards the side of w; NaN where there are none."""
+    """Directions of components p and q in a plane, on the side of w; NaN where no wave travels on."""
     root = lanes_sqrt(lanes(ONE) - wp.cw_mul(p, p) - wp.cw_mul(q, q))
     for i in range(LANES):
         root[i] = wp.where(w[i] < ZERO, -root[i], root[i])
