@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.threads import thread_count
 from ..models.camera.focal_plane import FocalPlane
 from ..models.surface import Surface
 
@@ -13,6 +15,8 @@ Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
 #: Newton steps to a CCD surface. Heights are tens of micrometres and slopes below 1e-3, so each step gains three
 #: digits: the third leaves less than 1e-14 m.
 STEPS = 3
+#: Rays that are carried at a time, so that their numbers stay in the cache.
+CHUNK = 8192
 
 
 @dataclass(frozen=True)
@@ -34,25 +38,45 @@ def land_on_ccds(
     in the telescope frame; ``index`` is the refractive index before the detector.
     """
     (x, y, z), (u, v, w) = detector.to_local(position).T, (direction @ detector.matrix).T
-    t, ccd = _distances(focal_plane, (x, y, z), (u, v, w))
+    ccd = focal_plane.ccd_at(x, y)
+    t = _distance(focal_plane, ccd, (x, y, z), (u, v, w))
+    # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
+    ccd = np.where(focal_plane.ccd_at(x + t * u, y + t * v) == ccd, ccd, -1).astype(np.int32)
+    t = np.where(ccd >= 0, t, 0.0)
     return Landing(position + t[:, None] * direction, index * t, ccd)
 
 
-def on_ccds(focal_plane: FocalPlane, position: Triple, direction: Triple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return x, y [m] and the CCDs of rays that are carried from the nominal surface to the CCD surfaces.
+def land_bundle(
+    focal_plane: FocalPlane, position: Triple, direction: Triple, *, threads: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Carry rays that land close to one another from the nominal surface to the CCD surfaces.
 
-    ``position`` [m], ``direction`` (of any length) and the result are in the frame of the detector. The CCD is -1 in a
-    gap, where x and y are those on the nominal surface.
+    ``position`` [m], ``direction`` and the returned x, y [m] are in the frame of the detector. Returned too is whether
+    there is a CCD; where there is none, x and y are those on the nominal surface. Each CCD is treated on its own, with
+    the numbers of its surface once and not for every ray.
     """
-    t, ccd = _distances(focal_plane, position, direction)
-    return position[0] + t * direction[0], position[1] + t * direction[1], ccd
+    x, y, _ = position
+    ccd = _bundle_ccds(focal_plane, x, y)
+    t = np.zeros_like(x)
+
+    def carry(first: int) -> None:
+        part = slice(first, first + CHUNK)
+        for one in np.unique(ccd[part]):
+            here = first + np.flatnonzero(ccd[part] == one)
+            (px, py, pz), (u, v, w) = ([component[here] for component in vector] for vector in (position, direction))
+            if one >= 0:
+                t[here] = _distance(focal_plane, np.array([one]), (px, py, pz), (u, v, w))
+
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        list(pool.map(carry, range(0, len(x), CHUNK)))
+    x, y = x + t * direction[0], y + t * direction[1]
+    on_ccd = (ccd >= 0) & (_bundle_ccds(focal_plane, x, y) == ccd)
+    return np.where(on_ccd, x, position[0]), np.where(on_ccd, y, position[1]), on_ccd
 
 
-def _distances(focal_plane: FocalPlane, position: Triple, direction: Triple) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances from the nominal surface, in lengths of the direction, and the CCDs; 0 and -1 in a gap."""
-    x, y, z = position
-    u, v, w = direction
-    ccd = focal_plane.ccd_at(x, y)
+def _distance(focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple) -> np.ndarray:
+    """Return the distances to the surfaces of CCDs, one for each ray or one for all, in lengths of the direction."""
+    (x, y, z), (u, v, w) = position, direction
     center_x, center_y = focal_plane.camera.centers[ccd].T
     t = np.zeros(len(x))
     for _ in range(STEPS):
@@ -61,6 +85,18 @@ def _distances(focal_plane: FocalPlane, position: Triple, direction: Triple) -> 
         slope = focal_plane.surfaces.gradient(ccd, dx, dy)
         rate = w - slope[:, 0] * u - slope[:, 1] * v
         t = t + (focal_plane.surfaces.height(ccd, dx, dy) - (z + t * w)) / rate
-    # A ray that crosses the edge on its last micrometres has left the CCD. (In a gap, index -1, t has no meaning.)
-    ccd = np.where(focal_plane.ccd_at(x + t * u, y + t * v) == ccd, ccd, -1).astype(np.int32)
-    return np.where(ccd >= 0, t, 0.0), ccd
+    return t
+
+
+def _bundle_ccds(focal_plane: FocalPlane, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the CCDs of positions [m], most of which lie on one."""
+    camera = focal_plane.camera
+    finite = np.isfinite(x)
+    if not finite.any():
+        return np.full(x.shape, -1)
+    [most] = focal_plane.ccd_at(np.median(x[finite])[None], np.median(y[finite])[None])
+    center_x, center_y = camera.centers[most]
+    ccd = np.where(np.maximum(np.abs(x - center_x), np.abs(y - center_y)) <= camera.half_size, most, -1)
+    others = np.flatnonzero(ccd < 0)
+    ccd[others] = focal_plane.ccd_at(x[others], y[others])
+    return ccd

@@ -12,7 +12,7 @@ from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.media.medium import ConstantIndex
 from ..models.telescope import Telescope
-from .detector import on_ccds
+from .detector import land_bundle
 from .kernels.packet import from_packets, lane_flags, lanes, packet_count, ray_packets, to_packets
 from .kernels.photons import trace_photons
 from .pack.surfaces import distinct_media, pack_surfaces
@@ -88,8 +88,8 @@ def land_photons(
     x, y, z, u, v, w = from_packets(landing, n)
     lit = from_packets(statuses, n) == RayStatus.OK
     if focal_plane is not None:
-        x, y, on_ccd = on_ccds(focal_plane, (x, y, z), (u, v, w))
-        lit &= on_ccd >= 0
+        x, y, on_ccd = land_bundle(focal_plane, (x, y, z), (u, v, w), threads=threads)
+        lit &= on_ccd
     depth = np.abs(w)
     return LandedPhotons(x, y, u / depth, v / depth, lit)
 
