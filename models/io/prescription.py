@@ -37,8 +37,7 @@ from ...core.errors import PrescriptionError, check_choice, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..telescope import Telescope
-from .batoid.reader import batoid_telescope, is_batoid
-from .batoid.writer import telescope_to_batoid
+from .batoid import ROOT as BATOID_ROOT
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
@@ -63,7 +62,6 @@ BUNDLED = (
 
 # Readers of the parts of a lens file, by its ending.
 _LENS_FILES = {".zmx": read_zemax_file, ".seq": read_codev_file}
-_YAML_WRITERS = {"pachon": telescope_to_yaml, "batoid": telescope_to_batoid}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
@@ -110,7 +108,12 @@ def load_telescope(
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
         content = read_mapping(path, max_bytes=MAX_BYTES)
-        return batoid_telescope(content, path, lenient=lenient) if is_batoid(content) else telescope_of(content, path)
+        if BATOID_ROOT not in content:
+            return telescope_of(content, path)
+        # Imported where it is needed, like the writer: the sections of the format take time to make.
+        from .batoid.reader import batoid_telescope
+
+        return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
         parts = _LENS_FILES[path.suffix.lower()]
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
@@ -182,11 +185,15 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     """
     target = Path(path)
     format = format or ("zemax" if target.suffix.lower() == ".zmx" else "pachon")
-    check_choice("format", format, ("zemax", *_YAML_WRITERS))
+    check_choice("format", format, ("pachon", "batoid", "zemax"))
     if format == "zemax":
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
             write_bytes(catalogue_path(target), glasses.encode(), PrescriptionError)
+    elif format == "batoid":
+        from .batoid.writer import telescope_to_batoid
+
+        lens = telescope_to_batoid(telescope)
     else:
-        lens = _YAML_WRITERS[format](telescope)
+        lens = telescope_to_yaml(telescope)
     write_bytes(target, lens.encode(), PrescriptionError)

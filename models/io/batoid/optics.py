@@ -20,12 +20,11 @@ from ...media.medium import Medium
 from ...telescope import rotation_matrix
 from ..yaml.reader import FieldSection, GroupSection, WavelengthsSection
 from ..yaml.values import ROWS, Number, OptionalText, PositiveNumber, Text
+from . import ROOT
 from .apertures import Obscuration
 from .media import AnyMedium
 from .shapes import AnySurface
 
-#: Key of the outermost optic.
-ROOT = "opticalSystem"
 #: Origin [m] and axes of a coordinate system in the global frame.
 Frame = tuple[np.ndarray, np.ndarray]
 _AXES = dict(zip("xyz", np.eye(3), strict=True))

@@ -29,8 +29,9 @@ from ...shapes.shape import Plane
 from ...surface import IDENTITY, Interaction, Matrix, Surface, Vector
 from ...telescope import VACUUM, Telescope
 from ..zemax.file import Findings
+from . import ROOT
 from .apertures import clear_region
-from .optics import ROOT, BatoidFile, Compound, Extras, Frame, Interface, Optic, Screen
+from .optics import BatoidFile, Compound, Extras, Frame, Interface, Optic, Screen
 
 #: Wavelength [m] used where none is given, and the widest range: that of optical telescopes.
 DEFAULT_WAVELENGTH = 550e-9
@@ -66,11 +67,6 @@ class _Placed:
     @property
     def axes(self) -> Matrix:
         return cast(Matrix, tuple(tuple(map(float, row)) for row in self.frame[1]))
-
-
-def is_batoid(content: dict[str, Any]) -> bool:
-    """Return whether the content of a YAML file is that of a batoid file."""
-    return ROOT in content
 
 
 def batoid_telescope(content: dict[str, Any], path: Path, *, lenient: bool = False) -> Telescope:

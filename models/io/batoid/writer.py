@@ -16,9 +16,10 @@ from ....core.errors import PrescriptionError, error_context
 from ...media.medium import Medium
 from ...surface import Interaction, Surface
 from ...telescope import Telescope, rotation_angles
+from . import ROOT
 from .apertures import obscuration_items
 from .media import medium_items
-from .optics import ROOT, Frame
+from .optics import Frame
 from .shapes import surface_items
 
 #: Shifts [m] and rotations [rad] that are rounding of rotation matrices.

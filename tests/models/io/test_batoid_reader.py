@@ -194,7 +194,7 @@ def test_what_batoid_cannot_hold_is_refused_by_name(lsst_r, tmp_path, change, me
 
 
 def test_formats_have_names(lsst_r, tmp_path):
-    with pytest.raises(ConfigError, match="format = 'oslo': expected one of zemax, pachon, batoid"):
+    with pytest.raises(ConfigError, match="format = 'oslo': expected one of pachon, batoid, zemax"):
         save_telescope(lsst_r, tmp_path / "out.yaml", format="oslo")
 
 
