@@ -176,6 +176,10 @@ class Telescope:
                     f"launch_distance = {self.launch_distance:.6g} m, where rays start"
                 )
 
+    def __repr__(self) -> str:
+        size, field = f"{self.pupil_diameter:.6g} m", f"{math.degrees(self.field_radius):.6g} deg"
+        return f"<Telescope {self.name}: {len(self.surfaces)} surfaces, pupil {size}, field radius {field}>"
+
     def __reduce__(self) -> tuple[Any, ...]:
         # A mapping proxy cannot be pickled: hand over plain dictionaries.
         plain: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}

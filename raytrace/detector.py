@@ -67,8 +67,12 @@ def land_bundle(
             if one >= 0:
                 t[here] = _distance(focal_plane, np.array([one]), (px, py, pz), (u, v, w))
 
-    with ThreadPoolExecutor(thread_count(threads)) as pool:
-        list(pool.map(carry, range(0, len(x), CHUNK)))
+    starts = range(0, len(x), CHUNK)
+    if len(starts) == 1:
+        carry(0)
+    else:
+        with ThreadPoolExecutor(thread_count(threads)) as pool:
+            list(pool.map(carry, starts))
     x, y = x + t * direction[0], y + t * direction[1]
     on_ccd = (ccd >= 0) & (_bundle_ccds(focal_plane, x, y) == ccd)
     return np.where(on_ccd, x, position[0]), np.where(on_ccd, y, position[1]), on_ccd
