@@ -16,6 +16,9 @@ from pachon.core.errors import DomainError, UnknownNameError
 from pachon.core.units import ARCSEC
 from pachon.imaging.wcs import ccd_wcs
 from pachon.models.camera.silicon import Silicon
+from pachon.models.shapes.freeform import ZernikeSag
+from pachon.models.shapes.grid import GridSag
+from pachon.models.surface import Interaction
 
 galsim = pytest.importorskip("galsim")
 
@@ -65,11 +68,24 @@ def celestial(wcs, pixel):
     return galsim.CelestialCoord(ra * galsim.radians, dec * galsim.radians)
 
 
-def test_photons_land_where_single_rays_do(lsst_r):
+def screened(telescope):
+    """The telescope with a deformed M2, and a phase screen in glass, where it depends on the wavelength."""
+    bent = telescope.with_deformation("M2", GridSag(np.linspace(-2, 2, 9), np.linspace(-2, 2, 9), 1e-6 * np.eye(9)))
+    entrance = bent.surface("L1_entrance")
+    screen = replace(
+        entrance, name="screen", interaction=Interaction.PHASE, vertex=(0.0, 0.0, entrance.vertex[2] + 0.01),
+        shape=ZernikeSag((0.0, 1e-5, 2e-5, 5e-6), 0.8), aperture=None,
+    )  # fmt: skip
+    place = bent.surfaces.index(entrance) + 1
+    return replace(bent, surfaces=(*bent.surfaces[:place], screen, *bent.surfaces[place:]))
+
+
+@pytest.mark.parametrize("change", [lambda telescope: telescope, screened], ids=["plain", "special"])
+def test_photons_land_where_single_rays_do(lsst_r, change):
     # Every ray launched and traced on its own, at its own wavelength and field.
-    given, field = photons(60), (0.004, -0.007)
-    out = traced(pachon.galsim.PachonOptics(lsst_r, field, pixel_size=1.0), given)
-    chief = pachon.trace(lsst_r, pachon.launch_rays(lsst_r, field, 624e-9, ([0.0], [0.0]))).position[0]
+    telescope, given, field = change(lsst_r), photons(60), (0.004, -0.007)
+    out = traced(pachon.galsim.PachonOptics(telescope, field, pixel_size=1.0), given)
+    chief = pachon.trace(telescope, pachon.launch_rays(telescope, field, 624e-9, ([0.0], [0.0]))).position[0]
     # At a pointing on the equator west and north of the object; the light goes the opposite way.
     slopes = np.tan(field)
     to_object = np.array([-slopes[0], -slopes[1], 1.0])
@@ -78,13 +94,13 @@ def test_photons_land_where_single_rays_do(lsst_r):
     for i in range(60):
         ray = -(to_object + ARCSEC * (given.x[i] * west + given.y[i] * north))
         start = pachon.launch_rays(
-            lsst_r,
+            telescope,
             (ray[0] / -ray[2], ray[1] / -ray[2]),
             given.wavelength[i] * 1e-9,
             ([given.pupil_u[i]], [given.pupil_v[i]]),
             projection="gnomonic",
         )
-        end = pachon.trace(lsst_r, start)
+        end = pachon.trace(telescope, start)
         assert bool(out.flux[i]) is not bool(end.vignetted[0])
         if out.flux[i]:
             assert np.abs(end.position[0, :2] - chief[:2] - [out.x[i], out.y[i]]).max() < NEAR
