@@ -80,7 +80,13 @@ def screened(telescope):
     return replace(bent, surfaces=(*bent.surfaces[:place], screen, *bent.surfaces[place:]))
 
 
-@pytest.mark.parametrize("change", [lambda telescope: telescope, screened], ids=["plain", "special"])
+# The kernel for unusual surfaces takes several seconds to compile.
+SPECIAL = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "change", [lambda telescope: telescope, pytest.param(screened, marks=SPECIAL)], ids=["plain", "special"]
+)
 def test_photons_land_where_single_rays_do(lsst_r, change):
     # Every ray launched and traced on its own, at its own wavelength and field.
     telescope, given, field = change(lsst_r), photons(60), (0.004, -0.007)
@@ -109,7 +115,7 @@ def test_photons_land_where_single_rays_do(lsst_r, change):
     assert 0 < out.flux.sum() < 60
 
 
-@pytest.mark.parametrize("name", ["LSST_r", "HSC"])
+@pytest.mark.parametrize("name", ["LSST_r", pytest.param("HSC", marks=SPECIAL)])
 def test_photons_land_where_batoids_rays_do(name):
     batoid = pytest.importorskip("batoid")
     telescope = pachon.load_telescope(Path(batoid.datadir) / name.split("_")[0] / f"{name}.yaml")
@@ -320,6 +326,7 @@ def test_without_galsim_one_line_says_what_to_install():
     assert done.stdout == "pachon.galsim.PachonOptics needs GalSim: pip install 'pachon[galsim]'\n"
 
 
+@pytest.mark.long
 def test_a_configuration_file_draws_a_ccd(tmp_path):
     path = Path(__file__).parents[2] / "docs" / "examples" / "galsim_lsst_ccd.yaml"
     [config] = galsim.config.ReadConfig(str(path))
