@@ -21,6 +21,7 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from ....core.errors import PrescriptionError
 from ....core.schema import Count, Parameters, Tagged, WrittenAs, checked, expected, written
@@ -68,6 +69,8 @@ def _radius(value: Any) -> float | None:
     return value if isinstance(value, float) and math.isinf(value) else as_number(value)
 
 
+#: No surface has powers of hundreds.
+_FIRST = Annotated[Count, Field(le=100)]
 _RADIUS = Annotated[float, checked(_radius, "a number")]
 _AXIS = Annotated[Numbers, WrittenAs(np.ndarray.tolist)]
 _NODES = Annotated[
@@ -87,7 +90,7 @@ SURFACES |= {
     "Sphere": SurfaceSection.of(Sphere, R=Number),
     "Paraboloid": SurfaceSection.of(lambda radius: Conic(radius, -1.0), R=Number),
     "Quadric": SurfaceSection.of(Conic, R=Number, conic=Number),
-    "Asphere": SurfaceSection.of(_asphere, R=_RADIUS, conic=Number, coefs=Numbers, imin=(Count, 2)),
+    "Asphere": SurfaceSection.of(_asphere, R=_RADIUS, conic=Number, coefs=Numbers, imin=(_FIRST, 2)),
     "Zernike": ZernikeSection.of(
         _zernike, coef=Numbers, R_outer=(Number, 1.0), R_inner=(Number, 0.0), x_origin=(Number, 0.0),
         y_origin=(Number, 0.0),

@@ -84,6 +84,10 @@ def test_equal_names_are_told_apart_by_the_optics_around_them(loaded):
     ("change", "message"),
     [
         ({"surface": {"type": "Paraboloid"}}, r"items\[M1\]\.surface\.R is missing"),
+        (
+            {"surface": {"type": "Asphere", "R": 9, "conic": 0, "coefs": [1e-3], "imin": 10**30}},
+            r"surface\.imin = 1000000.*: expected a number up to 100",
+        ),
         ({"surface": {"type": "Spline"}}, r"items\[M1\]\.surface\.type = 'Spline': expected one of Plane, Sphere, "),
         ({"surface": {"type": "Sphere", "R": "x"}}, r"items\[M1\]\.surface\.R = 'x': expected a number"),
         ({"surface": {"type": "Sphere", "R": 0}}, r"items\[M1\]\.surface\.radius = 0\.0: expected a finite radius"),
