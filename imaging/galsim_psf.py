@@ -34,7 +34,7 @@ def psf_object(
     """Return a PSF as an object of GalSim, to convolve galaxies with.
 
     The pixels have collected their light: it is to be drawn with ``method="no_pixel"``. Its centre is where the chief
-    ray lands for `psf` of :func:`~pachon.make_psfs`, else the centroid.
+    ray lands for images of :func:`~pachon.make_psfs`, else the middle pixel of the stamps, ``[size // 2, size // 2]``.
 
     Parameters
     ----------

@@ -19,6 +19,7 @@ from pachon.models.camera.silicon import Silicon
 from pachon.models.shapes.freeform import ZernikeSag
 from pachon.models.shapes.grid import GridSag
 from pachon.models.surface import Interaction
+from pachon.pipeline.focal_plane_psf.model import FocalPlanePsf
 
 galsim = pytest.importorskip("galsim")
 
@@ -181,13 +182,22 @@ def test_offsets_are_pixels_of_the_image_and_sky_offsets_by_its_wcs(lsst_r, wcs)
     assert out.flux.sum() == 4.0
 
 
+def test_a_rotated_camera_turns_the_offsets(lsst_r):
+    given, angle = photons(300), 0.6
+    plain = traced(pachon.galsim.PachonOptics(lsst_r, (0.002, 0.001)), given)
+    turned = traced(pachon.galsim.PachonOptics(lsst_r.with_rotator(angle), (0.002, 0.001)), given)
+    back = (turned.x + 1j * turned.y) * np.exp(1j * angle)
+    # Rounding of 2 cm in pixels of 10 um.
+    assert np.abs(back - plain.x - 1j * plain.y).max() < 1e-9
+
+
 def test_field_and_sky_position_are_two_names_of_a_place(lsst_r, wcs):
     sky = celestial(wcs, (1000.0, 2000.0))
     op = pachon.galsim.PachonOptics(lsst_r, sky_pos=sky, pointing=POINTING * u.rad, position_angle=ANGLE * u.rad)
     same = pachon.galsim.PachonOptics(lsst_r, op.field, pointing=POINTING, position_angle=ANGLE)
     given = photons(500)
     one, other = traced(op, given), traced(same, given)
-    # 1e-16 rad of rounding is 1e-9 pixel at 20 m per... of focal length.
+    # 1e-16 rad of rounding is 1e-10 pixel at a focal length of 10 m.
     assert np.abs(one.x - other.x).max() < 1e-8
     assert np.abs(one.y - other.y).max() < 1e-8
 
@@ -403,3 +413,20 @@ def test_models_of_psfs_become_objects(gaussian):
             pachon.galsim.psf_object(model, **options)
     with pytest.raises(DomainError, match=r"star = 3: expected 0 to 0"):
         pachon.galsim.psf_object(psfs_of(stamps[0]), star=3)
+
+
+def test_the_psf_of_the_focal_plane_becomes_an_object(gaussian, monkeypatch):
+    covariance_of = {"R22_S11": np.array([[4.0, 0.0], [0.0, 3.0]])}
+
+    def draw(self, ccd, x, y, *, threads=None):
+        assert (x, y) == (1e-3, -2e-3)
+        return gaussian(31, covariance_of[ccd])[None]
+
+    monkeypatch.setattr(FocalPlanePsf, "draw", draw)
+    model = object.__new__(FocalPlanePsf)
+    object.__setattr__(model, "pixel_scale", 0.2 * ARCSEC)
+    psf = pachon.galsim.psf_object(model, ccd="R22_S11", x=1e-3, y=-2e-3)
+    _, moments = covariance(psf.drawImage(nx=31, ny=31, scale=0.2, method="no_pixel").array)
+    assert moments == pytest.approx(covariance_of["R22_S11"], abs=0.03)
+    with pytest.raises(DomainError, match="ccd, x and y: expected the place"):
+        pachon.galsim.psf_object(model, x=1e-3, y=0.0)

@@ -75,8 +75,10 @@ def batoid_telescope(content: dict[str, Any], path: Path, *, lenient: bool = Fal
     PrescriptionError with file, key, value and expected value; with `lenient`, unknown keys are left out with a
     warning.
     """
-    known = copy.deepcopy({key: content[key] for key in (ROOT, "pachon") if key in content})
-    drop = Findings(lenient).report if lenient else None
+    known = {key: content[key] for key in (ROOT, "pachon") if key in content}
+    drop = None
+    if lenient:
+        known, drop = copy.deepcopy(known), Findings(lenient).report
     file = validated(BatoidFile, known, str(path), PrescriptionError, {}, drop=drop)
     with error_context(file=path):
         return _telescope(file, path)
