@@ -222,6 +222,21 @@ def test_heights_defocus_the_photons(lsst_r):
     assert traced(pachon.galsim.PachonOptics(lsst_r, (0.00205, 0.0), focal_plane=flat), given).flux.sum() == 0
 
 
+def test_photons_land_on_uneven_ccds_where_rays_do(lsst_r):
+    plane, field = pachon.FocalPlane.from_budget("lsst", seed=3), (0.0035, -0.0012)
+    given = photons(500, band=(620.0, 620.0))
+    given.x, given.y = np.zeros(500), np.zeros(500)
+    out = traced(pachon.galsim.PachonOptics(lsst_r, field, focal_plane=plane, pixel_size=1.0), given)
+    start = pachon.launch_rays(lsst_r, field, 620e-9, (given.pupil_u, given.pupil_v))
+    rays = pachon.trace(lsst_r, start, focal_plane=plane)
+    blue = pachon.launch_rays(lsst_r, field, lsst_r.default_wavelength, ([0.0], [0.0]))
+    chief = pachon.trace(lsst_r, blue, focal_plane=plane).position[0]
+    lit = out.flux > 0
+    assert np.array_equal(lit, ~rays.vignetted)
+    assert lit.sum() > 300
+    assert np.abs(np.stack([out.x, out.y], axis=1) - (rays.position - chief)[:, :2])[lit].max() < 1e-13
+
+
 def test_silicon_absorbs_at_depth_and_loses_red_light(lsst_r):
     silicon = Silicon(thickness=100e-6, temperature=173.0)
     wavelength, n = 980e-9, 40000
