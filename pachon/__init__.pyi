@@ -1,3 +1,4 @@
+from . import galsim as galsim
 from .core.errors import ConfigError as ConfigError
 from .core.errors import DomainError as DomainError
 from .core.errors import HeightWarning as HeightWarning

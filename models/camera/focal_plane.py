@@ -63,6 +63,11 @@ class FocalPlane:
     seed: int | None = None
     residual: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        measured = f", heights of {self.measured.sum()} measured" if self.measured.any() else ""
+        drawn = "" if self.seed is None else f", seed {self.seed}"
+        return f"<FocalPlane of {self.camera.name}: {len(self.camera)} CCDs{measured}{drawn}>"
+
     @classmethod
     def from_budget(
         cls,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
@@ -18,6 +18,9 @@ from astropy import units as u
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import require_file, write_bytes
 from ..shapes.grid import GridSag
+
+if TYPE_CHECKING:
+    from astropy.io import fits
 
 
 def read_grid(path: str | os.PathLike[str]) -> GridSag:
@@ -33,22 +36,28 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
     PrescriptionError
         If the file cannot be read, has no image of two dimensions, a unit that is no length, or is no valid grid.
     """
+    header, data = fits_image(Path(path), 2)
+    with error_context(file=path):
+        x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
+        return GridSag(x, y, data * length_unit(header, "BUNIT"))
+
+
+def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
+    """Return header and float64 data of the first image of a number of dimensions in a FITS file; PrescriptionError."""
     from astropy.io import fits  # few prescriptions have a grid
 
-    path = Path(path)
     require_file(path, PrescriptionError)
     try:
         with fits.open(path, memmap=False) as hdus:
-            images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
+            images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
         reason = " ".join(str(error).split())
         raise PrescriptionError(f"cannot be read as FITS ({reason[:120]})", file=path) from None
     if not images:
-        raise PrescriptionError("expected a FITS image of two dimensions", file=path)
+        number = {2: "two", 4: "four"}[dimensions]
+        raise PrescriptionError(f"expected a FITS image of {number} dimensions", file=path)
     header, data = images[0]
-    with error_context(file=path):
-        x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
-        return GridSag(x, y, np.asarray(data, dtype=np.float64) * length_unit(header, "BUNIT"))
+    return header, np.asarray(data, dtype=np.float64)
 
 
 def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:

@@ -89,6 +89,10 @@ class PsfModel:
     kernel: np.ndarray | None = None
     alpha: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        parts = f"{self.n_components} components ({self.basis}), order {self.order}, {self.n_stars} stars"
+        return f"<PsfModel: {parts}, stamps {self.mean.shape[1]} x {self.mean.shape[0]}>"
+
     @classmethod
     def fit(
         cls,

@@ -70,6 +70,13 @@ class Atmosphere(LayerScreens):
     exposure: float
     times: np.ndarray
 
+    def __repr__(self) -> str:
+        air = f"r0 {self.r0:.4g} m, outer scale {self.outer_scale:.4g} m"
+        return (
+            f"<Atmosphere: {len(self.altitudes)} layers, {air}, {self.exposure:.6g} s, "
+            f"seed {self.seed}, epoch {self.epoch}>"
+        )
+
     @classmethod
     def from_site(
         cls,
