@@ -22,12 +22,11 @@ from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
 from .height_fit import fit_heights, table_column
 
-# Half a second to import: only where a focal plane is read, or made a mesh or a table.
 if TYPE_CHECKING:
     import trimesh
     from astropy.table import Table
 
-# Rims of tiles read back from a file land this far [m] outside by rounding (in a float32 STL 0.34 m are good to 15 nm).
+# [m], by which rims of tiles of files may lie outside: 0.34 m in a float32 STL are good to 15 nm.
 _MESH_MARGIN = 1e-7
 
 
@@ -334,17 +333,16 @@ class FocalPlane:
         -------
         Trimesh
             Vertices [m], z the height; normals along +z. Tiles follow the order of `names` with
-            ``2 * cells_per_ccd**2`` faces each. Between vertices it departs from the surface by at most
-            `facet_error`.
+            ``2 * cells_per_ccd**2`` faces each. Between vertices it departs from the surface by up to `facet_error`.
         """
+        import trimesh  # half a second
+
         cells = _cells(cells_per_ccd)
         vertices = np.stack(self._nodes(cells)[1:], axis=-1)
         index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
         tile = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2).reshape(-1, 3)
         faces = tile + (np.arange(len(self.camera)) * index.size)[:, None, None]
-        import trimesh
-
         return trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
 
     def facet_error(self, cells_per_ccd: int = 32) -> np.ndarray:

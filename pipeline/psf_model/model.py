@@ -21,6 +21,7 @@ from ...core.products import read_fits, write_fits
 from ...core.threads import one_blas_thread
 from ...core.version import CREATOR
 from . import gaussian_process, kriging
+from .basis import elbow_of
 from .file import model_fields, model_hdus
 from .fit import fit_fields, weighted
 from .polynomial import Extent, design_matrix, mapped
@@ -218,18 +219,8 @@ class PsfModel:
 
     @property
     def elbow(self) -> int:
-        """Number of principal components before the eigenvalues flatten out.
-
-        The index, counted from 0, at which the logarithm of the eigenvalues lies farthest below the straight line
-        from the first to the middle one (Jee & Tyson 2011, sec. 3, find it by eye). Beyond the middle even pure noise
-        falls steeply, for want of stars. Eigenvalues under 1e-14 of the first are rounding and do not count.
-        """
-        values = self.eigenvalues[: (len(self.eigenvalues) + 1) // 2]
-        values = values[values > 1e-14 * values[0]]
-        if len(values) < 3:
-            return len(values)
-        curve = np.log(values)
-        return int(np.argmin(curve - np.linspace(curve[0], curve[-1], len(curve))))
+        """Number of principal components before the eigenvalues flatten out, see :func:`~.basis.elbow_of`."""
+        return elbow_of(self.eigenvalues)
 
     @property
     def leave_one_out_curve(self) -> np.ndarray:
