@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from reprlib import Repr
 from typing import Any, Self
 
 
@@ -37,6 +38,8 @@ class PachonError(Exception):
         place: str | None = None,
         key: str | None = None,
     ) -> None:
+        # Some texts hold what a library says of a file, and names out of it.
+        problem = cut_short(" ".join(problem.split("\n")), _MAX_MESSAGE)
         super().__init__(problem)
         self.problem = problem
         self.subject = subject
@@ -107,6 +110,26 @@ class DomainError(PachonError):
 
 class ProductError(PachonError):
     """Product that cannot be read or written."""
+
+
+#: Longest text of a value in a message, and of a message [characters].
+_MAX_VALUE, _MAX_MESSAGE = 80, 600
+_REPR = Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = _MAX_VALUE
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 8
+
+
+def shown(value: object) -> str:
+    """Return a value as messages show it: on one line, cut short, and large arrays by type and shape."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and getattr(value, "size", 0) > 8:
+        return f"{type(value).__name__} of shape {shape}"
+    return cut_short(" ".join(_REPR.repr(value).split()), _MAX_VALUE)
+
+
+def cut_short(text: str, length: int = 60) -> str:
+    """Return a text of at most `length` characters."""
+    return text if len(text) <= length else text[: length - 3] + "..."
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.random_streams import stream
 from ..core.threads import thread_count
@@ -30,6 +31,7 @@ MASK_BITS = {SATURATED: "SATURATED"}
 _ROWS = 128
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Exposure:
     """Settings of an image: the sum of exposures of one scene under one PSF.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
+from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
 from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
@@ -35,6 +36,7 @@ class PsfField:
     lit_order: int  #: its order
 
     @classmethod
+    @check_arguments
     def fit(
         cls,
         stamps: ArrayLike,
@@ -82,6 +84,7 @@ class PsfField:
         return cls(model, pixels, np.linalg.lstsq(terms, light, rcond=None)[0], order)
 
     @classmethod
+    @check_arguments
     def of_run(
         cls,
         experiment: Experiment,
@@ -115,16 +118,19 @@ class PsfField:
         """Pixels along a side of the PSF's stamps."""
         return self.model.mean.shape[0]
 
+    @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Return amplitudes of mean and components, shape [n, 1 + k]; the first is 1."""
         found = self.model.amplitudes(self._on_ccd(positions))
         return np.concatenate([np.ones((len(found), 1)), found], axis=1)
 
+    @check_arguments
     def lit_fraction(self, positions: ArrayLike) -> np.ndarray:
         """Return the part of the entrance pupil whose light arrives, shape [n]."""
         terms = design_matrix(self._on_ccd(positions), self.model.extent, self.lit_order)
         return np.clip((terms * self.lit).sum(axis=1), 0.0, 1.0)
 
+    @check_arguments
     def transforms(self, size: int) -> np.ndarray:
         """Return ``rfft2`` of mean and components, centred on pixel ``size // 2``: complex64 [1 + k, size, size//2+1].
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
@@ -44,6 +45,7 @@ class CcdScene:
     seed: int
     epoch: int
 
+    @check_arguments
     def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
         """Expose the scene, by other settings than its own if they are given; `threads` change no byte."""
         settings = self.exposure if exposure is None else exposure
@@ -74,6 +76,7 @@ class CcdScene:
         return CcdImage(self.name, found.image, found.variance, found.mask, header, objects)
 
 
+@check_arguments
 def draw_ccd(
     experiment: Experiment,
     ccd: str,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, PachonError, ProductError, error_context
 from ..core.files import make_folder, remove_leftovers, write_bytes, write_new_bytes
 from ..core.memory import require_bytes
@@ -48,6 +49,7 @@ class ImagesResult:
     objects: dict[str, int]  #: number of objects on each CCD of this call
 
 
+@check_arguments
 def simulate_images(
     config: ImagesConfig,
     folder: Path,

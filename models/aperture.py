@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
 
 
@@ -41,6 +42,7 @@ def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np
     return x * cosine + y * sine, y * cosine - x * sine
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Circle(Region):
     """Disc of a radius [m] about a centre x, y [m]; its rim is outside."""
@@ -60,6 +62,7 @@ class Circle(Region):
         return dx**2 + dy**2 < self.radius**2
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Annulus(Region):
     """Ring between two radii [m] about a centre x, y [m]; its inner rim is inside, its outer rim outside."""
@@ -81,6 +84,7 @@ class Annulus(Region):
         return (r2 >= self.inner**2) & (r2 < self.outer**2)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Rectangle(Region):
     """Rectangle of a width and height [m] about a centre x, y [m], without rim.
@@ -109,6 +113,7 @@ class Rectangle(Region):
         return (np.abs(along) < 0.5 * self.width) & (np.abs(across) < 0.5 * self.height)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Vane(Region):
     """Strip of a width [m] from a point x, y [m] outwards, at an angle [rad] from x towards y; endless, without rims.
@@ -135,6 +140,7 @@ class Vane(Region):
         return beside if self.both_ways else beside & (along > 0.0)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Polygon(Region):
     """Polygon of at least three corners (x, y) [m], in either sense; the last is joined to the first.
@@ -219,6 +225,7 @@ class _Combination(Region):
         _check_parts(type(self).__name__.lower(), self.parts)
 
 
+@check_arguments
 class Union(_Combination):
     """Points of at least one of several regions."""
 
@@ -226,6 +233,7 @@ class Union(_Combination):
         return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
 
 
+@check_arguments
 class Intersection(_Combination):
     """Points of all of several regions."""
 
@@ -233,6 +241,7 @@ class Intersection(_Combination):
         return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Complement(Region):
     """Points outside a region: what an obscuration leaves clear."""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.units import ARCSEC
 from .surface import Interaction, Surface
@@ -107,6 +108,7 @@ class _Trace:
     u_after: np.ndarray
 
 
+@check_arguments
 def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> FirstOrder:
     """Return the first-order properties of a centred telescope.
 
@@ -152,6 +154,7 @@ def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np
     return np.abs(_trace(telescope, wavelength, np.tan(field)).h).sum(axis=1)
 
 
+@check_arguments
 def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field: float | None = None) -> SeidelSums:
     """Return the Seidel sums of a centred telescope.
 

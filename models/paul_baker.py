@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from .aperture import Annulus, Circle
 from .first_order import footprints
@@ -29,6 +30,7 @@ from .telescope import VACUUM, Telescope
 COPLANAR = 2.0 - math.sqrt(3.0)
 
 
+@check_arguments
 def paul_baker(
     diameter: float = 8.4,
     focal_ratio: float = 4.0,

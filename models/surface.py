@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
 from .aperture import Aperture
 from .media.medium import Medium
@@ -33,6 +34,7 @@ class Interaction(IntEnum):
     PHASE = 4
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Surface:
     """One surface of a telescope, in the order that light meets them.

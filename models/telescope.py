@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
 from ..core.units import metres, radians
 from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
@@ -38,6 +39,7 @@ def rotation_matrix(tilt: Any) -> np.ndarray:
     return about_x @ about_y @ about_z
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Telescope:
     r"""An unfolded optical prescription.

@@ -12,6 +12,7 @@ from math import comb
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 
 #: Names of the first terms, as optical shops call them.
@@ -55,6 +56,7 @@ def _radial_coefficients(m: int, count: int, obscuration: float) -> np.ndarray:
     return np.linalg.inv(upper * signs[:, None])
 
 
+@check_arguments
 def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
     """Evaluate annular Zernike polynomials 1 ... jmax, orthonormal over the annulus (mean square one).
 

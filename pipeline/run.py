@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.files import write_bytes, write_json
 from ..core.products import write_ecsv
@@ -61,6 +62,7 @@ class RunResult:
     not_modelled: dict[str, str]
 
 
+@check_arguments
 def run(
     config: Configuration | Experiment,
     folder: Path,

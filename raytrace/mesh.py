@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from ..core.arguments import check_arguments
 from ..core.launch import launch, start_warp
 from ..core.warp_arrays import warp_array
 from ..models.surface import Surface
@@ -28,6 +29,7 @@ class MeshLanding:
     facet: np.ndarray  #: index of the facet, -1 for none, int32 [n]
 
 
+@check_arguments
 def land_on_mesh(
     detector: Surface, mesh: trimesh.Trimesh, position: np.ndarray, direction: np.ndarray, *, threads: int | None = None
 ) -> MeshLanding:

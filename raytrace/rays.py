@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
 from ..core.units import metres, radians
 from ..models.telescope import Telescope
@@ -69,6 +70,7 @@ def field_angles(slopes: np.ndarray, projection: str = "zemax") -> np.ndarray:
     raise ConfigError(f"projection = {projection!r}: expected one of {', '.join(PROJECTIONS)}")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Rays:
     """Rays of one wavelength before the first surface, in the telescope frame.
@@ -115,6 +117,7 @@ def check_wavelength(wavelength: Any) -> float:
     return float(value)
 
 
+@check_arguments
 def launch_rays(
     telescope: Telescope,
     field: tuple[ArrayLike, ArrayLike],

@@ -13,6 +13,7 @@ from astropy import units as u
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError, ProductError, error_context
 from ..core.files import read_bytes, write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
@@ -45,6 +46,7 @@ _PER_COMPONENT = {
 }
 
 
+@check_arguments
 def read_galaxies(path: str | Path, *, pointing: Any = None) -> Galaxies:
     """Read galaxies from a table: ECSV, FITS (its first table) or Parquet.
 
@@ -87,6 +89,7 @@ def read_galaxies(path: str | Path, *, pointing: Any = None) -> Galaxies:
         return _from_catalogue(columns, pointing)
 
 
+@check_arguments
 def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
     """Write galaxies as a table of their components, ECSV, FITS or Parquet by the ending of the path.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.warp_arrays import warp_array
@@ -19,6 +20,7 @@ _PER_GALAXY = ("xi", "eta", "magnitude", "radius")
 _PER_COMPONENT = ("dx", "dy", "fraction", "component_radius", "e1", "e2", "sersic")
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Galaxies:
     """Galaxies made of elliptical Sersic components.

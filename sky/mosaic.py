@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.memory import require_bytes
@@ -64,6 +65,7 @@ class GalaxyStamps:
     finest_pixel: float
 
     @classmethod
+    @check_arguments
     def from_mosaic(
         cls,
         path: str | Path,
@@ -124,6 +126,7 @@ class GalaxyStamps:
     def __len__(self) -> int:
         return len(self.magnitude)
 
+    @check_arguments
     def population(self, seed: int, *, density: float | None = None) -> StampPopulation:
         """Return these galaxies planted at random places and angles over the whole tangent plane.
 

@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.memory import require_bytes
 from ..core.units import ARCMIN, ARCSEC, radians, require_positive
@@ -56,6 +57,7 @@ def counts(magnitude: Any) -> np.ndarray:
     return COUNT * 10.0 ** (SLOPE * (np.asarray(magnitude, dtype=np.float64) - 25.0))
 
 
+@check_arguments
 @dataclass(frozen=True)
 class GalaxyPopulation:
     """Random galaxies over the whole tangent plane, the same in every region that is drawn.
@@ -142,6 +144,7 @@ class GalaxyPopulation:
         )
 
 
+@check_arguments
 def draw_galaxies(
     region: Any, faintest: float, seed: int, *, brightest: float = 20.0, density: float = 1.0
 ) -> Galaxies:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.random_streams import stream
 from ..core.units import metres
@@ -36,6 +37,7 @@ LARGEST_RMS = 10.0 * PAPER_RMS
 LINEAR_FRACTION = 0.5
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class ResidualWavefront:
     """An aberration added to the traced wavefront.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.units import field_label, metres
 from ..models.camera.focal_plane import FocalPlane
@@ -73,6 +74,7 @@ def image_jacobians(
     return jacobian
 
 
+@check_arguments
 def fields_at(
     telescope: Telescope,
     positions: ArrayLike,

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
 from ..core.units import metres
 from ..models.camera.focal_plane import FocalPlane
@@ -25,6 +26,7 @@ from .request import Request
 _ADVICE = "; wavefront_opd can do without it, with reference='mean'"
 
 
+@check_arguments
 def wavefront_opd(
     telescope: Telescope,
     field: ArrayLike,
@@ -119,6 +121,7 @@ def wavefront_opd(
     )
 
 
+@check_arguments
 def wavefront_opds(
     telescope: Telescope,
     fields: ArrayLike,

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError, check_choice
 from ..models.telescope import Telescope
 
@@ -17,6 +18,7 @@ from ..models.telescope import Telescope
 _DEFAULT_N_PUPIL = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
 
 
+@check_arguments
 @dataclass(frozen=True)
 class PupilSampling:
     """Points of an annulus and their weights in a mean.
@@ -110,6 +112,7 @@ def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampl
     return PupilSampling(points, np.ones(len(points)))
 
 
+@check_arguments
 def pupil_sampling(
     telescope: Telescope, sampling: str | PupilSampling = "gauss", n_pupil: int | None = None
 ) -> PupilSampling:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.units import metres, radians
 from ..models.telescope import Telescope
@@ -53,6 +54,7 @@ class Request:
     threads: int | None
 
     @classmethod
+    @check_arguments
     def of(
         cls,
         telescope: Telescope,
@@ -129,11 +131,13 @@ class Request:
         """Pupil points in units of the radius of the entrance pupil, shape [n_pupil, 2]."""
         return self.pupil.points / (0.5 * self.telescope.pupil_diameter)
 
+    @check_arguments
     def launch(self, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
         """Return the rays of one wavelength [m], field by field, through other pupil points [m] where given."""
         points = self.pupil.points if pupil is None else pupil
         return launch_bundles(self.telescope, self.directions, wavelength, points)
 
+    @check_arguments
     def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
         """Trace the rays of :meth:`launch` to the detector."""
         points = self.pupil.points if pupil is None else pupil
@@ -164,6 +168,7 @@ class Request:
             yield part, replace(self, fields=self.fields[part])
 
 
+@check_arguments
 def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.ndarray:
     """Return field angles [rad], shape [n, 2], that the telescope covers.
 

@@ -7,12 +7,14 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.units import metres
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
 from .chief_rays import chief_rays, image_jacobians
 
 
+@check_arguments
 def focus_height(telescope: Telescope, silicon: Silicon, wavelength: ArrayLike, threads: int | None = None) -> float:
     """Return the height of CCDs at which silicon is best in focus, along +z of the telescope [m].
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.units import require_positive
 from ..models.zernike_polynomials import annular_zernikes
 from .opd_map import OpdMap, ZernikeFit
 
 
+@check_arguments
 def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int = 28) -> ZernikeFit:
     """Fit annular Zernikes to an OPD map by least squares over its lit points.
 

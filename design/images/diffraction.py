@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.units import field_label, metres
 from ...models.telescope import Telescope
@@ -41,6 +42,7 @@ _AT_ONCE = 4096
 _PEAK, _MOST_PLACES, _FINE = 3.0, 192, 33
 
 
+@check_arguments
 def fft_psf(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -114,6 +116,7 @@ def fft_psf(
     return plan.image("fft", waves, int(across), progress)
 
 
+@check_arguments
 def huygens_psf(
     telescope: Telescope,
     fields: ArrayLike | None = None,

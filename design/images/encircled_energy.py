@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import zoom
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import arcseconds, metres
@@ -56,6 +57,7 @@ class EncircledEnergy(FieldResult):
     fraction: np.ndarray
     plate_scale: np.ndarray
 
+    @check_arguments
     def radius_holding(self, fraction: float) -> np.ndarray:
         """Return the radius that holds a fraction of the light [m], shape [n_field]; NaN beyond the curve."""
         if not 0 < fraction < 1:
@@ -90,6 +92,7 @@ class EncircledEnergy(FieldResult):
             return self._titled(figure, f"encircled energy {kind}, {self._nanometres()}")
 
 
+@check_arguments
 def encircled_energy(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -170,6 +173,7 @@ def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> Encir
     return EncircledEnergy(psf.request, "diffraction", radius, np.stack(rows), psf.plate_scale)
 
 
+@check_arguments
 def energy_curve(
     image: np.ndarray, center: tuple[float, float] | None = None, *, parts: int = _PARTS
 ) -> tuple[np.ndarray, np.ndarray]:

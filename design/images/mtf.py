@@ -19,6 +19,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, new_figure, styled
 from ...core.units import arcseconds
@@ -76,6 +77,7 @@ class Mtf(FieldResult):
         """Cut-off frequencies of the shortest wavelength [cycles/m], tangential and sagittal, shape [n_field, 2]."""
         return 1.0 / (self.wavelengths.min() * self.f_number)
 
+    @check_arguments
     def frequency_at(self, contrast: float) -> np.ndarray:
         """Return the lowest frequency at which the contrast falls to a value [cycles/m], shape [n_field, 2].
 
@@ -130,6 +132,7 @@ class Mtf(FieldResult):
             return self._titled(figure, f"modulation transfer, {self._nanometres()}")
 
 
+@check_arguments
 def mtf(
     telescope: Telescope,
     fields: ArrayLike | None = None,

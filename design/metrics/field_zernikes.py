@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
 from ...core.units import field_label, radians
@@ -123,6 +124,7 @@ class DoubleZernikes:
     at_nodes: FieldZernikes
     residual_rms: np.ndarray
 
+    @check_arguments
     def at(self, fields: ArrayLike) -> np.ndarray:
         """Return the pupil coefficients [m] of the expansion at field angles [rad], shape [n_field, jmax]."""
         x, y = np.atleast_2d(np.asarray(fields, dtype=np.float64)).T / self.field_radius
@@ -174,6 +176,7 @@ class DoubleZernikes:
             return figure
 
 
+@check_arguments
 def wavefront_zernikes(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -226,6 +229,7 @@ def wavefront_zernikes(
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil)
 
 
+@check_arguments
 def double_zernikes(
     telescope: Telescope,
     wavelength: ArrayLike | None = None,

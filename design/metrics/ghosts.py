@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import RED, new_figure, plain_text, styled
 from ...core.units import field_label
@@ -163,6 +164,7 @@ class Ghosts(FieldResult):
             )
 
 
+@check_arguments
 def ghosts(
     telescope: Telescope,
     field: ArrayLike | None = None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_of, new_figure, styled
 from ...models.telescope import Telescope
@@ -76,6 +77,7 @@ class Vignetting(FieldResult):
             return self._titled(figure, f"vignetting at {self._nanometres()}; {lit}")
 
 
+@check_arguments
 def vignetting(
     telescope: Telescope,
     fields: ArrayLike | None = None,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.plotting import BLUE, GREY, new_figure, plain_text, styled
 from ...core.threads import one_blas_thread
@@ -117,6 +118,7 @@ class Optimum:
             return figure
 
 
+@check_arguments
 @one_blas_thread()
 def optimize(
     telescope: Telescope,

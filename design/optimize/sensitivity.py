@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, new_figure, plain_text, styled
 from ...core.threads import one_blas_thread
@@ -58,6 +59,7 @@ class Sensitivity(FieldResult):
         """Rms wavefront over the field without piston and tilt, per unit of each parameter [m], shape [n_parameter]."""
         return np.sqrt((self.matrix[:, 3:] ** 2).sum(axis=1).mean(axis=0))
 
+    @check_arguments
     def modes(self, first: int = 4) -> tuple[np.ndarray, np.ndarray]:
         """Return singular values and modes of the matrix, each parameter in units of 1 m rms wavefront.
 
@@ -140,6 +142,7 @@ def field_rings(telescope: Telescope) -> np.ndarray:
     return np.concatenate(rings)
 
 
+@check_arguments
 def sensitivity(
     telescope: Telescope,
     parameters: Iterable[str | Parameter],

@@ -16,6 +16,7 @@ import numpy as np
 from astropy import units as u
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
 from ...models.shapes.shape import Shape, Sum
 from ...models.telescope import Telescope
@@ -35,6 +36,7 @@ def unit_size(text: str) -> float:
         raise ConfigError(f"unit = {text!r}: expected one of length, angle or temperature, or 1") from None
 
 
+@check_arguments
 @dataclass(frozen=True)
 class DegreeOfFreedom:
     """One degree of freedom.
@@ -53,6 +55,7 @@ class DegreeOfFreedom:
     of: Mapping[str, float] = field(hash=False)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class SurfaceDeformation:
     """Bending modes of surfaces, which add to their sag.
@@ -72,6 +75,7 @@ class SurfaceDeformation:
     shape: Shape
 
 
+@check_arguments
 @dataclass(frozen=True)
 class DegreesOfFreedom:
     """A vector of named degrees of freedom.

@@ -9,12 +9,14 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique
 from ...core.random_streams import stream
 
 DISTRIBUTIONS = ("uniform", "normal", "truncated")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Tolerance:
     """Tolerance of one degree of freedom.

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from ...core.arguments import check_arguments
 from ...core.errors import unknown_name
 from ...core.units import metres
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A mosaic of equal square CCDs, on rafts."""
@@ -88,6 +90,7 @@ class Camera:
 _ITL_RAFTS = {"R01", "R02", "R03", "R10", "R20", "R41", "R42", "R43"}
 
 
+@check_arguments
 @lru_cache(maxsize=1)
 def lsst_camera() -> Camera:
     """Return the LSST camera: 189 CCDs of 4096 x 4096 pixels of 10 um in 21 rafts of 3 x 3.

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import trimesh
 from astropy.table import Table
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, unknown_name
 from ...core.units import metres, radians
 from ..io.heights.file import read_heights
@@ -30,6 +31,7 @@ from .height_fit import fit_heights, table_column
 _MESH_MARGIN = 1e-7
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class FocalPlane:
     """Height of the CCD surfaces over the nominal focal plane.
@@ -56,7 +58,7 @@ class FocalPlane:
 
     camera: Camera
     surfaces: CcdSurfaces
-    measured: np.ndarray
+    measured: NDArray[np.bool_]
     terms: tuple[str, ...] = ()
     budget: HeightBudget | None = None
     seed: int | None = None

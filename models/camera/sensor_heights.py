@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import metres
 from .camera import Camera
@@ -76,6 +77,7 @@ class CornerSensor:
         """Name of the raft."""
         return self.name.split("_")[0]
 
+    @check_arguments
     def height(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the height [m] at positions on the focal plane [m], positive along +z; NaN off the measured sides."""
         dx, dy = np.broadcast_arrays(metres(x, "x") - self.center[0], metres(y, "y") - self.center[1])

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh_tridiagonal
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import metres
 from ..media.silicon import absorption_length, check_temperature, silicon_index
@@ -38,6 +39,7 @@ class ConversionPaths:
     weight: np.ndarray  #: parts of the light that enters, [n]; their sum is what is absorbed
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Silicon:
     """Silicon of a CCD.

@@ -33,6 +33,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
@@ -70,6 +71,7 @@ def bundled_names() -> tuple[str, ...]:
     return BUNDLED
 
 
+@check_arguments
 def load_telescope(
     name_or_path: str | os.PathLike[str],
     *,
@@ -154,6 +156,7 @@ def _bundled(name: str) -> Telescope:
     return read_telescope(DATA / f"{name}.yaml")
 
 
+@check_arguments
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
     """Write a prescription file: YAML, or where the name ends in ``.zmx`` a Zemax lens file.
 

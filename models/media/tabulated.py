@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
 
 INTERPOLATIONS = ("monotone", "linear")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class TabulatedIndex(Medium):
     """Medium whose index is interpolated from a table.

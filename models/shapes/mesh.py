@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, UnknownNameError, error_context
 from ..content_equality import ContentEquality
 from ..mesh_file import load_mesh
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 EDGE = 1e-9
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class MeshSurface(ContentEquality, Shape):
     """Surface of triangles with one height at each x, y.

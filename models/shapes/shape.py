@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, unknown_name
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -264,6 +265,7 @@ class Plane(Rotational):
         return Sphere(1.0 / value) if value else self
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Sphere(Rotational):
     """Sphere of a radius of curvature [m], positive where the centre lies on the +z side."""
@@ -271,6 +273,7 @@ class Sphere(Rotational):
     radius: float
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Conic(Rotational):
     """Conic of revolution: radius of curvature at the vertex [m], and conic constant (0 sphere, -1 paraboloid)."""
@@ -279,6 +282,7 @@ class Conic(Rotational):
     conic: float
 
 
+@check_arguments
 @dataclass(frozen=True)
 class EvenAsphere(Rotational):
     """Conic plus even powers of the distance from the axis.
@@ -298,6 +302,7 @@ class EvenAsphere(Rotational):
     coefficients: tuple[float, ...]
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Sum(Shape):
     """Sum of the sags of several shapes.

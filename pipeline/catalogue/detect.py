@@ -11,6 +11,7 @@ import sep
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import real_array, require_positive
 from ..measure.shapes import fwhm
@@ -29,6 +30,7 @@ _FWHM_SIDE, _FWHM_BATCH = 25, 2048
 _PIXEL_ROOM, _PIECES = 0.2, 8192
 
 
+@check_arguments
 def detect_objects(
     image: ArrayLike,
     variance: ArrayLike,

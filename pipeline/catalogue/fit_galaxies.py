@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ...core.units import real_array, require_positive
@@ -31,6 +32,7 @@ _BATCH_NUMBERS = 1 << 23
 _PSF_SUM_TOLERANCE = 1e-4
 
 
+@check_arguments
 def fit_galaxies(
     image: ArrayLike,
     variance: ArrayLike,
@@ -131,6 +133,7 @@ def fit_galaxies(
     return joined(parts, members)
 
 
+@check_arguments
 def fit_galaxy_stamps(
     stamps: ArrayLike,
     variance: ArrayLike,

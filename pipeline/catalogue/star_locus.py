@@ -8,6 +8,7 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import real_array, require_positive
 from ..simulate.stamps import center_stamps
@@ -73,6 +74,7 @@ class StarSelection:
     def __len__(self) -> int:
         return len(self.index)
 
+    @check_arguments
     def completeness(self, is_star: ArrayLike) -> float:
         """Return the fraction of true stars of sufficient S/N that were selected; NaN where there are none.
 
@@ -81,6 +83,7 @@ class StarSelection:
         true = self._truth(is_star) & (self.cuts & StarCut.FAINT == 0)
         return float((self.cuts[true] == 0).mean()) if true.any() else np.nan
 
+    @check_arguments
     def purity(self, is_star: ArrayLike) -> float:
         """Return the fraction of selected objects that are stars in truth; NaN where none were selected."""
         true = self._truth(is_star)
@@ -93,6 +96,7 @@ class StarSelection:
         return true
 
 
+@check_arguments
 def select_stars(
     objects: DetectedObjects,
     image: ArrayLike,

@@ -12,6 +12,7 @@ from astropy import units as u
 from astropy.io.registry import IORegistryError
 from astropy.table import Table
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import require_file
 from ...core.units import ARCSEC
@@ -91,6 +92,7 @@ class FocalPlaneStars:
         return good & np.isfinite(self.x) & np.isfinite(self.y)
 
     @classmethod
+    @check_arguments
     def of_ccds(
         cls, ccds: Iterable[CcdStars], pixel_scale: float, weight_fwhm: float = 0.7 * ARCSEC
     ) -> FocalPlaneStars:
@@ -103,6 +105,7 @@ class FocalPlaneStars:
         return cls(tuple(names.tolist()), x, y, values, noise, stamps, pixel_scale, weight_fwhm)
 
     @classmethod
+    @check_arguments
     def from_products(cls, products: Sequence[CcdProduct], weight_fwhm: float = 0.7 * ARCSEC) -> FocalPlaneStars:
         """Take the observed stars that are good enough for a PSF model from the products of a run."""
         ccds = [
@@ -112,6 +115,7 @@ class FocalPlaneStars:
         return cls.of_ccds(ccds, products[0].pixel_scale if products else np.nan, weight_fwhm)
 
     @classmethod
+    @check_arguments
     def from_table(
         cls,
         table: Table | Mapping[str, Any],
@@ -176,6 +180,7 @@ class FocalPlaneStars:
         return stars
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path, **options: Any) -> FocalPlaneStars:
         """Read stars from the folder of a run, or from a FITS or ECSV table with the columns of :meth:`from_table`."""
         place = Path(path)
@@ -202,6 +207,7 @@ class FocalPlaneStars:
         except DomainError as error:
             raise ProductError(error.reason, file=place) from None
 
+    @check_arguments
     def chosen(self, which: np.ndarray) -> FocalPlaneStars:
         """Return some of the stars, by a mask [n] or indices."""
         index = np.arange(len(self))[which]

@@ -10,6 +10,7 @@ import treecorr
 from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import ARCMIN, radians, real_array
 
@@ -72,11 +73,13 @@ class Correlation:
             "pairs": self.n_pairs,
         }
 
+    @check_arguments
     def within(self, separations: str) -> np.ndarray:
         """Return the bins of a range of :data:`SEPARATION_RANGES`, the upper end excluded, [n_bins] bool."""
         low, high = SEPARATION_RANGES[separations]
         return (self.r_arcmin >= low) & (self.r_arcmin < high)
 
+    @check_arguments
     def mean_xi_plus(self, separations: str) -> float:
         """Return the mean of xi+ over the pairs of a range of separations.
 
@@ -92,10 +95,12 @@ class Correlation:
         """
         return float(self._mean_over_pairs(separations, self.n_pairs, self.xi_plus))
 
+    @check_arguments
     def leave_one_out_mean_xi_plus(self, separations: str) -> np.ndarray:
         """Return :meth:`mean_xi_plus` without each patch in turn, [n_patches]."""
         return self._mean_over_pairs(separations, self.leave_one_out_pairs, self.leave_one_out_plus)
 
+    @check_arguments
     def error_mean_xi_plus(self, separations: str) -> float:
         """Return the jackknife error of :meth:`mean_xi_plus`; NaN without patches."""
         return float(jackknife_error(self.leave_one_out_mean_xi_plus(separations))) if self.n_patches else np.nan
@@ -108,6 +113,7 @@ class Correlation:
             return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
 
 
+@check_arguments
 def shear_correlation(
     x: ArrayLike,
     y: ArrayLike,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
 from ...core.units import positive_angle, require_positive
@@ -73,6 +74,7 @@ class Shapes:
         return len(self.flags)
 
 
+@check_arguments
 def measure_shapes(
     images: ArrayLike,
     pixel_scale: ArrayLike,

@@ -13,6 +13,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.table.meta import YamlParseError
 
+from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.files import read_bytes
 
@@ -24,6 +25,7 @@ class StarCutouts(NamedTuple):
     positions: np.ndarray  #: [n, 2], in the unit of the table
 
 
+@check_arguments
 def load_stars(
     catalogue: str | Path,
     *,

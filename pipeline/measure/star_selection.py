@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import real_array
 
@@ -81,6 +82,7 @@ def _defect_counts(flags: np.ndarray) -> str:
     )
 
 
+@check_arguments
 def flag_stars(
     stamps: ArrayLike, noise: ArrayLike, *, gain: float = 1.0, saturation: float | None = None, threshold: float = 6.0
 ) -> Selection:

@@ -16,6 +16,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.threads import one_blas_thread
@@ -88,6 +89,7 @@ class PsfModel:
     alpha: np.ndarray | None = None
 
     @classmethod
+    @check_arguments
     def fit(
         cls,
         stamps: ArrayLike,
@@ -246,6 +248,7 @@ class PsfModel:
             q, _ = np.linalg.qr(weighted(design_matrix(self.positions, self.extent, self.order), self.weights))
         return (q**2).sum(axis=1)
 
+    @check_arguments
     def at(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the PSF at positions of any number, [m, ny, nx], unit sum.
 
@@ -259,10 +262,12 @@ class PsfModel:
         """
         return self._combine(self.amplitudes(positions))
 
+    @check_arguments
     def draw(self, x: float, y: float) -> np.ndarray:
         """Evaluate the PSF at one position, [ny, nx], unit sum."""
         return self.at((x, y))[0]
 
+    @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the amplitudes of the components at positions, [m, k]."""
         terms = design_matrix(positions, self.extent, self.order)
@@ -294,6 +299,7 @@ class PsfModel:
         squares = (self._leave_one_out_residuals() ** 2).sum(axis=1) + self.unexplained
         return float(np.sqrt(squares.mean() / self.mean.size))
 
+    @check_arguments
     def truncated(self, n_components: int) -> PsfModel:
         """Return the model with its first components only, what the others held counted as unexplained.
 
@@ -315,6 +321,7 @@ class PsfModel:
             alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
+    @check_arguments
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
         """Return the model as FITS extensions, lossless; :meth:`from_hdus` reads them.
 
@@ -327,6 +334,7 @@ class PsfModel:
         return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
 
     @classmethod
+    @check_arguments
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
         """Read a model from FITS extensions written by :meth:`to_hdus`.
 
@@ -337,6 +345,7 @@ class PsfModel:
         """
         return cls(**model_fields(hdus, name))
 
+    @check_arguments
     def write(self, path: str | Path, name: str = "PSF") -> None:
         """Write the model to a FITS file of its own, with checksums; lossless.
 
@@ -348,6 +357,7 @@ class PsfModel:
         write_fits(Path(path), self.to_hdus(name), None, [CREATOR])
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path, name: str = "PSF") -> PsfModel:
         """Read a model from a FITS file: one of :meth:`write`, or the product of a CCD.
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from .pixel_boundaries import collect, with_rim, without_rim
 
@@ -96,6 +97,7 @@ def _shifts(charge: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return np.einsum("nyxab,ab->nyx", windows, kernel)
 
 
+@check_arguments
 def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = "itl", sky: float = 0.0) -> np.ndarray:
     """Return images of stars as a CCD collects them under the brighter-fatter effect.
 

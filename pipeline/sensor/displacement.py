@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from .pixel_boundaries import RIM, collect, with_rim, without_rim
 
@@ -28,6 +29,7 @@ class Displacement(ABC):
         """
 
 
+@check_arguments
 @dataclass(frozen=True)
 class TreeRings(Displacement):
     r"""Rings of doping about the axis of the silicon boule: radial displacement :math:`A \cos(2 \pi r/P + \varphi)`.
@@ -55,6 +57,7 @@ class TreeRings(Displacement):
         return size * along / np.where(radius > 0.0, radius, 1.0)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class EdgeRolloff(Displacement):
     """Outward displacement near the edges of a CCD, which falls exponentially with the distance from each edge.
@@ -80,6 +83,7 @@ class EdgeRolloff(Displacement):
         return self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))
 
 
+@check_arguments
 def displace_stamps(
     images: np.ndarray, effects: Sequence[Displacement], places: np.ndarray, pixel_size: float
 ) -> np.ndarray:

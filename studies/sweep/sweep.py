@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
 from ...core.memory import available_bytes, readable
 from ...core.progress import Reporter
@@ -38,6 +39,7 @@ class SweepOutcome:
     failed: int  #: could not be computed
 
 
+@check_arguments
 def run_sweep(
     sweep: SweepFile,
     path: str | os.PathLike[str],

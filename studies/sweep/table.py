@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.products import Columns, described_table
 from ...core.table_files import write_table
@@ -52,6 +53,7 @@ class SweepTable:
         return len(self.number)
 
 
+@check_arguments
 def load_sweep_table(path: str | os.PathLike[str]) -> SweepTable:
     """Read the results of a sweep from the file that ``pachon sweep`` or :func:`~pachon.run_sweep` wrote.
 

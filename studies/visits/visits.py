@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PachonError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.memory import readable
@@ -57,6 +58,7 @@ def stack_path(folder: Path, visits: int) -> Path:
     return folder / f"stack_{visits:04d}.fits"
 
 
+@check_arguments
 def stack_visits(
     config: VisitsConfig,
     folder: Path,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import metres, require_positive
 from ...models.io.site_file import load_site
@@ -71,6 +72,7 @@ class Atmosphere(LayerScreens):
     times: np.ndarray
 
     @classmethod
+    @check_arguments
     def from_site(
         cls,
         site: str | Site,
@@ -185,6 +187,7 @@ class Atmosphere(LayerScreens):
             fixed_modulus=bool(fixed_modulus),
         )
 
+    @check_arguments
     def at_times(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
         """Return the same turbulence at other times, with shared screens.
 
@@ -216,6 +219,7 @@ class Atmosphere(LayerScreens):
         middles.setflags(write=False)
         return self._with_shared_screens(exposure=exposure, times=middles)
 
+    @check_arguments
     def at_altitudes(self, altitudes: ArrayLike) -> Atmosphere:
         """Return the same layers at other altitudes, with shared screens.
 

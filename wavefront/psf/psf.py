@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.units import metres, radians
 from ...models.camera.focal_plane import FocalPlane
@@ -62,6 +63,7 @@ class Psfs:
     flags: np.ndarray
 
 
+@check_arguments
 def make_psfs(
     telescope: Telescope,
     fields: ArrayLike,

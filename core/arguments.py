@@ -1,0 +1,229 @@
+"""Validation of the arguments of public functions and classes by their annotations, before anything is computed."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import ConfigError, DomainError, PachonError, shown
+from .units import real_numbers
+
+Target = TypeVar("Target", bound=Callable[..., Any])
+#: Function of an argument's name and value: the value as the callee takes it, or a _MismatchError.
+_Check = Callable[[str, Any], Any]
+#: Arms of the union that ArrayLike is; ``ArrayLike | None`` is one flat union with them.
+_ARRAY_ARMS = frozenset(get_args(ArrayLike)) or frozenset({ArrayLike})
+
+
+class _MismatchError(Exception):
+    """Value that an annotation does not allow."""
+
+    def __init__(self, name: str, value: Any, expected: str, error: type[PachonError] = DomainError) -> None:
+        super().__init__(name)
+        self.name, self.value, self.expected, self.error = name, value, expected, error
+
+
+def check_arguments(target: Target) -> Target:
+    """Check the arguments of a function, or of constructor and public methods of a class, by their annotations.
+
+    A value of the wrong kind is a DomainError, or a ConfigError where one of several words is expected; it names
+    argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences and
+    mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
+    or objects. Masked ones become NaN; quantities keep their unit.
+
+    Names of arguments are checked by Python (TypeError); shapes, ranges and NaN by the function itself.
+    """
+    if not inspect.isclass(target):
+        return cast(Target, _checked(target))
+    for name, member in list(vars(target).items()):
+        if name.startswith("_") and name != "__init__":
+            continue
+        if isinstance(member, (classmethod, staticmethod)):
+            setattr(target, name, type(member)(_checked(member.__func__)))
+        elif inspect.isfunction(member):
+            setattr(target, name, _checked(member))
+    return target
+
+
+def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    parameters = [p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    if all(p.annotation is p.empty for p in parameters):
+        return function
+    places: list[tuple[str, _Check | None]] = []
+    checks: dict[str, _Check] = {}
+
+    @functools.wraps(function)
+    def checked(*args: Any, **options: Any) -> Any:
+        if not places:
+            # At the first call: an annotation may name a class of a module that is imported after this one.
+            places.extend((p.name, _check_of_parameter(function, p.name)) for p in parameters)
+            checks.update({name: check for name, check in places if check is not None})
+        try:
+            # Of several values of ``*names`` each has its check.
+            each = places + places[-1:] * (len(args) - len(places))
+            given = [v if check is None else check(name, v) for v, (name, check) in zip(args, each, strict=False)]
+            for name in options:
+                if name in checks:
+                    options[name] = checks[name](name, options[name])
+        except _MismatchError as problem:
+            text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
+            raise problem.error(text, key=problem.name) from None
+        return function(*given, **options)
+
+    return checked
+
+
+def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | None:
+    """Return the check of a parameter; None where any value will do."""
+    if name not in function.__annotations__:
+        return None
+    holder = types.SimpleNamespace(__annotations__={name: function.__annotations__[name]})
+    try:
+        return _check_of(typing.get_type_hints(holder, function.__globals__)[name])
+    except NameError:
+        # Imported for type checkers only.
+        return None
+
+
+def _check_of(kind: Any) -> _Check | None:
+    """Return the check of an annotation; None where any value will do."""
+    origin = get_origin(kind) or kind
+    if origin in (Union, types.UnionType):
+        arms = list(get_args(kind))
+        arrays = [_array] if set(arms) >= _ARRAY_ARMS else []
+        checks = [_check_of(arm) for arm in arms if not (arrays and arm in _ARRAY_ARMS)]
+        return None if None in checks else _either([*arrays, *filter(None, checks)], type(None) in arms)
+    if origin is Literal:
+        return _word(get_args(kind))
+    if origin in _SEQUENCES:
+        return _sequence(origin, get_args(kind))
+    if origin in (Mapping, dict):
+        return _mapping(get_args(kind))
+    if origin in _PLAIN:
+        return _plain(*_PLAIN[origin])
+    if origin is np.ndarray:
+        return _flags if kind == NDArray[np.bool_] else _array
+    if origin is Path:
+        return _path
+    if origin is Any or not inspect.isclass(origin) or getattr(origin, "_is_protocol", False):
+        return None
+    return _plain((origin,), f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}")
+
+
+#: Classes of values that plain annotations allow, and what is expected.
+_PLAIN: dict[Any, tuple[tuple[Any, ...], str]] = {
+    bool: ((bool, np.bool_), "True or False"),
+    int: ((int, np.integer), "a whole number"),
+    float: ((float, int, np.floating, np.integer), "a number"),
+    str: ((str,), "a text"),
+    os.PathLike: ((os.PathLike,), "a path"),
+    Callable: ((Callable,), "a function"),
+}
+_SEQUENCES = (tuple, list, Sequence, Iterable)
+
+
+def _plain(accepted: tuple[Any, ...], expected: str) -> _Check:
+    numbers = int in accepted
+
+    def check(name: str, value: Any) -> Any:
+        if numbers and type(value) is np.ndarray and value.ndim == 0:
+            value = value[()]
+        # To Python, boolean values are whole numbers.
+        if not isinstance(value, accepted) or (numbers and isinstance(value, bool)):
+            raise _MismatchError(name, value, expected)
+        return value
+
+    return check
+
+
+def _array(name: str, value: Any) -> Any:
+    numbers = real_numbers(value)
+    if numbers is None:
+        raise _MismatchError(name, value, "real numbers")
+    return numbers
+
+
+def _flags(name: str, value: Any) -> Any:
+    if np.asarray(value).dtype.kind != "b":
+        raise _MismatchError(name, value, "an array of True and False")
+    return value
+
+
+def _path(name: str, value: Any) -> Path:
+    if not isinstance(value, (str, os.PathLike)):
+        raise _MismatchError(name, value, "a path")
+    return Path(value)
+
+
+def _word(words: tuple[Any, ...]) -> _Check:
+    def check(name: str, value: Any) -> Any:
+        if not (isinstance(value, str) and value in words):
+            raise _MismatchError(name, value, f"one of {', '.join(words)}" if len(words) > 1 else words[0], ConfigError)
+        return value
+
+    return check
+
+
+def _either(checks: list[_Check], optional: bool) -> _Check:
+    def check(name: str, value: Any) -> Any:
+        if optional and value is None:
+            return None
+        problems = []
+        for each in checks:
+            try:
+                return each(name, value)
+            except _MismatchError as problem:
+                problems.append(problem)
+        # Of a sequence whose elements are wrong, the element is the likelier mistake.
+        inner = next((p for p in problems if p.name != name), None)
+        expected = " or ".join(dict.fromkeys(p.expected for p in problems))
+        raise inner or _MismatchError(name, value, expected, problems[0].error)
+
+    return check
+
+
+def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
+    fixed = kind is tuple and Ellipsis not in elements
+    checks = [_check_of(element) for element in elements if element is not Ellipsis] or [None]
+    expected = f"a sequence of {len(checks)}" if fixed else "a sequence"
+
+    def check(name: str, value: Any) -> Any:
+        if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, (Iterable, np.ndarray)):
+            raise _MismatchError(name, value, expected)
+        if not isinstance(value, (list, tuple, np.ndarray)):
+            # An iterator can be used once only.
+            return value
+        if np.ndim(value) == 0 if isinstance(value, np.ndarray) else False:
+            raise _MismatchError(name, value, expected)
+        if fixed and len(value) != len(checks):
+            raise _MismatchError(name, value, expected)
+        each = checks if fixed else checks * len(value)
+        found = [v if c is None else c(f"{name}[{i}]", v) for i, (v, c) in enumerate(zip(value, each, strict=True))]
+        return tuple(found) if kind is tuple else found
+
+    return check
+
+
+def _mapping(kinds: tuple[Any, ...]) -> _Check:
+    check_key, check_value = (_check_of(kind) for kind in kinds) if kinds else (None, None)
+
+    def check(name: str, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            raise _MismatchError(name, value, "a mapping")
+        for key, each in value.items():
+            if check_key is not None:
+                check_key(f"key of {name}", key)
+            if check_value is not None:
+                check_value(f"{name}[{shown(key)}]", each)
+        return value
+
+    return check
