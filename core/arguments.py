@@ -88,7 +88,7 @@ def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | Non
         return None
     holder = types.SimpleNamespace(__annotations__={name: function.__annotations__[name]})
     try:
-        return _check_of(typing.get_type_hints(holder, function.__globals__)[name])
+        return _check_of(typing.get_type_hints(holder, inspect.unwrap(function).__globals__)[name])
     except NameError:
         # Imported for type checkers only.
         return None
@@ -100,7 +100,8 @@ def _check_of(kind: Any) -> _Check | None:
     if origin in (Union, types.UnionType):
         arms = list(get_args(kind))
         arrays = [_array] if set(arms) >= _ARRAY_ARMS else []
-        checks = [_check_of(arm) for arm in arms if not (arrays and arm in _ARRAY_ARMS)]
+        others = [a for a in arms if a is not type(None) and not (arrays and a in _ARRAY_ARMS)]
+        checks = [_check_of(arm) for arm in others]
         return None if None in checks else _either([*arrays, *filter(None, checks)], type(None) in arms)
     if origin is Literal:
         return _word(get_args(kind))
@@ -111,7 +112,7 @@ def _check_of(kind: Any) -> _Check | None:
     if origin in _PLAIN:
         return _plain(*_PLAIN[origin])
     if origin is np.ndarray:
-        return _flags if kind == NDArray[np.bool_] else _array
+        return _flags if kind == NDArray[np.bool_] else _plain_array
     if origin is Path:
         return _path
     if origin is Any or not inspect.isclass(origin) or getattr(origin, "_is_protocol", False):
@@ -128,6 +129,8 @@ _PLAIN: dict[Any, tuple[tuple[Any, ...], str]] = {
     os.PathLike: ((os.PathLike,), "a path"),
     Callable: ((Callable,), "a function"),
 }
+#: Whole numbers to Python and NumPy, and to nobody else.
+_NO_NUMBERS = (bool, np.timedelta64)
 _SEQUENCES = (tuple, list, Sequence, Iterable)
 
 
@@ -137,8 +140,7 @@ def _plain(accepted: tuple[Any, ...], expected: str) -> _Check:
     def check(name: str, value: Any) -> Any:
         if numbers and type(value) is np.ndarray and value.ndim == 0:
             value = value[()]
-        # To Python, boolean values are whole numbers.
-        if not isinstance(value, accepted) or (numbers and isinstance(value, bool)):
+        if not isinstance(value, accepted) or (numbers and isinstance(value, _NO_NUMBERS)):
             raise _MismatchError(name, value, expected)
         return value
 
@@ -150,6 +152,12 @@ def _array(name: str, value: Any) -> Any:
     if numbers is None:
         raise _MismatchError(name, value, "real numbers")
     return numbers
+
+
+def _plain_array(name: str, value: Any) -> Any:
+    if hasattr(value, "unit"):
+        raise _MismatchError(name, value, "numbers without a unit")
+    return _array(name, value)
 
 
 def _flags(name: str, value: Any) -> Any:

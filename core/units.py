@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,17 @@ def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
 def real_array(values: Any, expectation: str) -> np.ndarray:
     """Return real numbers as a float64 array; DomainError with the expectation where they are none."""
     try:
-        return _si(values, u.dimensionless_unscaled, "")
+        return pure_numbers(values, "")
     except DomainError:
         raise DomainError(expectation) from None
+
+
+def pure_numbers(values: Any, name: str) -> np.ndarray:
+    """Return real numbers without a unit as a float64 array."""
+    try:
+        return _si(values, u.dimensionless_unscaled, name)
+    except DomainError:
+        raise DomainError(f"{name} = {shown(values)}: expected real numbers without a unit") from None
 
 
 def require_positive(value: Any, name: str, unit: str = "") -> float:
@@ -93,6 +102,62 @@ def positive_angle(value: Any, name: str) -> float:
 def metres(value: Any, name: str) -> np.ndarray:
     """Return a length in metres as a float64 array; plain numbers are metres already."""
     return _si(value, u.m, name)
+
+
+def length(value: Any, name: str) -> float:
+    """Return one length in metres; plain numbers are metres already."""
+    return _one(metres(value, name), name, "length")
+
+
+def angle(value: Any, name: str) -> float:
+    """Return one angle in radians; plain numbers are radians already."""
+    return _one(radians(value, name), name, "angle")
+
+
+def _one(values: np.ndarray, name: str, kind: str) -> float:
+    if values.ndim:
+        raise DomainError(f"{name} has shape {values.shape}: expected one {kind}")
+    return float(values)
+
+
+def broadcast_together(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Return arrays, which have names, broadcast to one shape."""
+    try:
+        return np.broadcast_arrays(*arrays.values())
+    except ValueError:
+        names, shapes = ", ".join(arrays), ", ".join(str(a.shape) for a in arrays.values())
+        raise DomainError(f"{names} have shapes {shapes}: expected shapes that fit together") from None
+
+
+def for_each(values: np.ndarray, count: int, name: str) -> np.ndarray:
+    """Return one number, or one for each of so many objects, as [count]."""
+    if values.shape not in ((), (count,)):
+        raise DomainError(f"{name} has shape {values.shape}: expected one number or [{count}]")
+    return np.broadcast_to(values, (count,))
+
+
+def plane_points(x: Any, y: Any) -> tuple[np.ndarray, ...]:
+    """Return points of a plane [m], which may be quantities, as two arrays of one shape."""
+    return broadcast_together({"x": metres(x, "x"), "y": metres(y, "y")})
+
+
+#: Largest number of pupil points, rays or steps in one call.
+MOST = 10**8
+
+
+def require_count(value: Any, name: str, least: int, most: int = MOST) -> int:
+    """Return a whole number in a range, or raise :class:`DomainError` naming the argument."""
+    number = value.item() if isinstance(value, np.generic) else value
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1 or number < least:
+        raise DomainError(f"{name} = {shown(value)}: expected a whole number of at least {least}", key=name)
+    if number > most:
+        raise DomainError(f"{name} = {shown(value)}: expected a whole number of at most {most}", key=name)
+    return int(number)
+
+
+def require_seed(value: Any, name: str = "seed") -> int:
+    """Return a seed of random numbers, a whole number from zero, or raise :class:`DomainError`."""
+    return require_count(value, name, 0, 2**128)
 
 
 def arcseconds(angle: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from scipy import fft
 
 from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
+from ..core.units import pure_numbers
 from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
 from ..pipeline.psf_model.model import PsfModel
@@ -68,7 +69,7 @@ class PsfField:
         PachonError
             As :meth:`pachon.PsfModel.fit`.
         """
-        places = np.asarray(positions, dtype=np.float64)
+        places = pure_numbers(positions, "positions")
         extent = (-0.5, pixels - 0.5, -0.5, pixels - 0.5)
         model = PsfModel.fit(
             stamps,
@@ -79,7 +80,7 @@ class PsfField:
             extent=extent,
             clip_sigma=None,
         )
-        light = np.ones(len(places)) if lit_fraction is None else np.asarray(lit_fraction, dtype=np.float64)
+        light = np.ones(len(places)) if lit_fraction is None else pure_numbers(lit_fraction, "lit_fraction")
         terms = design_matrix(places, extent, order)
         return cls(model, pixels, np.linalg.lstsq(terms, light, rcond=None)[0], order)
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import ARCSEC, radians
+from ..core.units import ARCSEC, angle, radians
 from ..models.camera.camera import Camera
 from ..models.telescope import Telescope
 from ..wavefront.chief_rays import fields_at
@@ -183,7 +183,7 @@ def ccd_wcs(
     DomainError
         If the pointing is no pair of finite angles with a declination up to 90 deg, or no polynomial is good enough.
     """
-    angles, rho = radians(pointing, "pointing"), float(radians(position_angle, "position_angle"))
+    angles, rho = radians(pointing, "pointing"), angle(position_angle, "position_angle")
     if angles.shape != (2,) or not np.isfinite(angles).all() or abs(angles[1]) > 0.5 * np.pi or not np.isfinite(rho):
         raise DomainError(
             f"pointing = {pointing!r}, position_angle = {position_angle!r}: expected finite angles, "

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
+from ..core.units import plane_points
 
 
 class Region(ABC):
@@ -174,7 +175,7 @@ class Polygon(Region):
 
         See Shimrat (1962), Communications of the ACM 5, 434 (algorithm 112).
         """
-        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        x, y = plane_points(x, y)
         inside = np.zeros(x.shape, dtype=bool)
         for (ax, ay), (bx, by) in zip(*self._edges, strict=True):
             if ay != by:

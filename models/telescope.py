@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
-from ..core.units import metres, radians
+from ..core.units import broadcast_together, metres, radians
 from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
 from .obstruction import Obstruction
 from .shapes.shape import Shape, Sum
@@ -344,7 +344,7 @@ class Telescope:
         DomainError
             If ``hypot(tx, ty)`` exceeds `field_limit`.
         """
-        x, y = np.broadcast_arrays(radians(tx, "tx"), radians(ty, "ty"))
+        x, y = broadcast_together({"tx": radians(tx, "tx"), "ty": radians(ty, "ty")})
         # Rounding of a limit that was converted from degrees must not exclude the limit itself.
         bad = ~(np.hypot(x, y) <= self.field_limit * (1 + 1e-12))
         if np.any(bad):

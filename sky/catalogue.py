@@ -12,6 +12,7 @@ import yaml
 from astropy import units as u
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
+from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, ProductError, error_context
@@ -47,7 +48,7 @@ _PER_COMPONENT = {
 
 
 @check_arguments
-def read_galaxies(path: str | Path, *, pointing: Any = None) -> Galaxies:
+def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Galaxies:
     """Read galaxies from a table: ECSV, FITS (its first table) or Parquet.
 
     Columns of a catalogue, in any case; units of the file are honoured, and where it has none these hold:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import field_label, metres
+from ..core.units import field_label, length, metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, field_angles, field_direction, parallel_rays
@@ -107,7 +107,7 @@ def fields_at(
         If a point lies outside the field that the telescope covers, or the search for its chief ray fails.
     """
     target = np.atleast_2d(metres(positions, "positions"))
-    light = telescope.default_wavelength if wavelength is None else float(metres(wavelength, "wavelength"))
+    light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     field_angles(np.zeros((1, 2)), projection)  # an unknown projection is an error before anything is traced
     slopes = _by_axis_scale(telescope, target, light, threads)
     if slopes is None:

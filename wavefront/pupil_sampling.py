@@ -6,12 +6,14 @@ an edge vignettes the pupil, all samplings converge with the number of points.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, check_choice
+from ..core.units import MOST, require_count
 from ..models.telescope import Telescope
 
 #: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
@@ -137,9 +139,10 @@ def pupil_sampling(
         return sampling
     check_choice("sampling", sampling, _DEFAULT_N_PUPIL)
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    n = _DEFAULT_N_PUPIL[sampling] if n_pupil is None else n_pupil
-    if int(n) != n or n < 1:
-        raise DomainError(f"n_pupil = {n!r}: expected a whole number of at least 1", key="n_pupil")
+    default = _DEFAULT_N_PUPIL[sampling]
+    # On a spiral the number of points, else of those along a radius or side.
+    most = MOST if sampling == "spiral" else math.isqrt(MOST)
+    n = require_count(default if n_pupil is None else n_pupil, "n_pupil", 1, most)
     if sampling == "gauss":
         return gauss_annulus(radius, obscuration, n, 4 * n)
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)
@@ -153,5 +156,4 @@ def _check_counts(obscuration: float, **counts: int) -> None:
     if not 0.0 <= obscuration < 1.0:
         raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
     for name, value in counts.items():
-        if int(value) != value or value < 1:
-            raise DomainError(f"{name} = {value!r}: expected a whole number of at least 1")
+        require_count(value, name, 1)

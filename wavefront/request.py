@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError
-from ..core.units import metres, radians
+from ..core.errors import DomainError, shown
+from ..core.units import metres, pure_numbers, radians
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, launch_bundles
@@ -202,7 +202,7 @@ def wavelength_points(telescope: Telescope, wavelengths: ArrayLike | None = None
 
 def relative_weights(weights: ArrayLike | None, count: int, name: str = "wavelength_weights") -> np.ndarray:
     """Return so many weights of sum 1, equal where none are given; negative or all zero they are a DomainError."""
-    values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    values = np.ones(count) if weights is None else pure_numbers(weights, name)
     if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
-        raise DomainError(f"{name} = {weights!r}: expected {count} numbers, none negative, not all zero")
+        raise DomainError(f"{name} = {shown(weights)}: expected {count} numbers, none negative, not all zero")
     return values / values.sum()

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from ...core.arguments import check_arguments
 from ...core.errors import unknown_name
-from ...core.units import metres
+from ...core.units import plane_points
 
 
 @check_arguments
@@ -76,7 +76,7 @@ class Camera:
 
     def ccd_at(self, x: ArrayLike, y: ArrayLike, *, margin: float = 0.0) -> np.ndarray:
         """Return the index of the CCD at points [m], or at most a margin [m] outside its rim; -1 without one."""
-        px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
+        px, py = plane_points(x, y)
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
         if np.any(finite):

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, unknown_name
-from ...core.units import metres, radians
+from ...core.units import metres, plane_points, radians, require_count
 from ..io.heights.file import read_heights
 from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 from .camera import Camera, load_camera
@@ -306,7 +306,7 @@ class FocalPlane:
 
     def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
-        px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
+        px, py = plane_points(x, y)
         ccd = self.camera.ccd_at(px, py)
         lit = ccd >= 0
         dx, dy = px - self.camera.centers[ccd, 0], py - self.camera.centers[ccd, 1]
@@ -384,7 +384,9 @@ class FocalPlane:
         return ccd, x, y, self.surfaces.height(ccd, dx, dy)
 
 
+#: Most cells along a side of a CCD.
+_MOST_CELLS = 1024
+
+
 def _cells(cells_per_ccd: int) -> int:
-    if isinstance(cells_per_ccd, bool) or not isinstance(cells_per_ccd, (int, np.integer)) or cells_per_ccd < 1:
-        raise DomainError(f"cells_per_ccd = {cells_per_ccd!r}: expected a whole number of one or more")
-    return int(cells_per_ccd)
+    return require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)

@@ -22,7 +22,7 @@ from scipy.linalg import eigh_tridiagonal
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import metres
+from ...core.units import length
 from ..media.silicon import absorption_length, check_temperature, silicon_index
 
 # Absorption lengths beyond which no light is left, to double precision.
@@ -56,7 +56,7 @@ class Silicon:
     temperature: float = 173.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "thickness", float(metres(self.thickness, "thickness")))
+        object.__setattr__(self, "thickness", length(self.thickness, "thickness"))
         if not 1e-6 <= self.thickness <= 1e-3:
             raise DomainError(f"thickness = {self.thickness!r}: expected 1e-06 to 0.001 m of silicon")
         check_temperature(self.temperature)

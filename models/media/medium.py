@@ -37,6 +37,7 @@ def wavelengths_within(wavelength: Any, wavelength_range: tuple[float, float], m
     return w
 
 
+@check_arguments
 class Medium(ABC):
     """A refractive medium: immutable and hashable.
 

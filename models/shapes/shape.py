@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, unknown_name
+from ...core.units import plane_points
 
 Pair = tuple[np.ndarray, np.ndarray]
 Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -50,7 +51,7 @@ def with_coefficient(coefficients: tuple[float, ...], place: int, value: float) 
 
 def coordinates(x: Any, y: Any) -> Pair:
     """Return x and y [m] as float64 arrays of one shape."""
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    x, y = plane_points(x, y)
     return x, y
 
 
@@ -59,6 +60,7 @@ def root(inside: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(inside >= 0, inside, np.nan))
 
 
+@check_arguments
 class Shape(ABC):
     """Shape of a surface: immutable and hashable.
 

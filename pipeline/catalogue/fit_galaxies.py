@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
-from ...core.units import real_array, require_positive
+from ...core.units import pure_numbers, real_array, require_positive
 from .cutouts import cut_out, first_pixel
 from .galaxy_fits import GalaxyFits, GalaxyFlag, joined
 from .gaussian_model import PARAMETERS, SIDE_STEP, GaussianStamps
@@ -41,7 +41,7 @@ def fit_galaxies(
     psf_images: ArrayLike,
     *,
     half_light_radius: ArrayLike,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
     segmentation: ArrayLike | None = None,
     max_evaluations: int = 30,
     tolerance: float = 1e-5,
@@ -97,7 +97,7 @@ def fit_galaxies(
     places = _positions(x, y, pixels.shape)
     count = len(places)
     try:
-        radius = np.broadcast_to(np.asarray(half_light_radius, dtype=np.float64), (count,))
+        radius = np.broadcast_to(pure_numbers(half_light_radius, "half_light_radius"), (count,))
     except (TypeError, ValueError) as error:
         raise DomainError(f"half_light_radius: expected one number or {count}") from error
     radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)
@@ -139,7 +139,7 @@ def fit_galaxy_stamps(
     variance: ArrayLike,
     psf_images: ArrayLike,
     *,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
     max_evaluations: int = 30,
     tolerance: float = 1e-5,
     threads: int | None = None,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import DomainError
 from ...core.units import real_array
 
 
 def check_pixels(
-    image: ArrayLike, variance: ArrayLike, mask: ArrayLike | None, *, axes: str = "[ny, nx]"
+    image: ArrayLike, variance: ArrayLike, mask: ArrayLike | NDArray[np.bool_] | None, *, axes: str = "[ny, nx]"
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return image and variance as float64, and the masked pixels as bool, all of one shape.
 

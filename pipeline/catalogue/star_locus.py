@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
@@ -75,7 +75,7 @@ class StarSelection:
         return len(self.index)
 
     @check_arguments
-    def completeness(self, is_star: ArrayLike) -> float:
+    def completeness(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:
         """Return the fraction of true stars of sufficient S/N that were selected; NaN where there are none.
 
         `is_star` [n] says which objects are stars in truth.
@@ -84,12 +84,12 @@ class StarSelection:
         return float((self.cuts[true] == 0).mean()) if true.any() else np.nan
 
     @check_arguments
-    def purity(self, is_star: ArrayLike) -> float:
+    def purity(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:
         """Return the fraction of selected objects that are stars in truth; NaN where none were selected."""
         true = self._truth(is_star)
         return float(true[self.index].mean()) if len(self) else np.nan
 
-    def _truth(self, is_star: ArrayLike) -> np.ndarray:
+    def _truth(self, is_star: ArrayLike | NDArray[np.bool_]) -> np.ndarray:
         true = np.asarray(is_star)
         if true.shape != self.cuts.shape or true.dtype.kind != "b":
             raise DomainError(f"is_star has shape {true.shape} and type {true.dtype}: expected bool {self.cuts.shape}")
@@ -108,7 +108,7 @@ def select_stars(
     isolation: float = 12.0,
     min_stars: int = 10,
     size: int = 31,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
 ) -> StarSelection:
     """Select isolated stars by the stellar locus, and cut out their stamps.
 

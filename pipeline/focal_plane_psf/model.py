@@ -14,7 +14,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
-from ...core.units import metres, positive_angle
+from ...core.units import length, positive_angle
 from ...core.version import CREATOR
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
@@ -188,7 +188,7 @@ class FocalPlanePsf:
                 stamp_size=stamp_size,
             )
             prior = height_prior(mosaic, focal_plane, budget)
-        rms = float(metres(alignment_rms, "alignment_rms"))
+        rms = length(alignment_rms, "alignment_rms")
         if not rms >= 0.0:
             raise DomainError(f"alignment_rms = {rms!r}: expected a length from 0")
         fitted = fit_field(mosaic, data, instrument, prior, rms, threads, reporter)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import ARCMIN, radians, real_array
+from ...core.units import ARCMIN, angle, radians, real_array, require_count
 
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
@@ -183,11 +183,10 @@ def shear_correlation(
     labels = None if patch is None else np.asarray(patch)
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
-    low, high = (float(radians(v, n)) for v, n in ((min_sep, "min_sep"), (max_sep, "max_sep")))
+    low, high = (angle(v, n) for v, n in ((min_sep, "min_sep"), (max_sep, "max_sep")))
     if not (np.isfinite(high) and 0.0 < low < high):
         raise DomainError(f"min_sep = {min_sep}, max_sep = {max_sep}: expected 0 < min_sep < max_sep")
-    if n_bins < 1:
-        raise DomainError(f"n_bins = {n_bins}: expected at least 1")
+    n_bins = require_count(n_bins, "n_bins", 1, 10**6)
     usable = np.all(np.isfinite(columns), axis=0)
     n_stars = int(usable.sum())
     if n_stars < 2:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
@@ -98,7 +98,7 @@ class PsfModel:
         basis: Literal["pca", "pixels", "shapelets"] = "pca",
         interpolation: Literal["polynomial", "gp"] = "polynomial",
         weights: ArrayLike | None = None,
-        masks: ArrayLike | None = None,
+        masks: NDArray[np.bool_] | None = None,
         n_components: int | Literal["auto"] | None = None,
         order: int | None = None,
         extent: ArrayLike | None = None,

@@ -21,6 +21,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
+from ...core.units import pure_numbers
 from .pixel_boundaries import collect, with_rim, without_rim
 
 #: Side of the pixels that the coefficients belong to [m].
@@ -128,7 +129,8 @@ def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = 
         If shapes do not fit, electrons are not positive, or the sky is negative.
     """
     check_choice("sensor", sensor, COEFFICIENTS)
-    stamps, counts = np.asarray(images, dtype=np.float64), np.asarray(electrons, dtype=np.float64)
+    stamps = pure_numbers(images, "images")
+    counts = pure_numbers(electrons, "electrons")
     if stamps.ndim != 3 or counts.shape != stamps.shape[:1]:
         raise DomainError(f"images, electrons of shapes {stamps.shape}, {counts.shape}: expected [n, ny, nx] and [n]")
     if not (np.isfinite(counts).all() and (counts > 0.0).all()):

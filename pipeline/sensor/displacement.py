@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.units import plane_points
 from .pixel_boundaries import RIM, collect, with_rim, without_rim
 
 
@@ -50,7 +51,7 @@ class TreeRings(Displacement):
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement, as :meth:`Displacement.at` says."""
-        along = np.stack(np.broadcast_arrays(np.subtract(x, self.center[0]), np.subtract(y, self.center[1])), axis=-1)
+        along = np.stack(plane_points(x, y), axis=-1) - np.array(self.center)
         radius = np.hypot(along[..., 0], along[..., 1])[..., None]
         size = self.amplitude * np.cos(2.0 * np.pi * radius / self.period + self.phase)
         # On the axis itself there is no direction.
@@ -77,7 +78,7 @@ class EdgeRolloff(Displacement):
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement, as :meth:`Displacement.at` says."""
-        place = np.stack(np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float)), axis=-1)
+        place = np.stack(plane_points(x, y), axis=-1)
         # Beyond an edge, where the rim of a stamp may lie, it stays that of the edge.
         upper, lower = (np.maximum(self.half_size - sign * place, 0.0) for sign in (1.0, -1.0))
         return self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))

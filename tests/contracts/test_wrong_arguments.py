@@ -48,10 +48,10 @@ def is_numbers(value):
         return False
 
 
-def wrong_kinds(value, default):
+def wrong_kinds(value, optional):
     """Values of a kind that the argument does not take; each must be refused."""
     yield "object", Surprise()
-    if default is not None and value is not None:
+    if value is not None and not optional:
         yield "None", None
     if is_numbers(value):
         array = np.asarray(value)
@@ -61,11 +61,13 @@ def wrong_kinds(value, default):
         yield "timedelta", np.full(array.shape, np.timedelta64(1, "s"))
         yield "bool", array.astype(bool) if array.ndim else True
         yield "texts", array.astype(str)
-        yield "objects", np.array(array, dtype=object) if array.ndim else np.array(Surprise())
+        if not isinstance(value, tuple):
+            # Each element of a tuple is checked on its own.
+            yield "objects", np.array(array, dtype=object) if array.ndim else np.array(Surprise())
         yield "mapping", {"a": 1.0}
         yield "unit", array * u.kg
-        if array.ndim:
-            yield "ragged", [list(np.ravel(array)), [1.0]]
+        if array.ndim and not isinstance(value, tuple):
+            yield "ragged", [[*np.ravel(array), 1.0], [1.0, 2.0, 3.0], [1.0]]
     elif isinstance(value, bool):
         yield "text", "yes"
         yield "number", 0.5
@@ -163,8 +165,8 @@ def mutated(function, arguments):
     """Return argument, name of the change, changed arguments and whether they must be refused."""
     parameters = inspect.signature(function).parameters
     for name, value in arguments.items():
-        default = parameters[name].default if name in parameters else inspect.Parameter.empty
-        kinds = [(True, *change) for change in wrong_kinds(value, default)]
+        optional = "None" in str(parameters[name].annotation)
+        kinds = [(True, *change) for change in wrong_kinds(value, optional)]
         for must, change, wrong in kinds + [(False, *change) for change in wrong_values(value)]:
             yield name, change, arguments | {name: wrong}, must
 
@@ -182,7 +184,8 @@ def outcomes(label, function, arguments, chosen):
         kind, text = said(function, wrong)
         if kind == valid[0] and text == valid[1]:
             kind = "accepted"
-        if kind == "refused" and name.rstrip("s") not in text:
+        told = isinstance(wrong[name], (str, Path)) and str(wrong[name])[:30] in text
+        if kind == "refused" and name.rstrip("s") not in text and not told:
             kind = "unnamed"
         if kind == "accepted" and must and not {(label, name, change), ("*", name, change)} & FINE:
             kind = "silent"

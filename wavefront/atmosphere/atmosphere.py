@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import metres, require_positive
+from ...core.units import metres, pure_numbers, require_positive
 from ...models.io.site_file import load_site
 from ...models.site import Site
 from .layer_screens import LayerScreens, screen_samples
@@ -206,7 +206,7 @@ class Atmosphere(LayerScreens):
             If the times are not the middles of equal steps of the exposure, or a layer drifts farther in it than its
             screen is long.
         """
-        middles = np.array(times, dtype=np.float64)
+        middles = pure_numbers(times, "times").copy()
         if middles.ndim != 1 or len(middles) == 0 or not np.all(np.isfinite(middles)):
             raise DomainError(f"times of shape {middles.shape}: expected a list of finite times in seconds")
         if exposure is None:

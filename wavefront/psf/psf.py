@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.units import metres, radians
+from ...core.units import length, metres, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
@@ -173,8 +173,8 @@ def make_psfs(
     shifts = None if dispersion is None else _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
     plane = ImagePlane(
         stamp_size,
-        float(metres(pixel_size, "pixel_size")),
-        float(metres(diffusion, "diffusion")),
+        length(pixel_size, "pixel_size"),
+        length(diffusion, "diffusion"),
         _on_detector(jitter, telescope, lengths),
     )
     maker = ENGINES[engine](
