@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import inspect
 import os
 import types
@@ -87,11 +88,16 @@ def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | Non
     if name not in function.__annotations__:
         return None
     holder = types.SimpleNamespace(__annotations__={name: function.__annotations__[name]})
+    names = dict(inspect.unwrap(function).__globals__)
     try:
-        return _check_of(typing.get_type_hints(holder, inspect.unwrap(function).__globals__)[name])
-    except NameError:
-        # Imported for type checkers only.
-        return None
+        return _check_of(typing.get_type_hints(holder, names)[name])
+    except NameError as missing:
+        # Imported for type checkers only: a package, or a class that some callee checks.
+        try:
+            names[missing.name] = importlib.import_module(missing.name)
+        except ImportError:
+            return None
+        return _check_of(typing.get_type_hints(holder, names)[name])
 
 
 def _check_of(kind: Any) -> _Check | None:
@@ -99,6 +105,10 @@ def _check_of(kind: Any) -> _Check | None:
     origin = get_origin(kind) or kind
     if origin in (Union, types.UnionType):
         arms = list(get_args(kind))
+        if str in arms and (Path in arms or os.PathLike in map(get_origin, arms)):
+            # Names of bundled files, too, are texts that may be paths.
+            others = [a for a in arms if a not in (str, Path, type(None)) and get_origin(a) is not os.PathLike]
+            return _either([_path, *filter(None, map(_check_of, others))], type(None) in arms)
         arrays = [_array] if set(arms) >= _ARRAY_ARMS else []
         others = [a for a in arms if a is not type(None) and not (arrays and a in _ARRAY_ARMS)]
         checks = [_check_of(arm) for arm in others]
@@ -114,7 +124,7 @@ def _check_of(kind: Any) -> _Check | None:
     if origin is np.ndarray:
         return _flags if kind == NDArray[np.bool_] else _plain_array
     if origin is Path:
-        return _path
+        return lambda name, value: Path(_path(name, value))
     if origin is Any or not inspect.isclass(origin) or getattr(origin, "_is_protocol", False):
         return None
     return _plain((origin,), f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}")
@@ -131,6 +141,8 @@ _PLAIN: dict[Any, tuple[tuple[Any, ...], str]] = {
 }
 #: Whole numbers to Python and NumPy, and to nobody else.
 _NO_NUMBERS = (bool, np.timedelta64)
+#: Longest path, and longest name of a file or folder, of common systems [characters].
+_LONGEST_PATH, _LONGEST_NAME = 4096, 255
 _SEQUENCES = (tuple, list, Sequence, Iterable)
 
 
@@ -161,15 +173,23 @@ def _plain_array(name: str, value: Any) -> Any:
 
 
 def _flags(name: str, value: Any) -> Any:
-    if np.asarray(value).dtype.kind != "b":
+    try:
+        kind = np.asarray(value).dtype.kind
+    except ValueError:
+        kind = ""
+    if kind != "b":
         raise _MismatchError(name, value, "an array of True and False")
     return value
 
 
-def _path(name: str, value: Any) -> Path:
+def _path(name: str, value: Any) -> str | os.PathLike[str]:
     if not isinstance(value, (str, os.PathLike)):
         raise _MismatchError(name, value, "a path")
-    return Path(value)
+    text = os.fspath(value)
+    if "\0" in text or len(text) > _LONGEST_PATH or max(map(len, Path(text).parts), default=0) > _LONGEST_NAME:
+        limits = f"at most {_LONGEST_PATH} characters, {_LONGEST_NAME} of them between slashes, and no zero byte"
+        raise _MismatchError(name, value, f"a path of {limits}")
+    return value
 
 
 def _word(words: tuple[Any, ...]) -> _Check:

@@ -17,6 +17,10 @@ ARCMIN = 60.0 * ARCSEC
 _APART = (u.Quantity, np.ma.MaskedArray)
 
 
+#: Largest number, so that its powers stay finite.
+_LARGEST = 1e50
+
+
 def real_numbers(values: Any) -> Any:
     """Return real numbers as an array of their own type, masked ones as NaN; None where they are anything else.
 
@@ -84,7 +88,7 @@ def require_positive(value: Any, name: str, unit: str = "") -> float:
     except DomainError:
         numbers = np.array(np.nan)
     number = float(numbers.item()) if numbers.size == 1 else np.nan
-    if not (np.isfinite(number) and number > 0.0):
+    if not 0.0 < number < _LARGEST:
         raise DomainError(f"{name} = {shown(value)}: expected a positive, finite number{' of ' + unit if unit else ''}")
     return number
 
@@ -117,6 +121,8 @@ def angle(value: Any, name: str) -> float:
 def _one(values: np.ndarray, name: str, kind: str) -> float:
     if values.ndim:
         raise DomainError(f"{name} has shape {values.shape}: expected one {kind}")
+    if np.abs(values) > _LARGEST:
+        raise DomainError(f"{name} = {float(values):g}: expected one {kind} below {_LARGEST:g} in SI units")
     return float(values)
 
 

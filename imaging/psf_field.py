@@ -12,7 +12,7 @@ from scipy import fft
 
 from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
-from ..core.units import pure_numbers
+from ..core.units import for_each, pure_numbers
 from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
 from ..pipeline.psf_model.model import PsfModel
@@ -80,7 +80,8 @@ class PsfField:
             extent=extent,
             clip_sigma=None,
         )
-        light = np.ones(len(places)) if lit_fraction is None else pure_numbers(lit_fraction, "lit_fraction")
+        share = 1.0 if lit_fraction is None else lit_fraction
+        light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
         terms = design_matrix(places, extent, order)
         return cls(model, pixels, np.linalg.lstsq(terms, light, rcond=None)[0], order)
 

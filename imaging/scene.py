@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, DomainError
+from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
@@ -128,6 +128,8 @@ def draw_ccd(
     DomainError
         If no light reaches the CCD, or the galaxies bury the sky.
     """
+    if not callable(galaxies) and not hasattr(galaxies, "transform"):
+        raise DomainError(f"galaxies = {shown(galaxies)}: expected Galaxies or a function that gives them")
     config, camera = experiment.config, experiment.camera
     if not np.isclose(experiment.pixel_size, camera.pixel_size) or not config.atmosphere.enabled:
         enabled = str(config.atmosphere.enabled).lower()

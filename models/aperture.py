@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import PrescriptionError
+from ..core.errors import PrescriptionError, shown
 from ..core.units import plane_points
 
 
@@ -34,7 +34,8 @@ def _require(condition: Any, problem: str) -> None:
 
 
 def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(x, dtype=np.float64) - centre_x, np.asarray(y, dtype=np.float64) - centre_y
+    px, py = plane_points(x, y)
+    return px - centre_x, py - centre_y
 
 
 def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -260,6 +261,9 @@ Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection 
 
 
 def _check_parts(name: str, parts: tuple[Aperture, ...]) -> None:
-    _require(isinstance(parts, tuple) and parts, f"{name} = {parts!r}: expected a tuple of at least one region")
+    _require(
+        isinstance(parts, tuple) and parts,
+        f"parts of a {name} = {shown(parts)}: expected a tuple of at least one region",
+    )
     for part in parts:
-        _require(isinstance(part, Aperture), f"{name} of {part!r}: expected an aperture")
+        _require(isinstance(part, Aperture), f"parts of a {name} with {shown(part)}: expected apertures")

@@ -82,6 +82,7 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
     DomainError
         If the obscuration or the index is out of range.
     """
+    require_count(jmax, "jmax", 1, MOST_TERMS)
     x, y, s, nodes = _annulus(x, y, obscuration)
     theta = np.arctan2(y, x)
     orders = [noll_to_nm(j) for j in range(1, jmax + 1)]

@@ -9,6 +9,7 @@ import trimesh
 import warp as wp
 
 from ..core.arguments import check_arguments
+from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.warp_arrays import warp_array
 from ..models.surface import Surface
@@ -53,6 +54,9 @@ def land_on_mesh(
     -------
     MeshLanding
     """
+    if position.ndim != 2 or position.shape[1] != 3 or direction.shape != position.shape:
+        shapes = f"{position.shape}, {direction.shape}"
+        raise DomainError(f"position, direction have shapes {shapes}: expected [n, 3] twice")
     start_warp()
     p = detector.to_local(position)
     d = direction @ detector.matrix

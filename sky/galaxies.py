@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError
+from ..core.errors import DomainError, shown
 from ..core.launch import launch, start_warp
 from ..core.units import broadcast_together, for_each, pure_numbers, radians
 from ..core.warp_arrays import warp_array
@@ -140,7 +140,12 @@ class Galaxies:
 
     def take(self, indices: Any) -> Galaxies:
         """Return some of the galaxies: indices, which may repeat, a boolean mask or a slice."""
-        chosen = np.arange(len(self))[indices]
+        try:
+            chosen = np.atleast_1d(np.arange(len(self))[indices])
+        except (IndexError, ValueError):
+            chosen = np.empty((0, 0))
+        if chosen.ndim != 1:
+            raise DomainError(f"indices = {shown(indices)}: expected integers below {len(self)}, a mask or a slice")
         counts = np.diff(self.first)[chosen]
         first = np.concatenate([[0], np.cumsum(counts)])
         component = np.arange(first[-1]) + np.repeat(self.first[chosen] - first[:-1], counts)

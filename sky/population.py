@@ -107,7 +107,10 @@ class GalaxyPopulation:
         """
         region = Region.between(xi, eta)
         # A galaxy has some four components: 450 bytes, twice while they are joined.
-        require_bytes(int(900 * region.area * self.surface_density), "galaxies of this region")
+        expected = 900 * region.area * self.surface_density
+        if not np.isfinite(expected):
+            raise DomainError(f"density = {self.density!r}: expected a number of galaxies that is finite")
+        require_bytes(int(expected), "galaxies of this region")
         return Galaxies.concatenate([self._galaxies_of(cell, region) for cell in region.cells()])
 
     def _galaxies_of(self, cell: Cell, region: Region) -> Galaxies:

@@ -107,6 +107,8 @@ def fields_at(
         If a point lies outside the field that the telescope covers, or the search for its chief ray fails.
     """
     target = np.atleast_2d(metres(positions, "positions"))
+    if target.ndim != 2 or target.shape[1] != 2:
+        raise DomainError(f"positions of shape {target.shape}: expected x, y, shape [n, 2]")
     light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     field_angles(np.zeros((1, 2)), projection)  # an unknown projection is an error before anything is traced
     slopes = _by_axis_scale(telescope, target, light, threads)

@@ -13,7 +13,7 @@ from scipy.ndimage import zoom
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
-from ...core.units import arcseconds, metres
+from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ..drawing import FEW, field_colors, field_text, finish_axes, second_scale
@@ -200,7 +200,7 @@ def energy_curve(
     DomainError
         If the image is not finite, or there is no light for a centroid.
     """
-    light = np.asarray(image, dtype=np.float64)
+    light = pure_numbers(image, "image")
     if light.ndim != 2 or not np.isfinite(light).all():
         raise DomainError(f"image of shape {light.shape}: expected a finite one, shape [ny, nx]")
     x, y = np.arange(light.shape[1], dtype=np.float64), np.arange(light.shape[0], dtype=np.float64)
@@ -209,6 +209,7 @@ def energy_curve(
         if not total > 0:
             raise DomainError(f"image of sum {total:.6g}: expected light, to have a centroid")
         center = float(light.sum(axis=0) @ x / total), float(light.sum(axis=1) @ y / total)
+    parts = require_count(parts, "parts", 1, 100)
     inside = (np.arange(parts) + 0.5) / parts - 0.5
     across, along = (np.add.outer(v - c, inside).ravel() for v, c in zip((x, y), center, strict=True))
     squared = np.add.outer(along**2, across**2).ravel()

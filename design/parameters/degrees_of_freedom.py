@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
+from ...core.units import pure_numbers
 from ...models.shapes.shape import Shape, Sum
 from ...models.telescope import Telescope
 from ..optimize.sensitivity import Sensitivity, sensitivity
@@ -187,10 +188,10 @@ class DegreesOfFreedom:
                         raise DomainError(f"{name} = {value}: expected a unit like {self.units[i]}") from None
                 vector[i] = value
         else:
-            vector = np.asarray(values, dtype=np.float64)
+            vector = pure_numbers(values, "values")
             if vector.shape != (len(self),):
                 raise DomainError(
-                    f"vector of shape {list(vector.shape)}: expected [{len(self)}], {self.names[0]} first"
+                    f"values of shape {list(vector.shape)}: expected [{len(self)}], {self.names[0]} first"
                 )
         for name, value in zip(self.names, vector, strict=True):
             if not np.isfinite(value):

@@ -63,11 +63,11 @@ class Silicon:
 
     def index(self, wavelength: ArrayLike) -> float:
         """Return the refractive index at a vacuum wavelength [m]."""
-        return float(silicon_index(wavelength, self.temperature))
+        return float(silicon_index(length(wavelength, "wavelength"), self.temperature))
 
     def absorption_length(self, wavelength: ArrayLike) -> float:
         """Return the absorption length at a vacuum wavelength [m]."""
-        return float(absorption_length(wavelength, self.temperature))
+        return float(absorption_length(length(wavelength, "wavelength"), self.temperature))
 
     def absorbed(self, wavelength: ArrayLike) -> float:
         """Return the part of the light that is absorbed before it reaches the gates."""

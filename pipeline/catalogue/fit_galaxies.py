@@ -166,7 +166,7 @@ def fit_galaxy_stamps(
         As of :func:`fit_galaxies`.
     """
     options = _options(max_evaluations, tolerance, threads)
-    pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]")
+    pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]", name="stamps")
     count, ny, nx = pixels.shape
     psfs, templates = _psfs(psf_images, count)
     side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
@@ -267,6 +267,8 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = matrix / (scale[:, :, None] * scale[:, None, :])
     # Six parameters of fewer pixels: the smallest eigenvalue is rounding.
+    known &= np.isfinite(scaled).all(axis=(1, 2))
+    scaled[~known] = np.eye(matrix.shape[1])
     known &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     result = np.full(matrix.shape, np.nan)
     result[known] = np.linalg.inv(scaled[known]) / (scale[known, :, None] * scale[known, None, :])

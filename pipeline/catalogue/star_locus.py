@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import real_array, require_positive
+from ...core.units import real_array, require_count, require_positive
 from ..simulate.stamps import center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
+from .pixel_checks import flagged
 
 # The locus is the fullest interval of half-light radii of this relative width, and has at least so many times the
 # objects that intervals as wide have to either side of it, between these multiples of its radius.
@@ -150,10 +151,11 @@ def select_stars(
     pixels = real_array(image, "image: expected real numbers [ny, nx]")
     if pixels.shape != objects.segmentation.shape:
         raise DomainError(f"image has shape {pixels.shape}: expected {objects.segmentation.shape}, that of the objects")
-    if mask is not None and np.shape(mask) != pixels.shape:
-        raise DomainError(f"mask has shape {np.shape(mask)}: expected {pixels.shape}, that of the image")
-    bad = ~np.isfinite(pixels) | (np.zeros(pixels.shape, dtype=bool) if mask is None else np.asarray(mask) != 0)
-    if size < 1 or size % 2 == 0:
+    masked = flagged(mask, pixels.shape)
+    if masked.shape != pixels.shape:
+        raise DomainError(f"mask has shape {masked.shape}: expected {pixels.shape}, that of the image")
+    bad = ~np.isfinite(pixels) | masked
+    if require_count(size, "size", 1, 4096) % 2 == 0:
         raise DomainError(f"size = {size}: expected an odd number of pixels")
     for name, value in (
         ("min_snr", min_snr),

@@ -118,7 +118,7 @@ class FocalPlaneStars:
     @check_arguments
     def from_table(
         cls,
-        table: Table | Mapping[str, Any],
+        table: Any,
         *,
         stamps: Any = None,
         pixel_scale: float | None = None,

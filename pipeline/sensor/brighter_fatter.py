@@ -133,6 +133,8 @@ def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = 
     counts = pure_numbers(electrons, "electrons")
     if stamps.ndim != 3 or counts.shape != stamps.shape[:1]:
         raise DomainError(f"images, electrons of shapes {stamps.shape}, {counts.shape}: expected [n, ny, nx] and [n]")
+    if not np.isfinite(stamps).all():
+        raise DomainError("images: expected finite numbers")
     if not (np.isfinite(counts).all() and (counts > 0.0).all()):
         raise DomainError(f"electrons = {electrons}: expected positive numbers")
     if not (np.isfinite(sky) and sky >= 0.0):

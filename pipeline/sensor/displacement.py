@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import plane_points
+from ...core.units import length, plane_points, require_positive
 from .pixel_boundaries import RIM, collect, with_rim, without_rim
 
 
@@ -116,6 +116,9 @@ def displace_stamps(
     """
     if images.ndim != 3 or places.shape != (len(images), 2):
         raise DomainError(f"images, places of shapes {images.shape}, {places.shape}: expected [n, ny, nx] and [n, 2]")
+    if not np.isfinite(images).all() or not np.isfinite(places).all():
+        raise DomainError("images, places: expected finite numbers")
+    pixel_size = require_positive(length(pixel_size, "pixel_size"), "pixel_size", "metres")
     if not effects:
         return images
     padded = with_rim(images)

@@ -171,8 +171,17 @@ def mutated(function, arguments):
             yield name, change, arguments | {name: wrong}, must
 
 
-#: Wrong kinds that are none: (function, argument, change).
-FINE = set()
+#: Wrong kinds that are none: masks of True and False, integers as objects, mappings by name; or another error of the
+#: example comes first.
+FINE = {
+    ("mask", "bool"),
+    ("indices", "bool"),
+    ("terms", "objects"),
+    ("exposures", "array"),
+    *((name, "mapping") for name in ("reflectivity", "expansion", "values")),
+    ("pointing", "unit"),
+    *((name, "unit") for name in ("wavelengths", "pixel_size", "diffusion", "jitter")),
+}
 
 
 def outcomes(label, function, arguments, chosen):
@@ -186,8 +195,9 @@ def outcomes(label, function, arguments, chosen):
             kind = "accepted"
         told = isinstance(wrong[name], (str, Path)) and str(wrong[name])[:30] in text
         if kind == "refused" and name.rstrip("s") not in text and not told:
-            kind = "unnamed"
-        if kind == "accepted" and must and not {(label, name, change), ("*", name, change)} & FINE:
+            # Of a value out of range the cause may lie in several arguments.
+            kind = "unnamed" if must else "told"
+        if kind == "accepted" and must and (name, change) not in FINE:
             kind = "silent"
         yield kind, f"{kind:9s}{label}({name}={change}): {text[:300]}"
 
@@ -197,8 +207,8 @@ def table(tmp_path_factory):
     return calls(tmp_path_factory.mktemp("calls"))
 
 
-#: What may come of a wrong argument.
-GOOD = ("refused", "accepted")
+#: What may come of a wrong argument: refused by name, told what is wrong (for a value out of range), or a result.
+GOOD = ("refused", "told", "accepted")
 
 
 def check(table, chosen):
