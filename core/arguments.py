@@ -94,7 +94,7 @@ def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | Non
     except NameError as missing:
         # Imported for type checkers only: a package, or a class that some callee checks.
         try:
-            names[missing.name] = importlib.import_module(missing.name)
+            names[missing.name] = importlib.import_module(str(missing.name))
         except ImportError:
             return None
         return _check_of(typing.get_type_hints(holder, names)[name])
@@ -105,7 +105,7 @@ def _check_of(kind: Any) -> _Check | None:
     origin = get_origin(kind) or kind
     if origin in (Union, types.UnionType):
         arms = list(get_args(kind))
-        if str in arms and (Path in arms or os.PathLike in map(get_origin, arms)):
+        if str in arms and any(arm is Path or get_origin(arm) is os.PathLike for arm in arms):
             # Names of bundled files, too, are texts that may be paths.
             others = [a for a in arms if a not in (str, Path, type(None)) and get_origin(a) is not os.PathLike]
             return _either([_path, *filter(None, map(_check_of, others))], type(None) in arms)
@@ -160,6 +160,8 @@ def _plain(accepted: tuple[Any, ...], expected: str) -> _Check:
 
 
 def _array(name: str, value: Any) -> Any:
+    if type(value) is float or type(value) is int:
+        return value
     numbers = real_numbers(value)
     if numbers is None:
         raise _MismatchError(name, value, "real numbers")
@@ -169,15 +171,15 @@ def _array(name: str, value: Any) -> Any:
 def _plain_array(name: str, value: Any) -> Any:
     if hasattr(value, "unit"):
         raise _MismatchError(name, value, "numbers without a unit")
-    return _array(name, value)
+    return np.asarray(_array(name, value))
 
 
 def _flags(name: str, value: Any) -> Any:
     try:
-        kind = np.asarray(value).dtype.kind
+        flags = np.asarray(value).dtype.kind == "b"
     except ValueError:
-        kind = ""
-    if kind != "b":
+        flags = False
+    if not flags:
         raise _MismatchError(name, value, "an array of True and False")
     return value
 
@@ -213,8 +215,10 @@ def _either(checks: list[_Check], optional: bool) -> _Check:
                 problems.append(problem)
         # Of a sequence whose elements are wrong, the element is the likelier mistake.
         inner = next((p for p in problems if p.name != name), None)
-        expected = " or ".join(dict.fromkeys(p.expected for p in problems))
-        raise inner or _MismatchError(name, value, expected, problems[0].error)
+        several = list(dict.fromkeys(p.expected for p in problems))
+        expected = " or ".join(several) if len(several) < 4 else f"one of {', '.join(several)}"
+        error = next((p.error for p in problems if p.error is not DomainError), DomainError)
+        raise inner or _MismatchError(name, value, expected, error)
 
     return check
 
@@ -225,7 +229,8 @@ def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
     expected = f"a sequence of {len(checks)}" if fixed else "a sequence"
 
     def check(name: str, value: Any) -> Any:
-        if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, (Iterable, np.ndarray)):
+        refused = (str, bytes) if kind is Iterable else (str, bytes, Mapping)
+        if isinstance(value, refused) or not isinstance(value, (Iterable, np.ndarray)):
             raise _MismatchError(name, value, expected)
         if not isinstance(value, (list, tuple, np.ndarray)):
             # An iterator can be used once only.

@@ -121,6 +121,9 @@ class ProductError(PachonError):
 def shown(value: object) -> str:
     """Return a value as messages show it: on one line, cut short, and large arrays by type and shape."""
     shape = getattr(value, "shape", None)
+    if shape == ():
+        # Numbers and quantities of NumPy and astropy without their types.
+        return cut_short(str(value), _MAX_VALUE)
     if isinstance(shape, tuple) and getattr(value, "size", 0) > 8:
         return f"{type(value).__name__} of shape {shape}"
     return cut_short(" ".join(_REPR.repr(value).split()), _MAX_VALUE)

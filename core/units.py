@@ -118,11 +118,16 @@ def angle(value: Any, name: str) -> float:
     return _one(radians(value, name), name, "angle")
 
 
+def one_number(value: Any, name: str) -> float:
+    """Return one number without a unit."""
+    return _one(pure_numbers(value, name), name, "number")
+
+
 def _one(values: np.ndarray, name: str, kind: str) -> float:
     if values.ndim:
         raise DomainError(f"{name} has shape {values.shape}: expected one {kind}")
-    if np.abs(values) > _LARGEST:
-        raise DomainError(f"{name} = {float(values):g}: expected one {kind} below {_LARGEST:g} in SI units")
+    if _LARGEST < np.abs(values) < np.inf:
+        raise DomainError(f"{name} = {float(values):g}: expected one {kind} below {_LARGEST:g} in SI")
     return float(values)
 
 

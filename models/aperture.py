@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import PrescriptionError, shown
+from ..core.errors import PrescriptionError
 from ..core.units import plane_points
 
 
@@ -217,6 +217,7 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
     return None
 
 
+@check_arguments
 @dataclass(frozen=True)
 class _Combination(Region):
     """Base of unions and intersections."""
@@ -224,7 +225,7 @@ class _Combination(Region):
     parts: tuple[Aperture, ...]
 
     def __post_init__(self) -> None:
-        _check_parts(type(self).__name__.lower(), self.parts)
+        _require(self.parts, f"{type(self).__name__.lower()} of no parts: expected at least one region")
 
 
 @check_arguments
@@ -250,20 +251,8 @@ class Complement(Region):
 
     part: Aperture
 
-    def __post_init__(self) -> None:
-        _check_parts("complement", (self.part,))
-
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         return np.logical_not(self.part.contains(x, y))
 
 
 Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
-
-
-def _check_parts(name: str, parts: tuple[Aperture, ...]) -> None:
-    _require(
-        isinstance(parts, tuple) and parts,
-        f"parts of a {name} = {shown(parts)}: expected a tuple of at least one region",
-    )
-    for part in parts:
-        _require(isinstance(part, Aperture), f"parts of a {name} with {shown(part)}: expected apertures")

@@ -67,11 +67,6 @@ class Surface:
     rotation: Matrix = IDENTITY
 
     def __post_init__(self) -> None:
-        for key, kind in (("interaction", Interaction), ("shape", Shape), ("medium_after", Medium)):
-            if not isinstance(getattr(self, key), kind):
-                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected an object of {kind.__name__}")
-        if self.aperture is not None and not isinstance(self.aperture, Aperture):
-            raise PrescriptionError(f"aperture = {self.aperture!r}: expected an aperture or None")
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
         axes = np.array(self.rotation, dtype=np.float64)

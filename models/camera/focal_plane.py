@@ -70,7 +70,7 @@ class FocalPlane:
         camera: str | Camera = "lsst",
         *,
         seed: int,
-        terms: Iterable[str] | None = None,
+        terms: str | Iterable[str] | None = None,
         budget: str | HeightBudget = "simulated",
     ) -> FocalPlane:
         """Draw heights from the budget of Jee & Tyson 2011, Table 1.
@@ -204,7 +204,7 @@ class FocalPlane:
         surfaces, measured = fit_heights(camera, x, y, z, margin=_MESH_MARGIN)
         return cls(camera, surfaces, measured)
 
-    def with_terms(self, terms: Iterable[str]) -> FocalPlane:
+    def with_terms(self, terms: str | Iterable[str]) -> FocalPlane:
         """Return the focal plane of the same seed and budget with only these terms.
 
         Raises

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh_tridiagonal
 
-from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import length
+from ...core.units import length, one_number
 from ..media.silicon import absorption_length, check_temperature, silicon_index
 
 # Absorption lengths beyond which no light is left, to double precision.
@@ -39,7 +38,6 @@ class ConversionPaths:
     weight: np.ndarray  #: parts of the light that enters, [n]; their sum is what is absorbed
 
 
-@check_arguments
 @dataclass(frozen=True)
 class Silicon:
     """Silicon of a CCD.
@@ -59,6 +57,7 @@ class Silicon:
         object.__setattr__(self, "thickness", length(self.thickness, "thickness"))
         if not 1e-6 <= self.thickness <= 1e-3:
             raise DomainError(f"thickness = {self.thickness!r}: expected 1e-06 to 0.001 m of silicon")
+        object.__setattr__(self, "temperature", one_number(self.temperature, "temperature"))
         check_temperature(self.temperature)
 
     def index(self, wavelength: ArrayLike) -> float:

@@ -17,7 +17,7 @@ from ...core.units import real_array, require_count, require_positive
 from ..measure.shapes import fwhm
 from .cutouts import cut_out
 from .objects import DetectedObjects, ObjectFlag
-from .pixel_checks import check_pixels, mask_bits
+from .pixel_checks import check_pixels
 
 # Kron photometry as in SExtractor: radius over which the Kron radius is averaged, its factor, the least radius, in
 # units of the rms axes.
@@ -80,7 +80,10 @@ def detect_objects(
         If shapes differ, a pixel that is not masked is not finite or has no positive variance, an option is out of
         range, or nothing is detected.
     """
-    bits = np.zeros(np.shape(image), dtype=np.int64) if mask is None else mask_bits(mask)
+    bits = np.zeros(np.shape(image), dtype=np.int64) if mask is None else np.asarray(mask)
+    if bits.dtype.kind not in "iub" or hasattr(mask, "unit"):
+        raise DomainError(f"mask has type {bits.dtype}: expected integers, the bits of each pixel")
+    bits = bits.astype(np.int64)
     require_count(saturated, "saturated", 0, 2**63 - 1)
     pixels, variances, ignored = check_pixels(image, variance, bits & ~np.int64(saturated))
     options = _options(threshold, min_area, kernel, deblend_levels, deblend_contrast)

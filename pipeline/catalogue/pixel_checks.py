@@ -43,18 +43,9 @@ def flagged(mask: ArrayLike | NDArray[np.bool_] | None, shape: tuple[int, ...]) 
     """Return where a mask is not zero, bool; nowhere in an image of a shape without a mask."""
     if mask is None:
         return np.zeros(shape, dtype=bool)
-    return mask_bits(mask) != 0
-
-
-def mask_bits(mask: ArrayLike | NDArray[np.bool_]) -> np.ndarray:
-    """Return the bits of the pixels of a mask as integers."""
-    try:
-        bits = np.asarray(mask)
-    except ValueError:
-        bits = np.empty(0)
-    if bits.dtype.kind not in "iub" or hasattr(mask, "unit"):
-        raise DomainError(f"mask = {shown(mask)}: expected the bits of each pixel as integers, or True and False")
-    return bits.astype(np.int64)
+    if hasattr(mask, "unit"):
+        raise DomainError(f"mask = {shown(mask)}: expected numbers without a unit")
+    return np.asarray(mask) != 0
 
 
 def _require(good: np.ndarray, name: str, values: np.ndarray, expected: str) -> None:

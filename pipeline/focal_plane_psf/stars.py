@@ -11,6 +11,7 @@ import numpy as np
 from astropy import units as u
 from astropy.io.registry import IORegistryError
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
@@ -208,7 +209,7 @@ class FocalPlaneStars:
             raise ProductError(error.reason, file=place) from None
 
     @check_arguments
-    def chosen(self, which: np.ndarray) -> FocalPlaneStars:
+    def chosen(self, which: np.ndarray | NDArray[np.bool_]) -> FocalPlaneStars:
         """Return some of the stars, by a mask [n] or indices."""
         index = np.arange(len(self))[which]
         return FocalPlaneStars(

@@ -11,8 +11,8 @@ from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, check_choice
-from ...core.units import ARCMIN, angle, pure_numbers, radians, real_array, require_count
+from ...core.errors import DomainError, check_choice, shown
+from ...core.units import ARCMIN, angle, radians, real_array, require_count
 
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
@@ -126,7 +126,7 @@ def shear_correlation(
     n_bins: int = 20,
     subtract_mean: bool = False,
     exact: bool | None = None,
-    patch: ArrayLike | None = None,
+    patch: Any = None,
     other: tuple[Any, Any] | None = None,
 ) -> Correlation:
     r"""Correlate ellipticities of star pairs (Jee & Tyson 2011, eq. 7).
@@ -181,7 +181,12 @@ def shear_correlation(
     columns += [real_array(v, "e1, e2: expected arrays of real numbers") for v in ellipticities]
     if columns[0].ndim != 1 or any(c.shape != columns[0].shape for c in columns):
         raise DomainError(f"x, y, e1, e2 have shapes {[c.shape for c in columns]}: expected [n] four times")
-    labels = None if patch is None else pure_numbers(patch, "patch")
+    try:
+        labels = None if patch is None else np.asarray(patch)
+    except ValueError:
+        raise DomainError(f"patch = {shown(patch)}: expected one label for each star") from None
+    if np.ma.is_masked(patch):
+        raise DomainError("patch has masked labels: expected one for each star")
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
     low, high = (angle(v, n) for v, n in ((min_sep, "min_sep"), (max_sep, "max_sep")))

@@ -68,7 +68,7 @@ def rho_statistics(
     max_sep: float | Quantity,
     n_bins: int = 20,
     exact: bool | None = None,
-    patch: ArrayLike | None = None,
+    patch: Any = None,
 ) -> RhoStatistics:
     """Compute the rho statistics 1 to 5 of a PSF model (Rowe 2010; Jarvis et al. 2016, sec. 3.4).
 

@@ -171,8 +171,8 @@ def mutated(function, arguments):
             yield name, change, arguments | {name: wrong}, must
 
 
-#: Wrong kinds that are none: masks of True and False, integers as objects, mappings by name; or another error of the
-#: example comes first.
+#: Wrong kinds that are none: masks of True and False, labels of any kind, integers as objects, mappings by name; or
+#: another error of the example comes first.
 FINE = {
     ("mask", "bool"),
     ("indices", "bool"),
@@ -180,6 +180,7 @@ FINE = {
     ("exposures", "array"),
     *((name, "mapping") for name in ("reflectivity", "expansion", "values")),
     ("pointing", "unit"),
+    *(("patch", change) for change in ("None", "bool", "complex", "texts", "objects", "unit")),
     *((name, "unit") for name in ("wavelengths", "pixel_size", "diffusion", "jitter")),
 }
 
@@ -196,7 +197,7 @@ def outcomes(label, function, arguments, chosen):
         told = isinstance(wrong[name], (str, Path)) and str(wrong[name])[:30] in text
         if kind == "refused" and name.rstrip("s") not in text and not told:
             # Of a value out of range the cause may lie in several arguments.
-            kind = "unnamed" if must else "told"
+            kind = "unnamed" if must and (name, change) not in FINE else "told"
         if kind == "accepted" and must and (name, change) not in FINE:
             kind = "silent"
         yield kind, f"{kind:9s}{label}({name}={change}): {text[:300]}"

@@ -78,8 +78,8 @@ class Atmosphere(LayerScreens):
         site: str | Site,
         seed: int,
         *,
-        r0: float | None = None,
-        outer_scale: float | None = None,
+        r0: ArrayLike | None = None,
+        outer_scale: ArrayLike | None = None,
         exposure: float = 15.0,
         time_step: float = 0.05,
         screen_size: int = 8192,
@@ -93,7 +93,7 @@ class Atmosphere(LayerScreens):
         wind_speeds: ArrayLike | None = None,
         wind_directions: ArrayLike | None = None,
         ground_lift: float = 0.0,
-        zenith_angle: float = 0.0,
+        zenith_angle: ArrayLike = 0.0,
         fixed_modulus: bool = False,
     ) -> Atmosphere:
         """Return the atmosphere of a site for one exposure.
