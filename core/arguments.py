@@ -227,11 +227,23 @@ def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
     fixed = kind is tuple and Ellipsis not in elements
     checks = [_check_of(element) for element in elements if element is not Ellipsis] or [None]
     expected = f"a sequence of {len(checks)}" if fixed else "a sequence"
+    simple = {element for element in elements if element is not Ellipsis}
+    simple = simple if kind is tuple and len(simple) == 1 and get_origin(*simple) is None else set()
 
     def check(name: str, value: Any) -> Any:
+        # Most tuples come from pachon itself, and are as they should be.
+        if (
+            type(value) is tuple
+            and simple
+            and simple.issuperset(map(type, value))
+            and (not fixed or len(value) == len(checks))
+        ):
+            return value
         refused = (str, bytes) if kind is Iterable else (str, bytes, Mapping)
         if isinstance(value, refused) or not isinstance(value, (Iterable, np.ndarray)):
             raise _MismatchError(name, value, expected)
+        if isinstance(value, Mapping):
+            value = list(value)
         if not isinstance(value, (list, tuple, np.ndarray)):
             # An iterator can be used once only.
             return value
@@ -256,7 +268,7 @@ def _mapping(kinds: tuple[Any, ...]) -> _Check:
             if check_key is not None:
                 check_key(f"key of {name}", key)
             if check_value is not None:
-                check_value(f"{name}[{shown(key)}]", each)
+                check_value(f"{name}[{key!r}]", each)
         return value
 
     return check
