@@ -28,7 +28,7 @@ from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .measure.summary import correlations, run_metrics
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
-from .run_folder import SUMMARY_NAME, claim_folder, finished_ccds, stamp_of
+from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of
 from .simulate.ccd_exposure import CcdExposure
 from .simulate.ccd_loop import simulate_ccds
 from .simulate.ccd_model import model_ccd
@@ -107,7 +107,7 @@ def run(
     # The report of a finished run needs no screens.
     if missing:
         check_memory(experiment, threads)
-    claim_folder(folder, experiment, resume=resume)
+    claim_run(folder, experiment, resume=resume)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     failed: dict[str, str] = {}

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, ProductError
+from ...core.files import make_folder, partial_path, publish_new
 from ...core.version import VERSION
 from ...pipeline.config import differences
 from .file import SweepFile, read_sweep
@@ -136,9 +137,9 @@ class SweepStore:
 
 def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
     """Create the file of a sweep with all its points and no results, whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = partial_path(path)
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         partial.unlink(missing_ok=True)
         connection = sqlite3.connect(partial)
         try:
@@ -159,9 +160,12 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
             connection.execute("PRAGMA journal_mode = WAL")
         finally:
             connection.close()
+        publish_new(partial, path)
+        # Of a store that was removed; nobody has opened the new one yet.
         for leftover in _beside(path):
             leftover.unlink(missing_ok=True)
-        partial.replace(path)
+    except FileExistsError:
+        raise store_exists(path) from None
     except sqlite3.Error as error:
         raise _problem(path, error) from None
     except OSError as error:
@@ -170,6 +174,11 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
         with suppress(OSError):
             for leftover in (partial, *_beside(partial)):
                 leftover.unlink(missing_ok=True)
+
+
+def store_exists(path: Path) -> ConfigError:
+    """Return the error for a new sweep whose store is there already."""
+    return ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
 
 
 def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:

@@ -17,7 +17,7 @@ from ...pipeline.config import Configuration
 from .design import design_points, point_count
 from .file import SweepFile
 from .point import PointMeasurement, check_sweep
-from .store import SweepPoint, SweepStore, check_same_sweep, create_store
+from .store import SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
 from .workers import Measure, Workers, serial_worker
 
 #: Function that makes workers of the function that computes a point.
@@ -78,7 +78,7 @@ def run_sweep(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     path, folder = Path(path), Path() if folder is None else folder
     if path.exists() and not resume:
-        raise ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
+        raise store_exists(path)
     if not path.exists():
         check_room(sweep, path)
         points = numbered_points(sweep, folder)
