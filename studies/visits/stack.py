@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
@@ -110,7 +111,7 @@ class PsfStack:
         cls,
         sums: PsfSums,
         sky: np.ndarray,
-        star: np.ndarray,
+        star: NDArray[np.bool_],
         axes: np.ndarray,
         pixel_scale: float,
         weight_fwhm: float,
