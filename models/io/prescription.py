@@ -37,6 +37,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
+from ..mesh_file import files_of_mesh
 from ..telescope import Telescope
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
@@ -135,6 +136,10 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
     # os.path takes every text, also such as are too long for a name.
     files = [name for name in named if os.path.isfile(path.parent / name)]
+    for name in files:
+        # A list that grows: files of meshes name no others.
+        beside = (os.path.join(os.path.dirname(name), other) for other in files_of_mesh(path.parent / name))
+        files += [other for other in beside if os.path.isfile(path.parent / other) and other not in files]
     if not files:
         return own
     contents = [own, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
