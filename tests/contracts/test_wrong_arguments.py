@@ -5,33 +5,23 @@ short run makes every fortieth.
 """
 
 import inspect
-import resource
-import signal
 import warnings
 import zlib
 from collections import Counter
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy import units as u
+from bounds import CHARACTERS, LINES, Hang, bounded
 from public_calls import calls
 
 import pachon
 from pachon.core.errors import PachonError
 
-#: Time [s] and memory [byte] that a call may take before it counts as a hang.
-SECONDS, MEMORY = 2.0, 2 << 30
-#: Longest error message [lines, characters].
-LINES, CHARACTERS = 3, 800
 #: Share of the calls in the short run.
 SHARE = 40
-
-
-class Hang(BaseException):
-    """A call that does not end."""
 
 
 class Surprise:
@@ -123,26 +113,6 @@ def wrong_values(value):
         yield "empty", type(value)()
         yield "texts", type(value)(["x"] * len(value))
         yield "longer", value + value
-
-
-@contextmanager
-def bounded():
-    """Limit time and memory of a block; Hang, or MemoryError."""
-
-    def stop(*_):
-        raise Hang
-
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    limits = resource.getrlimit(resource.RLIMIT_AS)
-    previous = signal.signal(signal.SIGALRM, stop)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, limits[1]))
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, previous)
-        resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def said(function, arguments):
