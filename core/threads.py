@@ -12,7 +12,7 @@ from functools import lru_cache
 from threadpoolctl import ThreadpoolController
 
 #: More threads than any machine has processors only take memory.
-_MOST_THREADS = 1024
+_MOST_THREADS = 128
 _LOCK = threading.RLock()
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy import units as u
-from bounds import CHARACTERS, LINES, Hang, bounded
+from bounds import CHARACTERS, LINES, MEMORY_OF_CALL, Hang, bounded
 from public_calls import calls
 
 import pachon
@@ -118,7 +118,7 @@ def wrong_values(value):
 def said(function, arguments):
     """Return the kind of the outcome of a call and what it said."""
     try:
-        with bounded(), warnings.catch_warnings():
+        with bounded(MEMORY_OF_CALL), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             function(**arguments)
     except PachonError as error:
