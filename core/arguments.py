@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
+from astropy import units as u
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import ConfigError, DomainError, PachonError, shown
@@ -169,7 +170,7 @@ def _array(name: str, value: Any) -> Any:
 
 
 def _plain_array(name: str, value: Any) -> Any:
-    if hasattr(value, "unit"):
+    if isinstance(value, u.Quantity):
         raise _MismatchError(name, value, "numbers without a unit")
     return np.asarray(_array(name, value))
 

@@ -24,22 +24,20 @@ _LARGEST = 1e50
 def real_numbers(values: Any) -> Any:
     """Return real numbers as an array of their own type, masked ones as NaN; None where they are anything else.
 
-    Quantities, and lists of them, keep their unit. Boolean values, times, complex numbers, texts and objects are none.
+    Quantities, lists of them and columns of tables keep their unit. Boolean values, times, complex numbers, texts and
+    objects are none.
     """
     if type(values) is np.ndarray:
         return values if values.dtype.kind in "iuf" else None
     if isinstance(values, (tuple, list)) and any(isinstance(v, _APART) for v in values):
         found = [real_numbers(v) for v in values]
         return None if any(v is None for v in found) else found
-    if getattr(values, "unit", None) is not None and not isinstance(values, u.Quantity):
-        # Columns of tables.
-        values = values.quantity
     if hasattr(values, "mask") and hasattr(values, "filled"):
         if values.dtype.kind not in "iuf":
             return None
         masked = np.any(values.mask)
         values = values.astype(np.float64).filled(np.nan) if masked else values.filled(0)
-    if not isinstance(values, u.Quantity):
+    if getattr(values, "unit", None) is None:
         try:
             values = np.asarray(values)
         except (TypeError, ValueError, OverflowError):
@@ -54,9 +52,10 @@ def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
         raise DomainError(f"{name} = {shown(value)}: expected a number in {unit} or a quantity")
     if isinstance(numbers, list):
         numbers = [_si(v, unit, name) for v in numbers]
-    elif isinstance(numbers, u.Quantity):
+    elif hasattr(numbers, "unit") and (isinstance(numbers, u.Quantity) or unit != u.dimensionless_unscaled):
+        # The unit of a column of pure numbers, such as pixels or magnitudes, says what they count.
         try:
-            numbers = numbers.to_value(unit)
+            numbers = u.Quantity(numbers, copy=None).to_value(unit)
         except u.UnitConversionError:
             raise DomainError(f"{name} = {shown(value)}: expected a unit that converts to {unit}") from None
     try:

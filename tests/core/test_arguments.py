@@ -105,6 +105,7 @@ def test_masked_values_are_nan():
 
 def test_columns_keep_their_unit():
     np.testing.assert_allclose(metres(Column([1.0, 2.0], unit="mm"), "x"), [1e-3, 2e-3])
+    np.testing.assert_array_equal(pure_numbers(Column([1.0, 2.0], unit="pix"), "x"), [1.0, 2.0])
     np.testing.assert_allclose(metres([1.0 * u.mm, 2.0 * u.m], "x"), [1e-3, 2.0])
 
 

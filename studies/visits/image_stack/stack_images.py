@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ....core.errors import ConfigError, DomainError, PachonError, ProductError
-from ....core.files import claim_folder, make_folder
+from ....core.files import claim_folder
 from ....core.memory import readable, require_bytes
 from ....core.products import Stamp
 from ....core.progress import Reporter
@@ -188,9 +188,8 @@ def stack_images(
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     stack = ImageStack.of(folder, settings)
-    make_folder(stack.folder)
-    _check_room(stack, threads)
     _claim(stack, resume)
+    _check_room(stack, threads)
     plan = stack.plan
     sums = {tile: _sums_so_far(stack, tile, resume) for tile in stack.tiles}
     done = min(s.visits for s in sums.values())
