@@ -10,14 +10,14 @@ import json
 import os
 import platform
 import stat
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .errors import PachonError, ProductError
+from .errors import PachonError, ProductError, cut_short
 
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
@@ -145,6 +145,21 @@ def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = 
     if max_bytes is not None and len(data) > max_bytes:
         raise error(f"expected a file of at most {max_bytes} bytes", file=path)
     return data
+
+
+@contextmanager
+def parsing(path: str | os.PathLike[str], problem: str, error: type[PachonError]) -> Iterator[None]:
+    """Raise `error` with a problem, such as ``"no FITS file"``, where another package cannot make sense of a file.
+
+    Parsers of others raise whatever a damaged file leads them to.
+    """
+    try:
+        yield
+    except PachonError:
+        raise
+    except Exception as cause:
+        reason = cut_short(" ".join(str(cause).split()), 120) or type(cause).__name__
+        raise error(f"{problem} ({reason})", file=path) from None
 
 
 def require_file(path: Path, error: type[PachonError]) -> None:

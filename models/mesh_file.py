@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from ..core.errors import PrescriptionError, cut_short, shown
-from ..core.files import read_bytes
+from ..core.errors import PrescriptionError, error_context, shown
+from ..core.files import parsing, read_bytes
 
 if TYPE_CHECKING:
     import trimesh
@@ -69,13 +69,8 @@ def load_mesh(path: str | os.PathLike[str], *, merged: bool) -> trimesh.Trimesh:
     # Unless merged, unprocessed: processing drops vertices that are not finite and joins corners.
     how: dict[str, Any] = {"force": "mesh"} if merged else {"process": False}
     load = trimesh.load if merged else trimesh.load_scene
-    try:
+    with parsing(path, "cannot be read as a mesh", PrescriptionError), error_context(file=path):
         mesh: Any = load(data, file_type=path.suffix.lower()[1:], resolver=_Beside(path.parent), **how)
-    except PrescriptionError as error:
-        raise error.within(file=path) from None
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        reason = cut_short(" ".join(str(error).split()), 120) or type(error).__name__
-        raise PrescriptionError(f"cannot be read as a mesh ({reason})", file=path) from None
     parts = mesh.geometry.values() if isinstance(mesh, trimesh.Scene) else [mesh]
     if not any(len(getattr(part, "faces", ())) for part in parts):
         raise PrescriptionError("expected a mesh with at least one triangle", file=path)

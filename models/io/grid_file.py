@@ -17,7 +17,7 @@ from astropy import units as u
 from astropy.io import fits
 
 from ...core.errors import PrescriptionError, error_context
-from ...core.files import require_file, write_bytes
+from ...core.files import parsing, require_file, write_bytes
 from ..shapes.grid import GridSag
 
 
@@ -36,16 +36,12 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
     """
     path = Path(path)
     require_file(path, PrescriptionError)
-    try:
-        with fits.open(path, memmap=False) as hdus:
-            images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        reason = " ".join(str(error).split())
-        raise PrescriptionError(f"cannot be read as FITS ({reason[:120]})", file=path) from None
+    with parsing(path, "cannot be read as FITS", PrescriptionError), fits.open(path, memmap=False) as hdus:
+        images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
     if not images:
         raise PrescriptionError("expected a FITS image of two dimensions", file=path)
     header, data = images[0]
-    with error_context(file=path):
+    with error_context(file=path), parsing(path, "cannot be read as FITS", PrescriptionError):
         x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
         return GridSag(x, y, np.asarray(data, dtype=np.float64) * length_unit(header, "BUNIT"))
 

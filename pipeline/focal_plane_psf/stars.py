@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
-from astropy.io.registry import IORegistryError
 from astropy.table import Table
 from numpy.typing import NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
-from ...core.files import require_file
+from ...core.files import parsing, require_file
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from ..measure.shapes import Shapes, measure_shapes
@@ -191,18 +190,9 @@ class FocalPlaneStars:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
             return cls.from_products([read_product(f, holdout_images=False) for f in files], **options)
         require_file(place, ProductError)
-        try:
-            table = (
-                Table.read(place)
-                if place.suffix.lower() in (".fits", ".fit")
-                else Table.read(place, format="ascii.ecsv")
-            )
-        except OSError as error:
-            raise ProductError(f"cannot be read ({error.strerror or error})", file=place) from None
-        except (ValueError, KeyError, TypeError, IndexError, IORegistryError) as error:
-            raise ProductError(
-                f"cannot be read as a table of stars ({' '.join(str(error).split())})", file=place
-            ) from None
+        with parsing(place, "cannot be read as a table of stars", ProductError):
+            kind = "fits" if place.suffix.lower() in (".fits", ".fit") else "ascii.ecsv"
+            table = Table.read(place, format=kind)
         try:
             return cls.from_table(table, **options)
         except DomainError as error:

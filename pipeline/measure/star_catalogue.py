@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from astropy.io import fits
 from astropy.table import Table
-from astropy.table.meta import YamlParseError
 
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
-from ...core.files import read_bytes
+from ...core.files import parsing, read_bytes
 
 
 class StarCutouts(NamedTuple):
@@ -69,7 +67,8 @@ def load_stars(
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
         if not tables:
             raise ProductError(f"has no table, expected one with columns {x}, {y}", file=path)
-        columns = {name: np.asarray(tables[0].data[name]) for name in tables[0].columns.names}
+        with parsing(path, "damaged or not FITS", ProductError):
+            columns = {name: np.asarray(tables[0].data[name]) for name in tables[0].columns.names}
     elif data.lstrip().startswith(b"# %ECSV"):
         columns = _ecsv(path, data)
     else:
@@ -101,12 +100,10 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
     """Return the parts of a FITS file in memory; the warning that it is cut short is an error, others are dropped."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        try:
+        with parsing(path, "damaged or not FITS", ProductError):
             hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
             for hdu in hdus:
                 hdu.data  # noqa: B018 - reads it now, within the checks
-        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise ProductError(f"damaged or not FITS ({' '.join(str(error).split())})", file=path) from None
     cut = [str(w.message) for w in caught if "truncated" in str(w.message).lower()]
     if cut:
         raise ProductError(f"cut short ({' '.join(cut[0].split())})", file=path)
@@ -115,10 +112,8 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
 
 def _ecsv(path: Path, data: bytes) -> dict[str, np.ndarray]:
     """Return the columns of an ECSV table; values left empty are NaN."""
-    try:
+    with parsing(path, "damaged or no ECSV table", ProductError):
         table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
-    except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, YamlParseError) as error:
-        raise ProductError(f"damaged or no ECSV table ({' '.join(str(error).split())})", file=path) from None
     columns = {}
     for name in table.colnames:
         values = table[name]

@@ -30,7 +30,7 @@ CENTRAL_RAFT = "R22"
 class VisitsSection(Section):
     """How the field is visited, and what is looked at."""
 
-    count: Count = Field(10, description="number of visits")
+    count: Count = Field(10, le=100_000, description="number of visits")
     dither_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=5)] = Field(
         0.0, description="radius of the disc over which pointings are spread [deg]"
     )
