@@ -78,7 +78,8 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
     require_file(Path(path), ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
-        with parsing(path, "cannot be read as FITS", ProductError), fits.open(path) as hdus:
+        with parsing(path, "cannot be read as FITS", ProductError), open(path, "rb") as file:
+            hdus = fits.open(file, memmap=False)
             found = next(((h.data, h.header) for h in hdus if h.is_image and np.ndim(h.data) == 2), None)
         if found is None:
             raise ProductError("has no image of two axes, expected a mosaic of the sky", file=path)

@@ -36,7 +36,8 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
     """
     path = Path(path)
     require_file(path, PrescriptionError)
-    with parsing(path, "cannot be read as FITS", PrescriptionError), fits.open(path, memmap=False) as hdus:
+    with parsing(path, "cannot be read as FITS", PrescriptionError), open(path, "rb") as file:
+        hdus = fits.open(file, memmap=False)
         images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
     if not images:
         raise PrescriptionError("expected a FITS image of two dimensions", file=path)

@@ -88,7 +88,7 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
     with parsing(path, "cannot be read", PrescriptionError):
         if path.suffix.lower() == ".ecsv":
             return Table.read(path, format="ascii.ecsv")
-        with warnings.catch_warnings(), fits.open(path, memmap=False) as hdus:
+        with warnings.catch_warnings(), open(path, "rb") as file, fits.open(file, memmap=False) as hdus:
             warnings.filterwarnings("error", ".*truncated", AstropyUserWarning)
             images = [hdu for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
             if not images:
