@@ -60,22 +60,23 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     parameters = [p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     if all(p.annotation is p.empty for p in parameters):
         return function
-    places: list[tuple[str, _Check | None]] = []
-    checks: dict[str, _Check] = {}
+
+    @functools.cache
+    def checks() -> dict[str, _Check | None]:
+        # At the first call: an annotation may name a class of a module that is imported after this one.
+        return {p.name: _check_of_parameter(function, p.name) for p in parameters}
 
     @functools.wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
-        if not places:
-            # At the first call: an annotation may name a class of a module that is imported after this one.
-            places.extend((p.name, _check_of_parameter(function, p.name)) for p in parameters)
-            checks.update({name: check for name, check in places if check is not None})
+        known = checks()
+        # Of several values of ``*names`` each has its check.
+        places = list(known.items())
+        places += places[-1:] * (len(args) - len(places))
         try:
-            # Of several values of ``*names`` each has its check.
-            each = places + places[-1:] * (len(args) - len(places))
-            given = [v if check is None else check(name, v) for v, (name, check) in zip(args, each, strict=False)]
-            for name in options:
-                if name in checks:
-                    options[name] = checks[name](name, options[name])
+            given = [v if check is None else check(name, v) for v, (name, check) in zip(args, places, strict=False)]
+            for name, value in options.items():
+                if (check := known.get(name)) is not None:
+                    options[name] = check(name, value)
         except _MismatchError as problem:
             text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
             raise problem.error(text, key=problem.name) from None

@@ -2,6 +2,7 @@
 
 import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -174,3 +175,16 @@ def test_checked_classes_stay_themselves():
     assert pachon.Circle.__init__.__doc__ == circle.__init__.__doc__
     assert pachon.trace.__name__ == "trace"
     assert "telescope" in pachon.trace.__wrapped__.__annotations__
+
+
+def test_many_threads_may_make_the_first_call():
+    @check_arguments
+    def first(a: float, b: ArrayLike, *more: int):
+        return a, b, more
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(lambda i: first(float(i), 1.0, 2, 3), range(8))) == {
+            (float(i), 1.0, (2, 3)) for i in range(8)
+        }
+    with pytest.raises(DomainError, match="more = 'x': expected a whole number"):
+        first(1.0, 1.0, 2, "x")
