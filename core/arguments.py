@@ -242,15 +242,15 @@ def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
         ):
             return value
         refused = (str, bytes) if kind is Iterable else (str, bytes, Mapping)
-        if isinstance(value, refused) or not isinstance(value, (Iterable, np.ndarray)):
+        # To Python, an array without axes is iterable too.
+        single = isinstance(value, np.ndarray) and not value.ndim
+        if single or isinstance(value, refused) or not isinstance(value, Iterable):
             raise _MismatchError(name, value, expected)
         if isinstance(value, Mapping):
             value = list(value)
         if not isinstance(value, (list, tuple, np.ndarray)):
             # An iterator can be used once only.
             return value
-        if np.ndim(value) == 0 if isinstance(value, np.ndarray) else False:
-            raise _MismatchError(name, value, expected)
         if fixed and len(value) != len(checks):
             raise _MismatchError(name, value, expected)
         each = checks if fixed else checks * len(value)
