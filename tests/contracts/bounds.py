@@ -2,11 +2,13 @@
 
 import resource
 import signal
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-#: Time [s] that a call may take before it counts as a hang, memory [byte] for a file, and for a call with its threads.
-SECONDS, MEMORY, MEMORY_OF_CALL = 2.0, 500_000_000, 2_000_000_000
+#: Times that a call may take before it counts as a hang [s]: of the processor, and by the clock of a busy machine.
+SECONDS, PATIENCE = 2.0, 20.0
+#: Memory for a file, and for a call with its threads [byte].
+MEMORY, MEMORY_OF_CALL = 500_000_000, 2_000_000_000
 #: Longest error message [lines, characters].
 LINES, CHARACTERS = 3, 800
 
@@ -18,18 +20,20 @@ class Hang(BaseException):
 @contextmanager
 def bounded(memory=MEMORY):
     """Limit time and memory of a block; Hang, or MemoryError."""
-
-    def stop(*_):
-        raise Hang
-
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    previous = signal.signal(signal.SIGALRM, stop)
-    resource.setrlimit(resource.RLIMIT_AS, (used + memory, limits[1]))
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    try:
+    with ExitStack() as after:
+        for name, timer, seconds in (
+            (signal.SIGPROF, signal.ITIMER_PROF, SECONDS),
+            (signal.SIGALRM, signal.ITIMER_REAL, PATIENCE),
+        ):
+            after.callback(signal.signal, name, signal.signal(name, _stop))
+            after.callback(signal.setitimer, timer, 0.0)
+            signal.setitimer(timer, seconds)
+        resource.setrlimit(resource.RLIMIT_AS, (used + memory, limits[1]))
+        after.callback(resource.setrlimit, resource.RLIMIT_AS, limits)
         yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, previous)
-        resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+def _stop(*_):
+    raise Hang

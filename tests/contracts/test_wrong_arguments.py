@@ -1,7 +1,7 @@
 """Public functions called with one wrong argument: an error of pachon that names it, never a hang, crash or raw error.
 
 ``pytest -m slow tests/contracts/test_wrong_arguments.py -s`` makes every call and prints the counts by outcome; the
-short run makes every fortieth.
+short run makes every fiftieth.
 """
 
 import inspect
@@ -21,7 +21,7 @@ import pachon
 from pachon.core.errors import PachonError
 
 #: Share of the calls in the short run.
-SHARE = 40
+SHARE = 50
 
 
 class Surprise:
@@ -206,3 +206,13 @@ def test_some_wrong_arguments(table):
 @pytest.mark.slow
 def test_all_wrong_arguments(table):
     check(table, lambda label, n: True)
+
+
+@pytest.mark.slow
+def test_a_call_that_does_not_end_is_found():
+    def endless():
+        while True:
+            pass
+
+    assert said(endless, {}) == ("hang", "")
+    assert said(lambda: bytearray(10 * MEMORY_OF_CALL), {})[0] == "raw"

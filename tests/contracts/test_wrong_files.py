@@ -18,7 +18,7 @@ import trimesh
 import yaml
 from astropy.io import fits
 from astropy.table import Table
-from bounds import CHARACTERS, Hang, bounded
+from bounds import CHARACTERS, SECONDS, Hang, bounded
 
 import pachon
 from pachon.core.errors import PachonError
@@ -228,7 +228,7 @@ def complaint(path, function):
         text = str(error)
         return None if text.strip() and "\n" not in text and len(text) <= CHARACTERS else f"message: {text}"
     except Hang:
-        return "more than 2 s"
+        return f"more than {SECONDS:g} s"
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return None
