@@ -6,7 +6,14 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from reprlib import Repr
 from typing import Any, Self
+
+#: Longest text of a value and of a path in a message, and of a message [characters].
+_MAX_VALUE, _MAX_PATH, _MAX_MESSAGE = 80, 200, 600
+_REPR = Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = _MAX_VALUE
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 8
 
 
 class PachonError(Exception):
@@ -37,6 +44,8 @@ class PachonError(Exception):
         place: str | None = None,
         key: str | None = None,
     ) -> None:
+        # Some texts hold what a library says of a file, and names out of it.
+        problem = cut_short(" ".join(problem.split("\n")), _MAX_MESSAGE)
         super().__init__(problem)
         self.problem = problem
         self.subject = subject
@@ -50,7 +59,7 @@ class PachonError(Exception):
     @property
     def reason(self) -> str:
         """Text of the error without its subject."""
-        where = ", ".join(part for part in (self.file, self.place) if part)
+        where = ", ".join(cut_short(part, _MAX_PATH) for part in (self.file, self.place) if part)
         return f"{where}: {self.problem}" if where else self.problem
 
     def within(
@@ -109,6 +118,22 @@ class ProductError(PachonError):
     """Product that cannot be read or written."""
 
 
+def shown(value: object) -> str:
+    """Return a value as messages show it: on one line, cut short, and large arrays by type and shape."""
+    shape = getattr(value, "shape", None)
+    if shape == ():
+        # Numbers and quantities of NumPy and astropy without their types.
+        return cut_short(str(value), _MAX_VALUE)
+    if isinstance(shape, tuple) and getattr(value, "size", 0) > 8:
+        return f"{type(value).__name__} of shape {shape}"
+    return cut_short(" ".join(_REPR.repr(value).split()), _MAX_VALUE)
+
+
+def cut_short(text: str, length: int = 60) -> str:
+    """Return a text of at most `length` characters."""
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
 @contextmanager
 def error_context(**context: Any) -> Iterator[None]:
     """Raise errors of the block again within a wider context; keywords as in :meth:`PachonError.within`."""
@@ -121,7 +146,7 @@ def error_context(**context: Any) -> Iterator[None]:
 def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise a ConfigError if an argument is not one of the choices."""
     if value not in (known := tuple(choices)):
-        raise ConfigError(f"{name} = {value!r}: expected one of {', '.join(known)}")
+        raise ConfigError(f"{name} = {shown(value)}: expected one of {', '.join(known)}")
 
 
 def check_unique(kind: str, names: Sequence[str]) -> None:
@@ -136,11 +161,14 @@ def unknown_name(kind: str, name: str, allowed: Iterable[str]) -> UnknownNameErr
     names = list(allowed)
     few = ", ".join(names) if len(names) <= 12 else f"{len(names)} names such as {', '.join(names[:3])}"
     hint = nearest(name, names, n=4, cutoff=0.5) or f"expected one of {few}"
-    return UnknownNameError(f"unknown {kind} {name!r}: {hint}")
+    return UnknownNameError(f"unknown {kind} {shown(name)}: {hint}")
 
 
 def nearest(name: object, known: Iterable[str], n: int = 2, cutoff: float = 0.6) -> str:
     """Return the known names nearest to a name, as "did you mean"; empty where none is near."""
+    if len(str(name)) > _MAX_VALUE:
+        # Comparing takes a time that grows with the square of the length.
+        return ""
     lowered = {key.lower(): key for key in known}
     near = [lowered[key] for key in get_close_matches(str(name).lower(), list(lowered), n=n, cutoff=cutoff)]
     return f"did you mean {' or '.join(near)}?" if near else ""

@@ -18,7 +18,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from .errors import PachonError, ProductError
+from .errors import PachonError, ProductError, cut_short
 
 
 def write_bytes(path: Path, data: bytes, error: type[PachonError] = ProductError) -> None:
@@ -32,15 +32,53 @@ def write_new_bytes(path: Path, data: bytes, error: type[PachonError] = ProductE
     Of several processes that write the same file at the same time, one gets True.
     """
     try:
-        _write(path, data, error, _publish_new)
+        _write(path, data, error, publish_new)
     except FileExistsError:
         return False
     return True
 
 
+def claim_folder(path: Path, content: bytes, *, products: str, check: Callable[[], None]) -> None:
+    """Write the configuration of a run into its folder, or find that the folder is another run's.
+
+    Of runs that start together in a new folder one writes the file. To the others, and in an old folder, `check`
+    compares it with theirs and raises where they differ; otherwise it is written again. Temporary files of processes
+    that ended are removed.
+
+    Parameters
+    ----------
+    path : Path
+        File of the configuration; its folder is made where missing.
+    content : bytes
+        Content of the file.
+    products : str
+        Pattern of the names of products. With some of them and without the file a folder is refused.
+    check : callable
+        Function that raises a ProductError where the file is of another configuration.
+
+    Raises
+    ------
+    ProductError
+        If the folder holds another run, or cannot be made or written.
+    """
+    folder = path.parent
+    make_folder(folder)
+    if not path.exists() and (left := sorted(folder.glob(products))):
+        raise ProductError(f"{folder} holds {left[0].name} but no {path.name}; choose another --out")
+    if not write_new_bytes(path, content):
+        check()
+        write_bytes(path, content)
+    remove_leftovers(folder)
+
+
+def partial_path(path: Path) -> Path:
+    """Return the temporary path under which this process writes a file."""
+    return path.with_name(f".{path.name}.{_owner(os.getpid())}.partial")
+
+
 def _write(path: Path, data: bytes, error: type[PachonError], publish: Callable[[Path, Path], None]) -> None:
     """Write a temporary file, give it its final name by a function, and leave no temporary file behind."""
-    partial = path.with_name(f".{path.name}.{_owner(os.getpid())}.partial")
+    partial = partial_path(path)
     try:
         try:
             with open(partial, "wb") as file:
@@ -57,7 +95,8 @@ def _write(path: Path, data: bytes, error: type[PachonError], publish: Callable[
         raise error(f"cannot write {path}: {problem.strerror or problem}") from None
 
 
-def _publish_new(partial: Path, path: Path) -> None:
+def publish_new(partial: Path, path: Path) -> None:
+    """Give a temporary file its final name, or raise FileExistsError where there is one already."""
     try:
         os.link(partial, path)
     except FileExistsError:
@@ -122,6 +161,21 @@ def read_bytes(path: Path, error: type[PachonError], *, max_bytes: int | None = 
     if max_bytes is not None and len(data) > max_bytes:
         raise error(f"expected a file of at most {max_bytes} bytes", file=path)
     return data
+
+
+@contextmanager
+def parsing(path: str | os.PathLike[str], problem: str, error: type[PachonError]) -> Iterator[None]:
+    """Raise `error` with a problem, such as ``"no FITS file"``, where another package cannot make sense of a file.
+
+    Parsers of others raise whatever a damaged file leads them to.
+    """
+    try:
+        yield
+    except PachonError:
+        raise
+    except Exception as cause:
+        reason = cut_short(" ".join(str(cause).split()), 120) or type(cause).__name__
+        raise error(f"{problem} ({reason})", file=path) from None
 
 
 def require_file(path: Path, error: type[PachonError]) -> None:

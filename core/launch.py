@@ -6,12 +6,15 @@ import os
 import platform
 import sys
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
+from .errors import ProductError
 from .threads import thread_count
 
 wp.config.log_level = wp.LOG_ERROR
@@ -45,7 +48,8 @@ def start_warp() -> None:
         void = os.open(os.devnull, os.O_WRONLY)
         try:
             os.dup2(void, 2)
-            wp.init()
+            with _kernel_cache():
+                wp.init()
         finally:
             os.dup2(kept, 2)
             os.close(kept)
@@ -67,8 +71,19 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
         if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
             name = kernel.module.name.rpartition(".")[2]
             print(f"compiling {name} for this machine (once)", file=sys.stderr, flush=True)
-        wp.load_module(kernel.module, device=device, block_dim=block)
+        with _kernel_cache():
+            wp.load_module(kernel.module, device=device, block_dim=block)
         _loaded.add(key)
+
+
+@contextmanager
+def _kernel_cache() -> Iterator[None]:
+    """Raise a ProductError with the remedy where the folder of compiled kernels cannot be made or written."""
+    try:
+        yield
+    except OSError as error:
+        text = f"cannot write compiled kernels to {error.filename}: {error.strerror}"
+        raise ProductError(f"{text}; WARP_CACHE_PATH names another folder") from None
 
 
 def launch(

@@ -15,7 +15,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
 
 from .errors import ProductError
-from .files import read_bytes, write_bytes
+from .files import parsing, read_bytes, write_bytes
 from .version import VERSION
 
 #: Comment of CHECKSUM and DATASUM. astropy's default is the time of day, with which no two runs have the same bytes.
@@ -86,18 +86,18 @@ def read_fits(path: Path) -> fits.HDUList:
     data = read_bytes(path, ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("error", AstropyWarning)
-        try:
+        with parsing(path, "damaged or no FITS product", ProductError):
             hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
             for hdu in hdus:
                 place = hdu.fileinfo()
                 if not _checksum_holds(data[place["hdrLoc"] : place["datLoc"] + place["datSpan"]]):
                     raise ProductError(f"damaged ({hdu.name} does not match its checksum)", file=path)
                 hdu.data  # noqa: B018 - reads it now, within the checks
+                # Parts are found by their names.
+                hdu.header.get("EXTNAME")
             if len(hdus) != hdus[0].header["NPARTS"]:
                 text = f"cut short; expected {hdus[0].header['NPARTS']} parts, found {len(hdus)}"
                 raise ProductError(text, file=path)
-        except (AstropyWarning, OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise ProductError(f"damaged or no FITS product ({' '.join(str(error).split())})", file=path) from None
     return hdus
 
 

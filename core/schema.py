@@ -23,8 +23,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError, core_schema
 
-from .errors import ConfigError, PachonError, nearest
-from .yaml_reader import as_number, cut_short
+from .errors import ConfigError, PachonError, cut_short, nearest
+from .yaml_reader import as_number
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -2,50 +2,93 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from astropy import units as u
 
-from .errors import DomainError
+from .errors import DomainError, shown
 
 #: One arcsecond, one arcminute [rad].
 ARCSEC = np.pi / 648000
 ARCMIN = 60.0 * ARCSEC
+#: Arrays that lose their unit or mask where NumPy makes one array of several.
+_APART = (u.Quantity, np.ma.MaskedArray)
+
+
+#: Largest number, so that its powers stay finite.
+_LARGEST = 1e50
+
+
+def real_numbers(values: Any) -> Any:
+    """Return real numbers as an array of their own type, masked ones as NaN; None where they are anything else.
+
+    Quantities, lists of them and columns of tables keep their unit. Boolean values, times, complex numbers, texts and
+    objects are none.
+    """
+    if type(values) is np.ndarray:
+        return values if values.dtype.kind in "iuf" else None
+    if isinstance(values, (tuple, list)) and any(isinstance(v, _APART) for v in values):
+        found = [real_numbers(v) for v in values]
+        return None if any(v is None for v in found) else found
+    if hasattr(values, "mask") and hasattr(values, "filled"):
+        if values.dtype.kind not in "iuf":
+            return None
+        masked = np.any(values.mask)
+        values = values.astype(np.float64).filled(np.nan) if masked else values.filled(0)
+    if getattr(values, "unit", None) is None:
+        try:
+            values = np.asarray(values)
+        except (TypeError, ValueError, OverflowError):
+            return None
+    return values if values.dtype.kind in "iuf" else None
 
 
 def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
-    if isinstance(value, u.Quantity):
-        try:
-            value = value.to_value(unit)
-        except u.UnitConversionError as error:
-            raise DomainError(f"{name} = {value}: expected a unit that converts to {unit}") from error
-    elif isinstance(value, (tuple, list)) and any(isinstance(v, u.Quantity) for v in value):
-        return np.stack([_si(v, unit, name) for v in value])
+    numbers = real_numbers(value)
     # The text is made where it is needed: that of a large array takes longer than many a trace.
+    if numbers is None:
+        raise DomainError(f"{name} = {shown(value)}: expected a number in {unit} or a quantity")
+    if isinstance(numbers, list):
+        numbers = [_si(v, unit, name) for v in numbers]
+    elif hasattr(numbers, "unit") and (isinstance(numbers, u.Quantity) or unit != u.dimensionless_unscaled):
+        # The unit of a column of pure numbers, such as pixels or magnitudes, says what they count.
+        try:
+            numbers = u.Quantity(numbers, copy=None).to_value(unit)
+        except u.UnitConversionError:
+            raise DomainError(f"{name} = {shown(value)}: expected a unit that converts to {unit}") from None
     try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError(f"{name} = {value!r}: expected a number in {unit} or a quantity") from error
+        return np.asarray(numbers, dtype=np.float64)
+    except ValueError:
+        raise DomainError(f"{name} = {shown(value)}: expected numbers of one shape in {unit}") from None
 
 
 def real_array(values: Any, expectation: str) -> np.ndarray:
     """Return real numbers as a float64 array; DomainError with the expectation where they are none."""
     try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError(expectation) from error
+        return pure_numbers(values, "")
+    except DomainError:
+        raise DomainError(expectation) from None
+
+
+def pure_numbers(values: Any, name: str) -> np.ndarray:
+    """Return real numbers without a unit as a float64 array."""
+    try:
+        return _si(values, u.dimensionless_unscaled, name)
+    except DomainError:
+        raise DomainError(f"{name} = {shown(values)}: expected real numbers without a unit") from None
 
 
 def require_positive(value: Any, name: str, unit: str = "") -> float:
     """Return a finite, positive float, or raise :class:`DomainError` naming the argument."""
-    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not (np.isfinite(number) and number > 0.0):
-        raise DomainError(f"{name} = {value!r}: expected a positive, finite number{' of ' + unit if unit else ''}")
+        numbers = real_array(value, "")
+    except DomainError:
+        numbers = np.array(np.nan)
+    number = float(numbers.item()) if numbers.size == 1 else np.nan
+    if not 0.0 < number < _LARGEST:
+        raise DomainError(f"{name} = {shown(value)}: expected a positive, finite number{' of ' + unit if unit else ''}")
     return number
 
 
@@ -62,6 +105,69 @@ def positive_angle(value: Any, name: str) -> float:
 def metres(value: Any, name: str) -> np.ndarray:
     """Return a length in metres as a float64 array; plain numbers are metres already."""
     return _si(value, u.m, name)
+
+
+def length(value: Any, name: str) -> float:
+    """Return one length in metres; plain numbers are metres already."""
+    return _one(metres(value, name), name, "length")
+
+
+def angle(value: Any, name: str) -> float:
+    """Return one angle in radians; plain numbers are radians already."""
+    return _one(radians(value, name), name, "angle")
+
+
+def one_number(value: Any, name: str) -> float:
+    """Return one number without a unit."""
+    return _one(pure_numbers(value, name), name, "number")
+
+
+def _one(values: np.ndarray, name: str, kind: str) -> float:
+    if values.ndim:
+        raise DomainError(f"{name} has shape {values.shape}: expected one {kind}")
+    if _LARGEST < np.abs(values) < np.inf:
+        raise DomainError(f"{name} = {float(values):g}: expected one {kind} below {_LARGEST:g} in SI")
+    return float(values)
+
+
+def broadcast_together(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Return arrays, which have names, broadcast to one shape."""
+    try:
+        return np.broadcast_arrays(*arrays.values())
+    except ValueError:
+        names, shapes = ", ".join(arrays), ", ".join(str(a.shape) for a in arrays.values())
+        raise DomainError(f"{names} have shapes {shapes}: expected shapes that fit together") from None
+
+
+def for_each(values: np.ndarray, count: int, name: str) -> np.ndarray:
+    """Return one number, or one for each of so many objects, as [count]."""
+    if values.shape not in ((), (count,)):
+        raise DomainError(f"{name} has shape {values.shape}: expected one number or [{count}]")
+    return np.broadcast_to(values, (count,))
+
+
+def plane_points(x: Any, y: Any) -> tuple[np.ndarray, ...]:
+    """Return points of a plane [m], which may be quantities, as two arrays of one shape."""
+    return broadcast_together({"x": metres(x, "x"), "y": metres(y, "y")})
+
+
+#: Largest number of pupil points, rays or steps in one call.
+MOST = 10**8
+
+
+def require_count(value: Any, name: str, least: int, most: int = MOST) -> int:
+    """Return a whole number in a range, or raise :class:`DomainError` naming the argument."""
+    number = value.item() if isinstance(value, np.generic) else value
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1 or number < least:
+        raise DomainError(f"{name} = {shown(value)}: expected a whole number of at least {least}", key=name)
+    if number > most:
+        raise DomainError(f"{name} = {shown(value)}: expected a whole number of at most {most}", key=name)
+    return int(number)
+
+
+def require_seed(value: Any, name: str = "seed") -> int:
+    """Return a seed of random numbers, a whole number from zero, or raise :class:`DomainError`."""
+    return require_count(value, name, 0, 2**128)
 
 
 def arcseconds(angle: np.ndarray) -> np.ndarray:

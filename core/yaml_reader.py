@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from .errors import PachonError, PrescriptionError
+from .errors import PachonError, PrescriptionError, cut_short
 from .files import read_bytes
 
 #: Longest file [byte] of a configuration; files with numbers of their own, such as prescriptions, may be longer.
@@ -149,11 +149,6 @@ def as_number(value: Any) -> float | None:
     except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None
-
-
-def cut_short(text: str, length: int = 60) -> str:
-    """Return a text of at most `length` characters."""
-    return text if len(text) <= length else text[: length - 3] + "..."
 
 
 def _reason(problem: object) -> str:

@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, error_context
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
@@ -111,6 +112,7 @@ class ImagesConfig(Section):
         return section_yaml(self, "All that decides these images.")
 
 
+@check_arguments
 def load_images_configuration(path: Path) -> ImagesConfig:
     """Read a configuration of images, and that of the run that it names.
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
+from ..core.arguments import check_arguments
 from ..core.errors import check_choice
 from ..core.threads import one_blas_thread, thread_count
 from .psf_field import PsfField
@@ -84,6 +85,7 @@ class SkyPixels(Protocol):
         """Return d(x, y)/d(xi, eta) [pixel/rad] at pixels, shape [n, 2, 2]."""
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Window:
     """Rectangle of pixels of a CCD; the first one is (x, y)."""

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.random_streams import stream
 from ..core.threads import thread_count
-from ..core.units import require_positive
+from ..core.units import pure_numbers, require_positive
 from ..pipeline.simulate.photometry import (
     DARK_CURRENT,
     FULL_WELL,
@@ -30,6 +31,7 @@ MASK_BITS = {SATURATED: "SATURATED"}
 _ROWS = 128
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Exposure:
     """Settings of an image: the sum of exposures of one scene under one PSF.
@@ -112,7 +114,7 @@ class Exposure:
 
     def electrons(self, magnitude: ArrayLike) -> np.ndarray:
         """Return the electrons of sources of AB magnitudes above the atmosphere."""
-        return self.total_time * 10.0 ** (0.4 * (self._band.zero_point - np.asarray(magnitude, dtype=np.float64)))
+        return self.total_time * 10.0 ** (0.4 * (self._band.zero_point - pure_numbers(magnitude, "magnitude")))
 
     @property
     def _band(self) -> Band:

@@ -10,6 +10,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from ..core.arguments import check_arguments
 from ..core.errors import ProductError
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
 from .exposure import MASK_BITS
@@ -70,6 +71,7 @@ class CcdImage:
         """World coordinates as those of astropy."""
         return WCS(self.header)
 
+    @check_arguments
     def write(self, path: str | Path) -> None:
         """Write a FITS file, whole or not at all, with checksums; equal images give equal bytes.
 
@@ -88,6 +90,7 @@ class CcdImage:
         write_fits(Path(path), [image, variance, mask, table_hdu("TRUTH", columns)], self.stamp, cards)
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path) -> CcdImage:
         """Read a file of :meth:`write`; ProductError if it is none, or damaged."""
         hdus = read_fits(Path(path))

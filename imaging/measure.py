@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from ..core.arguments import check_arguments
 from ..core.errors import PachonError
 from ..core.products import described_table
 from ..core.version import VERSION
@@ -116,6 +117,7 @@ class ImageCatalogue:
         return found
 
 
+@check_arguments
 def measure_image(
     image: CcdImage, *, order: int = 1, min_snr: float = 30.0, threads: int | None = None
 ) -> ImageCatalogue:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..core.plotting import ORANGE, new_figure, png_bytes, styled
+from ..core.plotting import ORANGE, new_figure, plain_text, png_bytes, styled
 from ..core.units import ARCSEC
 from .image_file import CcdImage
 from .scene import CcdScene
@@ -33,7 +33,9 @@ def preview_png(image: CcdImage) -> bytes:
         show_stretched(axes, binned, noise, pixel_scale_of(image) * step)
         draw_compass(axes, image)
         header = image.header
-        axes.set_title(f"{image.name}, {header['FILTER']} band, {header['EXPTIME']:g} s", loc="left")
+        axes.set_title(
+            f"{plain_text(image.name)}, {plain_text(header['FILTER'])} band, {header['EXPTIME']:g} s", loc="left"
+        )
         return png_bytes(figure)
 
 
@@ -54,7 +56,7 @@ def cutouts_png(scene: CcdScene, *, threads: int | None = None) -> bytes:
             show_stretched(
                 axes, image.image - _level(image), float(np.sqrt(np.median(image.variance))), pixel_scale_of(image)
             )
-            axes.set_title(f"{scene.name}, {exposure.band} band, {title}", loc="left")
+            axes.set_title(f"{plain_text(scene.name)}, {exposure.band} band, {title}", loc="left")
             if axes.get_subplotspec().is_first_col():
                 draw_compass(axes, image)
             else:

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft
 
+from ..core.arguments import check_arguments
 from ..core.threads import one_blas_thread
+from ..core.units import for_each, pure_numbers
 from ..pipeline.defaults import noise_free_components
 from ..pipeline.experiment import Experiment
 from ..pipeline.psf_model.model import PsfModel
@@ -35,6 +37,7 @@ class PsfField:
     lit_order: int  #: its order
 
     @classmethod
+    @check_arguments
     def fit(
         cls,
         stamps: ArrayLike,
@@ -66,7 +69,7 @@ class PsfField:
         PachonError
             As :meth:`pachon.PsfModel.fit`.
         """
-        places = np.asarray(positions, dtype=np.float64)
+        places = pure_numbers(positions, "positions")
         extent = (-0.5, pixels - 0.5, -0.5, pixels - 0.5)
         model = PsfModel.fit(
             stamps,
@@ -77,11 +80,13 @@ class PsfField:
             extent=extent,
             clip_sigma=None,
         )
-        light = np.ones(len(places)) if lit_fraction is None else np.asarray(lit_fraction, dtype=np.float64)
+        share = 1.0 if lit_fraction is None else lit_fraction
+        light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
         terms = design_matrix(places, extent, order)
         return cls(model, pixels, np.linalg.lstsq(terms, light, rcond=None)[0], order)
 
     @classmethod
+    @check_arguments
     def of_run(
         cls,
         experiment: Experiment,
@@ -115,16 +120,19 @@ class PsfField:
         """Pixels along a side of the PSF's stamps."""
         return self.model.mean.shape[0]
 
+    @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Return amplitudes of mean and components, shape [n, 1 + k]; the first is 1."""
         found = self.model.amplitudes(self._on_ccd(positions))
         return np.concatenate([np.ones((len(found), 1)), found], axis=1)
 
+    @check_arguments
     def lit_fraction(self, positions: ArrayLike) -> np.ndarray:
         """Return the part of the entrance pupil whose light arrives, shape [n]."""
         terms = design_matrix(self._on_ccd(positions), self.model.extent, self.lit_order)
         return np.clip((terms * self.lit).sum(axis=1), 0.0, 1.0)
 
+    @check_arguments
     def transforms(self, size: int) -> np.ndarray:
         """Return ``rfft2`` of mean and components, centred on pixel ``size // 2``: complex64 [1 + k, size, size//2+1].
 

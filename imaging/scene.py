@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import ConfigError, DomainError
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
 from ..pipeline.experiment import Experiment
@@ -44,6 +45,7 @@ class CcdScene:
     seed: int
     epoch: int
 
+    @check_arguments
     def exposed(self, exposure: Exposure | None = None, *, threads: int | None = None) -> CcdImage:
         """Expose the scene, by other settings than its own if they are given; `threads` change no byte."""
         settings = self.exposure if exposure is None else exposure
@@ -74,6 +76,7 @@ class CcdScene:
         return CcdImage(self.name, found.image, found.variance, found.mask, header, objects)
 
 
+@check_arguments
 def draw_ccd(
     experiment: Experiment,
     ccd: str,
@@ -125,6 +128,8 @@ def draw_ccd(
     DomainError
         If no light reaches the CCD, or the galaxies bury the sky.
     """
+    if not callable(galaxies) and not hasattr(galaxies, "transform"):
+        raise DomainError(f"galaxies = {shown(galaxies)}: expected Galaxies or a function that gives them")
     config, camera = experiment.config, experiment.camera
     if not np.isclose(experiment.pixel_size, camera.pixel_size) or not config.atmosphere.enabled:
         enabled = str(config.atmosphere.enabled).lower()

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, PachonError, ProductError, error_context
-from ..core.files import make_folder, remove_leftovers, write_bytes, write_new_bytes
+from ..core.files import claim_folder, write_bytes
 from ..core.memory import require_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
@@ -48,6 +49,7 @@ class ImagesResult:
     objects: dict[str, int]  #: number of objects on each CCD of this call
 
 
+@check_arguments
 def simulate_images(
     config: ImagesConfig,
     folder: Path,
@@ -203,12 +205,9 @@ def _galaxies(config: ImagesConfig, experiment: Experiment, exposure: Exposure) 
 
 def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
     """Make the folder, or check that its images are of the same configuration, and write images.yaml."""
-    make_folder(folder)
     path, now = folder / CONFIG_NAME, config.model_dump(mode="json", by_alias=True)
-    if not path.exists() and (left := sorted(folder.glob("image_*.fits"))):
-        raise ProductError(f"{folder} holds {left[0].name} but no {CONFIG_NAME}; choose another --out")
-    # Of runs that start together, one makes the file, and the others compare theirs with it.
-    if not write_new_bytes(path, config.to_yaml().encode()):
+
+    def check() -> None:
         try:
             before = read_mapping(path, ProductError)
         except ProductError as error:
@@ -220,5 +219,5 @@ def _claim(folder: Path, config: ImagesConfig, *, resume: bool) -> None:
         if found:
             text = "; ".join(found[:3])
             raise ProductError(f"{folder} holds images of another configuration ({text}); choose another --out")
-        write_bytes(path, config.to_yaml().encode())
-    remove_leftovers(folder)
+
+    claim_folder(path, config.to_yaml().encode(), products="image_*.fits", check=check)

@@ -20,8 +20,9 @@ from astropy.wcs import WCS
 from numpy.polynomial.polynomial import polyder, polyval2d
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import ARCSEC, radians
+from ..core.units import ARCSEC, angle, radians
 from ..models.camera.camera import Camera
 from ..models.telescope import Telescope
 from ..wavefront.chief_rays import fields_at
@@ -72,11 +73,13 @@ class CcdWcs:
         """Order of the polynomials: 1 is TAN without SIP."""
         return self.distortion.shape[1] - 1
 
+    @check_arguments
     def to_sky(self, pixels: ArrayLike) -> np.ndarray:
         """Return (xi, eta) [rad], shape [n, 2], of pixels (x, y), shape [n, 2]."""
         u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
         return (u + _values(self.distortion, u)) @ self.cd.T
 
+    @check_arguments
     def to_pixel(self, sky: ArrayLike) -> np.ndarray:
         """Return pixels (x, y), shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
         target = np.atleast_2d(np.asarray(sky, dtype=np.float64)) @ np.linalg.inv(self.cd).T
@@ -86,11 +89,13 @@ class CcdWcs:
             u = u + np.linalg.solve(self._derivative(u), miss[..., None])[..., 0]
         return u + self.reference_pixel
 
+    @check_arguments
     def jacobians(self, pixels: ArrayLike) -> np.ndarray:
         """Return d(x, y)/d(xi, eta) [pixel/rad] at pixels, shape [n, 2, 2]."""
         u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
         return np.linalg.inv(self.cd @ self._derivative(u))
 
+    @check_arguments
     def to_celestial(self, sky: ArrayLike) -> np.ndarray:
         """Return right ascension and declination [rad], shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
         xi, eta = np.atleast_2d(np.asarray(sky, dtype=np.float64)).T
@@ -100,6 +105,7 @@ class CcdWcs:
         delta = np.arctan2(np.sin(dec) + eta * np.cos(dec), np.hypot(xi, along))
         return np.stack([alpha % (2.0 * np.pi), delta], axis=1)
 
+    @check_arguments
     def to_header(self, corner: tuple[int, int] = (0, 0)) -> fits.Header:
         """Return the cards of a FITS image whose first pixel is the pixel (x, y) = `corner` of the CCD."""
         header = fits.Header()
@@ -122,6 +128,7 @@ class CcdWcs:
                             header[f"{name}_{i}_{j}"] = float(table[i, j])
         return header
 
+    @check_arguments
     def astropy(self, corner: tuple[int, int] = (0, 0)) -> WCS:
         """Return the WCS of astropy, with the number of pixels of the CCD less those before `corner`."""
         wcs = WCS(self.to_header(corner))
@@ -136,6 +143,7 @@ class CcdWcs:
         return derivative + np.eye(2)
 
 
+@check_arguments
 def ccd_wcs(
     telescope: Telescope,
     camera: Camera,
@@ -175,7 +183,7 @@ def ccd_wcs(
     DomainError
         If the pointing is no pair of finite angles with a declination up to 90 deg, or no polynomial is good enough.
     """
-    angles, rho = radians(pointing, "pointing"), float(radians(position_angle, "position_angle"))
+    angles, rho = radians(pointing, "pointing"), angle(position_angle, "position_angle")
     if angles.shape != (2,) or not np.isfinite(angles).all() or abs(angles[1]) > 0.5 * np.pi or not np.isfinite(rho):
         raise DomainError(
             f"pointing = {pointing!r}, position_angle = {position_angle!r}: expected finite angles, "

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
+from ..core.units import plane_points
 
 
 class Region(ABC):
@@ -32,7 +34,8 @@ def _require(condition: Any, problem: str) -> None:
 
 
 def _shifted(x: Any, y: Any, centre_x: float, centre_y: float) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(x, dtype=np.float64) - centre_x, np.asarray(y, dtype=np.float64) - centre_y
+    px, py = plane_points(x, y)
+    return px - centre_x, py - centre_y
 
 
 def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -41,6 +44,7 @@ def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np
     return x * cosine + y * sine, y * cosine - x * sine
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Circle(Region):
     """Disc of a radius [m] about a centre x, y [m]; its rim is outside."""
@@ -60,6 +64,7 @@ class Circle(Region):
         return dx**2 + dy**2 < self.radius**2
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Annulus(Region):
     """Ring between two radii [m] about a centre x, y [m]; its inner rim is inside, its outer rim outside."""
@@ -81,6 +86,7 @@ class Annulus(Region):
         return (r2 >= self.inner**2) & (r2 < self.outer**2)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Rectangle(Region):
     """Rectangle of a width and height [m] about a centre x, y [m], without rim.
@@ -109,6 +115,7 @@ class Rectangle(Region):
         return (np.abs(along) < 0.5 * self.width) & (np.abs(across) < 0.5 * self.height)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Vane(Region):
     """Strip of a width [m] from a point x, y [m] outwards, at an angle [rad] from x towards y; endless, without rims.
@@ -135,6 +142,7 @@ class Vane(Region):
         return beside if self.both_ways else beside & (along > 0.0)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Polygon(Region):
     """Polygon of at least three corners (x, y) [m], in either sense; the last is joined to the first.
@@ -168,7 +176,7 @@ class Polygon(Region):
 
         See Shimrat (1962), Communications of the ACM 5, 434 (algorithm 112).
         """
-        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        x, y = plane_points(x, y)
         inside = np.zeros(x.shape, dtype=bool)
         for (ax, ay), (bx, by) in zip(*self._edges, strict=True):
             if ay != by:
@@ -209,6 +217,7 @@ def _crossing_edges(corners: np.ndarray) -> tuple[int, int] | None:
     return None
 
 
+@check_arguments
 @dataclass(frozen=True)
 class _Combination(Region):
     """Base of unions and intersections."""
@@ -216,9 +225,10 @@ class _Combination(Region):
     parts: tuple[Aperture, ...]
 
     def __post_init__(self) -> None:
-        _check_parts(type(self).__name__.lower(), self.parts)
+        _require(self.parts, f"{type(self).__name__.lower()} of no parts: expected at least one region")
 
 
+@check_arguments
 class Union(_Combination):
     """Points of at least one of several regions."""
 
@@ -226,6 +236,7 @@ class Union(_Combination):
         return np.logical_or.reduce([part.contains(x, y) for part in self.parts])
 
 
+@check_arguments
 class Intersection(_Combination):
     """Points of all of several regions."""
 
@@ -233,23 +244,15 @@ class Intersection(_Combination):
         return np.logical_and.reduce([part.contains(x, y) for part in self.parts])
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Complement(Region):
     """Points outside a region: what an obscuration leaves clear."""
 
     part: Aperture
 
-    def __post_init__(self) -> None:
-        _check_parts("complement", (self.part,))
-
     def contains(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:  # noqa: D102
         return np.logical_not(self.part.contains(x, y))
 
 
 Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
-
-
-def _check_parts(name: str, parts: tuple[Aperture, ...]) -> None:
-    _require(isinstance(parts, tuple) and parts, f"{name} = {parts!r}: expected a tuple of at least one region")
-    for part in parts:
-        _require(isinstance(part, Aperture), f"{name} of {part!r}: expected an aperture")

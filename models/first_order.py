@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import ARCSEC
+from ..core.units import ARCSEC, length
 from .surface import Interaction, Surface
 from .telescope import Telescope
 
@@ -107,6 +108,7 @@ class _Trace:
     u_after: np.ndarray
 
 
+@check_arguments
 def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> FirstOrder:
     """Return the first-order properties of a centred telescope.
 
@@ -152,6 +154,7 @@ def footprints(telescope: Telescope, field: float, wavelength: Any = None) -> np
     return np.abs(_trace(telescope, wavelength, np.tan(field)).h).sum(axis=1)
 
 
+@check_arguments
 def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field: float | None = None) -> SeidelSums:
     """Return the Seidel sums of a centred telescope.
 
@@ -189,7 +192,8 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
 
 def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
     """Trace the ray at the rim of the pupil, parallel to the axis, and one through its centre with a slope."""
-    w = float(telescope.check_wavelength(telescope.default_wavelength if wavelength is None else wavelength))
+    w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
+    telescope.check_wavelength(w)
     surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
     if not surfaces:
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")

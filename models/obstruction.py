@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError, error_context
 from .content_equality import ContentEquality
 from .mesh_file import load_mesh
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Obstruction(ContentEquality):
     """A mesh that blocks every ray through one of its triangles.

@@ -19,7 +19,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.units import require_positive
 from .aperture import Annulus, Circle
 from .first_order import footprints
 from .shapes.shape import Conic, Plane, Sphere
@@ -29,6 +31,7 @@ from .telescope import VACUUM, Telescope
 COPLANAR = 2.0 - math.sqrt(3.0)
 
 
+@check_arguments
 def paul_baker(
     diameter: float = 8.4,
     focal_ratio: float = 4.0,
@@ -65,8 +68,7 @@ def paul_baker(
         If an argument is out of range, or the mirrors leave nothing of the primary.
     """
     for name, value in (("diameter", diameter), ("focal_ratio", focal_ratio), ("field_radius", field_radius)):
-        if not (math.isfinite(value) and value > 0):
-            raise DomainError(f"{name} = {value!r}: expected a positive number")
+        require_positive(value, name)
     if not 0 < beam_compression < 0.5:
         raise DomainError(f"beam_compression = {beam_compression!r}: expected between 0 and 0.5")
     m = beam_compression

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
 
 #: How far the weights of a site may be from a sum of 1: published ones are rounded to three digits.
 WEIGHT_TOLERANCE = 5e-3
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Weather:
     """Air at the telescope.
@@ -39,6 +41,7 @@ class Weather:
             raise PrescriptionError(f"water_vapour_mmhg = {self.water_vapour_mmhg!r}: expected 0 to the pressure")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Site:
     """Turbulence over a site, in layers that the wind carries along.

@@ -10,7 +10,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import PrescriptionError
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError, PrescriptionError
+from ..core.units import metres, pure_numbers
 from .aperture import Aperture
 from .media.medium import Medium
 from .shapes.shape import Shape
@@ -33,6 +35,7 @@ class Interaction(IntEnum):
     PHASE = 4
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Surface:
     """One surface of a telescope, in the order that light meets them.
@@ -64,11 +67,6 @@ class Surface:
     rotation: Matrix = IDENTITY
 
     def __post_init__(self) -> None:
-        for key, kind in (("interaction", Interaction), ("shape", Shape), ("medium_after", Medium)):
-            if not isinstance(getattr(self, key), kind):
-                raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected an object of {kind.__name__}")
-        if self.aperture is not None and not isinstance(self.aperture, Aperture):
-            raise PrescriptionError(f"aperture = {self.aperture!r}: expected an aperture or None")
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
         axes = np.array(self.rotation, dtype=np.float64)
@@ -85,11 +83,11 @@ class Surface:
 
     def to_local(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the telescope frame in the surface's own frame."""
-        return (np.asarray(points, dtype=np.float64) - np.array(self.vertex)) @ self.matrix
+        return (_points(points) - np.array(self.vertex)) @ self.matrix
 
     def to_telescope(self, points: ArrayLike) -> np.ndarray:
         """Return points [m], shape (..., 3), of the surface's own frame in the telescope frame."""
-        return np.asarray(points, dtype=np.float64) @ self.matrix.T + np.array(self.vertex)
+        return _points(points) @ self.matrix.T + np.array(self.vertex)
 
     def moved(
         self, *, rotation: ArrayLike = IDENTITY, about: ArrayLike = (0.0, 0.0, 0.0), shift: ArrayLike = (0, 0, 0)
@@ -109,9 +107,20 @@ class Surface:
         return replace(self, vertex=vertex, rotation=matrix)
 
 
+def _points(points: ArrayLike) -> np.ndarray:
+    values = metres(points, "points")
+    if values.shape[-1:] != (3,):
+        raise DomainError(f"points of shape {values.shape}: expected [..., 3]")
+    return values
+
+
 def move_frame(vertex: Vector, axes: Matrix, *, rotation: Any, about: Any, shift: Any) -> tuple[Vector, Matrix]:
     """Return a frame (origin [m] and axes as columns) rotated about a point [m], then shifted [m]."""
-    rotation, about, shift = np.asarray(rotation, dtype=np.float64), np.asarray(about), np.asarray(shift)
+    rotation = pure_numbers(rotation, "rotation")
+    about, shift = metres(about, "about"), metres(shift, "shift")
+    for name, value, shape in (("rotation", rotation, (3, 3)), ("about", about, (3,)), ("shift", shift, (3,))):
+        if value.shape != shape or not np.isfinite(value).all():
+            raise DomainError(f"{name} of shape {value.shape}: expected finite numbers of shape {shape}")
     if np.array_equal(rotation, np.eye(3)):
         # Without a rotation the axes keep their exact values.
         x, y, z = (float(v) for v in np.array(vertex) + shift)

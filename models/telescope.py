@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
-from ..core.units import metres, radians
+from ..core.units import broadcast_together, metres, radians
 from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
 from .obstruction import Obstruction
 from .shapes.shape import Shape, Sum
@@ -47,6 +48,7 @@ def rotation_angles(matrix: np.ndarray) -> tuple[float, float, float]:
     return math.atan2(-matrix[1, 2], matrix[2, 2]), about_y, math.atan2(-matrix[0, 1], matrix[0, 0])
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Telescope:
     r"""An unfolded optical prescription.
@@ -355,7 +357,7 @@ class Telescope:
         DomainError
             If ``hypot(tx, ty)`` exceeds `field_limit`.
         """
-        x, y = np.broadcast_arrays(radians(tx, "tx"), radians(ty, "ty"))
+        x, y = broadcast_together({"tx": radians(tx, "tx"), "ty": radians(ty, "ty")})
         # Rounding of a limit that was converted from degrees must not exclude the limit itself.
         bad = ~(np.hypot(x, y) <= self.field_limit * (1 + 1e-12))
         if np.any(bad):

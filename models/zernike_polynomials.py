@@ -12,7 +12,9 @@ from math import comb
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.units import plane_points, require_count
 
 #: Names of the first terms, as optical shops call them.
 NOLL_NAMES = {
@@ -30,10 +32,13 @@ NOLL_NAMES = {
 }
 
 
+#: Largest Noll index.
+MOST_TERMS = 10_000
+
+
 def noll_to_nm(j: int) -> tuple[int, int]:
     """Return radial degree n and signed azimuthal order m of Noll index j (m < 0: sine)."""
-    if int(j) != j or j < 1:
-        raise DomainError(f"Noll index = {j!r}: expected a whole number of at least 1")
+    require_count(j, "Noll index", 1, MOST_TERMS)
     n = int((np.sqrt(8 * j - 7) - 1) / 2)
     k = j - n * (n + 1) // 2
     m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k + 1) // 2) - 1
@@ -55,6 +60,7 @@ def _radial_coefficients(m: int, count: int, obscuration: float) -> np.ndarray:
     return np.linalg.inv(upper * signs[:, None])
 
 
+@check_arguments
 def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
     """Evaluate annular Zernike polynomials 1 ... jmax, orthonormal over the annulus (mean square one).
 
@@ -76,6 +82,7 @@ def annular_zernikes(jmax: int, x: np.ndarray, y: np.ndarray, obscuration: float
     DomainError
         If the obscuration or the index is out of range.
     """
+    require_count(jmax, "jmax", 1, MOST_TERMS)
     x, y, s, nodes = _annulus(x, y, obscuration)
     theta = np.arctan2(y, x)
     orders = [noll_to_nm(j) for j in range(1, jmax + 1)]
@@ -159,7 +166,7 @@ def _annulus(x: np.ndarray, y: np.ndarray, obscuration: float) -> tuple[np.ndarr
     """Return x and y as arrays of one shape, s = x^2 + y^2, and s scaled to -1 ... 1 between the rims."""
     if not 0 <= obscuration < 1:
         raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+    x, y = plane_points(x, y)
     s, low = x * x + y * y, obscuration**2
     return x, y, s, (2 * s - 1 - low) / (1 - low)
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from .core.arguments import check_arguments
+
 if TYPE_CHECKING:
     from .models.telescope import Telescope
 
 
+@check_arguments
 def assert_matches_baseline(
     model: str | os.PathLike[str] | Telescope | None,
     baseline: str | os.PathLike[str],

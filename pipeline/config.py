@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BeforeValidator, Field
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
 from ..core.schema import (
     Count,
@@ -240,6 +241,7 @@ def configuration_of(content: dict[str, Any], source: str) -> Configuration:
     return validated(Configuration, content, source)
 
 
+@check_arguments
 def load_configuration(path: Path) -> Configuration:
     """Read a configuration file; values that it leaves out stay open.
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, PachonError, PrescriptionError, error_context
 from ..core.files import read_bytes
 from ..core.progress import Reporter
@@ -70,6 +71,7 @@ class Experiment:
     atmosphere_only: bool = False
 
     @classmethod
+    @check_arguments
     def from_config(cls, config: Configuration, folder: Path | None = None) -> Experiment:
         """Make the telescope, focal plane and atmosphere of a configuration.
 
@@ -142,6 +144,7 @@ class Experiment:
         """Angle of the camera from +x towards +y of the telescope frame [rad]."""
         return math.radians(self.config.rotator_deg)
 
+    @check_arguments
     def displacements(self, name: str) -> tuple[Displacement, ...]:
         """Return the static displacements of charge on a CCD; the rings of each CCD have a phase of their own."""
         sensor = self.config.sensor
@@ -178,6 +181,7 @@ class Experiment:
         return () if self.atmosphere is None else ENGINES[self.config.psf.engine].screens
 
     @contextmanager
+    @check_arguments
     def screens(self, threads: int | None = None, reporter: Reporter | None = None) -> Iterator[None]:
         """Make all screens of the atmosphere, and release them at the end of the ``with`` block.
 

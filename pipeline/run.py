@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.files import write_bytes, write_json
 from ..core.products import write_ecsv
@@ -29,7 +30,7 @@ from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .measure.summary import correlations, run_metrics
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
-from .run_folder import SUMMARY_NAME, claim_folder, finished_ccds, stamp_of, write_ccd
+from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of, write_ccd
 from .simulate.ccd_loop import simulate_ccds
 
 _MESH_CELLS = 16
@@ -64,6 +65,7 @@ class RunResult:
     missing: tuple[str, ...] = ()
 
 
+@check_arguments
 def run(
     config: Configuration | Experiment,
     folder: Path,
@@ -120,7 +122,7 @@ def run(
     # The report of a finished run needs no screens.
     if missing and workers is None:
         check_memory(experiment, threads)
-    claim_folder(folder, experiment, resume=resume)
+    claim_run(folder, experiment, resume=resume)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     failed: dict[str, str] = {}

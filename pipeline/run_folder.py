@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..core.errors import PachonError, ProductError
-from ..core.files import remove_leftovers, write_bytes, write_new_bytes
+from ..core.files import claim_folder
 from ..core.products import Stamp
 from ..core.version import VERSION
 from .ccd_product import MODEL_CARD, product_path, read_product, write_product
@@ -17,34 +17,27 @@ from .simulate.ccd_model import model_ccd
 CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 
 
-def claim_folder(folder: Path, experiment: Experiment, *, resume: bool) -> None:
+def claim_run(folder: Path, experiment: Experiment, *, resume: bool) -> None:
     """Make the folder of a run or check that its content is of the same configuration, and write config.yaml.
 
     A run may be resumed with more CCDs than before, since no CCD depends on the others. A folder with another
     configuration's run, or one that cannot be made or written, raises ProductError.
     """
     path = folder / CONFIG_NAME
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        finished = sorted(folder.glob("ccd_*.fits"))
-        if finished and not path.exists():
-            raise ProductError(f"{folder} holds {finished[0].name} but no {CONFIG_NAME}; choose another --out")
-    except OSError as error:
-        raise ProductError(f"cannot make the folder {folder}: {error.strerror}") from None
     heading = (
         f"pachon {VERSION}: all that decides this run.",
         "The same bytes again: pachon run config.yaml --out OTHER",
     )
     content = to_yaml(experiment.config, heading).encode()
-    # Of runs that start together, one makes the file, and the others compare theirs with it.
-    if not write_new_bytes(path, content):
+
+    def check() -> None:
         try:
             before = load_configuration(path)
         except PachonError as error:
             raise ProductError(f"{folder} holds a run that cannot be read ({error}); choose another --out") from None
         _refuse_other(folder, before, experiment.config, resume)
-        write_bytes(path, content)
-    remove_leftovers(folder)
+
+    claim_folder(path, content, products="ccd_*.fits", check=check)
 
 
 def _refuse_other(folder: Path, before: Configuration, now: Configuration, resume: bool) -> None:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.warp_arrays import warp_array
 from ..models.surface import Surface
@@ -31,6 +33,7 @@ class MeshLanding:
     facet: np.ndarray  #: index of the facet, -1 for none, int32 [n]
 
 
+@check_arguments
 def land_on_mesh(
     detector: Surface, mesh: trimesh.Trimesh, position: np.ndarray, direction: np.ndarray, *, threads: int | None = None
 ) -> MeshLanding:
@@ -54,6 +57,9 @@ def land_on_mesh(
     -------
     MeshLanding
     """
+    if position.ndim != 2 or position.shape[1] != 3 or direction.shape != position.shape:
+        shapes = f"{position.shape}, {direction.shape}"
+        raise DomainError(f"position, direction have shapes {shapes}: expected [n, 3] twice")
     start_warp()
     p = detector.to_local(position)
     d = direction @ detector.matrix

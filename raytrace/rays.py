@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
-from ..core.units import metres, radians
+from ..core.units import angle, broadcast_together, metres, radians
 from ..models.telescope import Telescope
 from .kernels import surface as surface_kernels
 
@@ -42,7 +43,7 @@ def field_direction(tx: Any, ty: Any, projection: str = "zemax") -> np.ndarray:
     (vx, vy)/|vz| = (tx, ty); "postel" (zenithal equidistant), (vx, vy) = sin(rho) (tx, ty)/rho with rho = hypot(tx, ty)
     the angle from the axis. Another one is a ConfigError.
     """
-    tx, ty = np.broadcast_arrays(radians(tx, "field x"), radians(ty, "field y"))
+    tx, ty = broadcast_together({"field x": radians(tx, "field x"), "field y": radians(ty, "field y")})
     if projection == "zemax":
         sx, sy = np.tan(tx), np.tan(ty)
     elif projection == "gnomonic":
@@ -69,6 +70,7 @@ def field_angles(slopes: np.ndarray, projection: str = "zemax") -> np.ndarray:
     raise ConfigError(f"projection = {projection!r}: expected one of {', '.join(PROJECTIONS)}")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Rays:
     """Rays of one wavelength before the first surface, in the telescope frame.
@@ -107,6 +109,13 @@ class Rays:
         return len(self.path_length)
 
 
+def pupil_points(pupil: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, ...]:
+    """Return entrance-pupil coordinates [m] of one shape."""
+    return broadcast_together(
+        {f"pupil {name}": metres(v, f"pupil {name}") for name, v in zip("xy", pupil, strict=True)}
+    )
+
+
 def check_wavelength(wavelength: Any) -> float:
     """Return one wavelength in metres, or raise DomainError."""
     value = metres(wavelength, "wavelength")
@@ -115,6 +124,7 @@ def check_wavelength(wavelength: Any) -> float:
     return float(value)
 
 
+@check_arguments
 def launch_rays(
     telescope: Telescope,
     field: tuple[ArrayLike, ArrayLike],
@@ -149,11 +159,11 @@ def launch_rays(
     DomainError
         If the field or the wavelength lies outside what the telescope covers.
     """
-    tx, ty = (float(v) for v in np.broadcast_arrays(radians(field[0], "field x"), radians(field[1], "field y")))
+    tx, ty = angle(field[0], "field x"), angle(field[1], "field y")
     telescope.check_field(tx, ty)
     wavelength = check_wavelength(wavelength)
     telescope.check_wavelength(wavelength)
-    px, py = np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y"))
+    px, py = pupil_points(pupil)
     points = np.stack([px.ravel(), py.ravel()], axis=-1)
     return launch_bundles(telescope, field_direction(tx, ty, projection)[None], wavelength, points)
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
 from ..core.launch import launch
 from ..core.warp_arrays import warp_array
@@ -96,6 +97,7 @@ def trace(
 ) -> list[TraceResult]: ...
 
 
+@check_arguments
 def trace(
     telescope: Telescope,
     rays: Rays,

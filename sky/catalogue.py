@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from astropy import units as u
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyWarning
+from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError, ProductError, error_context
-from ..core.files import read_bytes, write_bytes
+from ..core.files import parsing, read_bytes, write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
 from ..core.units import radians
 from .galaxies import Galaxies
@@ -45,7 +46,8 @@ _PER_COMPONENT = {
 }
 
 
-def read_galaxies(path: str | Path, *, pointing: Any = None) -> Galaxies:
+@check_arguments
+def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Galaxies:
     """Read galaxies from a table: ECSV, FITS (its first table) or Parquet.
 
     Columns of a catalogue, in any case; units of the file are honoured, and where it has none these hold:
@@ -87,6 +89,7 @@ def read_galaxies(path: str | Path, *, pointing: Any = None) -> Galaxies:
         return _from_catalogue(columns, pointing)
 
 
+@check_arguments
 def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
     """Write galaxies as a table of their components, ECSV, FITS or Parquet by the ending of the path.
 
@@ -173,7 +176,7 @@ def _read_columns(path: Path) -> dict[str, Any]:
     table: Any
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
-        try:
+        with parsing(path, f"damaged or no {kind} table", ProductError):
             if kind == "Parquet":
                 content = _pyarrow(path)[1].read_table(io.BytesIO(data))
                 table = {name: content[name].to_numpy() for name in content.column_names}
@@ -181,9 +184,6 @@ def _read_columns(path: Path) -> dict[str, Any]:
                 table = Table.read(io.BytesIO(data), format="fits")
             else:
                 table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
-        except (OSError, ValueError, KeyError, TypeError, IndexError, yaml.YAMLError) as error:
-            text = " ".join(str(error).split())
-            raise ProductError(f"damaged or no {kind} table ({text})", file=path) from None
     names = table.colnames if isinstance(table, Table) else list(table)
     return {name.lower(): table[name] for name in names}
 
@@ -208,7 +208,10 @@ def _values(columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, 
         raise DomainError(f"column {key!r}, row {bad[0] + 1}: expected a finite number", key=key)
     if unit is None:
         return numbers
-    return radians(u.Quantity(numbers, getattr(column, "unit", None) or unit), key)
+    given = getattr(column, "unit", None)
+    if isinstance(given, u.UnrecognizedUnit):
+        raise DomainError(f"column {key!r} in {given}: expected a unit of angle", key=key)
+    return radians(u.Quantity(numbers, given or unit), key)
 
 
 def _from_catalogue(columns: dict[str, Any], pointing: Any) -> Galaxies:

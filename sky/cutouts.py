@@ -13,7 +13,7 @@ from astropy.utils.exceptions import AstropyWarning
 from astropy.wcs import WCS
 
 from ..core.errors import ProductError
-from ..core.files import require_file
+from ..core.files import parsing, require_file
 from ..core.memory import require_bytes
 from ..core.random_streams import stream
 from ..core.units import ARCMIN
@@ -78,22 +78,19 @@ def read_mosaic(path: str | Path, zero_point: float | str | None = None) -> Mosa
     require_file(Path(path), ProductError)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)
-        try:
-            with fits.open(path) as hdus:
-                found = next(((h.data, h.header) for h in hdus if h.is_image and np.ndim(h.data) == 2), None)
-        except OSError as error:
-            raise ProductError(f"cannot be read as FITS ({error.strerror or 'damaged'})", file=path) from None
+        with parsing(path, "cannot be read as FITS", ProductError), open(path, "rb") as file:
+            hdus = fits.open(file, memmap=False)
+            found = next(((h.data, h.header) for h in hdus if h.is_image and np.ndim(h.data) == 2), None)
         if found is None:
             raise ProductError("has no image of two axes, expected a mosaic of the sky", file=path)
         data, header = found
-        try:
+        with parsing(path, "celestial coordinates", ProductError):
             coordinates = WCS(header)
             scale = np.deg2rad(coordinates.celestial.pixel_scale_matrix) if coordinates.has_celestial else None
-        except (ValueError, TypeError, KeyError) as error:
-            raise ProductError(f"celestial coordinates: {' '.join(str(error).split())}", file=path) from None
     if scale is None or not abs(np.linalg.det(scale)) > 0.0:
         raise ProductError("has no celestial coordinates, expected CTYPE1 = 'RA---TAN' and the like", file=path)
-    return Mosaic(str(path), np.asarray(data, dtype=np.float32), scale, _zero_point(path, header, zero_point))
+    with parsing(path, "zero point", ProductError):
+        return Mosaic(str(path), np.asarray(data, dtype=np.float32), scale, _zero_point(path, header, zero_point))
 
 
 def _zero_point(path: str | Path, header: fits.Header, given: float | str | None) -> float:

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from ..core.errors import DomainError
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError, shown
 from ..core.launch import launch, start_warp
+from ..core.units import broadcast_together, for_each, pure_numbers, radians
 from ..core.warp_arrays import warp_array
 from .galaxy_kernels import transform_galaxies
 from .sersic import GREATEST_INDEX, LEAST_INDEX, sersic_table
@@ -19,6 +22,7 @@ _PER_GALAXY = ("xi", "eta", "magnitude", "radius")
 _PER_COMPONENT = ("dx", "dy", "fraction", "component_radius", "e1", "e2", "sersic")
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Galaxies:
     """Galaxies made of elliptical Sersic components.
@@ -92,14 +96,29 @@ class Galaxies:
 
     @classmethod
     def single(
-        cls, xi: Any, eta: Any, magnitude: Any, radius: Any, *, e1: Any = 0.0, e2: Any = 0.0, sersic: Any = 1.0
+        cls,
+        xi: ArrayLike,
+        eta: ArrayLike,
+        magnitude: ArrayLike,
+        radius: ArrayLike,
+        *,
+        e1: ArrayLike = 0.0,
+        e2: ArrayLike = 0.0,
+        sersic: ArrayLike = 1.0,
     ) -> Galaxies:
         """Return galaxies of one component each, from arrays of one shape [n] or scalars; units as in the class."""
-        values = (np.atleast_1d(np.asarray(v, float)) for v in (xi, eta, magnitude, radius, e1, e2, sersic))
-        xi, eta, magnitude, radius, e1, e2, sersic = np.broadcast_arrays(*values)
-        none = np.zeros(len(xi))
-        first = np.arange(len(xi) + 1)
-        return cls(xi, eta, magnitude, radius, first, none, none, none + 1.0, radius, e1, e2, sersic)
+        angles = {"xi": xi, "eta": eta, "radius": radius}
+        numbers = {"magnitude": magnitude, "e1": e1, "e2": e2, "sersic": sersic}
+        given = {name: radians(v, name) for name, v in angles.items()}
+        given |= {name: pure_numbers(v, name) for name, v in numbers.items()}
+        for name, values in given.items():
+            if values.ndim > 1:
+                raise DomainError(f"{name} has shape {values.shape}: expected one number or [n]")
+        each = broadcast_together({name: np.atleast_1d(values) for name, values in given.items()})
+        named = dict(zip(given, each, strict=True))
+        none = np.zeros(len(named["xi"]))
+        first = np.arange(len(none) + 1)
+        return cls(first=first, dx=none, dy=none, fraction=none + 1.0, component_radius=named["radius"], **named)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Galaxies]) -> Galaxies:
@@ -121,7 +140,12 @@ class Galaxies:
 
     def take(self, indices: Any) -> Galaxies:
         """Return some of the galaxies: indices, which may repeat, a boolean mask or a slice."""
-        chosen = np.arange(len(self))[indices]
+        try:
+            chosen = np.atleast_1d(np.arange(len(self))[indices])
+        except (IndexError, ValueError):
+            chosen = np.empty((0, 0))
+        if chosen.ndim != 1:
+            raise DomainError(f"indices = {shown(indices)}: expected integers below {len(self)}, a mask or a slice")
         counts = np.diff(self.first)[chosen]
         first = np.concatenate([[0], np.cumsum(counts)])
         component = np.arange(first[-1]) + np.repeat(self.first[chosen] - first[:-1], counts)
@@ -129,7 +153,7 @@ class Galaxies:
         parts |= {name: getattr(self, name)[component] for name in _PER_COMPONENT}
         return Galaxies(first=first, **parts)
 
-    def sheared(self, g1: Any, g2: Any, *, positions: bool = False) -> Galaxies:
+    def sheared(self, g1: ArrayLike, g2: ArrayLike, *, positions: bool = False) -> Galaxies:
         """Return the galaxies under a reduced shear that conserves areas.
 
         A source at theta is seen at S theta, S = [[1 + g1, g2], [g2, 1 - g1]] / sqrt(1 - |g|^2). An ellipticity e
@@ -155,12 +179,12 @@ class Galaxies:
             z = scale * (z + g * np.conj(z))
         return replace(self, xi=z.real, eta=z.imag, dx=d.real, dy=d.imag, e1=e.real, e2=e.imag)
 
-    def rotated(self, angle: Any, *, positions: bool = False) -> Galaxies:
+    def rotated(self, angle: ArrayLike, *, positions: bool = False) -> Galaxies:
         """Return the galaxies rotated from xi towards eta by an angle [rad], scalar or [n].
 
         Each is rotated about its own position; with `positions`, about the pointing.
         """
-        turn = np.exp(1j * np.broadcast_to(np.asarray(angle, float), len(self)))
+        turn = np.exp(1j * for_each(radians(angle, "angle"), len(self), "angle"))
         inner = turn[self.owner]
         e = (self.e1 + 1j * self.e2) * inner**2
         d = (self.dx + 1j * self.dy) * inner
@@ -229,7 +253,8 @@ class Galaxies:
 
 def reduced_shear(g1: Any, g2: Any, count: int) -> np.ndarray:
     """Return g1 + i g2 of each galaxy, or raise DomainError for a modulus of 1 and more."""
-    g = np.broadcast_to(np.asarray(g1, dtype=np.float64) + 1j * np.asarray(g2, dtype=np.float64), count)
+    first, second = (for_each(pure_numbers(v, name), count, name) for name, v in (("g1", g1), ("g2", g2)))
+    g = first + 1j * second
     if not np.all(np.abs(g) < 1.0):
         raise DomainError("g1, g2: expected a reduced shear below 1")
     return g

@@ -10,12 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.memory import require_bytes
 from ..core.threads import one_blas_thread
-from ..core.units import ARCMIN, ARCSEC, positive_angle, require_positive
+from ..core.units import ARCMIN, ARCSEC, for_each, positive_angle, radians, require_positive
 from ..core.warp_arrays import warp_array
 from .cells import SIDE, Cell, Region, arrivals
 from .cutouts import Cutouts, cut_galaxies, read_mosaic
@@ -64,14 +66,15 @@ class GalaxyStamps:
     finest_pixel: float
 
     @classmethod
+    @check_arguments
     def from_mosaic(
         cls,
         path: str | Path,
         *,
         zero_point: float | str | None = None,
-        psf_radius: Any = None,
+        psf_radius: ArrayLike | None = None,
         side: float = 5.0,
-        finest_pixel: Any = 0.2 * ARCSEC,
+        finest_pixel: ArrayLike = 0.2 * ARCSEC,
         seed: int = 0,
     ) -> GalaxyStamps:
         """Cut galaxies out of a FITS mosaic, as Jee & Tyson (2011, sec. 6.2) did with the Ultra Deep Field.
@@ -124,6 +127,7 @@ class GalaxyStamps:
     def __len__(self) -> int:
         return len(self.magnitude)
 
+    @check_arguments
     def population(self, seed: int, *, density: float | None = None) -> StampPopulation:
         """Return these galaxies planted at random places and angles over the whole tangent plane.
 
@@ -247,7 +251,7 @@ class PlantedGalaxies:
 
     def rotated(self, angle: Any, *, positions: bool = False) -> PlantedGalaxies:
         """Return the galaxies rotated from xi towards eta by an angle [rad], as :meth:`Galaxies.rotated`."""
-        return self._distorted(_rotation(np.broadcast_to(np.asarray(angle, float), len(self))), positions)
+        return self._distorted(_rotation(for_each(radians(angle, "angle"), len(self), "angle")), positions)
 
     def _distorted(self, matrix: np.ndarray, positions: bool) -> PlantedGalaxies:
         place = np.stack([self.xi, self.eta], axis=-1)

@@ -34,9 +34,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from ..core.errors import DomainError
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError, shown
 from ..core.memory import require_bytes
 from ..core.units import ARCMIN, ARCSEC, radians, require_positive
 from .cells import SIDE, Cell, Region, arrivals
@@ -56,6 +58,7 @@ def counts(magnitude: Any) -> np.ndarray:
     return COUNT * 10.0 ** (SLOPE * (np.asarray(magnitude, dtype=np.float64) - 25.0))
 
 
+@check_arguments
 @dataclass(frozen=True)
 class GalaxyPopulation:
     """Random galaxies over the whole tangent plane, the same in every region that is drawn.
@@ -94,7 +97,7 @@ class GalaxyPopulation:
         """Mean number of galaxies per rad^2."""
         return self.density * float(counts(self.faintest) - counts(self.brightest)) / ARCMIN**2
 
-    def galaxies_in(self, xi: Any, eta: Any) -> Galaxies:
+    def galaxies_in(self, xi: ArrayLike, eta: ArrayLike) -> Galaxies:
         """Return the galaxies whose centres lie in a rectangle of the tangent plane, cell by cell.
 
         Parameters
@@ -104,7 +107,10 @@ class GalaxyPopulation:
         """
         region = Region.between(xi, eta)
         # A galaxy has some four components: 450 bytes, twice while they are joined.
-        require_bytes(int(900 * region.area * self.surface_density), "galaxies of this region")
+        expected = 900 * region.area * self.surface_density
+        if not np.isfinite(expected):
+            raise DomainError(f"density = {self.density!r}: expected a number of galaxies that is finite")
+        require_bytes(int(expected), "galaxies of this region")
         return Galaxies.concatenate([self._galaxies_of(cell, region) for cell in region.cells()])
 
     def _galaxies_of(self, cell: Cell, region: Region) -> Galaxies:
@@ -142,8 +148,9 @@ class GalaxyPopulation:
         )
 
 
+@check_arguments
 def draw_galaxies(
-    region: Any, faintest: float, seed: int, *, brightest: float = 20.0, density: float = 1.0
+    region: ArrayLike, faintest: float, seed: int, *, brightest: float = 20.0, density: float = 1.0
 ) -> Galaxies:
     """Draw galaxies like those of the Hubble Ultra Deep Field over a part of the sky.
 
@@ -175,6 +182,8 @@ def draw_galaxies(
     population = GalaxyPopulation(faintest, seed, brightest, density)
     ends = radians(region, "region")
     if ends.shape not in ((), (2, 2)):
-        raise DomainError(f"region = {region}: expected a half-width or ((xi, xi), (eta, eta))")
+        raise DomainError(f"region = {shown(region)}: expected a half-width or ((xi, xi), (eta, eta))")
+    if ends.shape == ():
+        require_positive(ends, "region", "radians")
     square = Region.around(region) if ends.shape == () else Region.between(*ends)
     return population.galaxies_in(square.xi, square.eta)

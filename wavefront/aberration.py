@@ -20,9 +20,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.random_streams import stream
-from ..core.units import metres
+from ..core.units import metres, plane_points, radians, require_seed
 from ..models.telescope import Telescope
 from ..models.zernike_polynomials import annular_zernike_gradients, annular_zernikes, noll_to_nm
 
@@ -36,6 +37,7 @@ LARGEST_RMS = 10.0 * PAPER_RMS
 LINEAR_FRACTION = 0.5
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class ResidualWavefront:
     """An aberration added to the traced wavefront.
@@ -121,8 +123,7 @@ class ResidualWavefront:
         if not 0.0 <= linear_fraction <= 1.0:
             raise DomainError(f"linear_fraction = {linear_fraction!r}: expected 0 to 1")
         for name, number in (("seed", seed), ("epoch", epoch)):
-            if not (isinstance(number, int | np.integer) and number >= 0):
-                raise DomainError(f"{name} = {number!r}: expected a whole number from 0")
+            require_seed(number, name)
         chosen = sorted(set(terms))
         if not chosen or chosen[0] < 4:
             raise DomainError(f"terms = {chosen}: expected Noll indices from 4 (piston and tilt are not drawn)")
@@ -139,7 +140,10 @@ class ResidualWavefront:
 
     def at(self, slopes: ArrayLike) -> np.ndarray:
         """Return the coefficients [m] at field slopes [..., 2] of the light's travel, shape [..., n_term]."""
-        tx, ty = np.split(np.asarray(slopes, dtype=np.float64), 2, axis=-1)
+        values = radians(slopes, "slopes")
+        if values.shape[-1:] != (2,):
+            raise DomainError(f"slopes of shape {values.shape}: expected [..., 2]")
+        tx, ty = np.split(values, 2, axis=-1)
         return self.coefficients + tx * self.field_gradient[:, 0] + ty * self.field_gradient[:, 1]
 
     def opd(self, x: ArrayLike, y: ArrayLike, slopes: ArrayLike = (0.0, 0.0)) -> np.ndarray:
@@ -166,7 +170,8 @@ class ResidualWavefront:
     def _basis(self, terms: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the terms or their derivatives from j = 4 on."""
         radius = 0.5 * self.pupil_diameter
-        return terms(3 + len(self.coefficients), np.divide(x, radius), np.divide(y, radius), self.pupil_obscuration)[3:]
+        px, py = plane_points(x, y)
+        return terms(3 + len(self.coefficients), px / radius, py / radius, self.pupil_obscuration)[3:]
 
 
 def _combined(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:

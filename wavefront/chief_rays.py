@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import field_label, metres
+from ..core.units import field_label, length, metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, field_angles, field_direction, parallel_rays
@@ -73,6 +74,7 @@ def image_jacobians(
     return jacobian
 
 
+@check_arguments
 def fields_at(
     telescope: Telescope,
     positions: ArrayLike,
@@ -105,7 +107,9 @@ def fields_at(
         If a point lies outside the field that the telescope covers, or the search for its chief ray fails.
     """
     target = np.atleast_2d(metres(positions, "positions"))
-    light = telescope.default_wavelength if wavelength is None else float(metres(wavelength, "wavelength"))
+    if target.ndim != 2 or target.shape[1] != 2:
+        raise DomainError(f"positions of shape {target.shape}: expected x, y, shape [n, 2]")
+    light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     field_angles(np.zeros((1, 2)), projection)  # an unknown projection is an error before anything is traced
     slopes = _by_axis_scale(telescope, target, light, threads)
     if slopes is None:

@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
-from ..core.units import metres
+from ..core.units import length, require_count
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import RayStatus
+from ..raytrace.rays import RayStatus, pupil_points
 from ..raytrace.trace import trace
 from .chief_rays import image_jacobians, reference_rays
 from .opd_map import OpdMap, OpdMaps
@@ -25,6 +26,7 @@ from .request import Request
 _ADVICE = "; wavefront_opd can do without it, with reference='mean'"
 
 
+@check_arguments
 def wavefront_opd(
     telescope: Telescope,
     field: ArrayLike,
@@ -119,6 +121,7 @@ def wavefront_opd(
     )
 
 
+@check_arguments
 def wavefront_opds(
     telescope: Telescope,
     fields: ArrayLike,
@@ -176,6 +179,10 @@ def wavefront_opds(
     )
 
 
+#: Most points along a side of a map.
+_MOST_ACROSS = 8192
+
+
 def _pupil_points(
     telescope: Telescope, pupil: tuple[ArrayLike, ArrayLike] | None, grid: int | None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -183,13 +190,11 @@ def _pupil_points(
     if pupil is not None and grid is not None:
         raise ConfigError("pupil and grid are both given: expected one of them")
     if pupil is None:
-        n = 64 if grid is None else grid
-        if int(n) != n or n < 2:
-            raise DomainError(f"grid = {n!r}: expected a whole number of at least 2 points across the pupil")
-        u = ((np.arange(int(n)) + 0.5) / int(n) - 0.5) * telescope.pupil_diameter
+        n = 64 if grid is None else require_count(grid, "grid", 2, _MOST_ACROSS)
+        u = ((np.arange(n) + 0.5) / n - 0.5) * telescope.pupil_diameter
         x, y = np.meshgrid(u, u)
     else:
-        x, y = (np.array(v) for v in np.broadcast_arrays(metres(pupil[0], "pupil x"), metres(pupil[1], "pupil y")))
+        x, y = (np.array(v) for v in pupil_points(pupil))
     return x, y
 
 
@@ -207,7 +212,7 @@ def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarra
 def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> float:
     if sphere_radius is None:
         return telescope.reference_sphere_radius
-    radius = float(metres(sphere_radius, "sphere_radius"))
+    radius = length(sphere_radius, "sphere_radius")
     if not radius > 0:
         raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")
     return radius

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.plotting import BLUE, figure_of, new_figure, plain_text, styled
 from ..models.zernike_polynomials import NOLL_NAMES
@@ -82,6 +83,7 @@ class OpdMap(_PupilMaps):
         terms, *_ = np.linalg.lstsq(plane[self.lit], self.value[self.lit], rcond=None)
         return self.value - plane @ terms
 
+    @check_arguments
     def plot(self, zernikes: ZernikeFit | None = None, name: str = "") -> Figure:
         """Draw the map in nanometres and waves, with and without piston and tilt, and Zernike terms as bars.
 

@@ -6,17 +6,21 @@ an edge vignettes the pupil, all samplings converge with the number of points.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError, check_choice
+from ..core.units import MOST, require_count
 from ..models.telescope import Telescope
 
 #: Default ``n_pupil``: points along the radius (gauss, rings), in all (spiral) or along the diameter (square).
 _DEFAULT_N_PUPIL = {"gauss": 20, "rings": 24, "spiral": 2000, "square": 64}
 
 
+@check_arguments
 @dataclass(frozen=True)
 class PupilSampling:
     """Points of an annulus and their weights in a mean.
@@ -110,6 +114,7 @@ def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampl
     return PupilSampling(points, np.ones(len(points)))
 
 
+@check_arguments
 def pupil_sampling(
     telescope: Telescope, sampling: str | PupilSampling = "gauss", n_pupil: int | None = None
 ) -> PupilSampling:
@@ -134,9 +139,10 @@ def pupil_sampling(
         return sampling
     check_choice("sampling", sampling, _DEFAULT_N_PUPIL)
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    n = _DEFAULT_N_PUPIL[sampling] if n_pupil is None else n_pupil
-    if int(n) != n or n < 1:
-        raise DomainError(f"n_pupil = {n!r}: expected a whole number of at least 1", key="n_pupil")
+    default = _DEFAULT_N_PUPIL[sampling]
+    # On a spiral the number of points, else of those along a radius or side.
+    most = MOST if sampling == "spiral" else math.isqrt(MOST)
+    n = require_count(default if n_pupil is None else n_pupil, "n_pupil", 1, most)
     if sampling == "gauss":
         return gauss_annulus(radius, obscuration, n, 4 * n)
     return {"rings": ring_annulus, "spiral": spiral_annulus, "square": square_annulus}[sampling](radius, obscuration, n)
@@ -150,5 +156,4 @@ def _check_counts(obscuration: float, **counts: int) -> None:
     if not 0.0 <= obscuration < 1.0:
         raise DomainError(f"obscuration = {obscuration!r}: expected 0 <= obscuration < 1")
     for name, value in counts.items():
-        if int(value) != value or value < 1:
-            raise DomainError(f"{name} = {value!r}: expected a whole number of at least 1")
+        require_count(value, name, 1)

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import DomainError
-from ..core.units import metres, radians
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError, shown
+from ..core.units import metres, pure_numbers, radians
 from ..models.telescope import Telescope
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, launch_bundles
@@ -53,6 +54,7 @@ class Request:
     threads: int | None
 
     @classmethod
+    @check_arguments
     def of(
         cls,
         telescope: Telescope,
@@ -129,11 +131,13 @@ class Request:
         """Pupil points in units of the radius of the entrance pupil, shape [n_pupil, 2]."""
         return self.pupil.points / (0.5 * self.telescope.pupil_diameter)
 
+    @check_arguments
     def launch(self, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
         """Return the rays of one wavelength [m], field by field, through other pupil points [m] where given."""
         points = self.pupil.points if pupil is None else pupil
         return launch_bundles(self.telescope, self.directions, wavelength, points)
 
+    @check_arguments
     def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
         """Trace the rays of :meth:`launch` to the detector."""
         points = self.pupil.points if pupil is None else pupil
@@ -164,6 +168,7 @@ class Request:
             yield part, replace(self, fields=self.fields[part])
 
 
+@check_arguments
 def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.ndarray:
     """Return field angles [rad], shape [n, 2], that the telescope covers.
 
@@ -197,7 +202,7 @@ def wavelength_points(telescope: Telescope, wavelengths: ArrayLike | None = None
 
 def relative_weights(weights: ArrayLike | None, count: int, name: str = "wavelength_weights") -> np.ndarray:
     """Return so many weights of sum 1, equal where none are given; negative or all zero they are a DomainError."""
-    values = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    values = np.ones(count) if weights is None else pure_numbers(weights, name)
     if values.shape != (count,) or not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
-        raise DomainError(f"{name} = {weights!r}: expected {count} numbers, none negative, not all zero")
+        raise DomainError(f"{name} = {shown(weights)}: expected {count} numbers, none negative, not all zero")
     return values / values.sum()

@@ -7,12 +7,14 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.units import metres
+from ..core.arguments import check_arguments
+from ..core.units import length
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
 from .chief_rays import chief_rays, image_jacobians
 
 
+@check_arguments
 def focus_height(telescope: Telescope, silicon: Silicon, wavelength: ArrayLike, threads: int | None = None) -> float:
     """Return the height of CCDs at which silicon is best in focus, along +z of the telescope [m].
 
@@ -24,7 +26,7 @@ def focus_height(telescope: Telescope, silicon: Silicon, wavelength: ArrayLike, 
     DomainError
         If silicon is transparent at the wavelength.
     """
-    light = float(metres(wavelength, "wavelength"))
+    light = length(wavelength, "wavelength")
     axis = np.array([[0.0, 0.0, -1.0]])
     scale = abs(float(np.linalg.det(image_jacobians(telescope, axis, light, threads)[0])))
     # The mean over the annulus of the square of the light's direction cosines, pupil coordinate over focal length.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import require_positive
-from ..models.zernike_polynomials import annular_zernikes
+from ..core.units import require_count, require_positive
+from ..models.zernike_polynomials import MOST_TERMS, annular_zernikes
 from .opd_map import OpdMap, ZernikeFit
 
 
+@check_arguments
 def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int = 28) -> ZernikeFit:
     """Fit annular Zernikes to an OPD map by least squares over its lit points.
 
@@ -32,7 +34,7 @@ def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int
         farthest to ten times.
     """
     pupil_radius, lit = require_positive(pupil_radius, "pupil_radius", "metres"), opd.lit
-    if lit.sum() < jmax:
+    if lit.sum() < require_count(jmax, "jmax", 1, MOST_TERMS):
         raise DomainError(f"jmax = {jmax}: only {int(lit.sum())} pupil points are lit; expected at least as many")
     farthest = float(np.hypot(opd.x[lit], opd.y[lit]).max())
     if not 0.1 * pupil_radius <= farthest <= 10.0 * pupil_radius:

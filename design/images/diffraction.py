@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.units import field_label, metres
+from ...core.units import field_label, length, require_count
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
 from ...wavefront.request import Request, relative_weights
@@ -41,6 +42,7 @@ _AT_ONCE = 4096
 _PEAK, _MOST_PLACES, _FINE = 3.0, 192, 33
 
 
+@check_arguments
 def fft_psf(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -97,8 +99,8 @@ def fft_psf(
                 f"across the pupil; expected at most {_MOST} (a smaller image, or n_pupil)",
                 key="n_pupil",
             )
-    elif int(across) != across or across < 8:
-        raise DomainError(f"n_pupil = {across!r}: expected a whole number of at least 8", key="n_pupil")
+    else:
+        across = require_count(across, "n_pupil", 8, _MOST)
     period = across * plan.wave_over_range
     if period < side or period < plan.spread:
         what = f"an image of {side * 1e6:.4g} um and spots of {plan.spread * 1e6:.4g} um"
@@ -114,6 +116,7 @@ def fft_psf(
     return plan.image("fft", waves, int(across), progress)
 
 
+@check_arguments
 def huygens_psf(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -191,9 +194,7 @@ class _Plan:
 
     def __init__(self, request: Request, pixel: Any, pixels: int, reference: str) -> None:
         check_choice("reference", reference, REFERENCES)
-        if int(pixels) != pixels or not 3 <= pixels <= 4096:
-            raise DomainError(f"pixels = {pixels!r}: expected a whole number from 3 to 4096")
-        self.request, self.pixels = request, int(pixels)
+        self.request, self.pixels = request, require_count(pixels, "pixels", 3, 4096)
         # The middle of the images weighs all wavelengths alike.
         alike, pupil = relative_weights(None, len(request.wavelengths)), pupil_sampling(request.telescope)
         self.spots = spot_diagram(replace(request, weights=alike, pupil=pupil), reference)
@@ -209,7 +210,7 @@ class _Plan:
             # Where the spots are far larger than an Airy disc, they set the scale.
             self.pixel = max(self.wave_over_range / _PER_AIRY, 1.25 * self.spread / self.pixels)
         else:
-            self.pixel = float(metres(pixel, "pixel"))
+            self.pixel = length(pixel, "pixel")
             if not (np.isfinite(self.pixel) and self.pixel > 0):
                 raise DomainError(f"pixel = {pixel!r}: expected a positive length in metres")
 

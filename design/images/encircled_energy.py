@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import zoom
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
-from ...core.units import arcseconds, metres
+from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ..drawing import FEW, field_colors, field_text, finish_axes, second_scale
@@ -56,6 +57,7 @@ class EncircledEnergy(FieldResult):
     fraction: np.ndarray
     plate_scale: np.ndarray
 
+    @check_arguments
     def radius_holding(self, fraction: float) -> np.ndarray:
         """Return the radius that holds a fraction of the light [m], shape [n_field]; NaN beyond the curve."""
         if not 0 < fraction < 1:
@@ -90,6 +92,7 @@ class EncircledEnergy(FieldResult):
             return self._titled(figure, f"encircled energy {kind}, {self._nanometres()}")
 
 
+@check_arguments
 def encircled_energy(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -170,6 +173,7 @@ def energy_of_psf(psf: DiffractionPsf, radii: np.ndarray | None = None) -> Encir
     return EncircledEnergy(psf.request, "diffraction", radius, np.stack(rows), psf.plate_scale)
 
 
+@check_arguments
 def energy_curve(
     image: np.ndarray, center: tuple[float, float] | None = None, *, parts: int = _PARTS
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +200,7 @@ def energy_curve(
     DomainError
         If the image is not finite, or there is no light for a centroid.
     """
-    light = np.asarray(image, dtype=np.float64)
+    light = pure_numbers(image, "image")
     if light.ndim != 2 or not np.isfinite(light).all():
         raise DomainError(f"image of shape {light.shape}: expected a finite one, shape [ny, nx]")
     x, y = np.arange(light.shape[1], dtype=np.float64), np.arange(light.shape[0], dtype=np.float64)
@@ -205,6 +209,7 @@ def energy_curve(
         if not total > 0:
             raise DomainError(f"image of sum {total:.6g}: expected light, to have a centroid")
         center = float(light.sum(axis=0) @ x / total), float(light.sum(axis=1) @ y / total)
+    parts = require_count(parts, "parts", 1, 100)
     inside = (np.arange(parts) + 0.5) / parts - 0.5
     across, along = (np.add.outer(v - c, inside).ravel() for v, c in zip((x, y), center, strict=True))
     squared = np.add.outer(along**2, across**2).ravel()

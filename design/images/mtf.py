@@ -11,6 +11,7 @@ sagittal modulation is across it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -19,9 +20,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, RED, new_figure, styled
-from ...core.units import arcseconds
+from ...core.units import MOST, arcseconds, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import field_text, finish_axes, grid_shape, legend_below, panels_of, second_scale
@@ -76,6 +78,7 @@ class Mtf(FieldResult):
         """Cut-off frequencies of the shortest wavelength [cycles/m], tangential and sagittal, shape [n_field, 2]."""
         return 1.0 / (self.wavelengths.min() * self.f_number)
 
+    @check_arguments
     def frequency_at(self, contrast: float) -> np.ndarray:
         """Return the lowest frequency at which the contrast falls to a value [cycles/m], shape [n_field, 2].
 
@@ -130,6 +133,7 @@ class Mtf(FieldResult):
             return self._titled(figure, f"modulation transfer, {self._nanometres()}")
 
 
+@check_arguments
 def mtf(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -157,8 +161,7 @@ def mtf(
     DomainError
         If no light passes, or the lattice is too coarse for the spots.
     """
-    if int(n_pupil) != n_pupil or n_pupil < 16:
-        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 16", key="n_pupil")
+    n_pupil = require_count(n_pupil, "n_pupil", 16, math.isqrt(MOST))
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )

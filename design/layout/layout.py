@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, plain_text, styled
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
@@ -133,6 +134,7 @@ class Layout:
         return exported
 
 
+@check_arguments
 def layout(
     telescope: Telescope,
     fields: ArrayLike | None = None,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
 from ...core.units import field_label
@@ -108,6 +109,7 @@ class Distortion(FieldResult):
             return self._titled(figure, f"distortion against f tan θ, {self._nanometres()}; {points}")
 
 
+@check_arguments
 def distortion(
     telescope: Telescope,
     fields: ArrayLike | None = None,

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
-from ...core.units import field_label, radians
+from ...core.units import angle, field_label, require_count
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
@@ -123,6 +124,7 @@ class DoubleZernikes:
     at_nodes: FieldZernikes
     residual_rms: np.ndarray
 
+    @check_arguments
     def at(self, fields: ArrayLike) -> np.ndarray:
         """Return the pupil coefficients [m] of the expansion at field angles [rad], shape [n_field, jmax]."""
         x, y = np.atleast_2d(np.asarray(fields, dtype=np.float64)).T / self.field_radius
@@ -174,6 +176,7 @@ class DoubleZernikes:
             return figure
 
 
+@check_arguments
 def wavefront_zernikes(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -213,11 +216,10 @@ def wavefront_zernikes(
         telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     )
     points, sample, w = request.fields, request.pupil, request.wavelength
-    if int(jmax) != jmax or not 1 <= jmax <= len(sample):
-        raise DomainError(f"jmax = {jmax!r}: expected a whole number from 1 to the {len(sample)} points of the pupil")
+    jmax = require_count(jmax, "jmax", 1, len(sample))
     x, y = request.unit_pupil.T
-    terms = annular_zernikes(int(jmax), x, y, telescope.pupil_obscuration).T
-    coefficients, residual = np.empty((len(points), int(jmax))), np.empty(len(points))
+    terms = annular_zernikes(jmax, x, y, telescope.pupil_obscuration).T
+    coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
     for part, some in request.parts():
         optics = trace_pupils(telescope, some.fields, w, sample.points, projection=projection, threads=threads)
         value = -optics.path[:, 0]
@@ -226,6 +228,11 @@ def wavefront_zernikes(
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil)
 
 
+#: Most rings of field points.
+_MOST_RINGS = 100
+
+
+@check_arguments
 def double_zernikes(
     telescope: Telescope,
     wavelength: ArrayLike | None = None,
@@ -259,12 +266,12 @@ def double_zernikes(
     DomainError
         If the disc is out of range, or there are too few points for the terms.
     """
-    radius = telescope.field_radius if field_radius is None else float(radians(field_radius, "field_radius"))
+    radius = telescope.field_radius if field_radius is None else angle(field_radius, "field_radius")
     if not (np.isfinite(radius) and radius > 0):
         raise DomainError(f"field_radius = {field_radius!r}: expected a positive angle")
+    rings = require_count(rings, "rings", 1, _MOST_RINGS)
     nodes = gauss_annulus(radius, 0.0, rings, 4 * rings)
-    if int(kmax) != kmax or not 1 <= kmax <= len(nodes):
-        raise DomainError(f"kmax = {kmax!r}: expected a whole number from 1 to the {len(nodes)} points of the field")
+    kmax = require_count(kmax, "kmax", 1, len(nodes))
     at_nodes = wavefront_zernikes(
         telescope,
         nodes.points,
@@ -276,7 +283,7 @@ def double_zernikes(
         projection=projection,
         threads=threads,
     )
-    terms = annular_zernikes(int(kmax), *(nodes.points.T / radius)).T
+    terms = annular_zernikes(kmax, *(nodes.points.T / radius)).T
     root = np.sqrt(nodes.weights)[:, None]
     coefficients, *_ = np.linalg.lstsq(terms * root, at_nodes.coefficients * root, rcond=None)
     rest = at_nodes.coefficients - terms @ coefficients

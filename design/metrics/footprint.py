@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import RED, plain_text, styled
 from ...models.surface import Surface
@@ -111,6 +112,7 @@ class Footprint(FieldResult):
             return self._titled(figure, "footprints [mm]")
 
 
+@check_arguments
 def footprint(
     telescope: Telescope,
     surfaces: str | Sequence[str] | None = None,

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import RED, new_figure, plain_text, styled
-from ...core.units import field_label
+from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import draw_circle, field_text, panels_of
@@ -163,6 +164,7 @@ class Ghosts(FieldResult):
             )
 
 
+@check_arguments
 def ghosts(
     telescope: Telescope,
     field: ArrayLike | None = None,
@@ -199,11 +201,10 @@ def ghosts(
     DomainError
         If a number is out of range, no surface can make a ghost, or the star itself does not reach the detector.
     """
-    if int(n_pupil) != n_pupil or n_pupil < 400:
-        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 400")
+    n_pupil = require_count(n_pupil, "n_pupil", 400)
     where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
     request = Request.of(
-        telescope, where, wavelength, sampling="spiral", n_pupil=int(n_pupil), projection=projection, threads=threads
+        telescope, where, wavelength, sampling="spiral", n_pupil=n_pupil, projection=projection, threads=threads
     )
     coatings = Coatings(telescope, reflectivity, detector_reflectivity)
     pairs = ghost_pairs(telescope)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, new_figure, styled
 from ...core.units import field_label
@@ -135,6 +136,7 @@ class PrincipalRays(FieldResult):
             return self._titled(figure, f"chief and marginal rays, {self._nanometres()}")
 
 
+@check_arguments
 def principal_rays(
     telescope: Telescope,
     fields: ArrayLike | None = None,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, RED, styled
 from ...core.units import arcseconds
@@ -82,6 +83,7 @@ class SpotDiagram(FieldResult):
         largest = radius.max(axis=(1, 2))
         return np.where(largest >= 0, largest, np.nan)
 
+    @check_arguments
     def radius_holding(self, fraction: float = 0.8) -> np.ndarray:
         """Return the radius about the centroid that holds a fraction of the rays [m], shape [n_field].
 
@@ -148,6 +150,7 @@ class SpotDiagram(FieldResult):
         return self.displacement - self.centroid[:, None, None]
 
 
+@check_arguments
 def spots(
     telescope: Telescope,
     fields: ArrayLike | None = None,

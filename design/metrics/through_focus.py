@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import new_figure, styled
 from ...core.units import field_label, metres
@@ -101,6 +102,7 @@ class ThroughFocus(FieldResult):
             return self._titled(figure, f"through focus; the spots of all fields together are smallest at {common}")
 
 
+@check_arguments
 def through_focus(
     telescope: Telescope,
     fields: ArrayLike | None = None,

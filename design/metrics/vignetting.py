@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, figure_of, new_figure, styled
+from ...core.units import require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import draw_field_map, finish_axes, spread_in_field
@@ -76,6 +78,7 @@ class Vignetting(FieldResult):
             return self._titled(figure, f"vignetting at {self._nanometres()}; {lit}")
 
 
+@check_arguments
 def vignetting(
     telescope: Telescope,
     fields: ArrayLike | None = None,
@@ -105,10 +108,9 @@ def vignetting(
     DomainError
         If the number of rays is out of range, or no light reaches the detector on the axis.
     """
-    if int(n_pupil) != n_pupil or n_pupil < 16:
-        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 16")
+    n_pupil = require_count(n_pupil, "n_pupil", 16)
     # A multiple of four, so that the four parts are equally large.
-    count = 4 * (int(n_pupil) // 4)
+    count = 4 * (n_pupil // 4)
     request = Request.of(
         telescope,
         field_disc(telescope) if fields is None else fields,

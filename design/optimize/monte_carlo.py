@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_choice
 from ...core.plotting import BLUE, GREY, RED, new_figure, plain_text, styled
 from ...models.telescope import Telescope
@@ -73,6 +74,7 @@ class MonteCarlo:
     nominal: float
     contribution: np.ndarray
 
+    @check_arguments
     def at_most(self, fraction: float) -> float:
         """Return the quantile of the merit [m] for a fraction (0 to 1) of the telescopes; lost ones count as worst."""
         return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), fraction, method="higher"))
@@ -131,6 +133,7 @@ class MonteCarlo:
             return figure
 
 
+@check_arguments
 def monte_carlo(
     telescope: Telescope,
     tolerances: Iterable[Tolerance],

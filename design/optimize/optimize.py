@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from ...core.errors import ConfigError, DomainError, PachonError
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, DomainError, PachonError, shown
 from ...core.plotting import BLUE, GREY, new_figure, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
@@ -117,6 +118,7 @@ class Optimum:
             return figure
 
 
+@check_arguments
 @one_blas_thread()
 def optimize(
     telescope: Telescope,
@@ -186,6 +188,8 @@ def optimize(
         projection=projection,
         threads=threads,
     )
+    if not isinstance(merit, str) and not hasattr(merit, "derivatives"):
+        raise ConfigError(f"merit = {shown(merit)}: expected 'spots', 'wavefront' or a Merit")
     wanted = merit if not isinstance(merit, str) else _merit(merit, telescope, rays, reference, goal)
     problem = _Problem(telescope, chosen, wanted, tuple(targets))
     low, high = _bounds(telescope, chosen, bounds or {})

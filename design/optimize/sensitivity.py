@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, new_figure, plain_text, styled
 from ...core.threads import one_blas_thread
-from ...core.units import field_label
+from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
-from ...models.zernike_polynomials import annular_zernikes
+from ...models.zernike_polynomials import MOST_TERMS, annular_zernikes
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
@@ -58,6 +59,7 @@ class Sensitivity(FieldResult):
         """Rms wavefront over the field without piston and tilt, per unit of each parameter [m], shape [n_parameter]."""
         return np.sqrt((self.matrix[:, 3:] ** 2).sum(axis=1).mean(axis=0))
 
+    @check_arguments
     def modes(self, first: int = 4) -> tuple[np.ndarray, np.ndarray]:
         """Return singular values and modes of the matrix, each parameter in units of 1 m rms wavefront.
 
@@ -140,6 +142,7 @@ def field_rings(telescope: Telescope) -> np.ndarray:
     return np.concatenate(rings)
 
 
+@check_arguments
 def sensitivity(
     telescope: Telescope,
     parameters: Iterable[str | Parameter],
@@ -176,8 +179,7 @@ def sensitivity(
         If an address is unknown.
     """
     chosen = parse_parameters(parameters, telescope)
-    if int(n_zernike) != n_zernike or n_zernike < 1:
-        raise DomainError(f"n_zernike = {n_zernike!r}: expected a whole number of at least 1")
+    n_zernike = require_count(n_zernike, "n_zernike", 1, MOST_TERMS)
     request = Request.of(
         telescope,
         field_rings(telescope) if fields is None else fields,

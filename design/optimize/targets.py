@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
@@ -17,6 +18,7 @@ from .jacobian import ParameterColumns
 _SMALL_FIELD = 1e-4
 
 
+@check_arguments
 @dataclass(frozen=True)
 class FocalLength:
     """Focal length: distance on the detector of two chief rays near the axis over the tangent of their angle.
@@ -56,6 +58,7 @@ class FocalLength:
         return np.array([rate * length - self.weight * self.value]), (rate / length * apart @ change)[None]
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Target:
     """Any property of a telescope, with derivatives from central differences.

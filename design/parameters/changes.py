@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from ...models.telescope import Telescope
 from .parameters import Parameter, apply
@@ -12,6 +13,7 @@ _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "arcsec": 4.84813681109536e-06, "deg": 0.017453292519943295}
 
 
+@check_arguments
 def apply_changes(telescope: Telescope, changes: Mapping[str, float]) -> Telescope:
     """Return a telescope with changes applied.
 

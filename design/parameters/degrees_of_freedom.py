@@ -16,7 +16,9 @@ import numpy as np
 from astropy import units as u
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_unique, unknown_name
+from ...core.units import pure_numbers
 from ...models.shapes.shape import Shape, Sum
 from ...models.telescope import Telescope
 from ..optimize.sensitivity import Sensitivity, sensitivity
@@ -35,6 +37,7 @@ def unit_size(text: str) -> float:
         raise ConfigError(f"unit = {text!r}: expected one of length, angle or temperature, or 1") from None
 
 
+@check_arguments
 @dataclass(frozen=True)
 class DegreeOfFreedom:
     """One degree of freedom.
@@ -53,6 +56,7 @@ class DegreeOfFreedom:
     of: Mapping[str, float] = field(hash=False)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class SurfaceDeformation:
     """Bending modes of surfaces, which add to their sag.
@@ -72,6 +76,7 @@ class SurfaceDeformation:
     shape: Shape
 
 
+@check_arguments
 @dataclass(frozen=True)
 class DegreesOfFreedom:
     """A vector of named degrees of freedom.
@@ -157,7 +162,7 @@ class DegreesOfFreedom:
             raise unknown_name(f"degree of freedom{f' of {self.name}' if self.name else ''}", name, self.names)
         return self.names.index(name)
 
-    def vector(self, values: ArrayLike) -> np.ndarray:
+    def vector(self, values: ArrayLike | Mapping[str, Any]) -> np.ndarray:
         """Return values as a vector, shape [n], each in its unit.
 
         Parameters
@@ -183,17 +188,17 @@ class DegreesOfFreedom:
                         raise DomainError(f"{name} = {value}: expected a unit like {self.units[i]}") from None
                 vector[i] = value
         else:
-            vector = np.asarray(values, dtype=np.float64)
+            vector = pure_numbers(values, "values")
             if vector.shape != (len(self),):
                 raise DomainError(
-                    f"vector of shape {list(vector.shape)}: expected [{len(self)}], {self.names[0]} first"
+                    f"values of shape {list(vector.shape)}: expected [{len(self)}], {self.names[0]} first"
                 )
         for name, value in zip(self.names, vector, strict=True):
             if not np.isfinite(value):
                 raise DomainError(f"{name} = {float(value)!r}: expected a finite number")
         return vector
 
-    def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
+    def apply(self, telescope: Telescope, values: ArrayLike | Mapping[str, Any]) -> Telescope:
         """Return the telescope with a vector of degrees of freedom applied.
 
         Deformations are added to the surfaces first, then other parameters change, then bodies move, groups before

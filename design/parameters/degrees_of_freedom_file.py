@@ -26,6 +26,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, PrescriptionError, error_context, unknown_name
 from ...core.schema import Section, checked, expected, mapping, problem, validated
 from ...core.yaml_reader import as_number, read_mapping
@@ -42,6 +43,7 @@ from .degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeform
 BUNDLED = {"lsst": "lsst_degrees_of_freedom.yaml"}
 
 
+@check_arguments
 def load_degrees_of_freedom(name_or_path: str | os.PathLike[str]) -> DegreesOfFreedom:
     """Load degrees of freedom that come with the package by name ("lsst"), or a file of them by its path.
 

@@ -25,6 +25,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique, unknown_name
 from ...models.media.medium import with_index_change
 from ...models.shapes.shape import Shape
@@ -35,6 +36,7 @@ from .shape_terms import shape_with_term, term_unit
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Parameter:
     """One parameter.

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
@@ -14,6 +15,7 @@ from .degrees_of_freedom import DegreeOfFreedom
 from .shape_terms import term_unit
 
 
+@check_arguments
 def thermal(
     telescope: Telescope, expansion: float | Mapping[str, float], dn_dt: Mapping[str, float] | None = None
 ) -> DegreeOfFreedom:

@@ -9,12 +9,15 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique
 from ...core.random_streams import stream
+from ...core.units import require_count, require_seed
 
 DISTRIBUTIONS = ("uniform", "normal", "truncated")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Tolerance:
     """Tolerance of one degree of freedom.
@@ -69,7 +72,7 @@ class Tolerance:
 
     def draw(self, seed: int, n: int) -> np.ndarray:
         """Return ``n`` deviations, shape [n]; the first ones do not depend on ``n`` or on other tolerances."""
-        uniform = stream(seed, "tolerance", self.name).uniform(size=n)
+        uniform = stream(require_seed(seed), "tolerance", self.name).uniform(size=require_count(n, "n", 1))
         if self.distribution == "uniform":
             return self.size * (2.0 * uniform - 1.0)
         low = 0.0 if self.limit is None else ndtr(-self.limit / self.size)
@@ -86,7 +89,4 @@ def draw(tolerances: Iterable[Tolerance], seed: int, n: int = 1) -> np.ndarray:
     if not chosen:
         raise ConfigError("tolerances = []: expected at least one")
     check_unique("tolerance", [t.name for t in chosen])
-    for key, value, least in (("n", n, 1), ("seed", seed, 0)):
-        if int(value) != value or value < least:
-            raise DomainError(f"{key} = {value!r}: expected a whole number of at least {least}")
-    return np.stack([t.draw(seed, int(n)) for t in chosen], axis=1)
+    return np.stack([t.draw(seed, n) for t in chosen], axis=1)

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import unknown_name
-from ...core.units import metres
+from ...core.units import plane_points
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A mosaic of equal square CCDs, on rafts."""
@@ -79,7 +81,7 @@ class Camera:
 
     def ccd_at(self, x: ArrayLike, y: ArrayLike, *, margin: float = 0.0) -> np.ndarray:
         """Return the index of the CCD at points [m], or at most a margin [m] outside its rim; -1 without one."""
-        px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
+        px, py = plane_points(x, y)
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
         if np.any(finite):
@@ -93,6 +95,7 @@ class Camera:
 _ITL_RAFTS = {"R01", "R02", "R03", "R10", "R20", "R41", "R42", "R43"}
 
 
+@check_arguments
 @lru_cache(maxsize=1)
 def lsst_camera() -> Camera:
     """Return the LSST camera: 189 CCDs of 4096 x 4096 pixels of 10 um in 21 rafts of 3 x 3.

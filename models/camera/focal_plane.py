@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, unknown_name
-from ...core.units import metres, radians
+from ...core.units import metres, plane_points, radians, require_count
 from .camera import Camera, load_camera
 from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
@@ -28,8 +29,11 @@ if TYPE_CHECKING:
 
 # [m], by which rims of tiles of files may lie outside: 0.34 m in a float32 STL are good to 15 nm.
 _MESH_MARGIN = 1e-7
+#: Most cells along a side of a CCD.
+_MOST_CELLS = 1024
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class FocalPlane:
     """Height of the CCD surfaces over the nominal focal plane.
@@ -56,7 +60,7 @@ class FocalPlane:
 
     camera: Camera
     surfaces: CcdSurfaces
-    measured: np.ndarray
+    measured: NDArray[np.bool_]
     terms: tuple[str, ...] = ()
     budget: HeightBudget | None = None
     seed: int | None = None
@@ -73,7 +77,7 @@ class FocalPlane:
         camera: str | Camera = "lsst",
         *,
         seed: int,
-        terms: Iterable[str] | None = None,
+        terms: str | Iterable[str] | None = None,
         budget: str | HeightBudget = "simulated",
     ) -> FocalPlane:
         """Draw heights from the budget of Jee & Tyson 2011, Table 1.
@@ -211,7 +215,7 @@ class FocalPlane:
         surfaces, measured = fit_heights(camera, x, y, z, margin=_MESH_MARGIN)
         return cls(camera, surfaces, measured)
 
-    def with_terms(self, terms: Iterable[str]) -> FocalPlane:
+    def with_terms(self, terms: str | Iterable[str]) -> FocalPlane:
         """Return the focal plane of the same seed and budget with only these terms.
 
         Raises
@@ -313,7 +317,7 @@ class FocalPlane:
 
     def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
-        px, py = np.broadcast_arrays(metres(x, "x"), metres(y, "y"))
+        px, py = plane_points(x, y)
         ccd = self.camera.ccd_at(px, py)
         lit = ccd >= 0
         dx, dy = px - self.camera.centers[ccd, 0], py - self.camera.centers[ccd, 1]
@@ -337,7 +341,7 @@ class FocalPlane:
         """
         import trimesh  # half a second
 
-        cells = _cells(cells_per_ccd)
+        cells = require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
         vertices = np.stack(self._nodes(cells)[1:], axis=-1)
         index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
@@ -362,7 +366,7 @@ class FocalPlane:
         ndarray, shape (n_ccd,)
             Upper bound of ``|mesh height - height|`` [m] on each CCD.
         """
-        cell = self.camera.ccd_size / _cells(cells_per_ccd)
+        cell = self.camera.ccd_size / require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
         return 0.25 * self.surfaces.curvature_bound() * cell**2
 
     def to_table(self, cells_per_ccd: int = 32) -> Table:
@@ -378,10 +382,10 @@ class FocalPlane:
         Table
             Columns ccd (name), x, y, z [m].
         """
-        # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
-        ccd, *points = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
         from astropy.table import Table
 
+        # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
+        ccd, *points = self._nodes(require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS), scale=1.0 - 1e-9)
         return Table([np.array(self.names)[ccd], *points], names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
 
     def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, ...]:
@@ -392,9 +396,3 @@ class FocalPlane:
         ccd, dx, dy = ccd.ravel(), dx.ravel(), dy.ravel()
         x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
         return ccd, x, y, self.surfaces.height(ccd, dx, dy)
-
-
-def _cells(cells_per_ccd: int) -> int:
-    if isinstance(cells_per_ccd, bool) or not isinstance(cells_per_ccd, (int, np.integer)) or cells_per_ccd < 1:
-        raise DomainError(f"cells_per_ccd = {cells_per_ccd!r}: expected a whole number of one or more")
-    return int(cells_per_ccd)

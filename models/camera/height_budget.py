@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, unknown_name
 from ...core.random_streams import stream
 from .camera import Camera
@@ -29,6 +30,7 @@ from .ccd_surfaces import CcdSurfaces
 _POTATO_POINTS = 129
 
 
+@check_arguments
 @dataclass(frozen=True)
 class HeightBudget:
     """Peak-to-valley size of each term of the focal-plane height."""

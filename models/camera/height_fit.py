@@ -71,7 +71,7 @@ def table_column(table: Any, name: str) -> np.ndarray:
     else:
         columns = getattr(getattr(table, "dtype", None), "names", None) or ()
     if name not in columns:
-        raise DomainError(f"heights: column {name!r} is missing: expected columns x, y, z")
+        raise DomainError(f"table of heights: column {name!r} is missing: expected columns x, y, z")
     column = table[name]
     if hasattr(table, "colnames") and getattr(column, "unit", None) is not None:
         column = getattr(column, "quantity", column)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from .focal_plane import FocalPlane
 
@@ -31,6 +32,7 @@ class HeightStatistics:
     shape_rms: float  #: rms about the best plane of each CCD
 
 
+@check_arguments
 def height_statistics(focal_plane: FocalPlane) -> dict[str, HeightStatistics]:
     """Compute statistics of the CCDs with measured heights, of all of them where none is measured.
 

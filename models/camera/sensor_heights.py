@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import metres
+from ...core.units import plane_points
 from .camera import Camera
 from .ccd_surfaces import CcdSurfaces
 from .zernike_surfaces import ZernikeSurfaces
@@ -76,9 +77,11 @@ class CornerSensor:
         """Name of the raft."""
         return self.name.split("_")[0]
 
+    @check_arguments
     def height(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the height [m] at positions on the focal plane [m], positive along +z; NaN off the measured sides."""
-        dx, dy = np.broadcast_arrays(metres(x, "x") - self.center[0], metres(y, "y") - self.center[1])
+        px, py = plane_points(x, y)
+        dx, dy = px - self.center[0], py - self.center[1]
         first = np.zeros(dx.shape, dtype=np.int64)
         inside = self.surface.inside(first, dx, dy)
         out = np.full(dx.shape, np.nan)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.units import metres
+from ...core.units import length, one_number
 from ..media.silicon import absorption_length, check_temperature, silicon_index
 
 # Absorption lengths beyond which no light is left, to double precision.
@@ -53,18 +53,19 @@ class Silicon:
     temperature: float = 173.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "thickness", float(metres(self.thickness, "thickness")))
+        object.__setattr__(self, "thickness", length(self.thickness, "thickness"))
         if not 1e-6 <= self.thickness <= 1e-3:
             raise DomainError(f"thickness = {self.thickness!r}: expected 1e-06 to 0.001 m of silicon")
+        object.__setattr__(self, "temperature", one_number(self.temperature, "temperature"))
         check_temperature(self.temperature)
 
     def index(self, wavelength: ArrayLike) -> float:
         """Return the refractive index at a vacuum wavelength [m]."""
-        return float(silicon_index(wavelength, self.temperature))
+        return float(silicon_index(length(wavelength, "wavelength"), self.temperature))
 
     def absorption_length(self, wavelength: ArrayLike) -> float:
         """Return the absorption length at a vacuum wavelength [m]."""
-        return float(absorption_length(wavelength, self.temperature))
+        return float(absorption_length(length(wavelength, "wavelength"), self.temperature))
 
     def absorbed(self, wavelength: ArrayLike) -> float:
         """Return the part of the light that is absorbed before it reaches the gates."""

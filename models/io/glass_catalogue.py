@@ -14,6 +14,7 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, unknown_name
 from ..media.air import ZERO_CELSIUS, Air
 from ..media.dispersion import FORMULAS, Dispersion
@@ -56,6 +57,7 @@ class Glass:
     temperature: float
 
 
+@check_arguments
 class GlassCatalogue:
     """Glasses by name; names do not depend on the case.
 

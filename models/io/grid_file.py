@@ -16,7 +16,7 @@ import numpy as np
 from astropy import units as u
 
 from ...core.errors import PrescriptionError, error_context
-from ...core.files import require_file, write_bytes
+from ...core.files import parsing, require_file, write_bytes
 from ..shapes.grid import GridSag
 
 if TYPE_CHECKING:
@@ -47,17 +47,15 @@ def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
     from astropy.io import fits  # few prescriptions have a grid
 
     require_file(path, PrescriptionError)
-    try:
-        with fits.open(path, memmap=False) as hdus:
-            images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        reason = " ".join(str(error).split())
-        raise PrescriptionError(f"cannot be read as FITS ({reason[:120]})", file=path) from None
+    with parsing(path, "cannot be read as FITS", PrescriptionError), open(path, "rb") as file:
+        hdus = fits.open(file, memmap=False)
+        images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]
     if not images:
         number = {2: "two", 4: "four"}[dimensions]
         raise PrescriptionError(f"expected a FITS image of {number} dimensions", file=path)
     header, data = images[0]
-    return header, np.asarray(data, dtype=np.float64)
+    with parsing(path, "cannot be read as FITS", PrescriptionError):
+        return header, np.asarray(data, dtype=np.float64)
 
 
 def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:

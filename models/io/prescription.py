@@ -33,9 +33,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, check_choice, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
+from ..mesh_file import files_of_mesh
 from ..telescope import Telescope
 from .batoid import ROOT as BATOID_ROOT
 from .codev.reader import read_codev_file
@@ -71,6 +73,7 @@ def bundled_names() -> tuple[str, ...]:
     return BUNDLED
 
 
+@check_arguments
 def load_telescope(
     name_or_path: str | os.PathLike[str],
     *,
@@ -140,6 +143,10 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
         named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
     # os.path takes every text, also such as are too long for a name.
     files = [name for name in named if os.path.isfile(path.parent / name)]
+    for name in files:
+        # A list that grows: files of meshes name no others.
+        beside = (os.path.join(os.path.dirname(name), other) for other in files_of_mesh(path.parent / name))
+        files += [other for other in beside if os.path.isfile(path.parent / other) and other not in files]
     if not files:
         return own
     contents = [own, *(hashlib.sha256(read_bytes(path.parent / n, PrescriptionError)).hexdigest() for n in files)]
@@ -161,6 +168,7 @@ def _bundled(name: str) -> Telescope:
     return read_telescope(DATA / f"{name}.yaml")
 
 
+@check_arguments
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format: str = "") -> None:
     """Write a prescription file: YAML, ours or batoid's, or a Zemax lens file.
 

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, error_context, unknown_name
 from ...core.schema import Section, validated
 from ...core.yaml_reader import read_mapping
@@ -62,6 +63,7 @@ def site_names() -> tuple[str, ...]:
     return BUNDLED
 
 
+@check_arguments
 def load_site(name_or_path: str | os.PathLike[str]) -> Site:
     """Load a bundled site by name, or any site by the path of its ``.yaml`` file.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
 
@@ -25,6 +26,7 @@ GAS_CONSTANT = 8.314510
 WATER_MOLAR_MASS = 0.018015
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Air(Medium):
     """Moist air as a medium.

@@ -28,6 +28,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .medium import ConstantIndex, Medium, check_wavelength_range, real_index, wavelengths_within
 
@@ -69,6 +70,7 @@ FORMULAS = {
 }
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Dispersion(Medium):
     """Medium whose index follows a named dispersion formula.
@@ -117,6 +119,7 @@ LINE_D, LINE_F, LINE_C, LINE_G = 0.5875618, 0.4861327, 0.6562725, 0.4358343
 INFRARED_TERM = -0.0128
 
 
+@check_arguments
 def model_glass(nd: float, vd: float, partial_dispersion: float = 0.0) -> Dispersion | ConstantIndex:
     """Return a glass of given index and dispersion at the d line.
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PrescriptionError
 from ...core.units import metres
 
@@ -36,6 +37,7 @@ def wavelengths_within(wavelength: Any, wavelength_range: tuple[float, float], m
     return w
 
 
+@check_arguments
 class Medium(ABC):
     """A refractive medium: immutable and hashable.
 
@@ -81,6 +83,7 @@ def real_index(index: np.ndarray, wavelength: np.ndarray, *, squared: bool = Fal
     return np.sqrt(index) if squared else index
 
 
+@check_arguments
 @dataclass(frozen=True)
 class ConstantIndex(Medium):
     """Medium with one refractive index at every wavelength.
@@ -104,6 +107,7 @@ class ConstantIndex(Medium):
         return np.full_like(metres(wavelength, "wavelength"), self.n)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Sellmeier(Medium):
     """Medium whose index follows the Sellmeier formula of any number of terms.
@@ -142,6 +146,7 @@ class Sellmeier(Medium):
             return real_index(np.asarray(1.0 + sum(terms)), w, squared=True)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class RelativeToAir(Medium):
     """Medium with an index relative to air by wavelength in air, as in glass catalogues.
@@ -168,6 +173,7 @@ class RelativeToAir(Medium):
         return n_air * self.relative.index(w / n_air)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class ChangedIndex(Medium):
     """Medium with the index of another plus a constant at every wavelength.

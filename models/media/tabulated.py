@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 INTERPOLATIONS = ("monotone", "linear")
 
 
+@check_arguments
 @dataclass(frozen=True)
 class TabulatedIndex(Medium):
     """Medium whose index is interpolated from a table.

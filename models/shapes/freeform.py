@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .polar_polynomial import PolarPolynomial, from_monomials, from_zernikes
 from .shape import (
@@ -27,6 +28,7 @@ from .shape import (
 )
 
 
+@check_arguments
 @dataclass(frozen=True)
 class OddAsphere(Shape):
     """Conic plus all powers of the distance from the axis.
@@ -142,6 +144,7 @@ class _TwoRadii(Shape):
         return replace(self, **_conic_change(name, value))
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Biconic(_TwoRadii):
     """Conics of different radii `radius_x`, `radius_y` [m] along x and y; an infinite radius is flat.
@@ -224,6 +227,7 @@ class Biconic(_TwoRadii):
         return f, fx, fy
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Toroid(_TwoRadii):
     """A conic of the y, z plane rotated about an axis parallel to y, `radius_x` [m] from the vertex.
@@ -309,6 +313,7 @@ class _Polynomial(Shape):
         return self.polynomial.hessian(x, y)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class XYPolynomial(_Polynomial):
     """Sum of ``a x^i y^j`` over terms (i, j, a), with a in m^(1 - i - j), each pair of powers once."""
@@ -344,6 +349,7 @@ class XYPolynomial(_Polynomial):
         return XYPolynomial(tuple((i, j, value if name == f"x{i}y{j}" else a) for i, j, a in self.terms))
 
 
+@check_arguments
 @dataclass(frozen=True)
 class ZernikeSag(_Polynomial):
     """Sum of Zernike polynomials, orthonormal over the annulus between two radii, Noll order.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from ..content_equality import ContentEquality
 from .bicubic import hermite, hermite_curvature, hermite_slope
@@ -19,6 +20,7 @@ LEAST_NODES = 4
 EQUAL_STEPS = 1e-5
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class GridSag(ContentEquality, Shape):
     """Bicubic interpolation of a sag on a regular grid.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, UnknownNameError, error_context
 from ..content_equality import ContentEquality
 from ..mesh_file import load_mesh
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 EDGE = 1e-9
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class MeshSurface(ContentEquality, Shape):
     """Surface of triangles with one height at each x, y.
@@ -48,8 +50,11 @@ class MeshSurface(ContentEquality, Shape):
     smooth: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "vertices", np.reshape(self.vertices, (-1, 3)))
-        object.__setattr__(self, "faces", np.reshape(self.faces, (-1, 3)))
+        for name in ("vertices", "faces"):
+            # Of an empty array any shape will do.
+            if np.size(getattr(self, name)) and np.shape(getattr(self, name))[1:] != (3,):
+                raise PrescriptionError(f"mesh {name} of shape {np.shape(getattr(self, name))}: expected [n, 3]")
+            object.__setattr__(self, name, np.reshape(getattr(self, name), (-1, 3)))
         self._freeze(vertices=np.float64, faces=np.int32)
         n = len(self.vertices)
         if len(self.faces) == 0:

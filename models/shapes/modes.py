@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .grid import GridSag
 from .shape import Triple
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False, repr=False)
 class GridModes(GridSag):
     """Sum of maps times amounts, interpolated as a :class:`~pachon.models.shapes.grid.GridSag`.

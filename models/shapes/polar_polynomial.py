@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.units import plane_points
 from ..zernike_polynomials import noll_to_nm, radial_series
 
 
@@ -63,7 +64,7 @@ class PolarPolynomial:
 
     def _sums(self, x: Any, y: Any) -> tuple[np.ndarray, ...]:
         """Return the complex sum and its derivatives z, s, zz, zs, ss, with z = x + iy and s independent."""
-        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        x, y = plane_points(x, y)
         z, s = x + 1j * y, x * x + y * y
         f, f_z, f_s, f_zz, f_zs, f_ss = (np.zeros(x.shape, dtype=np.complex128) for _ in range(6))
         for series in self.terms[::-1]:

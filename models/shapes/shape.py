@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, unknown_name
+from ...core.units import plane_points
 
 Pair = tuple[np.ndarray, np.ndarray]
 Triple = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -49,7 +51,7 @@ def with_coefficient(coefficients: tuple[float, ...], place: int, value: float) 
 
 def coordinates(x: Any, y: Any) -> Pair:
     """Return x and y [m] as float64 arrays of one shape."""
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    x, y = plane_points(x, y)
     return x, y
 
 
@@ -58,6 +60,7 @@ def root(inside: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(inside >= 0, inside, np.nan))
 
 
+@check_arguments
 class Shape(ABC):
     """Shape of a surface: immutable and hashable.
 
@@ -264,6 +267,7 @@ class Plane(Rotational):
         return Sphere(1.0 / value) if value else self
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Sphere(Rotational):
     """Sphere of a radius of curvature [m], positive where the centre lies on the +z side."""
@@ -271,6 +275,7 @@ class Sphere(Rotational):
     radius: float
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Conic(Rotational):
     """Conic of revolution: radius of curvature at the vertex [m], and conic constant (0 sphere, -1 paraboloid)."""
@@ -279,6 +284,7 @@ class Conic(Rotational):
     conic: float
 
 
+@check_arguments
 @dataclass(frozen=True)
 class EvenAsphere(Rotational):
     """Conic plus even powers of the distance from the axis.
@@ -298,6 +304,7 @@ class EvenAsphere(Rotational):
     coefficients: tuple[float, ...]
 
 
+@check_arguments
 @dataclass(frozen=True)
 class Sum(Shape):
     """Sum of the sags of several shapes.

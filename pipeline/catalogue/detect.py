@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import sep
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import real_array, require_positive
+from ...core.units import real_array, require_count, require_positive
 from ..measure.shapes import fwhm
 from .cutouts import cut_out
 from .objects import DetectedObjects, ObjectFlag
@@ -29,10 +30,11 @@ _FWHM_SIDE, _FWHM_BATCH = 25, 2048
 _PIXEL_ROOM, _PIECES = 0.2, 8192
 
 
+@check_arguments
 def detect_objects(
     image: ArrayLike,
     variance: ArrayLike,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
     *,
     saturated: int = 0,
     threshold: float = 3.0,
@@ -79,13 +81,14 @@ def detect_objects(
         range, or nothing is detected.
     """
     bits = np.zeros(np.shape(image), dtype=np.int64) if mask is None else np.asarray(mask)
-    if bits.dtype.kind not in "iub":
+    if bits.dtype.kind not in "iub" or hasattr(mask, "unit"):
         raise DomainError(f"mask has type {bits.dtype}: expected integers, the bits of each pixel")
     bits = bits.astype(np.int64)
+    require_count(saturated, "saturated", 0, 2**63 - 1)
     pixels, variances, ignored = check_pixels(image, variance, bits & ~np.int64(saturated))
     options = _options(threshold, min_area, kernel, deblend_levels, deblend_contrast)
-    if background_size is not None and background_size < 1:
-        raise DomainError(f"background_size = {background_size}: expected at least 1 pixel")
+    if background_size is not None:
+        require_count(background_size, "background_size", 1, 2**31 - 1)
     if ignored.all():
         raise DomainError("mask: expected at least one pixel that is not masked")
     data = np.where(ignored, 0.0, pixels)
@@ -113,8 +116,7 @@ def _options(
     """Return the arguments of SEP's extraction."""
     options: dict[str, Any] = {"thresh": require_positive(threshold, "threshold", "standard deviations")}
     for name, value in (("min_area", min_area), ("deblend_levels", deblend_levels)):
-        if value < 1:
-            raise DomainError(f"{name} = {value}: expected at least 1")
+        require_count(value, name, 1, 2**31 - 1)
     if not 0.0 <= deblend_contrast <= 1.0:
         raise DomainError(f"deblend_contrast = {deblend_contrast}: expected a number from 0 to 1")
     if kernel is not None:

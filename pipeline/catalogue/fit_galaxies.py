@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
-from ...core.units import real_array, require_positive
+from ...core.units import pure_numbers, real_array, require_positive
 from .cutouts import cut_out, first_pixel
 from .galaxy_fits import GalaxyFits, GalaxyFlag, joined
 from .gaussian_model import PARAMETERS, SIDE_STEP, GaussianStamps
@@ -31,6 +32,7 @@ _BATCH_NUMBERS = 1 << 23
 _PSF_SUM_TOLERANCE = 1e-4
 
 
+@check_arguments
 def fit_galaxies(
     image: ArrayLike,
     variance: ArrayLike,
@@ -39,7 +41,7 @@ def fit_galaxies(
     psf_images: ArrayLike,
     *,
     half_light_radius: ArrayLike,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
     segmentation: ArrayLike | None = None,
     max_evaluations: int = 30,
     tolerance: float = 1e-5,
@@ -95,7 +97,7 @@ def fit_galaxies(
     places = _positions(x, y, pixels.shape)
     count = len(places)
     try:
-        radius = np.broadcast_to(np.asarray(half_light_radius, dtype=np.float64), (count,))
+        radius = np.broadcast_to(pure_numbers(half_light_radius, "half_light_radius"), (count,))
     except (TypeError, ValueError) as error:
         raise DomainError(f"half_light_radius: expected one number or {count}") from error
     radius = np.where(np.isnan(radius), 0.5 * STAMP_SIDES[0] / STAMP_RADII, radius)
@@ -131,12 +133,13 @@ def fit_galaxies(
     return joined(parts, members)
 
 
+@check_arguments
 def fit_galaxy_stamps(
     stamps: ArrayLike,
     variance: ArrayLike,
     psf_images: ArrayLike,
     *,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
     max_evaluations: int = 30,
     tolerance: float = 1e-5,
     threads: int | None = None,
@@ -163,7 +166,7 @@ def fit_galaxy_stamps(
         As of :func:`fit_galaxies`.
     """
     options = _options(max_evaluations, tolerance, threads)
-    pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]")
+    pixels, variances, ignored = check_pixels(stamps, variance, mask, axes="[n, ny, nx]", name="stamps")
     count, ny, nx = pixels.shape
     psfs, templates = _psfs(psf_images, count)
     side = -(-max(ny, nx) // SIDE_STEP) * SIDE_STEP
@@ -264,6 +267,8 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     scale = np.where(scale > 0.0, scale, 1.0)
     scaled = matrix / (scale[:, :, None] * scale[:, None, :])
     # Six parameters of fewer pixels: the smallest eigenvalue is rounding.
+    known &= np.isfinite(scaled).all(axis=(1, 2))
+    scaled[~known] = np.eye(matrix.shape[1])
     known &= np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
     result = np.full(matrix.shape, np.nan)
     result[known] = np.linalg.inv(scaled[known]) / (scale[known, :, None] * scale[known, None, :])

@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.products import Columns, described_table
 from ...core.units import real_array, require_positive
@@ -211,6 +212,7 @@ def joined(parts: Sequence[GalaxyFits], places: Sequence[np.ndarray]) -> GalaxyF
     return GalaxyFits(**values)
 
 
+@check_arguments
 def usable_galaxies(
     fits: GalaxyFits,
     half_light_radius: ArrayLike,

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import real_array, require_positive
 
 
+@check_arguments
 def match_positions(x: ArrayLike, y: ArrayLike, true_x: ArrayLike, true_y: ArrayLike, radius: float) -> np.ndarray:
     """Match positions to true ones that are mutually nearest.
 
@@ -89,6 +91,7 @@ class DetectionRates:
         return _fraction(self.n_real, self.n_detected)
 
 
+@check_arguments
 def detection_rates(
     magnitude: ArrayLike, match: ArrayLike, true_magnitude: ArrayLike, edges: ArrayLike
 ) -> DetectionRates:

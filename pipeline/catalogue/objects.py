@@ -8,6 +8,7 @@ from enum import IntFlag
 import numpy as np
 from astropy.table import Table
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.products import Columns, described_table
 from ...core.version import VERSION
@@ -94,10 +95,12 @@ class DetectedObjects:
         """Ellipticity of the isophote along the diagonal x = y."""
         return self.ellipticity * np.sin(2.0 * self.theta)
 
+    @check_arguments
     def magnitude(self, zero_point: float) -> np.ndarray:
         """Return magnitudes for that of unit flux; NaN where the flux is not positive."""
         return zero_point - 2.5 * np.log10(np.where(self.flux > 0.0, self.flux, np.nan))
 
+    @check_arguments
     def table(self, zero_point: float | None = None) -> Table:
         """Return the catalogue as a table with units and descriptions, with magnitudes where a zero point is given.
 

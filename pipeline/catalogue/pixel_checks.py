@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ...core.errors import DomainError
+from ...core.errors import DomainError, shown
 from ...core.units import real_array
 
 
 def check_pixels(
-    image: ArrayLike, variance: ArrayLike, mask: ArrayLike | None, *, axes: str = "[ny, nx]"
+    image: ArrayLike,
+    variance: ArrayLike,
+    mask: ArrayLike | NDArray[np.bool_] | None,
+    *,
+    axes: str = "[ny, nx]",
+    name: str = "image",
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return image and variance as float64, and the masked pixels as bool, all of one shape.
 
@@ -19,19 +24,28 @@ def check_pixels(
     DomainError
         If shapes differ, or a pixel that is not masked is not finite or has no positive variance.
     """
-    pixels = real_array(image, f"image: expected real numbers {axes}")
+    pixels = real_array(image, f"{name}: expected real numbers {axes}")
     variances = real_array(variance, f"variance: expected real numbers {axes}")
-    ignored = np.zeros(pixels.shape, dtype=bool) if mask is None else np.asarray(mask) != 0
+    ignored = flagged(mask, pixels.shape)
     if pixels.ndim != axes.count(",") + 1 or 0 in pixels.shape[-2:]:
-        raise DomainError(f"image has shape {pixels.shape}: expected {axes}")
+        raise DomainError(f"{name} has shape {pixels.shape}: expected {axes}")
     if variances.ndim == 0:
         variances = np.broadcast_to(variances, pixels.shape)
-    for name, other in (("variance", variances), ("mask", ignored)):
+    for other_name, other in (("variance", variances), ("mask", ignored)):
         if other.shape != pixels.shape:
-            raise DomainError(f"{name} has shape {other.shape}: expected {pixels.shape}, that of the image")
-    _require(np.isfinite(pixels) | ignored, "image", pixels, "finite")
+            raise DomainError(f"{other_name} has shape {other.shape}: expected {pixels.shape}, that of the {name}")
+    _require(np.isfinite(pixels) | ignored, name, pixels, "finite")
     _require((np.isfinite(variances) & (variances > 0.0)) | ignored, "variance", variances, "positive and finite")
     return pixels, variances, ignored
+
+
+def flagged(mask: ArrayLike | NDArray[np.bool_] | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Return where a mask is not zero, bool; nowhere in an image of a shape without a mask."""
+    if mask is None:
+        return np.zeros(shape, dtype=bool)
+    if hasattr(mask, "unit"):
+        raise DomainError(f"mask = {shown(mask)}: expected numbers without a unit")
+    return np.asarray(mask) != 0
 
 
 def _require(good: np.ndarray, name: str, values: np.ndarray, expected: str) -> None:

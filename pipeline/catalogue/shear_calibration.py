@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import real_array
 
@@ -39,6 +40,7 @@ class ShearCalibration:
     n_rings: int
 
 
+@check_arguments
 def shear_calibration(e1: ArrayLike, e2: ArrayLike, shear1: ArrayLike, shear2: ArrayLike) -> ShearCalibration:
     """Fit straight lines to the mean ellipticities of rings of galaxies against their shear.
 

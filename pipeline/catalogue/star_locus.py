@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import real_array, require_positive
+from ...core.units import real_array, require_count, require_positive
 from ..simulate.stamps import center_stamps
 from .cutouts import cut_out, first_pixel
 from .objects import DetectedObjects
+from .pixel_checks import flagged
 
 # The locus is the fullest interval of half-light radii of this relative width, and has at least so many times the
 # objects that intervals as wide have to either side of it, between these multiples of its radius.
@@ -73,7 +75,8 @@ class StarSelection:
     def __len__(self) -> int:
         return len(self.index)
 
-    def completeness(self, is_star: ArrayLike) -> float:
+    @check_arguments
+    def completeness(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:
         """Return the fraction of true stars of sufficient S/N that were selected; NaN where there are none.
 
         `is_star` [n] says which objects are stars in truth.
@@ -81,18 +84,20 @@ class StarSelection:
         true = self._truth(is_star) & (self.cuts & StarCut.FAINT == 0)
         return float((self.cuts[true] == 0).mean()) if true.any() else np.nan
 
-    def purity(self, is_star: ArrayLike) -> float:
+    @check_arguments
+    def purity(self, is_star: ArrayLike | NDArray[np.bool_]) -> float:
         """Return the fraction of selected objects that are stars in truth; NaN where none were selected."""
         true = self._truth(is_star)
         return float(true[self.index].mean()) if len(self) else np.nan
 
-    def _truth(self, is_star: ArrayLike) -> np.ndarray:
+    def _truth(self, is_star: ArrayLike | NDArray[np.bool_]) -> np.ndarray:
         true = np.asarray(is_star)
         if true.shape != self.cuts.shape or true.dtype.kind != "b":
             raise DomainError(f"is_star has shape {true.shape} and type {true.dtype}: expected bool {self.cuts.shape}")
         return true
 
 
+@check_arguments
 def select_stars(
     objects: DetectedObjects,
     image: ArrayLike,
@@ -104,7 +109,7 @@ def select_stars(
     isolation: float = 12.0,
     min_stars: int = 10,
     size: int = 31,
-    mask: ArrayLike | None = None,
+    mask: ArrayLike | NDArray[np.bool_] | None = None,
 ) -> StarSelection:
     """Select isolated stars by the stellar locus, and cut out their stamps.
 
@@ -146,10 +151,11 @@ def select_stars(
     pixels = real_array(image, "image: expected real numbers [ny, nx]")
     if pixels.shape != objects.segmentation.shape:
         raise DomainError(f"image has shape {pixels.shape}: expected {objects.segmentation.shape}, that of the objects")
-    if mask is not None and np.shape(mask) != pixels.shape:
-        raise DomainError(f"mask has shape {np.shape(mask)}: expected {pixels.shape}, that of the image")
-    bad = ~np.isfinite(pixels) | (np.zeros(pixels.shape, dtype=bool) if mask is None else np.asarray(mask) != 0)
-    if size < 1 or size % 2 == 0:
+    masked = flagged(mask, pixels.shape)
+    if masked.shape != pixels.shape:
+        raise DomainError(f"mask has shape {masked.shape}: expected {pixels.shape}, that of the image")
+    bad = ~np.isfinite(pixels) | masked
+    if require_count(size, "size", 1, 4096) % 2 == 0:
         raise DomainError(f"size = {size}: expected an odd number of pixels")
     for name, value in (
         ("min_snr", min_snr),

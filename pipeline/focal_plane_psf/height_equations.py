@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from ...core.files import write_bytes
+from ...core.files import make_folder, write_bytes
 from ...core.threads import one_blas_thread
 from .covariance import Covariance
 from .fit import BlockEquations, ExposureFit
@@ -69,7 +69,7 @@ class HeightEquations(NamedTuple):
         for i, covariance in enumerate(self.state.covariances):
             for name, value in vars(covariance).items():
                 arrays[f"{name}_{i}"] = np.asarray(value)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         content = io.BytesIO()
         np.savez(content, key=key, **arrays)
         write_bytes(path, content.getvalue())

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
-from ...core.units import metres, positive_angle
+from ...core.units import length, positive_angle
 from ...core.version import CREATOR
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
@@ -85,6 +86,7 @@ class FocalPlanePsf:
     pca: ResidualImages | None = None
 
     @classmethod
+    @check_arguments
     def fit(
         cls,
         stars: Any,
@@ -186,7 +188,7 @@ class FocalPlanePsf:
                 stamp_size=stamp_size,
             )
             prior = height_prior(mosaic, focal_plane, budget)
-        rms = float(metres(alignment_rms, "alignment_rms"))
+        rms = length(alignment_rms, "alignment_rms")
         if not rms >= 0.0:
             raise DomainError(f"alignment_rms = {rms!r}: expected a length from 0")
         fitted = fit_field(mosaic, data, instrument, prior, rms, threads, reporter)
@@ -229,6 +231,7 @@ class FocalPlanePsf:
         """Fitted heights of the CCDs; None without a telescope."""
         return None if self.field.optics is None else self.field.optics.plane
 
+    @check_arguments
     def shapes(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> PsfShapes:
         """Return the shapes of the PSF.
 
@@ -241,6 +244,7 @@ class FocalPlanePsf:
         """
         return PsfShapes.of_values(self.field.predict(self.field.mosaic.places(ccd, x, y), threads=threads)[0])
 
+    @check_arguments
     def predict(
         self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
     ) -> tuple[PsfShapes, PsfShapes]:
@@ -250,12 +254,14 @@ class FocalPlanePsf:
         sigma = np.sqrt(np.maximum(np.zeros_like(values) if variance is None else variance, 0.0))
         return PsfShapes.of_values(values), PsfShapes(sigma[:, 0], sigma[:, 1], np.exp(values[:, 2]) * sigma[:, 2])
 
+    @check_arguments
     def uncertainty(
         self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
     ) -> PsfShapes:
         """Return standard deviations of e1, e2 and the size [rad]; arguments as for :meth:`shapes`."""
         return self.predict(ccd, x, y, threads=threads)[1]
 
+    @check_arguments
     def draw(self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None) -> np.ndarray:
         """Return images of the PSF, centred and of unit sum, shape [n, ny, nx]; arguments as for :meth:`shapes`.
 
@@ -267,6 +273,7 @@ class FocalPlanePsf:
         values, _ = self.field.predict(places, threads=threads)
         return self._images(places, values, threads)
 
+    @check_arguments
     def draw_uncertainty(
         self, ccd: str | Sequence[str], x: ArrayLike, y: ArrayLike, *, threads: int | None = None
     ) -> np.ndarray:
@@ -282,11 +289,13 @@ class FocalPlanePsf:
             total += (0.5 * (ends[0] - ends[1])) ** 2
         return np.sqrt(total)
 
+    @check_arguments
     def write(self, path: str | Path) -> None:
         """Write the model as a FITS file, telescope included."""
         write_fits(Path(path), model_hdus(self), None, [CREATOR])
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path) -> FocalPlanePsf:
         """Read a model; ProductError if the file is missing, damaged or of another kind."""
         return cls(**model_fields(read_fits(Path(path)), Path(path)))

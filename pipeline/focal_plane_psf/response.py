@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.units import ARCSEC, metres, positive_angle, radians
+from ...core.units import ARCSEC, angle, length, metres, positive_angle, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.io.yaml.writer import telescope_to_yaml
@@ -107,9 +107,9 @@ class Instrument:
             telescope,
             np.atleast_1d(metres(wavelengths, "wavelengths")),
             Atmosphere.from_site("cerro_pachon", seed=0) if atmosphere is None else atmosphere,
-            float(metres(pixel_size, "pixel_size")),
-            float(metres(diffusion, "diffusion")),
-            float(radians(jitter, "jitter")),
+            length(pixel_size, "pixel_size"),
+            length(diffusion, "diffusion"),
+            angle(jitter, "jitter"),
             positive_angle(weight_fwhm, "weight_fwhm"),
             None if dispersion is None else radians(dispersion, "dispersion"),
             stamp_size,

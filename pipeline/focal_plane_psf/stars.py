@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
-from astropy.io.registry import IORegistryError
 from astropy.table import Table
+from numpy.typing import NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
-from ...core.files import require_file
+from ...core.files import parsing, require_file
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from ..measure.shapes import Shapes, measure_shapes
@@ -91,6 +92,7 @@ class FocalPlaneStars:
         return good & np.isfinite(self.x) & np.isfinite(self.y)
 
     @classmethod
+    @check_arguments
     def of_ccds(
         cls, ccds: Iterable[CcdStars], pixel_scale: float, weight_fwhm: float = 0.7 * ARCSEC
     ) -> FocalPlaneStars:
@@ -103,6 +105,7 @@ class FocalPlaneStars:
         return cls(tuple(names.tolist()), x, y, values, noise, stamps, pixel_scale, weight_fwhm)
 
     @classmethod
+    @check_arguments
     def from_products(cls, products: Sequence[CcdProduct], weight_fwhm: float = 0.7 * ARCSEC) -> FocalPlaneStars:
         """Take the observed stars that are good enough for a PSF model from the products of a run."""
         ccds = [
@@ -112,9 +115,10 @@ class FocalPlaneStars:
         return cls.of_ccds(ccds, products[0].pixel_scale if products else np.nan, weight_fwhm)
 
     @classmethod
+    @check_arguments
     def from_table(
         cls,
-        table: Table | Mapping[str, Any],
+        table: Any,
         *,
         stamps: Any = None,
         pixel_scale: float | None = None,
@@ -176,6 +180,7 @@ class FocalPlaneStars:
         return stars
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path, **options: Any) -> FocalPlaneStars:
         """Read stars from the folder of a run, or from a FITS or ECSV table with the columns of :meth:`from_table`."""
         place = Path(path)
@@ -185,24 +190,16 @@ class FocalPlaneStars:
                 raise ProductError("no products of a run (ccd_*.fits)", file=place)
             return cls.from_products([read_product(f, holdout_images=False) for f in files], **options)
         require_file(place, ProductError)
-        try:
-            table = (
-                Table.read(place)
-                if place.suffix.lower() in (".fits", ".fit")
-                else Table.read(place, format="ascii.ecsv")
-            )
-        except OSError as error:
-            raise ProductError(f"cannot be read ({error.strerror or error})", file=place) from None
-        except (ValueError, KeyError, TypeError, IndexError, IORegistryError) as error:
-            raise ProductError(
-                f"cannot be read as a table of stars ({' '.join(str(error).split())})", file=place
-            ) from None
+        with parsing(place, "cannot be read as a table of stars", ProductError):
+            kind = "fits" if place.suffix.lower() in (".fits", ".fit") else "ascii.ecsv"
+            table = Table.read(place, format=kind)
         try:
             return cls.from_table(table, **options)
         except DomainError as error:
             raise ProductError(error.reason, file=place) from None
 
-    def chosen(self, which: np.ndarray) -> FocalPlaneStars:
+    @check_arguments
+    def chosen(self, which: np.ndarray | NDArray[np.bool_]) -> FocalPlaneStars:
         """Return some of the stars, by a mask [n] or indices."""
         index = np.arange(len(self))[which]
         return FocalPlaneStars(

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.linalg
 from astropy.io import fits
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
@@ -74,6 +75,7 @@ class StaticHeights:
         """Return the prior that these heights are for another exposure."""
         return HeightPrior.known(self.focal_plane, self.covariance)
 
+    @check_arguments
     def write(self, path: str | Path) -> None:
         """Write a FITS file."""
         surfaces = self.focal_plane.surfaces
@@ -89,6 +91,7 @@ class StaticHeights:
         write_fits(Path(path), hdus, None, cards)
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path, camera: str | Camera | None = None) -> StaticHeights:
         """Read heights, of a camera that is not bundled with `camera`; ProductError if the file is no such product."""
         hdus = read_fits(Path(path))
@@ -107,6 +110,7 @@ class StaticHeights:
             raise ProductError(f"no product with heights ({' '.join(str(error).split())})", file=path) from None
 
 
+@check_arguments
 def fit_static_heights(
     exposures: Sequence[Any],
     telescope: Telescope,

@@ -10,8 +10,9 @@ import treecorr
 from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
-from ...core.errors import DomainError
-from ...core.units import ARCMIN, radians, real_array
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError, check_choice, shown
+from ...core.units import ARCMIN, angle, radians, real_array, require_count
 
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
@@ -72,11 +73,14 @@ class Correlation:
             "pairs": self.n_pairs,
         }
 
+    @check_arguments
     def within(self, separations: str) -> np.ndarray:
         """Return the bins of a range of :data:`SEPARATION_RANGES`, the upper end excluded, [n_bins] bool."""
+        check_choice("separations", separations, SEPARATION_RANGES)
         low, high = SEPARATION_RANGES[separations]
         return (self.r_arcmin >= low) & (self.r_arcmin < high)
 
+    @check_arguments
     def mean_xi_plus(self, separations: str) -> float:
         """Return the mean of xi+ over the pairs of a range of separations.
 
@@ -92,10 +96,12 @@ class Correlation:
         """
         return float(self._mean_over_pairs(separations, self.n_pairs, self.xi_plus))
 
+    @check_arguments
     def leave_one_out_mean_xi_plus(self, separations: str) -> np.ndarray:
         """Return :meth:`mean_xi_plus` without each patch in turn, [n_patches]."""
         return self._mean_over_pairs(separations, self.leave_one_out_pairs, self.leave_one_out_plus)
 
+    @check_arguments
     def error_mean_xi_plus(self, separations: str) -> float:
         """Return the jackknife error of :meth:`mean_xi_plus`; NaN without patches."""
         return float(jackknife_error(self.leave_one_out_mean_xi_plus(separations))) if self.n_patches else np.nan
@@ -108,6 +114,7 @@ class Correlation:
             return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
 
 
+@check_arguments
 def shear_correlation(
     x: ArrayLike,
     y: ArrayLike,
@@ -119,7 +126,7 @@ def shear_correlation(
     n_bins: int = 20,
     subtract_mean: bool = False,
     exact: bool | None = None,
-    patch: ArrayLike | None = None,
+    patch: Any = None,
     other: tuple[Any, Any] | None = None,
 ) -> Correlation:
     r"""Correlate ellipticities of star pairs (Jee & Tyson 2011, eq. 7).
@@ -174,14 +181,18 @@ def shear_correlation(
     columns += [real_array(v, "e1, e2: expected arrays of real numbers") for v in ellipticities]
     if columns[0].ndim != 1 or any(c.shape != columns[0].shape for c in columns):
         raise DomainError(f"x, y, e1, e2 have shapes {[c.shape for c in columns]}: expected [n] four times")
-    labels = None if patch is None else np.asarray(patch)
+    try:
+        labels = None if patch is None else np.asarray(patch)
+    except ValueError:
+        raise DomainError(f"patch = {shown(patch)}: expected one label for each star") from None
+    if np.ma.is_masked(patch):
+        raise DomainError("patch has masked labels: expected one for each star")
     if labels is not None and labels.shape != columns[0].shape:
         raise DomainError(f"patch has shape {labels.shape}: expected {columns[0].shape}, one for each star")
-    low, high = (float(radians(v, n)) for v, n in ((min_sep, "min_sep"), (max_sep, "max_sep")))
+    low, high = (angle(v, n) for v, n in ((min_sep, "min_sep"), (max_sep, "max_sep")))
     if not (np.isfinite(high) and 0.0 < low < high):
         raise DomainError(f"min_sep = {min_sep}, max_sep = {max_sep}: expected 0 < min_sep < max_sep")
-    if n_bins < 1:
-        raise DomainError(f"n_bins = {n_bins}: expected at least 1")
+    n_bins = require_count(n_bins, "n_bins", 1, 10**6)
     usable = np.all(np.isfinite(columns), axis=0)
     n_stars = int(usable.sum())
     if n_stars < 2:

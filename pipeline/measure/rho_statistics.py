@@ -26,6 +26,7 @@ import numpy as np
 from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import real_array
 from .correlation import Correlation, shear_correlation
@@ -52,6 +53,7 @@ class RhoStatistics:
         return iter((f"rho{k}", getattr(self, f"rho{k}")) for k in range(1, 6))
 
 
+@check_arguments
 def rho_statistics(
     x: ArrayLike,
     y: ArrayLike,
@@ -66,7 +68,7 @@ def rho_statistics(
     max_sep: float | Quantity,
     n_bins: int = 20,
     exact: bool | None = None,
-    patch: ArrayLike | None = None,
+    patch: Any = None,
 ) -> RhoStatistics:
     """Compute the rho statistics 1 to 5 of a PSF model (Rowe 2010; Jarvis et al. 2016, sec. 3.4).
 

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.threads import one_blas_thread
-from ...core.units import positive_angle, require_positive
+from ...core.units import positive_angle, pure_numbers, real_numbers, require_positive
 
 _BATCH_PIXELS = 1 << 20  # 8 MB a work array: the memory used does not grow with the number of stars
 
@@ -73,6 +74,7 @@ class Shapes:
         return len(self.flags)
 
 
+@check_arguments
 def measure_shapes(
     images: ArrayLike,
     pixel_scale: ArrayLike,
@@ -132,7 +134,7 @@ def measure_shapes(
     tolerance = require_positive(tolerance, "tolerance", "pixels")
     count = len(stack)
     try:
-        level = np.broadcast_to(np.asarray(background, dtype=np.float64), (count,))
+        level = np.broadcast_to(pure_numbers(background, "background"), (count,))
     except ValueError as error:
         raise DomainError(f"background has shape {np.shape(background)}: expected one value or {count}") from error
     batch = max(1, _BATCH_PIXELS // (stack.shape[1] * stack.shape[2]))
@@ -334,7 +336,8 @@ def _area_above(fine: np.ndarray, level: float) -> float:
 
 def _stack(images: Any) -> np.ndarray:
     """Return the images as an array [n, ny, nx]."""
-    array = np.asarray(images)
+    numbers = real_numbers(images)
+    array = np.empty(0) if numbers is None or hasattr(numbers, "unit") else np.asarray(numbers)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or min(array.shape[1:]) < 3 or array.dtype.kind not in "iufb":

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from astropy.io import fits
 from astropy.table import Table
-from astropy.table.meta import YamlParseError
 
+from ...core.arguments import check_arguments
 from ...core.errors import ProductError
-from ...core.files import read_bytes
+from ...core.files import parsing, read_bytes
 
 #: Names that SExtractor and the LSST pipelines have for columns, in lower case.
 OTHER_NAMES = {
@@ -34,6 +33,7 @@ class StarCutouts(NamedTuple):
     positions: np.ndarray  #: [n, 2], in the unit of the table
 
 
+@check_arguments
 def load_stars(
     catalogue: str | Path,
     *,
@@ -78,9 +78,10 @@ def load_stars(
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
         if not tables:
             raise ProductError(f"has no table, expected one with columns {x}, {y}", file=path)
-        # SExtractor's LDAC files have a table of the image's header before that of the objects.
-        table = next((t for t in tables if _known_as(x, t.columns.names)), tables[0])
-        columns = {name: np.asarray(table.data[name]) for name in table.columns.names}
+        with parsing(path, "damaged or not FITS", ProductError):
+            # SExtractor's LDAC files have a table of the image's header before that of the objects.
+            table = next((t for t in tables if _known_as(x, t.columns.names)), tables[0])
+            columns = {name: np.asarray(table.data[name]) for name in table.columns.names}
     elif data.lstrip().startswith(b"# %ECSV"):
         columns = _ecsv(path, data)
     else:
@@ -119,12 +120,10 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
     """Return the parts of a FITS file in memory; the warning that it is cut short is an error, others are dropped."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        try:
+        with parsing(path, "damaged or not FITS", ProductError):
             hdus = fits.open(io.BytesIO(data), lazy_load_hdus=False)
             for hdu in hdus:
                 hdu.data  # noqa: B018 - reads it now, within the checks
-        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise ProductError(f"damaged or not FITS ({' '.join(str(error).split())})", file=path) from None
     cut = [str(w.message) for w in caught if "truncated" in str(w.message).lower()]
     if cut:
         raise ProductError(f"cut short ({' '.join(cut[0].split())})", file=path)
@@ -133,10 +132,8 @@ def _fits(path: Path, data: bytes) -> fits.HDUList:
 
 def _ecsv(path: Path, data: bytes) -> dict[str, np.ndarray]:
     """Return the columns of an ECSV table; values left empty are NaN."""
-    try:
+    with parsing(path, "damaged or no ECSV table", ProductError):
         table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
-    except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, YamlParseError) as error:
-        raise ProductError(f"damaged or no ECSV table ({' '.join(str(error).split())})", file=path) from None
     columns = {}
     for name in table.colnames:
         values = table[name]

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import real_array
+from ...core.units import pure_numbers, real_array
 
 # How far stars of one CCD may differ from their median: this fraction of the geometric mean of the pixel's value and
 # the peak's, one standard deviation.
@@ -81,6 +82,7 @@ def _defect_counts(flags: np.ndarray) -> str:
     )
 
 
+@check_arguments
 def flag_stars(
     stamps: ArrayLike, noise: ArrayLike, *, gain: float = 1.0, saturation: float | None = None, threshold: float = 6.0
 ) -> Selection:
@@ -119,7 +121,7 @@ def flag_stars(
     images = _images(stamps)
     count = len(images)
     try:
-        rms = np.broadcast_to(np.asarray(noise, dtype=np.float64), (count,))
+        rms = np.broadcast_to(pure_numbers(noise, "noise"), (count,))
     except (TypeError, ValueError) as error:
         raise DomainError(f"noise = {noise!r}: expected one number or {count}") from error
     for name, value in (("noise", rms), ("gain", gain), ("threshold", threshold), ("saturation", saturation)):

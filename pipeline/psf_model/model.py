@@ -14,8 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.threads import one_blas_thread
@@ -64,12 +65,10 @@ class PsfModel:
     scale : float
         rms width of the Gaussian under shapelets [pixel]; NaN else.
     weights : array or None
-        Of the stars in the polynomials, [n].
-        Under kriging the inverse variances of their noise, in units of the middle star's.
+        Of the stars in the polynomials, [n]; under kriging their inverse variances, in units of the middle star's.
     kernel : array or None
         Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
-        the noise, [k, 3]; under kriging five columns, see :data:`.kriging.COLUMNS`. None where there are only
-        polynomials.
+        the noise, [k, 3]; under kriging [k, :data:`.kriging.COLUMNS`]. None where there are only polynomials.
     alpha : array or None
         Dual coefficients of the Gaussian process: inverse covariance times coefficients less trend, [n, k].
     """
@@ -95,6 +94,7 @@ class PsfModel:
         return f"<PsfModel: {parts}, stamps {self.mean.shape[1]} x {self.mean.shape[0]}>"
 
     @classmethod
+    @check_arguments
     def fit(
         cls,
         stamps: ArrayLike,
@@ -103,7 +103,7 @@ class PsfModel:
         basis: Literal["pca", "pixels", "shapelets"] = "pca",
         interpolation: Literal["polynomial", "gp", "kriging"] = "polynomial",
         weights: ArrayLike | None = None,
-        masks: ArrayLike | None = None,
+        masks: NDArray[np.bool_] | None = None,
         n_components: int | Literal["auto"] | None = None,
         order: int | None = None,
         extent: ArrayLike | None = None,
@@ -152,8 +152,7 @@ class PsfModel:
         gain : float or None
             Electrons in a unit of the stamps, for the photon noise in kriging; None for none.
         clip_sigma : float or None
-            Pixels that deviate by more standard deviations are rejected; None rejects nothing, as befits stars without
-            noise.
+            Pixels that deviate by more standard deviations are rejected; with None, for noise-free stars, none is.
         max_iterations : int
             Most passes of the rejection.
         replacement : str
@@ -249,11 +248,11 @@ class PsfModel:
             q, _ = np.linalg.qr(weighted(design_matrix(self.positions, self.extent, self.order), self.weights))
         return (q**2).sum(axis=1)
 
+    @check_arguments
     def at(self, positions: ArrayLike) -> np.ndarray:
-        """Evaluate the PSF at positions of any number, [m, ny, nx], unit sum.
+        """Evaluate the PSF at positions, [m, ny, nx], unit sum.
 
-        Outside the extent the polynomials are extrapolated. Each position is evaluated on its own: splitting a batch
-        changes no byte.
+        Outside the extent polynomials are extrapolated. Positions are evaluated on their own: no batch changes a byte.
 
         Parameters
         ----------
@@ -262,10 +261,12 @@ class PsfModel:
         """
         return self._combine(self.amplitudes(positions))
 
+    @check_arguments
     def draw(self, x: float, y: float) -> np.ndarray:
         """Evaluate the PSF at one position, [ny, nx], unit sum."""
         return self.at((x, y))[0]
 
+    @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the amplitudes of the components at positions, [m, k]."""
         terms = design_matrix(positions, self.extent, self.order)
@@ -287,10 +288,9 @@ class PsfModel:
     def leave_one_out(self) -> np.ndarray:
         """Return the model at each star with that star left out of the interpolation, [n, ny, nx].
 
-        Mean PSF and components are held, to which the star did contribute, and so is the kernel of a Gaussian process;
-        only the polynomials are those of the other n - 1 stars. That needs no new fit: the residual of a star left out
-        is its residual in the full fit divided by 1 - leverage. NaN where the other stars do not determine the
-        polynomials.
+        Mean PSF, components and the kernel of a process are held, to which the star did contribute; only the
+        polynomials are those of the other n - 1 stars. That needs no new fit: the residual of a star left out is that
+        in the full fit divided by 1 - leverage. NaN where the other stars do not determine the polynomials.
         """
         return self._combine(self.coefficients - self._leave_one_out_residuals())
 
@@ -300,6 +300,7 @@ class PsfModel:
         squares = (self._leave_one_out_residuals() ** 2).sum(axis=1) + self.unexplained
         return float(np.sqrt(squares.mean() / self.mean.size))
 
+    @check_arguments
     def truncated(self, n_components: int) -> PsfModel:
         """Return the model with its first components only, what the others held counted as unexplained.
 
@@ -321,6 +322,7 @@ class PsfModel:
             alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
+    @check_arguments
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
         """Return the model as FITS extensions, lossless; :meth:`from_hdus` reads them.
 
@@ -333,6 +335,7 @@ class PsfModel:
         return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
 
     @classmethod
+    @check_arguments
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
         """Read a model from FITS extensions written by :meth:`to_hdus`.
 
@@ -343,6 +346,7 @@ class PsfModel:
         """
         return cls(**model_fields(hdus, name))
 
+    @check_arguments
     def write(self, path: str | Path, name: str = "PSF") -> None:
         """Write the model to a FITS file of its own, with checksums; lossless.
 
@@ -354,6 +358,7 @@ class PsfModel:
         write_fits(Path(path), self.to_hdus(name), None, [CREATOR])
 
     @classmethod
+    @check_arguments
     def read(cls, path: str | Path, name: str = "PSF") -> PsfModel:
         """Read a model from a FITS file: one of :meth:`write`, or the product of a CCD.
 

@@ -17,6 +17,10 @@ def term_count(order: int) -> int:
     return (order + 1) * (order + 2) // 2
 
 
+#: Highest order of a polynomial.
+MOST_ORDER = 100
+
+
 def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:
     """Return the polynomial terms at each position, [n, n_terms], of total degree up to `order`.
 
@@ -24,8 +28,8 @@ def design_matrix(positions: Any, extent: Extent, order: int) -> np.ndarray:
     from the extent to [-1, 1]. They span the same functions as x^l y^m (Jee & Tyson 2011, sec. 3) and stay nearly
     orthogonal for stars spread over the CCD, so that the fit loses no digits.
     """
-    if order < 0:
-        raise ConfigError(f"order = {order}: expected a polynomial order that is not negative")
+    if not 0 <= order <= MOST_ORDER:
+        raise ConfigError(f"order = {order}: expected a polynomial order from 0 to {MOST_ORDER}")
     along_u, along_v = (np.polynomial.legendre.legvander(t, order) for t in mapped(positions, extent).T)
     columns = [along_u[:, total - m] * along_v[:, m] for total in range(order + 1) for m in range(total + 1)]
     return np.stack(columns, axis=1)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, styled
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, plain_text, styled
 from ...models.camera.camera import Camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_statistics import height_statistics, sampled_heights
@@ -32,7 +32,7 @@ def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
         _draw_map(axes, focal_plane, float(np.nanpercentile(np.abs(heights), _SCALE)))
         if camera.vendors:
             _draw_borders(axes, camera)
-        axes.set_title(title)
+        axes.set_title(plain_text(title))
         statistics = height_statistics(focal_plane)
         edge = float(np.ceil(np.nanpercentile(np.abs(heights), 99.8)))
         for name, of in groups.items():

@@ -19,7 +19,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
+from ...core.units import pure_numbers
 from .pixel_boundaries import collect, with_rim, without_rim
 
 #: Side of the pixels that the coefficients belong to [m].
@@ -96,6 +98,7 @@ def _shifts(charge: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return np.einsum("nyxab,ab->nyx", windows, kernel)
 
 
+@check_arguments
 def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = "itl", sky: float = 0.0) -> np.ndarray:
     """Return images of stars as a CCD collects them under the brighter-fatter effect.
 
@@ -126,9 +129,12 @@ def brighter_fatter(images: np.ndarray, electrons: np.ndarray, *, sensor: str = 
         If shapes do not fit, electrons are not positive, or the sky is negative.
     """
     check_choice("sensor", sensor, COEFFICIENTS)
-    stamps, counts = np.asarray(images, dtype=np.float64), np.asarray(electrons, dtype=np.float64)
+    stamps = pure_numbers(images, "images")
+    counts = pure_numbers(electrons, "electrons")
     if stamps.ndim != 3 or counts.shape != stamps.shape[:1]:
         raise DomainError(f"images, electrons of shapes {stamps.shape}, {counts.shape}: expected [n, ny, nx] and [n]")
+    if not np.isfinite(stamps).all():
+        raise DomainError("images: expected finite numbers")
     if not (np.isfinite(counts).all() and (counts > 0.0).all()):
         raise DomainError(f"electrons = {electrons}: expected positive numbers")
     if not (np.isfinite(sky) and sky >= 0.0):

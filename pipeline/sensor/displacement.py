@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.units import length, plane_points, require_positive
 from .pixel_boundaries import RIM, collect, with_rim, without_rim
 
 
@@ -28,6 +30,7 @@ class Displacement(ABC):
         """
 
 
+@check_arguments
 @dataclass(frozen=True)
 class TreeRings(Displacement):
     r"""Rings of doping about the axis of the silicon boule: radial displacement :math:`A \cos(2 \pi r/P + \varphi)`.
@@ -48,13 +51,14 @@ class TreeRings(Displacement):
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement, as :meth:`Displacement.at` says."""
-        along = np.stack(np.broadcast_arrays(np.subtract(x, self.center[0]), np.subtract(y, self.center[1])), axis=-1)
+        along = np.stack(plane_points(x, y), axis=-1) - np.array(self.center)
         radius = np.hypot(along[..., 0], along[..., 1])[..., None]
         size = self.amplitude * np.cos(2.0 * np.pi * radius / self.period + self.phase)
         # On the axis itself there is no direction.
         return size * along / np.where(radius > 0.0, radius, 1.0)
 
 
+@check_arguments
 @dataclass(frozen=True)
 class EdgeRolloff(Displacement):
     """Outward displacement near the edges of a CCD, which falls exponentially with the distance from each edge.
@@ -74,12 +78,13 @@ class EdgeRolloff(Displacement):
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement, as :meth:`Displacement.at` says."""
-        place = np.stack(np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float)), axis=-1)
+        place = np.stack(plane_points(x, y), axis=-1)
         # Beyond an edge, where the rim of a stamp may lie, it stays that of the edge.
         upper, lower = (np.maximum(self.half_size - sign * place, 0.0) for sign in (1.0, -1.0))
         return self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))
 
 
+@check_arguments
 def displace_stamps(
     images: np.ndarray, effects: Sequence[Displacement], places: np.ndarray, pixel_size: float
 ) -> np.ndarray:
@@ -111,6 +116,9 @@ def displace_stamps(
     """
     if images.ndim != 3 or places.shape != (len(images), 2):
         raise DomainError(f"images, places of shapes {images.shape}, {places.shape}: expected [n, ny, nx] and [n, 2]")
+    if not np.isfinite(images).all() or not np.isfinite(places).all():
+        raise DomainError("images, places: expected finite numbers")
+    pixel_size = require_positive(length(pixel_size, "pixel_size"), "pixel_size", "metres")
     if not effects:
         return images
     padded = with_rim(images)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, PachonError
 from ...core.version import VERSION
 from ...models.io.prescription import bundled_names, load_telescope
@@ -40,6 +41,7 @@ def bundled_baselines() -> tuple[Path, ...]:
     return tuple(sorted(_BUNDLED.glob(f"*{SUFFIX}")))
 
 
+@check_arguments
 def make_baseline(
     model: str,
     folder: str | os.PathLike[str] = "",
@@ -120,6 +122,7 @@ def make_baseline(
     return baseline, left_out
 
 
+@check_arguments
 def check_baseline(
     path: str | os.PathLike[str],
     model: str | os.PathLike[str] | Telescope | None = None,

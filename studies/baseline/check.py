@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
+
 #: Rows of a table that are shown by default; fewer where all metrics pass.
 _SHOWN, _SHOWN_PASSED = 20, 3
 _COLUMNS = ("metric", "now", "baseline", "tolerance", "unit", "deviation / tolerance", "checked against")
@@ -87,6 +89,7 @@ class BaselineCheck:
             "deviations": [{**vars(d), "deviation_over_tolerance": d.ratio} for d in self.deviations],
         }
 
+    @check_arguments
     def text(self, everything: bool = False) -> str:
         """Return verdict, notes and a table of the worst metrics, or of all."""
         shown = None if everything else _SHOWN_PASSED if self.passed else _SHOWN

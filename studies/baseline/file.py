@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from ...core.files import read_bytes, write_bytes
 from ...core.schema import Positive, Real, Section, validated
@@ -49,6 +50,7 @@ class Baseline(Section):
     figures: Annotated[dict[str, BaselineMetric], Field(min_length=1)] = Field(description="the metrics by name")
 
 
+@check_arguments
 def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     """Read a baseline; ConfigError if it is no JSON, no baseline or of another version of the format."""
     try:
@@ -72,6 +74,7 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     return baseline
 
 
+@check_arguments
 def write_baseline(path: str | os.PathLike[str], baseline: Baseline) -> None:
     """Write a baseline, whole or not at all; ProductError if it cannot be written."""
     write_bytes(Path(path), baseline_text(baseline).encode())

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice
 from ...core.progress import Reporter
 from ...models.camera.focal_plane import FocalPlane
@@ -65,6 +66,7 @@ class Shims:
     focal_plane: FocalPlane  #: shimmed
 
 
+@check_arguments
 def shim(
     experiment: Experiment,
     *,

@@ -11,7 +11,7 @@ from astropy.table import Table
 from scipy.stats import norm, qmc
 
 from ...core.errors import ConfigError
-from ...core.files import require_file
+from ...core.files import parsing, require_file
 from ...core.random_streams import stream
 from .file import Design, SweepFile, SweptParameter
 
@@ -115,11 +115,8 @@ def _quantiles(parameter: SweptParameter, u: np.ndarray) -> list[Any]:
 def _from_table(path: Path) -> list[Point]:
     """Return the rows of an ECSV table as points."""
     require_file(path, ConfigError)
-    try:
+    with parsing(path, "no ECSV table", ConfigError):
         table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:
-        # Readers of astropy raise many kinds of errors for files that are no tables.
-        raise ConfigError(f"no ECSV table ({' '.join(str(error).split())[:120]})", file=path) from None
     if not len(table):
         raise ConfigError("no rows; expected at least one point", file=path)
     points = []

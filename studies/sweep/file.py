@@ -25,6 +25,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
@@ -99,6 +100,7 @@ class SweepFile(Section):
         return digest({"sweep": self.model_dump(mode="json"), "files": contents})
 
 
+@check_arguments
 def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
     """Read a sweep file and the configuration that it names; ConfigError of one line with file, key and value."""
     path = Path(path)

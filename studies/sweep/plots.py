@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...core.plotting import figure_of, new_figure, png_bytes, styled
+from ...core.plotting import figure_of, new_figure, plain_text, png_bytes, styled
 from .analysis import Allowance, Budget, Curve
 from .table import SweepTable
 
@@ -61,14 +61,14 @@ def _draw_tornado(axes: Axes, metric: str, curves: Sequence[Curve]) -> None:
             textcoords="offset points", va="center", fontsize=7, color="0.4",
         )  # fmt: skip
     axes.axvline(0.0, color="0.3", linewidth=0.8)
-    axes.set_yticks(range(len(ordered)), [c.parameter for c in ordered])
+    axes.set_yticks(range(len(ordered)), [plain_text(c.parameter) for c in ordered])
     axes.set_title(metric, loc="left")
     axes.set_xlabel("change from nominal")
     axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 3))
     axes.grid(True, axis="x", color="0.92", linewidth=0.6)
     axes.set_axisbelow(True)
     for mark, color in names.items():
-        axes.plot([], [], color=color, linewidth=2.2, label=mark)
+        axes.plot([], [], color=color, linewidth=2.2, label=plain_text(mark))
     if names:
         axes.legend(loc="lower right")
 
@@ -85,8 +85,10 @@ def curves_plot(curves: Sequence[Curve]) -> bytes:
                     curve.value, low, high, color=_LOW, alpha=0.18, linewidth=0, label="replicas, 1 sigma"
                 )
             for i, (mark, (value, _)) in enumerate(curve.marks.items()):
-                axes.axvline(value, color=_MARKS[i % len(_MARKS)], linewidth=1.0, linestyle="--", label=mark)
-            axes.set_xlabel(curve.parameter)
+                axes.axvline(
+                    value, color=_MARKS[i % len(_MARKS)], linewidth=1.0, linestyle="--", label=plain_text(mark)
+                )
+            axes.set_xlabel(plain_text(curve.parameter))
             axes.grid(True, color="0.92", linewidth=0.6)
         panels[0, 0].legend(loc="best")
         return png_bytes(figure)
@@ -110,9 +112,9 @@ def pairs_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
                 x, y = (table.parameters[chosen[k]].astype(float) for k in (j, i + 1))
                 dots = axes.scatter(x, y, c=values, s=9, cmap="viridis", vmin=low, vmax=high, linewidths=0)
                 if i == n - 1:
-                    axes.set_xlabel(chosen[j])
+                    axes.set_xlabel(plain_text(chosen[j]))
                 if j == 0:
-                    axes.set_ylabel(chosen[i + 1])
+                    axes.set_ylabel(plain_text(chosen[i + 1]))
         bar = figure_of(grid[0, 0]).colorbar(dots, ax=grid.ravel().tolist(), fraction=0.03, pad=0.02)
         bar.set_label(metric)
         return png_bytes(figure)
@@ -135,7 +137,7 @@ def scatter_plot(table: SweepTable, metric: str, names: Sequence[str]) -> bytes:
             axes.fill_between(
                 middle, quartiles[:, 0], quartiles[:, 2], color=_LOW, alpha=0.2, linewidth=0, label="quartiles"
             )
-            axes.set_xlabel(name)
+            axes.set_xlabel(plain_text(name))
             axes.grid(True, color="0.92", linewidth=0.6)
         panels[0, 0].legend(loc="best")
         return png_bytes(figure)
@@ -150,7 +152,7 @@ def correlations_plot(found: Mapping[str, Mapping[str, tuple[float, float]]]) ->
             rho, error = np.array([each[name] for name in ordered]).T
             colors = [_HIGH if r > 0 else _LOW for r in rho]
             axes.barh(range(len(ordered)), rho, xerr=error, height=0.62, color=colors, alpha=0.75, ecolor="0.3")
-            axes.set_yticks(range(len(ordered)), ordered)
+            axes.set_yticks(range(len(ordered)), [plain_text(name) for name in ordered])
             axes.set_xlim(-1.05, 1.05)
             axes.axvline(0.0, color="0.3", linewidth=0.8)
             axes.set_title(metric, loc="left")
@@ -169,13 +171,13 @@ def budget_plot(budgets: Sequence[Budget]) -> bytes:
             up, down = 0.0, 0.0
             for name, change in sorted(budget.changes.items(), key=lambda item: names.index(item[0])):
                 base = up if change >= 0 else down
-                label = name if i == 0 else None
+                label = plain_text(name) if i == 0 else None
                 axes.bar(2.0 * i, change, 0.7, bottom=base, color=colors[names.index(name)], label=label)
                 up, down = (up + change, down) if change >= 0 else (up, down + change)
             error = budget.together_error if np.isfinite(budget.together_error) else None
             axes.bar(2.0 * i + 0.8, budget.together, 0.7, yerr=error, color="0.75", edgecolor="0.3", ecolor="0.2")
         positions = [p for i in range(len(budgets)) for p in (2.0 * i, 2.0 * i + 0.8)]
-        labels = [text for budget in budgets for text in (f"{budget.mark}\none by one", f"{budget.mark}\ntogether")]
+        labels = [f"{plain_text(budget.mark)}\n{how}" for budget in budgets for how in ("one by one", "together")]
         axes.set_xticks(positions, labels, fontsize=7)
         axes.axhline(0.0, color="0.3", linewidth=0.8)
         axes.set_ylabel(f"change of {budgets[0].metric}")
@@ -198,7 +200,8 @@ def allowance_plot(curves: Sequence[Curve], allowances: Sequence[Allowance], tar
         axes = figure.subplots()
         for curve, allowed, color in zip(curves, allowances, colors, strict=True):
             distance, rises = np.abs(curve.value - curve.nominal), curve.change > 0
-            label = curve.parameter if np.isnan(allowed.power) else f"{curve.parameter}, power {allowed.power:.2f}"
+            power = "" if np.isnan(allowed.power) else f", power {allowed.power:.2f}"
+            label = plain_text(curve.parameter) + power
             axes.plot(
                 distance[rises], curve.change[rises], "o-", color=color, markersize=3.0, linewidth=1.1, label=label
             )

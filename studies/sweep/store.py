@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import ConfigError, ProductError
+from ...core.errors import ConfigError, ProductError, cut_short
+from ...core.files import make_folder, partial_path, publish_new
 from ...core.version import VERSION
 from ...pipeline.config import differences
 from .file import SweepFile, read_sweep
@@ -71,7 +72,7 @@ class SweepStore:
         if not path.is_file():
             raise ProductError("no such file; expected the store of a sweep, such as pachon sweep makes", file=path)
         self.path = path
-        with self._guarded():
+        with self.guarded():
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
         if about.get("format") != str(FORMAT):
@@ -86,36 +87,37 @@ class SweepStore:
 
     def close(self) -> None:
         """Close the file, with the content of the write-ahead log."""
-        with self._guarded():
+        with self.guarded():
             self._connection.close()
 
     @property
     def sweep(self) -> SweepFile:
         """Sweep of the store."""
-        return read_sweep(json.loads(self.about["sweep"]), str(self.path))
+        with self.guarded():
+            return read_sweep(json.loads(self.about["sweep"]), str(self.path))
 
     def points(self) -> list[SweepPoint]:
         """Return all points in order."""
-        with self._guarded():
+        with self.guarded():
             rows = self._connection.execute("SELECT number, parameters, seed FROM points ORDER BY number").fetchall()
-        return [SweepPoint(number, json.loads(parameters), seed) for number, parameters, seed in rows]
+            return [SweepPoint(number, json.loads(parameters), seed) for number, parameters, seed in rows]
 
     def results(self) -> list[PointResult]:
         """Return the results so far, in the order of the points."""
-        with self._guarded():
+        with self.guarded():
             rows = self._connection.execute(
                 "SELECT number, metrics, problem, seconds, worker FROM results ORDER BY number"
             ).fetchall()
-        return [_result(*row) for row in rows]
+            return [_result(*row) for row in rows]
 
     def finished(self) -> set[int]:
         """Return the numbers of the points with results."""
-        with self._guarded():
+        with self.guarded():
             return {number for (number,) in self._connection.execute("SELECT number FROM results")}
 
     def forget_problems(self) -> int:
         """Delete results of points that could not be computed, and return their number."""
-        with self._guarded(), self._connection:
+        with self.guarded(), self._connection:
             return self._connection.execute("DELETE FROM results WHERE problem IS NOT NULL").rowcount
 
     def write(self, result: PointResult) -> None:
@@ -128,22 +130,25 @@ class SweepStore:
             result.worker,
             VERSION,
         )
-        with self._guarded(), self._connection:
+        with self.guarded(), self._connection:
             self._connection.execute("INSERT OR IGNORE INTO results VALUES (?, ?, ?, ?, ?, ?)", row)
 
     @contextmanager
-    def _guarded(self) -> Iterator[None]:
+    def guarded(self) -> Iterator[None]:
+        """Raise a ProductError where the file cannot be read or written, or its content is not that of a store."""
         try:
             yield
         except sqlite3.Error as error:
             raise _problem(self.path, error) from None
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+            raise _damaged(self.path, error) from None
 
 
 def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
     """Create the file of a sweep with all its points and no results, whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
+    partial = partial_path(path)
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         partial.unlink(missing_ok=True)
         connection = sqlite3.connect(partial)
         try:
@@ -164,9 +169,12 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
             connection.execute("PRAGMA journal_mode = WAL")
         finally:
             connection.close()
+        publish_new(partial, path)
+        # Of a store that was removed; nobody has opened the new one yet.
         for leftover in _beside(path):
             leftover.unlink(missing_ok=True)
-        partial.replace(path)
+    except FileExistsError:
+        raise store_exists(path) from None
     except sqlite3.Error as error:
         raise _problem(path, error) from None
     except OSError as error:
@@ -177,6 +185,11 @@ def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], ext
                 leftover.unlink(missing_ok=True)
 
 
+def store_exists(path: Path) -> ConfigError:
+    """Return the error for a new sweep whose store is there already."""
+    return ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
+
+
 def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:
     """Yield number, parameters and metrics (JSON) of every readable point of a damaged store."""
     try:
@@ -185,10 +198,11 @@ def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:
         return
     try:
         last = next(iter(connection.execute("SELECT max(number) FROM points")), (None,))[0]
-    except sqlite3.Error:
+    except (sqlite3.Error, ValueError):
         last = None
-    for number in range(0 if last is None else last + 1):
-        with suppress(sqlite3.Error):
+    # A damaged number may be any; a row takes more than a byte.
+    for number in range(min(last + 1, path.stat().st_size) if isinstance(last, int) else 0):
+        with suppress(sqlite3.Error, ValueError):
             yield from connection.execute(
                 "SELECT number, parameters, metrics FROM results JOIN points USING (number) WHERE number = ?", (number,)
             )
@@ -239,7 +253,12 @@ def _problem(path: Path, error: sqlite3.Error) -> ProductError:
     if "locked" in text:
         return ProductError(f"cannot write {path}: {text}; is another sweep writing to it?")
     if "malformed" in text or "not a database" in text or "no such table" in text:
-        return DamagedStoreError(
-            f"damaged, or no store of a sweep ({text}); pachon sweep export saves what it can", file=path
-        )
+        return _damaged(path, error)
     return ProductError(text, file=path)
+
+
+def _damaged(path: Path, error: Exception) -> DamagedStoreError:
+    text = cut_short(" ".join(str(error).split()), 120)
+    return DamagedStoreError(
+        f"damaged, or no store of a sweep ({text}); pachon sweep export saves what it can", file=path
+    )

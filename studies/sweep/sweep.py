@@ -7,6 +7,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, ProductError
 from ...core.memory import available_bytes, readable
 from ...core.progress import Reporter
@@ -16,7 +17,7 @@ from ...pipeline.config import Configuration
 from .design import design_points, point_count
 from .file import SweepFile
 from .point import PointMeasurement, check_sweep
-from .store import SweepPoint, SweepStore, check_same_sweep, create_store
+from .store import SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
 
 #: More points than this are a mistake: at a second each they would take a year.
 MOST_POINTS = 30_000_000
@@ -35,6 +36,7 @@ class SweepOutcome:
     failed: int  #: could not be computed
 
 
+@check_arguments
 def run_sweep(
     sweep: SweepFile,
     path: str | os.PathLike[str],
@@ -73,7 +75,7 @@ def run_sweep(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     path, folder = Path(path), Path() if folder is None else folder
     if path.exists() and not resume:
-        raise ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
+        raise store_exists(path)
     if not path.exists():
         check_room(sweep, path)
         points = numbered_points(sweep, folder)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.products import Columns, described_table
 from ...core.table_files import write_table
@@ -52,6 +53,7 @@ class SweepTable:
         return len(self.number)
 
 
+@check_arguments
 def load_sweep_table(path: str | os.PathLike[str]) -> SweepTable:
     """Read the results of a sweep from the file that ``pachon sweep`` or :func:`~pachon.run_sweep` wrote.
 
@@ -66,22 +68,26 @@ def load_sweep_table(path: str | os.PathLike[str]) -> SweepTable:
 
 def read_table(store: SweepStore) -> SweepTable:
     """Return the table of a store, in the order of the points."""
-    points = {p.number: p for p in store.points()}
-    results = store.results()
-    rows = [points[r.number] for r in results]
-    names = list(dict.fromkeys(name for p in points.values() for name in p.parameters))
-    metrics = list(dict.fromkeys(name for r in results for name in r.metrics or {}))
-    order = list(store.sweep.parameters) or names
-    names.sort(key=lambda n: order.index(n) if n in order else len(order))
-    return SweepTable(
-        name=store.sweep.name,
-        number=np.array([r.number for r in results], dtype=np.int64),
-        seed=np.array([p.seed for p in rows], dtype=np.int64),
-        parameters={n: np.array([p.parameters.get(n) for p in rows]) for n in names},
-        metrics={n: np.array([(r.metrics or {}).get(n, np.nan) for r in results], dtype=np.float64) for n in metrics},
-        problem=np.array([r.problem or "" for r in results], dtype=str),
-        seconds=np.array([r.seconds for r in results], dtype=np.float64),
-    )
+    with store.guarded():
+        points = {p.number: p for p in store.points()}
+        results = store.results()
+        rows = [points[r.number] for r in results]
+        names = list(dict.fromkeys(name for p in points.values() for name in p.parameters))
+        measured = [r.metrics or {} for r in results]
+        metrics = list(dict.fromkeys(name for m in measured for name in m))
+        order = list(store.sweep.parameters) or names
+        names.sort(key=lambda n: order.index(n) if n in order else len(order))
+        return SweepTable(
+            name=store.sweep.name,
+            number=np.array([r.number for r in results], dtype=np.int64),
+            seed=np.array([p.seed for p in rows], dtype=np.int64),
+            parameters={n: np.array([p.parameters.get(n) for p in rows]) for n in names},
+            metrics={
+                n: np.array([(r.metrics or {}).get(n, np.nan) for r in results], dtype=np.float64) for n in metrics
+            },
+            problem=np.array([r.problem or "" for r in results], dtype=str),
+            seconds=np.array([r.seconds for r in results], dtype=np.float64),
+        )
 
 
 def export_table(store: SweepStore, path: Path) -> int:

@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
@@ -29,7 +30,7 @@ CENTRAL_RAFT = "R22"
 class VisitsSection(Section):
     """How the field is visited, and what is looked at."""
 
-    count: Count = Field(10, description="number of visits")
+    count: Count = Field(10, le=100_000, description="number of visits")
     dither_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=5)] = Field(
         0.0, description="radius of the disc over which pointings are spread [deg]"
     )
@@ -84,6 +85,7 @@ class VisitsConfig(Section):
         return section_yaml(self, "All that decides these visits.")
 
 
+@check_arguments
 def load_visits_configuration(path: Path) -> VisitsConfig:
     """Read a configuration of visits, and that of the run that it names.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Stamp, column, read_fits, table_hdu, write_fits
@@ -37,6 +38,7 @@ SHEAR = 0.02
 _ORIENTATIONS = 4
 
 
+@check_arguments
 def null_test(
     folder: Path,
     *,

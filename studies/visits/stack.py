@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from numpy.typing import NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
 from ...core.units import ARCMIN, ARCSEC
@@ -104,11 +106,12 @@ class PsfStack:
     model_size: np.ndarray
 
     @classmethod
+    @check_arguments
     def of(
         cls,
         sums: PsfSums,
         sky: np.ndarray,
-        star: np.ndarray,
+        star: NDArray[np.bool_],
         axes: np.ndarray,
         pixel_scale: float,
         weight_fwhm: float,
@@ -158,6 +161,7 @@ class PsfStack:
     def __len__(self) -> int:
         return len(self.xi)
 
+    @check_arguments
     def write(self, path: Path, stamp: Stamp) -> None:
         """Write the stack as a FITS table of points and two cubes of images."""
         table = table_hdu(
@@ -171,6 +175,7 @@ class PsfStack:
         write_fits(path, [table, *images], stamp, [(VISITS_CARD, self.visits, "in the stack")])
 
     @classmethod
+    @check_arguments
     def read(cls, path: Path, stamp: Stamp | None = None) -> PsfStack:
         """Read a stack; ProductError for a damaged file and, with a stamp, for one of another configuration."""
         hdus = _read(path, stamp)

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PachonError, ProductError
-from ...core.files import make_folder, write_bytes, write_json
+from ...core.files import claim_folder, make_folder, write_bytes, write_json
 from ...core.memory import readable
 from ...core.products import Stamp, write_ecsv
 from ...core.progress import Reporter
@@ -57,6 +58,7 @@ def stack_path(folder: Path, visits: int) -> Path:
     return folder / f"stack_{visits:04d}.fits"
 
 
+@check_arguments
 def stack_visits(
     config: VisitsConfig,
     folder: Path,
@@ -100,17 +102,17 @@ def stack_visits(
     frame = StackFrame.of(experiment, STACK_STAMP)
     points = sky_points_of(experiment, config, frame)
     visits = config.plan(experiment.config.seed)
-    _check_folder(folder, config, resume)
+    make_folder(folder)
+    _check_room(folder, points, len(config.kept))
+    _claim(folder, config, resume)
     sums = _sums_so_far(folder, stamp, len(points), resume)
     if sums.visits > len(visits):
         raise ProductError(f"{folder} holds {sums.visits} visits: expected at most {len(visits)}; choose another --out")
     gone = [n for n in config.kept if n <= sums.visits and not stack_path(folder, n).exists()]
     if gone:
         raise ProductError(f"{folder} kept no stack of {gone[0]} visits, and has gone on; choose another --out")
-    write_bytes(folder / CONFIG_NAME, config.to_yaml().encode())
     if sums.visits:
         reporter.line(f"{sums.visits} of {len(visits)} visits are stacked already")
-    _check_room(folder, points, len(config.kept))
     scale = pixel_scale_of(frame)
     for visit in visits[sums.visits :]:
         reporter.line(f"visit {visit.number + 1} of {len(visits)}, roll {np.rad2deg(visit.roll):.0f} deg")
@@ -156,11 +158,11 @@ def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFram
     return draw_points(experiment.config.seed, radius, cell_of(experiment, frame), settings.stars, settings.places)
 
 
-def _check_folder(folder: Path, config: VisitsConfig, resume: bool) -> None:
-    """Make the folder, or check that its visits are of the same configuration, but for their number."""
-    make_folder(folder)
+def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
+    """Write the configuration, or check that the visits of the folder are of the same, but for their number."""
     path = folder / CONFIG_NAME
-    if path.exists():
+
+    def check() -> None:
         try:
             before = load_visits_configuration(path)
         except PachonError as error:
@@ -174,6 +176,8 @@ def _check_folder(folder: Path, config: VisitsConfig, resume: bool) -> None:
         found = differences(old, new)
         if found:
             raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])})")
+
+    claim_folder(path, config.to_yaml().encode(), products="stack_*.fits", check=check)
 
 
 def _sums_so_far(folder: Path, stamp: Stamp, n: int, resume: bool) -> PsfSums:

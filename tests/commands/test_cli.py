@@ -240,7 +240,7 @@ def test_a_full_disk_is_one_line(capsys, settings_file, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, os.strerror(28), "/data/run")
 
-    monkeypatch.setattr(run_module, "claim_folder", full)
+    monkeypatch.setattr(run_module, "claim_run", full)
     assert main(["run", str(settings_file), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err == "pachon: error: /data/run: No space left on device\n"
 

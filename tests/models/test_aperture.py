@@ -111,8 +111,7 @@ def test_a_polygon_that_crosses_itself_is_refused(corners):
         (lambda: Rectangle(1.0, 1.0, angle=np.inf), "expected finite centre and angle"),
         (lambda: Vane(-0.1), "vane = -0.1 m: expected a positive width"),
         (lambda: Vane(0.1, x=np.nan), "expected finite point and angle"),
-        (lambda: Union(()), "union = .*: expected a tuple of at least one region"),
-        (lambda: Complement("disc"), "complement of 'disc': expected an aperture"),
+        (lambda: Union(()), "union of no parts: expected at least one region"),
     ],
 )
 def test_impossible_regions_are_refused(make, message):

@@ -179,7 +179,7 @@ def test_images_are_an_eighth_of_an_arcsecond_over_the_field():
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({"diameter": 0.0}, "diameter = 0.0: expected a positive number"),
+        ({"diameter": 0.0}, "diameter = 0.0: expected a positive, finite number"),
         ({"focal_ratio": -1.0}, "focal_ratio = -1.0"),
         ({"field_radius": float("nan")}, "field_radius = nan"),
         ({"beam_compression": 0.5}, "beam_compression = 0.5: expected between 0 and 0.5"),

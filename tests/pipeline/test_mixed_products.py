@@ -4,23 +4,31 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
+from pachon.core import files
 from pachon.core.errors import ConfigError, ProductError
 from pachon.core.files import _owner, remove_leftovers, write_new_bytes
 from pachon.core.workers import Workers
+from pachon.imaging import simulate
+from pachon.imaging.config import ImagesConfig
 from pachon.models.io.grid_file import write_grid
 from pachon.models.io.prescription import load_telescope, prescription_digest, save_telescope
 from pachon.models.shapes.grid import GridSag
-from pachon.pipeline import run_folder
-from pachon.pipeline.config import load_configuration
+from pachon.pipeline.config import Configuration, load_configuration
 from pachon.pipeline.experiment import Experiment
-from pachon.pipeline.run_folder import claim_folder
+from pachon.pipeline.run_folder import claim_run
 from pachon.studies.sweep.file import load_sweep
-from pachon.studies.sweep.store import PointResult, SweepStore
+from pachon.studies.sweep.store import PointResult, SweepStore, create_store
 from pachon.studies.sweep.sweep import run_sweep
+from pachon.studies.visits import visits
+from pachon.studies.visits.config import VisitsConfig
+from pachon.studies.visits.image_stack import stack_images
+from pachon.studies.visits.image_stack.config import ImageStackConfig
 
 
 def _grid(path, height):
@@ -93,24 +101,61 @@ def test_a_new_file_is_written_once_and_whole(tmp_path, links, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["config.yaml"]
 
 
-def test_a_run_that_comes_second_in_a_new_folder_is_refused(tmp_path, configuration, monkeypatch):
-    first, second = (
-        Experiment.from_config(load_configuration(configuration).model_copy(update={"seed": seed}), tmp_path)
-        for seed in (1, 2)
-    )
+def _run(folder, seed, configuration):
+    config = load_configuration(configuration).model_copy(update={"seed": seed})
+    claim_run(folder, Experiment.from_config(config, configuration.parent), resume=False)
+
+
+def _images(folder, seed, _):
+    simulate._claim(folder, ImagesConfig(run=Configuration(seed=seed)), resume=False)
+
+
+def _visits(folder, seed, _):
+    visits._claim(folder, VisitsConfig(run=Configuration(seed=seed)), False)
+
+
+def _stacked_images(folder, seed, _):
+    stack_images._claim(SimpleNamespace(folder=folder, settings=ImageStackConfig(tiles=seed)), False)
+
+
+CLAIMS = {"config.yaml": _run, "images.yaml": _images, "visits": _visits, "stack-images": _stacked_images}
+
+
+@pytest.mark.parametrize("claim", CLAIMS.values(), ids=CLAIMS)
+def test_a_run_that_comes_second_in_a_new_folder_is_refused(tmp_path, configuration, monkeypatch, claim):
     folder = tmp_path / "out"
     # The first run writes its configuration after the second has found none.
-    real = run_folder.write_new_bytes
+    real = files.write_new_bytes
 
     def late(path, content):
-        monkeypatch.setattr(run_folder, "write_new_bytes", real)
-        claim_folder(folder, first, resume=False)
+        monkeypatch.setattr(files, "write_new_bytes", real)
+        claim(folder, 1, configuration)
         return real(path, content)
 
-    monkeypatch.setattr(run_folder, "write_new_bytes", late)
-    with pytest.raises(ProductError, match="another configuration"):
-        claim_folder(folder, second, resume=False)
-    assert load_configuration(folder / "config.yaml").seed == 1
+    monkeypatch.setattr(files, "write_new_bytes", late)
+    with pytest.raises(ProductError, match=r"another configuration|holds visits already|holds images already"):
+        claim(folder, 2, configuration)
+    [written] = folder.iterdir()
+    content = yaml.safe_load(written.read_text())
+    assert 1 in (content.get("seed"), content.get("tiles"), content.get("run", {}).get("seed"))
+
+
+def test_a_sweep_that_comes_second_is_refused(tmp_path, configuration, monkeypatch):
+    path = configuration.parent / "sweep.yaml"
+    path.write_text("base: run.yaml\nparameters: {M2.dz_um: {values: [0, 1]}}\ndesign: {kind: grid}\n")
+    sweep, out = load_sweep(path), tmp_path / "s.db"
+    create_store(out, sweep, [], {"folder": "first"})
+    with pytest.raises(ConfigError, match="exists: go on with it by --resume"):
+        create_store(out, sweep, [], {"folder": "second"})
+    with SweepStore(out) as store:
+        assert store.about["folder"] == "first"
+    assert not [p for p in tmp_path.iterdir() if "partial" in p.name]
+
+
+def test_products_without_their_configuration_are_refused(tmp_path):
+    (tmp_path / "image_R22_S11.fits").write_bytes(b"")
+    with pytest.raises(ProductError, match=r"holds image_R22_S11.fits but no images.yaml"):
+        _images(tmp_path, 1, None)
 
 
 def test_temporary_files_of_live_processes_and_other_machines_stay(tmp_path):

@@ -189,7 +189,7 @@ def test_galaxies_are_spread_over_the_cells_evenly(wide):
         ((ARCMIN, 19.0, 1), "brightest < faintest"),
         ((ARCMIN, np.nan, 1), "brightest < faintest"),
         ((ARCMIN, 25.0, -1), "seed = -1"),
-        ((-1.0, 25.0, 1), "half_width"),
+        ((-1.0, 25.0, 1), "region = -1"),
         (((0.1, 0.0), (0.0, 0.1)), "xi = "),
         (([1.0, 2.0, 3.0], 25.0, 1), "region = "),
         ((0.3, 29.0, 1), "galaxies of this region: needs about"),

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import metres, require_positive
+from ...core.units import metres, pure_numbers, require_positive
 from ...models.io.site_file import load_site
 from ...models.site import Site
 from .layer_screens import LayerScreens, screen_samples
@@ -78,13 +79,14 @@ class Atmosphere(LayerScreens):
         )
 
     @classmethod
+    @check_arguments
     def from_site(
         cls,
         site: str | Site,
         seed: int,
         *,
-        r0: float | None = None,
-        outer_scale: float | None = None,
+        r0: ArrayLike | None = None,
+        outer_scale: ArrayLike | None = None,
         exposure: float = 15.0,
         time_step: float = 0.05,
         screen_size: int = 8192,
@@ -98,7 +100,7 @@ class Atmosphere(LayerScreens):
         wind_speeds: ArrayLike | None = None,
         wind_directions: ArrayLike | None = None,
         ground_lift: float = 0.0,
-        zenith_angle: float = 0.0,
+        zenith_angle: ArrayLike = 0.0,
         fixed_modulus: bool = False,
     ) -> Atmosphere:
         """Return the atmosphere of a site for one exposure.
@@ -192,6 +194,7 @@ class Atmosphere(LayerScreens):
             fixed_modulus=bool(fixed_modulus),
         )
 
+    @check_arguments
     def at_times(self, times: ArrayLike, exposure: float | None = None) -> Atmosphere:
         """Return the same turbulence at other times, with shared screens.
 
@@ -210,7 +213,7 @@ class Atmosphere(LayerScreens):
             If the times are not the middles of equal steps of the exposure, or a layer drifts farther in it than its
             screen is long.
         """
-        middles = np.array(times, dtype=np.float64)
+        middles = pure_numbers(times, "times").copy()
         if middles.ndim != 1 or len(middles) == 0 or not np.all(np.isfinite(middles)):
             raise DomainError(f"times of shape {middles.shape}: expected a list of finite times in seconds")
         if exposure is None:
@@ -223,6 +226,7 @@ class Atmosphere(LayerScreens):
         middles.setflags(write=False)
         return self._with_shared_screens(exposure=exposure, times=middles)
 
+    @check_arguments
     def at_altitudes(self, altitudes: ArrayLike) -> Atmosphere:
         """Return the same layers at other altitudes, with shared screens.
 

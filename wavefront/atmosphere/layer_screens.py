@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ...core.errors import DomainError, unknown_name
 from ...core.memory import require_bytes
 from ...core.random_streams import stream
+from ...core.units import plane_points
 from .layers import Layers
 from .screens import draw_modes, phase_screen, slope_screen, working_bytes
 from .spline import evaluate
@@ -202,7 +203,7 @@ class LayerScreens(Layers):
         if scale not in scales:
             raise unknown_name("scale", scale, tuple(scales))
         make, pixel = scales[scale]
-        x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+        x, y = plane_points(x, y)
         return evaluate(make(layer), pixel, x, y)
 
 

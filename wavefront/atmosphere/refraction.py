@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import DomainError
-from ...core.units import metres, radians
+from ...core.units import angle, metres, radians
 from ...models.media.air import filippenko_refractivity
 from ...models.site import Weather
 
@@ -67,7 +67,7 @@ def dispersion_shift(
     weather : Weather
         Weather at the telescope, such as ``site.weather``.
     """
-    zenith, position = require_zenith_angle(zenith_angle), float(radians(position_angle, "position_angle"))
+    zenith, position = require_zenith_angle(zenith_angle), angle(position_angle, "position_angle")
     if not math.isfinite(position):
         raise DomainError(f"position_angle = {position!r} rad: expected a finite angle")
     waves = np.atleast_1d(metres(wavelength, "wavelength"))

@@ -10,6 +10,7 @@ import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
+from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import clear_ring, pack_surfaces
@@ -42,8 +43,7 @@ class SpokePupil:
     @classmethod
     def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
         """Return approximately ``count`` points of an annulus of given diameter [m] and linear obscuration."""
-        if not count >= 10:
-            raise DomainError(f"n_pupil = {count!r}: expected at least 10 pupil points")
+        require_count(count, "n_pupil", 10)
         n_ring = min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), _MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)

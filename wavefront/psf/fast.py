@@ -27,6 +27,7 @@ import warp as wp
 
 from ...core.errors import DomainError
 from ...core.launch import launch
+from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
@@ -80,11 +81,8 @@ class FastPsfEngine(PsfEngine):
             n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
         if oversampling is None:
             oversampling = OVERSAMPLING_STILL if still else OVERSAMPLING
-        if not n_pupil >= 10:
-            raise DomainError(f"n_pupil = {n_pupil!r}: expected at least 10 pupil points")
-        if int(oversampling) != oversampling or not 1 <= oversampling <= 32:
-            raise DomainError(f"oversampling = {oversampling!r}: expected a whole number of cells, 1 to 32 to a pixel")
-        self._oversampling = int(oversampling)
+        require_count(n_pupil, "n_pupil", 10)
+        self._oversampling = require_count(oversampling, "oversampling", 1, 32)
         self._place_pupil(n_pupil)
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.errors import DomainError
+from ...core.units import require_count
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,7 @@ class ImagePlane:
     jitter: float = 0.0  #: rms along each axis of how far the telescope's pointing moves images during an exposure [m]
 
     def __post_init__(self) -> None:
-        if int(self.stamp_size) != self.stamp_size or self.stamp_size < 3:
-            raise DomainError(f"stamp_size = {self.stamp_size!r}: expected a whole number of at least 3 pixels")
+        require_count(self.stamp_size, "stamp_size", 3, 4096)
         if not (math.isfinite(self.pixel_size) and self.pixel_size > 0.0):
             raise DomainError(f"pixel_size = {self.pixel_size!r}: expected a positive length in metres")
         for name, rms in (("diffusion", self.diffusion), ("jitter", self.jitter)):

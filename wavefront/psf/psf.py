@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.units import ARCSEC, metres, radians
+from ...core.units import ARCSEC, angle, length, metres, pure_numbers, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
@@ -67,6 +68,7 @@ class Psfs:
         return f"<Psfs: images {list(self.image.shape)}, {pixel}, {', '.join(waves)} nm>"
 
 
+@check_arguments
 def make_psfs(
     telescope: Telescope,
     fields: ArrayLike,
@@ -176,8 +178,8 @@ def make_psfs(
     shifts = None if dispersion is None else _table(radians(dispersion, "dispersion"), "dispersion", len(lengths))
     plane = ImagePlane(
         stamp_size,
-        float(metres(pixel_size, "pixel_size")),
-        float(metres(diffusion, "diffusion")),
+        length(pixel_size, "pixel_size"),
+        length(diffusion, "diffusion"),
         _on_detector(jitter, telescope, lengths),
     )
     maker = ENGINES[engine](
@@ -227,20 +229,15 @@ def make_psfs(
 
 def _on_detector(jitter: Any, telescope: Telescope, wavelengths: np.ndarray) -> float:
     """Return the displacement on the detector [m] of a jitter [rad], at the centre of the field."""
-    angle = radians(jitter, "jitter")
-    if angle.size != 1 or not (np.isfinite(angle) & (angle >= 0.0)).all():
-        raise DomainError(f"jitter = {jitter!r}: expected an angle in radians from 0")
-    if not angle.any():
-        return 0.0
-    return float(angle.item() * center_focal_length(telescope, wavelengths))
+    spread = angle(jitter, "jitter")
+    if not spread >= 0.0:
+        raise DomainError(f"jitter = {spread:g}: expected an angle in radians from 0")
+    return spread * center_focal_length(telescope, wavelengths) if spread else 0.0
 
 
 def _table(values: Any, name: str, count: int | None) -> np.ndarray:
     """Return pairs of finite numbers as a float64 array of shape [count, 2]."""
-    try:
-        table = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise DomainError(f"{name} = {values!r}: expected pairs of numbers") from error
+    table = pure_numbers(values, name)
     if count is None:
         table = np.atleast_2d(table) if table.size else table.reshape(0, 2)
     if table.ndim != 2 or table.shape[1] != 2 or (count is not None and len(table) != count):

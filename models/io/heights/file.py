@@ -18,7 +18,7 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
 from ....core.errors import HeightWarning, PrescriptionError, error_context
-from ....core.files import require_file
+from ....core.files import parsing, require_file
 from ...camera.camera import Camera
 from ...camera.ccd_surfaces import CcdSurfaces
 from ...camera.height_fit import fit_heights
@@ -34,16 +34,6 @@ _COVERED = 0.9
 _LARGEST = 0.2e-3
 # Cells a side into which a CCD is divided to find gaps, and points that a cell should have.
 _MOST_CELLS, _POINTS_PER_CELL = 16, 4
-_FITS_PROBLEMS = (
-    AstropyUserWarning,
-    fits.VerifyError,
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,18 +85,15 @@ def _content(path: Path) -> Table | dict[str, np.ndarray]:
     if path.suffix.lower() not in ENDINGS:
         raise PrescriptionError(f"expected a file of heights that ends in {', '.join(ENDINGS)}", file=path)
     require_file(path, PrescriptionError)
-    try:
+    with parsing(path, "cannot be read", PrescriptionError):
         if path.suffix.lower() == ".ecsv":
             return Table.read(path, format="ascii.ecsv")
-        with warnings.catch_warnings(), fits.open(path, memmap=False) as hdus:
+        with warnings.catch_warnings(), open(path, "rb") as file, fits.open(file, memmap=False) as hdus:
             warnings.filterwarnings("error", ".*truncated", AstropyUserWarning)
             images = [hdu for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
             if not images:
                 return Table.read(hdus)
             return image_points(images, hdus[0].header, path)
-    except _FITS_PROBLEMS as error:
-        reason = " ".join(str(error).split())
-        raise PrescriptionError(f"cannot be read ({reason[:120]})", file=path) from None
 
 
 def _table_points(table: Table, path: Path) -> np.ndarray:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
+from ....core.arguments import check_arguments
 from ....core.errors import PrescriptionError, unknown_name
 from ...camera.sensor_heights import CornerSensor, SensorHeights
 from ...camera.zernike_surfaces import ZernikeSurfaces
@@ -78,6 +79,7 @@ def bundled_heights(name: str) -> SensorHeights:
     return zernike_heights(Table.read(path, format="ascii.ecsv"), path)
 
 
+@check_arguments
 def corner_sensors(name: str = "lsstcam") -> tuple[CornerSensor, ...]:
     """Return the wavefront sensors and guiders of a camera as built, with their measured heights.
 

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from ....core.errors import PrescriptionError
+from ....core.errors import PrescriptionError, cut_short
 from ....core.files import read_bytes
-from ....core.yaml_reader import cut_short
 
 
 def read_text(path: Path) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ....core.errors import ConfigError, DomainError, PachonError, ProductError
-from ....core.files import make_folder, write_bytes
+from ....core.files import claim_folder
 from ....core.memory import readable, require_bytes
 from ....core.products import Stamp
 from ....core.progress import Reporter
@@ -345,16 +345,17 @@ def _resolved(
 
 def _claim(stack: ImageStack, resume: bool) -> None:
     """Make the folder, or check that its images are of the same settings."""
-    make_folder(stack.folder)
     path = stack.folder / SETTINGS_NAME
-    before = _settings_before(stack.folder)
-    if before is not None:
+
+    def check() -> None:
         if not resume:
             raise ProductError(f"{stack.folder} holds images already; go on with --resume, or remove it")
-        found = differences(*(s.model_dump(mode="json") for s in (before, stack.settings)))
+        settings = (load_image_stack_configuration(path), stack.settings)
+        found = differences(*(s.model_dump(mode="json") for s in settings))
         if found:
             raise ProductError(f"{stack.folder} holds images of other settings ({'; '.join(found[:3])})")
-    write_bytes(path, stack.settings.to_yaml().encode())
+
+    claim_folder(path, stack.settings.to_yaml().encode(), products="*.fits", check=check)
 
 
 def _sums_so_far(stack: ImageStack, tile: Tile, resume: bool) -> TileSums:

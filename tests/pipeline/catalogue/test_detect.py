@@ -171,10 +171,10 @@ def test_tables(found, tmp_path, ending):
         ({"mask": np.zeros((SIDE, SIDE))}, "mask has type float64: expected integers"),
         ({"mask": np.ones((SIDE, SIDE), dtype=int)}, "at least one pixel that is not masked"),
         ({"threshold": 0.0}, "threshold = 0.0: expected a positive"),
-        ({"min_area": 0}, "min_area = 0: expected at least 1"),
-        ({"deblend_levels": 0}, "deblend_levels = 0: expected at least 1"),
+        ({"min_area": 0}, "min_area = 0: expected a whole number of at least 1"),
+        ({"deblend_levels": 0}, "deblend_levels = 0: expected a whole number of at least 1"),
         ({"deblend_contrast": 2.0}, "deblend_contrast = 2.0: expected a number from 0 to 1"),
-        ({"background_size": 0}, "background_size = 0: expected at least 1"),
+        ({"background_size": 0}, "background_size = 0: expected a whole number of at least 1"),
         ({"kernel": np.zeros((3, 3))}, "expected .* with a positive sum"),
     ],
 )

@@ -289,7 +289,7 @@ DOT = np.ones((1, 1))
         ({"segmentation": np.zeros((40, 50))}, "segmentation has shape .* float64: expected integers"),
         ({"image": NAN}, r"image\[0, 7\] = nan: expected finite where the mask is zero"),
         ({"image": np.zeros(9)}, r"image has shape \(9,\): expected \[ny, nx\]"),
-        ({"image": "sky"}, "image: expected real numbers"),
+        ({"image": "sky"}, "image = 'sky': expected real numbers"),
         ({"variance": IMAGE}, r"variance\[0, 0\] = 0: expected positive and finite"),
         ({"x": [50.0]}, r"x, y \[0\] = \(50, 8\): expected a position in the image"),
         ({"x": [np.nan]}, r"x, y \[0\] = \(nan, 8\)"),

@@ -228,7 +228,7 @@ def test_bad_patches():
         shear_correlation(x, y, e1, e2, patch=["R22_S11"] * 10, **BINS)
     with pytest.raises(DomainError, match="shapes"):
         shear_correlation(x, y, e1, e2, other=(e1, e2[:5]), **BINS)
-    with pytest.raises(DomainError, match="other: 3 arrays given, expected two"):
+    with pytest.raises(DomainError, match=r"other = .*: expected a sequence of 2"):
         shear_correlation(x, y, e1, e2, other=(e1, e2, e1), **BINS)
 
 
@@ -238,7 +238,7 @@ def test_bad_arguments():
         shear_correlation(x, y[:5], e1, e2, **BINS)
     with pytest.raises(DomainError, match="shapes"):
         shear_correlation(0.0, 0.0, 0.0, 0.0, **BINS)
-    with pytest.raises(DomainError, match="e1, e2"):
+    with pytest.raises(DomainError, match="e1 = "):
         shear_correlation(x, y, ["a"] * 10, e2, **BINS)
     with pytest.raises(DomainError, match="0 of 10 stars"):
         shear_correlation(x, y, e1 * np.nan, e2, **BINS)

@@ -136,7 +136,7 @@ def test_bad_arguments():
     stamps, shapes, _ = observed(8, count=4)
     with pytest.raises(DomainError, match="stamps have shape"):
         flag_stars(stamps[0], NOISE)
-    with pytest.raises(DomainError, match="stamps: expected"):
+    with pytest.raises(DomainError, match="stamps = 'stars': expected"):
         flag_stars("stars", NOISE)
     with pytest.raises(DomainError, match="noise ="):
         flag_stars(stamps, [1.0, 2.0])

@@ -57,3 +57,23 @@ def test_a_metric_that_nothing_raises_has_a_report_without_allowances(tmp_path, 
     pictures = {path.name for path in report.parent.glob("*.png")}
     assert "curves_fwhm.png" in pictures
     assert not any(name.startswith("allowance") for name in pictures)
+
+
+@pytest.mark.long
+def test_names_are_shown_letter_by_letter(tmp_path):
+    """HTML in a name is no HTML in the report, and dollar signs are no mathematics in its pictures."""
+    script, maths = "<script>alert(1)</script>", "M2 x$^{$.dz_um"
+    content = SWEEP.model_dump(mode="json")
+    named = {script: content["parameters"]["a"], maths: content["parameters"]["b"]}
+    for parameter in named.values():
+        parameter["marks"] = {script: parameter["marks"]["budget"], "$\\frac{$": 1.5}
+    sweep = read_sweep(content | {"parameters": named, "name": script}, "test")
+    create_store(tmp_path / "s.sweep", sweep, points := numbered_points(sweep, Path()), {})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            xi = 1e-6 * sum(value**2 for value in p.parameters.values())
+            store.write(PointResult(p.number, {"xi_raw_short": xi}, None, 0.1, "here"))
+        page = write_report(store, tmp_path / "report").read_text()
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert maths in page

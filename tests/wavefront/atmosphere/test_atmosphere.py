@@ -282,7 +282,7 @@ def test_quantities_and_sites_are_accepted():
         ({"time_step": -1.0}, "time_step = -1.0"),
         ({"screen_size": 0}, "screen_size = 0: expected a whole number of samples from 4"),
         ({"time_step": 1e-12}, "time_step = 1e-12: expected at most 10000000 steps in 2 s"),
-        ({"r0": [0.1, 0.2]}, "r0 = [0.1, 0.2]"),
+        ({"r0": [0.1, 0.2]}, "r0 = array([0.1, 0.2])"),
         ({"screen_size": 10**6}, "screen_size = 1000000"),
         ({"screen_size": 512.5}, "screen_size = 512.5"),
         ({"fine_size": "many"}, "fine_size = 'many'"),

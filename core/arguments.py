@@ -1,0 +1,276 @@
+"""Validation of the arguments of public functions and classes by their annotations, before anything is computed."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import os
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
+
+import numpy as np
+from astropy import units as u
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import ConfigError, DomainError, PachonError, shown
+from .units import real_numbers
+
+Target = TypeVar("Target", bound=Callable[..., Any])
+#: Function of an argument's name and value: the value as the callee takes it, or a _MismatchError.
+_Check = Callable[[str, Any], Any]
+#: Arms of the union that ArrayLike is; ``ArrayLike | None`` is one flat union with them.
+_ARRAY_ARMS = frozenset(get_args(ArrayLike)) or frozenset({ArrayLike})
+
+
+class _MismatchError(Exception):
+    """Value that an annotation does not allow."""
+
+    def __init__(self, name: str, value: Any, expected: str, error: type[PachonError] = DomainError) -> None:
+        super().__init__(name)
+        self.name, self.value, self.expected, self.error = name, value, expected, error
+
+
+def check_arguments(target: Target) -> Target:
+    """Check the arguments of a function, or of constructor and public methods of a class, by their annotations.
+
+    A value of the wrong kind is a DomainError, or a ConfigError where one of several words is expected; it names
+    argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences and
+    mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
+    or objects. Masked ones become NaN; quantities keep their unit.
+
+    Names of arguments are checked by Python (TypeError); shapes, ranges and NaN by the function itself.
+    """
+    if not inspect.isclass(target):
+        return cast(Target, _checked(target))
+    for name, member in list(vars(target).items()):
+        if name.startswith("_") and name != "__init__":
+            continue
+        if isinstance(member, (classmethod, staticmethod)):
+            setattr(target, name, type(member)(_checked(member.__func__)))
+        elif inspect.isfunction(member):
+            setattr(target, name, _checked(member))
+    return target
+
+
+def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    parameters = [p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    if all(p.annotation is p.empty for p in parameters):
+        return function
+
+    @functools.cache
+    def checks() -> dict[str, _Check | None]:
+        # At the first call: an annotation may name a class of a module that is imported after this one.
+        return {p.name: _check_of_parameter(function, p.name) for p in parameters}
+
+    @functools.wraps(function)
+    def checked(*args: Any, **options: Any) -> Any:
+        known = checks()
+        # Of several values of ``*names`` each has its check.
+        places = list(known.items())
+        places += places[-1:] * (len(args) - len(places))
+        try:
+            given = [v if check is None else check(name, v) for v, (name, check) in zip(args, places, strict=False)]
+            for name, value in options.items():
+                if (check := known.get(name)) is not None:
+                    options[name] = check(name, value)
+        except _MismatchError as problem:
+            text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
+            raise problem.error(text, key=problem.name) from None
+        return function(*given, **options)
+
+    return checked
+
+
+def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | None:
+    """Return the check of a parameter; None where any value will do."""
+    if name not in function.__annotations__:
+        return None
+    holder = types.SimpleNamespace(__annotations__={name: function.__annotations__[name]})
+    names = dict(inspect.unwrap(function).__globals__)
+    try:
+        return _check_of(typing.get_type_hints(holder, names)[name])
+    except NameError as missing:
+        # Imported for type checkers only: a package, or a class that some callee checks.
+        try:
+            names[missing.name] = importlib.import_module(str(missing.name))
+        except ImportError:
+            return None
+        return _check_of(typing.get_type_hints(holder, names)[name])
+
+
+def _check_of(kind: Any) -> _Check | None:
+    """Return the check of an annotation; None where any value will do."""
+    origin = get_origin(kind) or kind
+    if origin in (Union, types.UnionType):
+        arms = list(get_args(kind))
+        if str in arms and any(arm is Path or get_origin(arm) is os.PathLike for arm in arms):
+            # Names of bundled files, too, are texts that may be paths.
+            others = [a for a in arms if a not in (str, Path, type(None)) and get_origin(a) is not os.PathLike]
+            return _either([_path, *filter(None, map(_check_of, others))], type(None) in arms)
+        arrays = [_array] if set(arms) >= _ARRAY_ARMS else []
+        others = [a for a in arms if a is not type(None) and not (arrays and a in _ARRAY_ARMS)]
+        checks = [_check_of(arm) for arm in others]
+        return None if None in checks else _either([*arrays, *filter(None, checks)], type(None) in arms)
+    if origin is Literal:
+        return _word(get_args(kind))
+    if origin in _SEQUENCES:
+        return _sequence(origin, get_args(kind))
+    if origin in (Mapping, dict):
+        return _mapping(get_args(kind))
+    if origin in _PLAIN:
+        return _plain(*_PLAIN[origin])
+    if origin is np.ndarray:
+        return _flags if kind == NDArray[np.bool_] else _plain_array
+    if origin is Path:
+        return lambda name, value: Path(_path(name, value))
+    if origin is Any or not inspect.isclass(origin) or getattr(origin, "_is_protocol", False):
+        return None
+    return _plain((origin,), f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}")
+
+
+#: Classes of values that plain annotations allow, and what is expected.
+_PLAIN: dict[Any, tuple[tuple[Any, ...], str]] = {
+    bool: ((bool, np.bool_), "True or False"),
+    int: ((int, np.integer), "a whole number"),
+    float: ((float, int, np.floating, np.integer), "a number"),
+    str: ((str,), "a text"),
+    os.PathLike: ((os.PathLike,), "a path"),
+    Callable: ((Callable,), "a function"),
+}
+#: Whole numbers to Python and NumPy, and to nobody else.
+_NO_NUMBERS = (bool, np.timedelta64)
+#: Longest path, and longest name of a file or folder, of common systems [characters].
+_LONGEST_PATH, _LONGEST_NAME = 4096, 255
+_SEQUENCES = (tuple, list, Sequence, Iterable)
+
+
+def _plain(accepted: tuple[Any, ...], expected: str) -> _Check:
+    numbers = int in accepted
+
+    def check(name: str, value: Any) -> Any:
+        if numbers and type(value) is np.ndarray and value.ndim == 0:
+            value = value[()]
+        if not isinstance(value, accepted) or (numbers and isinstance(value, _NO_NUMBERS)):
+            raise _MismatchError(name, value, expected)
+        return value
+
+    return check
+
+
+def _array(name: str, value: Any) -> Any:
+    if type(value) is float or type(value) is int:
+        return value
+    numbers = real_numbers(value)
+    if numbers is None:
+        raise _MismatchError(name, value, "real numbers")
+    return numbers
+
+
+def _plain_array(name: str, value: Any) -> Any:
+    if isinstance(value, u.Quantity):
+        raise _MismatchError(name, value, "numbers without a unit")
+    return np.asarray(_array(name, value))
+
+
+def _flags(name: str, value: Any) -> Any:
+    try:
+        flags = np.asarray(value).dtype.kind == "b"
+    except ValueError:
+        flags = False
+    if not flags:
+        raise _MismatchError(name, value, "an array of True and False")
+    return value
+
+
+def _path(name: str, value: Any) -> str | os.PathLike[str]:
+    if not isinstance(value, (str, os.PathLike)):
+        raise _MismatchError(name, value, "a path")
+    text = os.fspath(value)
+    if "\0" in text or len(text) > _LONGEST_PATH or max(map(len, Path(text).parts), default=0) > _LONGEST_NAME:
+        limits = f"at most {_LONGEST_PATH} characters, {_LONGEST_NAME} of them between slashes, and no zero byte"
+        raise _MismatchError(name, value, f"a path of {limits}")
+    return value
+
+
+def _word(words: tuple[Any, ...]) -> _Check:
+    def check(name: str, value: Any) -> Any:
+        if not (isinstance(value, str) and value in words):
+            raise _MismatchError(name, value, f"one of {', '.join(words)}" if len(words) > 1 else words[0], ConfigError)
+        return value
+
+    return check
+
+
+def _either(checks: list[_Check], optional: bool) -> _Check:
+    def check(name: str, value: Any) -> Any:
+        if optional and value is None:
+            return None
+        problems = []
+        for each in checks:
+            try:
+                return each(name, value)
+            except _MismatchError as problem:
+                problems.append(problem)
+        # Of a sequence whose elements are wrong, the element is the likelier mistake.
+        inner = next((p for p in problems if p.name != name), None)
+        several = list(dict.fromkeys(p.expected for p in problems))
+        expected = " or ".join(several) if len(several) < 4 else f"one of {', '.join(several)}"
+        error = next((p.error for p in problems if p.error is not DomainError), DomainError)
+        raise inner or _MismatchError(name, value, expected, error)
+
+    return check
+
+
+def _sequence(kind: Any, elements: tuple[Any, ...]) -> _Check:
+    fixed = kind is tuple and Ellipsis not in elements
+    checks = [_check_of(element) for element in elements if element is not Ellipsis] or [None]
+    expected = f"a sequence of {len(checks)}" if fixed else "a sequence"
+    simple = {element for element in elements if element is not Ellipsis}
+    simple = simple if kind is tuple and len(simple) == 1 and get_origin(*simple) is None else set()
+
+    def check(name: str, value: Any) -> Any:
+        # Most tuples come from pachon itself, and are as they should be.
+        if (
+            type(value) is tuple
+            and simple
+            and simple.issuperset(map(type, value))
+            and (not fixed or len(value) == len(checks))
+        ):
+            return value
+        refused = (str, bytes) if kind is Iterable else (str, bytes, Mapping)
+        # To Python, an array without axes is iterable too.
+        single = isinstance(value, np.ndarray) and not value.ndim
+        if single or isinstance(value, refused) or not isinstance(value, Iterable):
+            raise _MismatchError(name, value, expected)
+        if isinstance(value, Mapping):
+            value = list(value)
+        if not isinstance(value, (list, tuple, np.ndarray)):
+            # An iterator can be used once only.
+            return value
+        if fixed and len(value) != len(checks):
+            raise _MismatchError(name, value, expected)
+        each = checks if fixed else checks * len(value)
+        found = [v if c is None else c(f"{name}[{i}]", v) for i, (v, c) in enumerate(zip(value, each, strict=True))]
+        return tuple(found) if kind is tuple else found
+
+    return check
+
+
+def _mapping(kinds: tuple[Any, ...]) -> _Check:
+    check_key, check_value = (_check_of(kind) for kind in kinds) if kinds else (None, None)
+
+    def check(name: str, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            raise _MismatchError(name, value, "a mapping")
+        for key, each in value.items():
+            if check_key is not None:
+                check_key(f"key of {name}", key)
+            if check_value is not None:
+                check_value(f"{name}[{key!r}]", each)
+        return value
+
+    return check

@@ -1,0 +1,426 @@
+"""A valid call of every public function, of constructors and of methods: tiny, to be called with wrong arguments."""
+
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+import pachon
+
+ROOT = Path(__file__).parents[2]
+WAVELENGTH = 620e-9
+
+
+class _Made:
+    """Objects that several calls need, each made once."""
+
+    def __init__(self, folder):
+        self.folder, self._kept = folder, {}
+
+    def __getattr__(self, name):
+        if name not in self._kept:
+            self._kept[name] = getattr(type(self), f"make_{name}")(self)
+        return self._kept[name]
+
+    def make_tel(self):
+        return pachon.paul_baker()
+
+    def make_file(self):
+        path = self.folder / "telescope.yaml"
+        pachon.save_telescope(self.tel, path)
+        return path
+
+    def make_lsst(self):
+        return pachon.load_telescope("lsst_v3.3_r")
+
+    def make_rays(self):
+        return pachon.launch_rays(self.tel, (0.0, 0.0), WAVELENGTH, ([3.0, -3.0], [0.0, 0.1]))
+
+    def make_opd(self):
+        return pachon.wavefront_opd(self.tel, (0.0, 0.0), WAVELENGTH, grid=16)
+
+    def make_stamps(self):
+        y, x = np.mgrid[-7:8, -7:8]
+        widths = np.linspace(1.5, 2.0, 12)[:, None, None]
+        return np.exp(-0.5 * (x * x + y * y) / widths**2)
+
+    def make_places(self):
+        return np.random.default_rng(1).uniform(-1.0, 1.0, (12, 2))
+
+    def make_model(self):
+        return pachon.PsfModel.fit(self.stamps, self.places, n_components=2, order=1)
+
+    def make_spots(self):
+        return pachon.spots(self.tel, [(0.0, 0.0)], n_pupil=3)
+
+    def make_image(self):
+        rng = np.random.default_rng(2)
+        image = rng.normal(0.0, 1.0, (96, 128))
+        y, x = np.indices(image.shape)
+        for i in range(15):
+            cx, cy = 12 + 25 * (i % 5), 16 + 30 * (i // 5)
+            image += 500.0 * np.exp(-0.5 * ((x - cx) ** 2 + (y - cy) ** 2) / 2.0**2)
+        return image
+
+    def make_objects(self):
+        return pachon.detect_objects(self.image, np.ones_like(self.image), background_size=None)
+
+    def make_fits(self):
+        return pachon.fit_galaxies(
+            self.image, np.ones_like(self.image), [12.0], [16.0], self.stamps[0] / self.stamps[0].sum(),
+            half_light_radius=[2.4],
+        )  # fmt: skip
+
+    def make_galaxies(self):
+        return pachon.Galaxies.single([0.0, 1e-5], [0.0, 1e-5], [22.0, 23.0], [2e-6, 3e-6])
+
+    def make_plane(self):
+        return pachon.FocalPlane.flat("lsst")
+
+    def make_camera(self):
+        return pachon.lsst_camera()
+
+    def make_silicon(self):
+        return pachon.Silicon()
+
+    def make_grid(self):
+        axis = np.linspace(-5.0, 5.0, 9)
+        return pachon.GridSag(axis, axis, 1e-6 * np.add.outer(axis, axis))
+
+    def make_cube(self):
+        import trimesh
+
+        return trimesh.creation.box((0.1, 0.1, 0.1))
+
+    def make_dofs(self):
+        return pachon.DegreesOfFreedom.of_parameters(self.tel, ["M2.dz"])
+
+    def make_air(self):
+        return pachon.Atmosphere.from_site("cerro_pachon", 1, exposure=0.5, time_step=0.5, screen_size=1024,
+                                           screen_length=560.0)  # fmt: skip
+
+    def make_correlation(self):
+        return pachon.shear_correlation(**self.columns, min_sep=1e-3, max_sep=1e-1, n_bins=3)
+
+    def make_columns(self):
+        rng = np.random.default_rng(4)
+        names = ("x", "y", "e1", "e2")
+        return dict(zip(names, rng.uniform(-0.02, 0.02, (4, 30)), strict=True))
+
+    def make_aberration(self):
+        return pachon.ResidualWavefront.draw(self.tel)
+
+    def make_config(self):
+        return pachon.Configuration(telescope="none.yaml")
+
+    def make_baseline(self):
+        return pachon.read_baseline(ROOT / "studies/baseline/bundled/lsst_v3.3_r.baseline.json")
+
+    def make_sweep(self):
+        return pachon.load_sweep(ROOT / "studies/sweep/examples/table1_small.yaml")
+
+    def make_ccd_image(self):
+        return pachon.CcdImage(
+            "R22_S11", self.image, np.ones_like(self.image), np.zeros(self.image.shape, int), fits.Header()
+        )
+
+    def make_table(self):
+        third = [0.0, 1e-3, 2e-3]
+        return {"ccd": ["R22_S11"] * 3, "x": third, "y": third, "e1": [0.0] * 3, "e2": [0.0] * 3, "size": [2e-6] * 3,
+                "snr": [50.0] * 3}  # fmt: skip
+
+    def make_stars(self):
+        return pachon.FocalPlaneStars.from_table(self.table)
+
+    def make_experiment(self):
+        config = pachon.Configuration(
+            ccds=("R22_S11",), wavelengths_nm=(620.0,), psf={"engine": "long_exposure", "n_pupil": 60}
+        )
+        return pachon.Experiment.from_config(config)
+
+
+def calls(folder):
+    """Return the calls: callable and keyword arguments by label."""
+    m = _Made(folder)
+    tel, w = m.tel, WAVELENGTH
+    on_axis = np.zeros((1, 2))
+    x, y = np.linspace(-1.0, 1.0, 4), np.linspace(0.0, 1.0, 4)
+    radius = tel.pupil_diameter / 2
+    psf = m.stamps[0] / m.stamps[0].sum()
+    flat = np.ones_like(m.image)
+    shear = np.full((4, 6), 0.1) + np.linspace(-0.01, 0.01, 6)
+    design = {"telescope": tel, "fields": on_axis, "projection": "zemax", "threads": 1}
+    waves = design | {"wavelengths": [w], "wavelength_weights": [1.0]}
+    mono = design | {"wavelength": w}
+    one = {"telescope": tel, "wavelength": w, "projection": "zemax", "threads": 1}
+    no_fields = {k: v for k, v in one.items() if k != "fields"}
+    pairs = m.columns | {"min_sep": 1e-3, "max_sep": 1e-1, "n_bins": 3, "exact": False}
+    sizes = {"size": np.full(30, 1e-6), "model_e1": pairs["e1"] * 0.9, "model_e2": pairs["e2"] * 0.9,
+             "model_size": np.full(30, 1.1e-6)}  # fmt: skip
+    made = {
+        "fft_psf": (pachon.fft_psf, waves | {"pixel": 1e-6, "pixels": 16, "n_pupil": 48, "reference": "centroid"}),
+        "huygens_psf": (pachon.huygens_psf, waves | {"pixel": 1e-6, "pixels": 8, "sampling": "square", "n_pupil": 8,
+                                                     "reference": "centroid"}),
+        "encircled_energy": (pachon.encircled_energy, waves | {"kind": "geometric", "radii": [1e-6, 2e-6],
+                             "reference": "centroid", "sampling": "spiral", "pixels": 32, "n_pupil": 50}),
+        "energy_curve": (pachon.energy_curve, {"image": m.stamps[0], "center": (7.0, 7.0), "parts": 2}),
+        "mtf": (pachon.mtf, waves | {"n_pupil": 48}),
+        "layout": (pachon.layout, mono),
+        "distortion": (pachon.distortion, mono | {"fields": 0.003 * np.eye(4, 2), "reference": "chief", "n_pupil": 3,
+                       "sampling": "gauss"}),
+        "double_zernikes": (pachon.double_zernikes, no_fields | {"jmax": 6, "kmax": 3, "rings": 2, "n_pupil": 6,
+                            "field_radius": tel.field_radius, "pupil": "full", "sampling": "gauss"}),
+        "wavefront_zernikes": (pachon.wavefront_zernikes, mono | {"jmax": 6, "pupil": "full", "sampling": "gauss",
+                               "n_pupil": 6}),
+        "footprint": (pachon.footprint, mono | {"surfaces": ["M2"], "sampling": "rings", "n_pupil": 3}),
+        "ghosts": (pachon.ghosts, {"telescope": m.lsst, "field": (0.0, 0.0), "wavelength": w, "reflectivity": 0.01,
+                   "detector_reflectivity": 0.1, "n_pupil": 400, "projection": "zemax", "threads": 1}),
+        "principal_rays": (pachon.principal_rays, mono),
+        "spots": (pachon.spots, waves | {"sampling": "gauss", "n_pupil": 3, "reference": "centroid"}),
+        "through_focus": (pachon.through_focus, waves | {"defocus": [-1e-5, 0.0, 1e-5], "sampling": "gauss",
+                          "n_pupil": 3}),
+        "vignetting": (pachon.vignetting, mono | {"n_pupil": 64}),
+        "monte_carlo": (pachon.monte_carlo, {"telescope": tel, "tolerances": [pachon.Tolerance("M2.dz", 1e-5)],
+                        "merit": "spots", "n": 2, "seed": 1, "method": "linear", "fields": on_axis,
+                        "wavelengths": [w], "sampling": "gauss", "n_pupil": 3, "threads": 1, "compensators": []}),
+        "optimize": (pachon.optimize, waves | {"variables": ["M2.dz"], "merit": "spots", "n_pupil": 3,
+                     "bounds": {"M2.dz": (-1e-3, 1e-3)}, "targets": [], "field_weights": [1.0],
+                     "reference": "centroid", "sampling": "gauss"}),
+        "sensitivity": (pachon.sensitivity, mono | {"parameters": ["M2.dz"], "n_zernike": 6,
+                        "sampling": "gauss", "n_pupil": 6}),
+        "apply_changes": (pachon.apply_changes, {"telescope": m.lsst, "changes": {"M2.dz_um": 1.0}}),
+        "load_degrees_of_freedom": (pachon.load_degrees_of_freedom, {"name_or_path": "lsst"}),
+        "thermal": (pachon.thermal, {"telescope": tel, "expansion": 1e-6, "dn_dt": {}}),
+        "load_images_configuration": (pachon.load_images_configuration, {"path": m.folder / "none.yaml"}),
+        "ccd_wcs": (pachon.ccd_wcs, {"telescope": m.lsst, "camera": m.camera, "ccd": "R22_S11", "pointing": (0.0, 0.0),
+                    "position_angle": 0.0, "wavelength": w, "threads": 1}),
+        "lsst_camera": (pachon.lsst_camera, {}),
+        "height_statistics": (pachon.height_statistics, {"focal_plane": m.plane}),
+        "first_order": (pachon.first_order, {"telescope": tel, "wavelength": w}),
+        "seidel_sums": (pachon.seidel_sums, {"telescope": tel, "wavelength": w, "field": 0.01}),
+        "corner_sensors": (pachon.corner_sensors, {"name": "lsstcam"}),
+        "load_telescope": (pachon.load_telescope, {"name_or_path": m.file, "lenient": False, "glass_catalogues": []}),
+        "save_telescope": (pachon.save_telescope, {"telescope": tel, "path": m.folder / "saved.yaml"}),
+        "load_site": (pachon.load_site, {"name_or_path": "cerro_pachon"}),
+        "model_glass": (pachon.model_glass, {"nd": 1.5168, "vd": 64.2, "partial_dispersion": 0.0}),
+        "paul_baker": (pachon.paul_baker, {"diameter": 8.4, "focal_ratio": 4.0, "beam_compression": 0.26,
+                       "field_radius": 0.008}),
+        "annular_zernikes": (pachon.annular_zernikes, {"jmax": 6, "x": x, "y": y, "obscuration": 0.5}),
+        "detect_objects": (pachon.detect_objects, {"image": m.image, "variance": flat,
+                           "mask": np.zeros(flat.shape, int), "saturated": 0, "threshold": 3.0, "min_area": 5,
+                           "kernel": np.ones((3, 3)), "deblend_levels": 32, "deblend_contrast": 0.005,
+                           "background_size": 32}),
+        "fit_galaxies": (pachon.fit_galaxies, {"image": m.image, "variance": flat, "x": [12.0, 37.0], "y": [16.0, 16.0],
+                         "psf_images": psf, "half_light_radius": [2.4, 2.4], "mask": np.zeros(flat.shape, int),
+                         "segmentation": m.objects.segmentation, "max_evaluations": 5, "tolerance": 1e-3,
+                         "threads": 1}),
+        "fit_galaxy_stamps": (pachon.fit_galaxy_stamps, {"stamps": m.stamps[:2], "variance": np.ones((2, 15, 15)),
+                              "psf_images": psf, "mask": np.zeros((2, 15, 15), int), "max_evaluations": 5,
+                              "tolerance": 1e-3, "threads": 1}),
+        "usable_galaxies": (pachon.usable_galaxies, {"fits": m.fits, "half_light_radius": [3.0],
+                            "star_half_light_radius": [2.0], "least_ratio": 1.2, "most_error": 0.2}),
+        "detection_rates": (pachon.detection_rates, {"magnitude": [20.1, 21.2], "match": [0, 1],
+                            "true_magnitude": [20.0, 21.0, 22.0], "edges": [19.0, 21.5, 23.0]}),
+        "match_positions": (pachon.match_positions, {"x": x, "y": y, "true_x": x, "true_y": y, "radius": 0.1}),
+        "shear_calibration": (pachon.shear_calibration, {"e1": shear, "e2": shear, "shear1": [0.0, 0.01, 0.02, 0.03],
+                              "shear2": [0.0, 0.01, -0.02, 0.03]}),
+        "select_stars": (pachon.select_stars, {"objects": m.objects, "image": m.image, "min_snr": 30.0,
+                         "bright_snr": 60.0, "n_sigma": 4.0, "max_ellipticity": 0.1, "isolation": 5.0, "min_stars": 3,
+                         "size": 15, "mask": np.zeros(flat.shape, int)}),
+        "load_configuration": (pachon.load_configuration, {"path": m.folder / "none.yaml"}),
+        "shear_correlation": (pachon.shear_correlation, pairs | {"subtract_mean": False,
+                              "patch": np.repeat([0, 1, 2], 10)}),
+        "rho_statistics": (pachon.rho_statistics, pairs | sizes | {"patch": np.repeat([0, 1, 2], 10)}),
+        "measure_shapes": (pachon.measure_shapes, {"images": m.stamps, "pixel_scale": 1e-6, "weight_fwhm": 4e-6,
+                           "background": 0.0, "max_iterations": 5, "tolerance": 1e-4}),
+        "load_stars": (pachon.load_stars, {"catalogue": m.folder / "none.fits", "x": "x", "y": "y", "stamp": "stamp"}),
+        "flag_stars": (pachon.flag_stars, {"stamps": m.stamps, "noise": 0.01, "gain": 1.0, "saturation": 10.0,
+                       "threshold": 6.0}),
+        "brighter_fatter": (pachon.brighter_fatter, {"images": m.stamps, "electrons": np.full(12, 1e4), "sensor": "itl",
+                            "sky": 10.0}),
+        "displace_stamps": (pachon.displace_stamps, {"images": m.stamps, "places": m.places * 1e-3, "pixel_size": 1e-5,
+                            "effects": [pachon.EdgeRolloff(1e-6, 1e-4, 2e-2)]}),
+        "land_on_mesh": (pachon.land_on_mesh, {"detector": tel.surfaces[-1], "mesh": m.cube, "threads": 1,
+                         "position": np.array([[0.0, 0.0, -1.0]]), "direction": np.array([[0.0, 0.0, 1.0]])}),
+        "launch_rays": (pachon.launch_rays, {"telescope": tel, "field": (0.0, 0.0), "wavelength": w, "pupil": (x, y),
+                        "projection": "zemax"}),
+        "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "surfaces": "last", "threads": 1}),
+        "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0)}),
+        "write_galaxies": (pachon.write_galaxies, {"path": m.folder / "galaxies.ecsv", "galaxies": m.galaxies}),
+        "draw_galaxies": (pachon.draw_galaxies, {"region": ((-1e-4, 1e-4), (-1e-4, 1e-4)), "faintest": 24.0, "seed": 1,
+                          "brightest": 20.0, "density": 1.0}),
+        "check_baseline": (pachon.check_baseline, {"path": m.folder / "none.json", "threads": 1}),
+        "assert_matches_baseline": (pachon.assert_matches_baseline, {"model": m.file, "threads": 1,
+                                    "baseline": m.folder / "none.json"}),
+        "make_baseline": (pachon.make_baseline, {"model": str(m.folder / "none.yaml"), "folder": m.folder}),
+        "read_baseline": (pachon.read_baseline, {"path": m.folder / "none.json"}),
+        "write_baseline": (pachon.write_baseline, {"path": m.folder / "b.json", "baseline": m.baseline}),
+        "load_sweep": (pachon.load_sweep, {"path": m.folder / "none.yaml"}),
+        "load_sweep_table": (pachon.load_sweep_table, {"path": m.folder / "none.db"}),
+        "run_sweep": (pachon.run_sweep, {"sweep": m.sweep, "path": m.file}),
+        "run": (pachon.run, {"config": m.config, "folder": m.folder / "none", "resume": False, "strict": False,
+                             "threads": 1}),
+        "simulate_images": (pachon.simulate_images, {"config": pachon.ImagesConfig(run=m.config), "resume": False,
+                            "threads": 1, "folder": m.folder / "none"}),
+        "stack_visits": (pachon.stack_visits, {"config": pachon.VisitsConfig(run=m.config), "resume": False,
+                         "threads": 1, "folder": m.folder / "none"}),
+        "null_test": (pachon.null_test, {"folder": m.folder / "none", "tiles": 2, "rings": 10, "resume": False,
+                      "threads": 1}),
+        "load_visits_configuration": (pachon.load_visits_configuration, {"path": m.folder / "none.yaml"}),
+        "shim": (pachon.shim, {"experiment": m.experiment, "merit": "fwhm", "parts": "rafts", "threads": 1}),
+        "measure_image": (pachon.measure_image, {"image": m.ccd_image, "order": 1, "min_snr": 30.0, "threads": 1}),
+        "draw_ccd": (pachon.draw_ccd, {"experiment": m.experiment, "ccd": "none", "galaxies": m.galaxies,
+                     "pointing": (0.0, 0.0), "position_angle": 0.0, "threads": 1}),
+        "fit_static_heights": (pachon.fit_static_heights, {"exposures": [], "telescope": tel, "steps": 1,
+                               "alignment_rms": 1e-7, "threads": 1}),
+        "fields_at": (pachon.fields_at, {"telescope": tel, "positions": [(0.0, 0.0), (0.01, 0.0)], "wavelength": w,
+                      "projection": "zemax", "threads": 1}),
+        "wavefront_opd": (pachon.wavefront_opd, one | {"field": (0.0, 0.0), "pupil": (x, y), "reference": "chief",
+                          "sphere_radius": 5.0}),
+        "wavefront_opds": (pachon.wavefront_opds, one | {"fields": on_axis, "grid": 8, "sphere_radius": 5.0}),
+        "make_psfs": (pachon.make_psfs, {"telescope": tel, "fields": on_axis, "wavelengths": [w], "engine": "fast",
+                      "stamp_size": 15, "pixel_size": 1e-5, "diffusion": 4e-6, "jitter": 0.0, "n_pupil": 40,
+                      "atmosphere": None, "threads": 1}),
+        "pupil_sampling": (pachon.pupil_sampling, {"telescope": tel, "sampling": "gauss", "n_pupil": 3}),
+        "field_points": (pachon.field_points, {"telescope": tel, "fields": on_axis}),
+        "focus_height": (pachon.focus_height, {"telescope": m.lsst, "silicon": m.silicon, "wavelength": w,
+                         "threads": 1}),
+        "fit_zernikes": (pachon.fit_zernikes, {"opd": m.opd, "pupil_radius": radius, "jmax": 6,
+                         "obscuration": tel.pupil_obscuration}),
+    }  # fmt: skip
+    return made | _methods(m, tel, w, x, y)
+
+
+def _methods(m, tel, w, x, y):
+    """Constructors and methods."""
+    xy = {"x": x, "y": y}
+    out = {
+        "FocalLength": (pachon.FocalLength, {"value": 10.0, "weight": 1.0, "wavelength": w}),
+        "Tolerance": (pachon.Tolerance, {"name": "M2.dz", "size": 1e-5, "distribution": "uniform"}),
+        "Tolerance.draw": (pachon.Tolerance("a", 1.0).draw, {"seed": 1, "n": 3}),
+        "Parameter.parse": (pachon.Parameter.parse, {"text": "M2.dz", "telescope": tel}),
+        "DegreesOfFreedom.of_parameters": (pachon.DegreesOfFreedom.of_parameters, {"telescope": tel,
+                                           "addresses": ["M2.dz"]}),
+        "DegreesOfFreedom.apply": (m.dofs.apply, {"telescope": tel, "values": [1e-6]}),
+        "DegreesOfFreedom.select": (m.dofs.select, {"names": ["M2.dz"]}),
+        "SpotDiagram.radius_holding": (m.spots.radius_holding, {"fraction": 0.8}),
+        "Window": (pachon.Window, {"x": 0, "y": 0, "width": 10, "height": 10}),
+        "Exposure": (pachon.Exposure, {"band": "r", "time": 15.0, "exposures": 1, "gain": 1.0, "sky": 21.0,
+                     "pixel_scale": 1e-6, "read_noise": 8.8, "dark_current": 0.2, "full_well": 1e5,
+                     "subtract_background": True, "noise": True}),
+        "Exposure.electrons": (pachon.Exposure().electrons, {"magnitude": [20.0, 21.0]}),
+        "PsfField.fit": (pachon.PsfField.fit, {"stamps": m.stamps, "positions": 100 + 50 * m.places, "pixels": 200,
+                         "lit_fraction": np.full(12, 0.9), "n_components": 2, "order": 1,
+                         "interpolation": "polynomial"}),
+        "Annulus": (pachon.Annulus, {"inner": 1.0, "outer": 2.0, "x": 0.0, "y": 0.0}),
+        "Circle": (pachon.Circle, {"radius": 1.0, "x": 0.0, "y": 0.0}),
+        "Circle.contains": (pachon.Circle(1.0).contains, xy),
+        "Rectangle": (pachon.Rectangle, {"width": 1.0, "height": 2.0, "x": 0.0, "y": 0.0, "angle": 0.0}),
+        "Vane": (pachon.Vane, {"width": 1.0, "x": 0.0, "y": 0.0, "angle": 0.0, "both_ways": True}),
+        "Polygon": (pachon.Polygon, {"corners": ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))}),
+        "Polygon.contains": (pachon.Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))).contains, xy),
+        "Union": (pachon.Union, {"parts": (pachon.Circle(1.0), pachon.Circle(2.0))}),
+        "Complement": (pachon.Complement, {"part": pachon.Circle(1.0)}),
+        "Camera.ccd_at": (m.camera.ccd_at, {"x": [0.0, 0.1], "y": [0.0, 0.1], "margin": 0.0}),
+        "Camera.ccd_index": (m.camera.ccd_index, {"name": "R22_S11"}),
+        "FocalPlane.from_budget": (pachon.FocalPlane.from_budget, {"camera": "lsst", "seed": 1, "terms": ["raft"],
+                                   "budget": "simulated"}),
+        "FocalPlane.flat": (pachon.FocalPlane.flat, {"camera": "lsst"}),
+        "FocalPlane.as_measured": (pachon.FocalPlane.as_measured, {"name": "lsstcam"}),
+        "FocalPlane.from_file": (pachon.FocalPlane.from_file, {"path": m.folder / "none.fits"}),
+        "FocalPlane.from_heights": (pachon.FocalPlane.from_heights, {"table": {"x": [0.0], "y": [0.0], "z": [0.0]}}),
+        "FocalPlane.from_mesh": (pachon.FocalPlane.from_mesh, {"mesh": m.cube}),
+        "FocalPlane.with_moved": (m.plane.with_moved, {"name": "R22", "dz": 1e-6, "rx": 0.0, "ry": 0.0}),
+        "FocalPlane.height": (m.plane.height, {"x": [0.0, 0.1], "y": [0.0, 0.1]}),
+        "FocalPlane.to_mesh": (m.plane.to_mesh, {"cells_per_ccd": 2}),
+        "HeightBudget": (pachon.HeightBudget, {"global_height": 1e-6, "raft_height": 1e-6, "ccd_height": 1e-6,
+                         "ccd_tilt": 1e-6, "potato_chip": 1e-6}),
+        "Silicon": (pachon.Silicon, {"thickness": 1e-4, "temperature": 173.0}),
+        "Silicon.absorption_length": (m.silicon.absorption_length, {"wavelength": w}),
+        "GlassCatalogue.read": (pachon.GlassCatalogue.read, {"path": m.folder / "none.agf"}),
+        "Air": (pachon.Air, {"pressure": 101325.0, "temperature": 288.0, "water_vapour": 0.0, "co2_ppm": 450.0,
+                "formula": "ciddor"}),
+        "Air.index": (pachon.Air().index, {"wavelength": [w]}),
+        "Dispersion": (pachon.Dispersion, {"formula": "schott", "coefficients": (2.2, -0.01, 0.01, 0.0002, 0.0, 0.0),
+                       "wavelength_range": (3e-7, 2e-6)}),
+        "ConstantIndex": (pachon.ConstantIndex, {"n": 1.5}),
+        "ConstantIndex.index": (pachon.ConstantIndex(1.5).index, {"wavelength": [w]}),
+        "Sellmeier": (pachon.Sellmeier, {"B": (1.0, 0.2, 1.0), "C": (0.006, 0.02, 100.0)}),
+        "TabulatedIndex": (pachon.TabulatedIndex, {"wavelengths": (4e-7, 5e-7, 6e-7), "indices": (1.5, 1.49, 1.48),
+                           "interpolation": "monotone"}),
+        "ChangedIndex": (pachon.ChangedIndex, {"medium": pachon.ConstantIndex(1.5), "change": 1e-5}),
+        "Obstruction": (pachon.Obstruction, {"name": "o", "triangles": np.eye(3)[None], "before": ("M2",)}),
+        "Obstruction.from_mesh": (pachon.Obstruction.from_mesh, {"name": "o", "mesh": m.cube, "scale": 1.0}),
+        "Obstruction.from_file": (pachon.Obstruction.from_file, {"path": m.folder / "none.stl", "scale": 1.0}),
+        "Biconic": (pachon.Biconic, {"radius_x": 5.0, "radius_y": 6.0, "conic_x": 0.0, "conic_y": 0.0}),
+        "OddAsphere": (pachon.OddAsphere, {"radius": 5.0, "conic": 0.0, "coefficients": (0.0, 1e-6)}),
+        "Toroid": (pachon.Toroid, {"radius_x": 5.0, "radius_y": 6.0, "conic_y": 0.0}),
+        "XYPolynomial": (pachon.XYPolynomial, {"terms": ((1, 0, 1e-6),)}),
+        "ZernikeSag": (pachon.ZernikeSag, {"coefficients": (0.0, 1e-6), "outer_radius": 4.0, "inner_radius": 0.5}),
+        "GridSag": (pachon.GridSag, {"x": np.arange(5.0), "y": np.arange(5.0), "values": np.zeros((5, 5))}),
+        "MeshSurface": (pachon.MeshSurface, {"vertices": np.eye(3), "faces": np.array([[0, 1, 2]]), "smooth": False}),
+        "MeshSurface.from_file": (pachon.MeshSurface.from_file, {"path": m.folder / "none.stl", "scale": 1.0}),
+        "Conic": (pachon.Conic, {"radius": 5.0, "conic": 0.0}),
+        "Conic.sag": (pachon.Conic(5.0).sag, xy),
+        "Conic.gradient": (pachon.Conic(5.0).gradient, xy),
+        "EvenAsphere": (pachon.EvenAsphere, {"radius": 5.0, "conic": 0.0, "coefficients": (1e-6,)}),
+        "EvenAsphere.sag": (pachon.EvenAsphere(5.0, 0.0, (1e-6,)).sag, xy),
+        "Sphere": (pachon.Sphere, {"radius": 5.0}),
+        "Sum": (pachon.Sum, {"parts": (pachon.Conic(5.0), m.grid)}),
+        "Weather": (pachon.Weather, {"pressure_mmhg": 520.0, "temperature_c": 10.0, "water_vapour_mmhg": 8.0}),
+        "Site": (pachon.Site, {"name": "s", "altitudes": (0.0, 1e3), "weights": (0.5, 0.5), "wind_speeds": (5.0, 10.0),
+                 "r0": 0.1, "outer_scale": 30.0, "weather": pachon.Weather(520.0, 10.0, 8.0)}),
+        "Surface": (pachon.Surface, {"name": "s", "interaction": pachon.Interaction.REFRACT, "shape": pachon.Conic(5.0),
+                    "vertex": (0.0, 0.0, 0.0), "medium_after": pachon.ConstantIndex(1.0),
+                    "aperture": pachon.Circle(1.0)}),
+        "Surface.to_local": (tel.surfaces[0].to_local, {"points": np.zeros((2, 3))}),
+        "Surface.moved": (tel.surfaces[0].moved, {"shift": (0.0, 0.0, 0.0), "about": (0.0, 0.0, 0.0)}),
+        "Telescope.perturbed": (tel.perturbed, {"name": "M2", "shift": (0.0, 0.0, 0.0), "tilt": (0.0, 0.0, 0.0),
+                                "about": (0.0, 0.0, 0.0)}),
+        "Telescope.with_rotator": (tel.with_rotator, {"angle": 0.1}),
+        "Telescope.with_shape": (tel.with_shape, {"name": "M2", "shape": pachon.Conic(5.0)}),
+        "Telescope.with_deformation": (tel.with_deformation, {"name": "M2", "deformation": m.grid}),
+        "Telescope.surface": (tel.surface, {"name": "M2"}),
+        "Telescope.check_wavelength": (tel.check_wavelength, {"wavelength": w}),
+        "Telescope.check_field": (tel.check_field, {"tx": [0.0], "ty": [0.0]}),
+        "FocalPlanePsf.fit": (pachon.FocalPlanePsf.fit, {"stars": m.stars, "telescope": tel, "camera": "lsst",
+                              "wavelengths": [w],
+                              "pixel_size": 1e-5, "diffusion": 4e-6, "jitter": 0.0, "threads": 1}),
+        "FocalPlaneStars.from_table": (pachon.FocalPlaneStars.from_table, {"table": m.table, "weight_fwhm": 3.4e-6}),
+        "Correlation.within": (m.correlation.within, {"separations": "short"}),
+        "PsfModel.fit": (pachon.PsfModel.fit, {"stamps": m.stamps, "positions": m.places, "basis": "pca",
+                         "interpolation": "polynomial", "weights": np.ones(12), "n_components": 2, "order": 1,
+                         "masks": np.zeros((12, 15, 15), bool), "extent": (-1.0, 1.0, -1.0, 1.0), "clip_sigma": 3.0}),
+        "PsfModel.at": (m.model.at, {"positions": m.places[:2]}),
+        "PsfModel.draw": (m.model.draw, {"x": 0.0, "y": 0.0}),
+        "PsfModel.truncated": (m.model.truncated, {"n_components": 1}),
+        "PsfModel.read": (pachon.PsfModel.read, {"path": m.folder / "none.fits", "name": "PSF"}),
+        "EdgeRolloff": (pachon.EdgeRolloff, {"amplitude": 1e-6, "length": 1e-4, "half_size": 0.02}),
+        "TreeRings": (pachon.TreeRings, {"amplitude": 1e-7, "period": 1e-3, "center": (0.03, 0.03), "phase": 0.0}),
+        "TreeRings.at": (pachon.TreeRings(1e-7, 1e-3, (0.03, 0.03)).at, xy),
+        "Rays": (pachon.Rays, {"position": np.zeros((2, 3)), "direction": np.full((2, 3), 0.577), "wavelength": w,
+                 "path_length": np.zeros(2)}),
+        "Galaxies.single": (pachon.Galaxies.single, {"xi": [0.0], "eta": [0.0], "magnitude": [22.0], "radius": [1e-6],
+                            "e1": 0.1, "e2": 0.0, "sersic": 1.0}),
+        "Galaxies.sheared": (m.galaxies.sheared, {"g1": 0.01, "g2": 0.0, "positions": True}),
+        "Galaxies.rotated": (m.galaxies.rotated, {"angle": 0.1, "positions": True}),
+        "Galaxies.take": (m.galaxies.take, {"indices": [0, 1]}),
+        "GalaxyStamps.from_mosaic": (pachon.GalaxyStamps.from_mosaic, {"path": m.folder / "none.fits", "side": 5.0,
+                                     "seed": 1}),
+        "GalaxyPopulation": (pachon.GalaxyPopulation, {"faintest": 24.0, "seed": 1, "brightest": 20.0,
+                             "density": 1.0}),
+        "GalaxyPopulation.galaxies_in": (pachon.GalaxyPopulation(23.0, 1).galaxies_in, {"xi": (-1e-4, 1e-4),
+                                         "eta": (-1e-4, 1e-4)}),
+        "ResidualWavefront.draw": (pachon.ResidualWavefront.draw, {"telescope": tel, "rms": 2e-7, "seed": 1, "epoch": 0,
+                                   "terms": [4, 5, 6], "linear_fraction": 0.5}),
+        "ResidualWavefront.opd": (m.aberration.opd, {**xy, "slopes": (0.0, 0.0)}),
+        "Atmosphere.from_site": (pachon.Atmosphere.from_site, {"site": "cerro_pachon", "seed": 1, "r0": 0.1,
+                                 "outer_scale": 30.0, "exposure": 0.5, "time_step": 0.5, "screen_size": 1024,
+                                 "screen_length": 560.0, "fine_size": 3072, "fine_pixel": 0.014, "epoch": 0}),
+        "Atmosphere.at_times": (m.air.at_times, {"times": [0.25, 0.75], "exposure": 1.0}),
+        "Request.of": (pachon.Request.of, {"telescope": tel, "fields": np.zeros((1, 2)), "wavelengths": [w],
+                       "wavelength_weights": [1.0], "sampling": "gauss", "n_pupil": 3, "projection": "zemax",
+                       "threads": 1}),
+        "CcdImage.read": (pachon.CcdImage.read, {"path": m.folder / "none.fits"}),
+    }  # fmt: skip
+    return out

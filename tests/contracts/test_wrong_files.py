@@ -1,0 +1,286 @@
+"""Mutated files of every format that is read: a result or an error of pachon in one line, within 2 s and 500 MB.
+
+YAML prescriptions, configurations and sweeps have a test of their own (``test_bad_input.py``). ``pytest -m slow
+tests/contracts/test_bad_input.py tests/contracts/test_wrong_files.py`` makes 10 000 cases of those and 19 200 of these.
+"""
+
+import base64
+import gzip
+import io
+import os
+import warnings
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from astropy.io import fits
+from astropy.table import Table
+from bounds import CHARACTERS, SECONDS, Hang, bounded
+
+import pachon
+from pachon.core.errors import PachonError
+from pachon.imaging.image_file import OBJECT_COLUMNS
+from pachon.models.io.grid_file import read_grid, write_grid
+from pachon.models.io.prescription import DATA
+from pachon.models.mesh_file import load_mesh
+from pachon.sky.cutouts import read_mosaic
+from pachon.studies.sweep.file import read_sweep
+from pachon.studies.sweep.store import PointResult, SweepStore, create_store, readable_rows
+
+ROOT = Path(__file__).parents[2]
+CORPUS = Path(__file__).parent / "corpus"
+#: Folder to which files that fail are copied, to join the corpus.
+KEEP = os.environ.get("PACHON_KEEP_WRONG_FILES")
+CAMERA = pachon.lsst_camera()
+RNG = np.random.default_rng(5)
+
+
+def _text(table, kind):
+    text = io.StringIO()
+    table.write(text, format=kind)
+    return text.getvalue().encode()
+
+
+def _fits(*hdus):
+    data = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(data)
+    return data.getvalue()
+
+
+def _points():
+    offsets = RNG.uniform(-20.0, 20.0, (12, 2))
+    columns = {"x": offsets[:, 0], "y": offsets[:, 1], "z": np.ones(12)}
+    return Table(columns, units={"x": "mm", "y": "mm", "z": "um"})
+
+
+def _stars():
+    stamps = np.exp(-0.5 * (np.mgrid[-3:4, -3:4] ** 2).sum(axis=0))
+    return Table({"x": np.arange(3.0), "y": np.arange(3.0), "stamp": np.stack([stamps] * 3)})
+
+
+def _written(write, suffix, folder):
+    path = folder / f"written{suffix}"
+    write(path)
+    return path.read_bytes()
+
+
+def _store(path):
+    sweep = read_sweep({"parameters": {"a": {"nominal": 0, "range": [0, 4]}}, "design": {"points": 3}}, "test")
+    create_store(path, sweep, [], {})
+    with SweepStore(path) as store:
+        store._connection.execute("""INSERT INTO points VALUES (0, '{"a": 1.0}', 1)""")
+        store._connection.commit()
+        store.write(PointResult(0, {"fwhm": 1.0}, None, 0.1, "here"))
+
+
+def _image(path):
+    pixels = RNG.normal(size=(16, 16))
+    objects = {key: np.zeros(2) for key in OBJECT_COLUMNS}
+    mask = np.zeros(pixels.shape, int)
+    pachon.CcdImage("R22_S11", pixels, np.ones_like(pixels), mask, fits.Header(), objects).write(path)
+
+
+def _use_store(path):
+    try:
+        pachon.load_sweep_table(path)
+    finally:
+        # What an export saves of a damaged store.
+        list(readable_rows(path))
+
+
+def _mesh(kind):
+    made = trimesh.creation.box((1.0, 1.0, 1.0)).export(file_type=kind)
+    return made.encode() if isinstance(made, str) else made
+
+
+def _gltf():
+    made = trimesh.creation.box((1.0, 1.0, 1.0)).export(file_type="gltf")
+    text = made["model.gltf"]
+    for name, content in made.items():
+        if name != "model.gltf":
+            text = text.replace(name.encode(), b"data:application/octet-stream;base64," + base64.b64encode(content))
+    return text
+
+
+def _mosaic():
+    sky = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 1, "CRPIX2": 1, "CRVAL1": 0, "CRVAL2": 0}
+    scale = {"CDELT1": -1e-5, "CDELT2": 1e-5, "CUNIT1": "deg", "CUNIT2": "deg"}
+    return fits.ImageHDU(RNG.normal(size=(24, 24)).astype(np.float32), fits.Header(sky | scale))
+
+
+def _psf_model(path):
+    stamps = np.exp(-0.5 * (np.mgrid[-3:4, -3:4] ** 2).sum(axis=0)) + 0.01 * RNG.random((6, 7, 7))
+    pachon.PsfModel.fit(stamps, RNG.uniform(-1, 1, (6, 2)), n_components=2, order=0).write(path)
+
+
+GRID = pachon.GridSag(np.arange(5.0), np.arange(5.0), np.zeros((5, 5)))
+GALAXIES = pachon.Galaxies.single([0.0, 1e-5], [0.0, 1e-5], [22.0, 23.0], [2e-6, 3e-6])
+LENS = ROOT / "tests/data/zmx/lens1.zmx"
+SEQ = b"""RDM;LEN
+TITLE 'singlet'
+EPD   8.0
+DIM   M
+WL    656.3 587.6
+REF   1
+WTW   1 1
+XAN   0.0 0.0
+YAN   0.0 8.5
+SO    0.0 0.1e14
+S     60.0 5.0 516.642
+S     -60.0 2.0
+  STO
+S     0.0 60.0
+SI    0.0 0.0
+GO
+"""
+
+
+def _cases(folder):
+    """Return ending, content and use of each format."""
+    return {
+        "zmx": (".zmx", LENS.read_bytes(), lambda p: pachon.load_telescope(p, lenient=True)),
+        "seq": (".seq", SEQ, lambda p: pachon.load_telescope(p, lenient=True)),
+        "agf": (".agf", next(DATA.glob("*.agf")).read_bytes(), pachon.GlassCatalogue.read),
+        "baseline": (".json", (ROOT / "studies/baseline/bundled/lsst_v3.3_r.baseline.json").read_bytes(),
+                     pachon.read_baseline),
+        "site": (".yaml", (DATA / "cerro_pachon.yaml").read_bytes(), pachon.load_site),
+        "images": (".yaml", b"run: {ccds: [R22_S11], seed: 3}\nimage: {exposures: 2}\n",
+                   lambda p: pachon.load_images_configuration(p)),
+        "visits": (".yaml", b"run: {ccds: [R22_S11]}\nvisits: {count: 3, snapshots: [1, 3]}\n",
+                   lambda p: pachon.load_visits_configuration(p).plan(1)),
+        "degrees": (".yaml", yaml.safe_dump({"name": "mine", "degrees_of_freedom": [
+            {"name": "a", "unit": "um", "of": "M2.dz"}]}).encode(), pachon.load_degrees_of_freedom),
+        "heights_ecsv": (".ecsv", _text(_points(), "ascii.ecsv"), lambda p: pachon.FocalPlane.from_file(p)),
+        "heights_fits": (".fits", _fits(fits.table_to_hdu(_points())), lambda p: pachon.FocalPlane.from_file(p)),
+        "galaxies_ecsv": (".ecsv", _written(lambda p: pachon.write_galaxies(p, GALAXIES), ".ecsv", folder),
+                          pachon.read_galaxies),
+        "galaxies_fits": (".fits", _written(lambda p: pachon.write_galaxies(p, GALAXIES), ".fits", folder),
+                          pachon.read_galaxies),
+        "stars": (".fits", _fits(fits.table_to_hdu(_stars())), pachon.load_stars),
+        "mosaic": (".fits", _fits(_mosaic()), lambda p: read_mosaic(p, 25.0)),
+        "grid": (".fits", _written(lambda p: write_grid(GRID, p), ".fits", folder), read_grid),
+        "image": (".fits", _written(_image, ".fits", folder), pachon.CcdImage.read),
+        "psf_model": (".fits", _written(_psf_model, ".fits", folder), pachon.PsfModel.read),
+        "stl": (".stl", _mesh("stl"), lambda p: load_mesh(p, merged=True)),
+        "glb": (".glb", _mesh("glb"), lambda p: load_mesh(p, merged=False)),
+        "gltf": (".gltf", _gltf(), lambda p: load_mesh(p, merged=True)),
+        "obj": (".obj", _mesh("obj"), lambda p: load_mesh(p, merged=True)),
+        "ply": (".ply", _mesh("ply"), lambda p: load_mesh(p, merged=True)),
+        "off": (".off", _mesh("off"), lambda p: load_mesh(p, merged=True)),
+        "store": (".sweep", _written(_store, ".sweep", folder), _use_store),
+    }  # fmt: skip
+
+
+NAMES = (
+    "zmx", "seq", "agf", "baseline", "site", "images", "visits", "degrees", "heights_ecsv", "heights_fits",
+    "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image", "psf_model", "stl", "glb", "gltf", "obj",
+    "ply", "off", "store",
+)  # fmt: skip
+TOKENS = [
+    b"", b"0", b"-1", b"1e400", b"nan", b"inf", b"-0.0", b"9" * 60, b"null", b"[]", b"{}", b"[" * 50, b'"', b"'", b"\0",
+    b"\xff\xfe", b"\xc3\xa9", b"\n", b"2147483648", b"999999999", b"/dev/zero", b"1_0", b"\t", b"T", b"#",
+]  # fmt: skip
+
+
+def mutated(data, rng):
+    """Return the bytes after one to three mutations: of a stretch, a bit, a number or a line."""
+    for _ in range(rng.integers(1, 4)):
+        at = int(rng.integers(0, max(1, len(data))))
+        length = int(rng.choice([1, 2, 4, 8, 80, 2880]))
+        token = TOKENS[rng.integers(len(TOKENS))]
+        kind = rng.choice(["bit", "drop", "double", "token", "end", "zero", "largest", "number", "line"])
+        if kind == "bit" and data:
+            data = data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :]
+        elif kind == "drop":
+            data = data[:at] + data[at + length :]
+        elif kind == "double":
+            data = data[:at] + data[at : at + length] + data[at:]
+        elif kind == "token":
+            data = data[:at] + token + data[at:]
+        elif kind == "end":
+            data = data[:at]
+        elif kind in ("zero", "largest"):
+            byte = b"\0" if kind == "zero" else b"\xff"
+            data = data[:at] + byte * min(length, len(data) - at) + data[at + length :]
+        elif kind == "number":
+            # The next word of digits.
+            first = next((i for i in range(at, len(data)) if data[i : i + 1].isdigit()), len(data))
+            last = next((i for i in range(first, len(data)) if not data[i : i + 1].isdigit()), len(data))
+            data = data[:first] + token + data[last:]
+        elif kind == "line":
+            lines = data.split(b"\n")
+            i, j = rng.integers(0, len(lines), 2)
+            lines[i], lines[j] = lines[j], lines[i]
+            data = b"\n".join(lines)
+    return data
+
+
+def complaint(path, function):
+    """Use a file and return what is wrong with how it was refused; None where it was read or refused as it should."""
+    try:
+        with bounded(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            function(path)
+    except PachonError as error:
+        text = str(error)
+        return None if text.strip() and "\n" not in text and len(text) <= CHARACTERS else f"message: {text}"
+    except Hang:
+        return f"more than {SECONDS:g} s"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory):
+    made = _cases(tmp_path_factory.mktemp("made"))
+    assert tuple(made) == NAMES
+    return made
+
+
+def fuzz(name, case, tmp_path, count):
+    suffix, data, function = case
+    bad = []
+    for seed in range(count):
+        for beside in tmp_path.iterdir():
+            beside.unlink()
+        path = tmp_path / f"file{suffix}"
+        path.write_bytes(mutated(data, np.random.default_rng([zlib.crc32(name.encode()), seed])))
+        if (problem := complaint(path, function)) is not None:
+            bad.append(f"{name}, seed {seed}: {problem[:200]}")
+            if KEEP:
+                kept = gzip.compress(path.read_bytes(), mtime=0)
+                (Path(KEEP) / f"{name}.{seed}{suffix}.gz").write_bytes(kept)
+    assert not bad, "\n".join(bad)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_as_they_are_are_read(name, cases, tmp_path):
+    suffix, data, function = cases[name]
+    (tmp_path / f"file{suffix}").write_bytes(data)
+    with warnings.catch_warnings():
+        # Some CCDs have no heights.
+        warnings.simplefilter("ignore", pachon.HeightWarning)
+        function(tmp_path / f"file{suffix}")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+def test_mutated_files_are_read_or_refused(name, cases, tmp_path):
+    fuzz(name, cases[name], tmp_path, 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_eight_hundred_mutated_files_of_each_format(name, cases, tmp_path):
+    fuzz(name, cases[name], tmp_path, 800)
+
+
+@pytest.mark.parametrize("path", sorted(CORPUS.iterdir()), ids=lambda path: path.name)
+def test_files_that_once_failed(path, cases, tmp_path):
+    suffix, _, function = cases[path.name.partition(".")[0]]
+    (tmp_path / f"file{suffix}").write_bytes(gzip.decompress(path.read_bytes()))
+    assert complaint(tmp_path / f"file{suffix}", function) is None
