@@ -54,7 +54,7 @@ def model_command(
     path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
     with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
         own = fit_own_stars(
-            load_stars(stars, x=x, y=y, stamp=stamp, images=images),
+            *load_stars(stars, x=x, y=y, stamp=stamp, images=images),
             pixel_arcsec * ARCSEC,
             size=size,
             min_snr=min_snr,

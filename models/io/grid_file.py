@@ -37,7 +37,7 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
         If the file cannot be read, has no image of two dimensions, a unit that is no length, or is no valid grid.
     """
     header, data = fits_image(Path(path), 2)
-    with error_context(file=path):
+    with error_context(file=path), parsing(Path(path), "cannot be read as FITS", PrescriptionError):
         x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
         return GridSag(x, y, data * length_unit(header, "BUNIT"))
 

@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.table import Table
-from numpy.typing import ArrayLike
+from astropy.units import Quantity
+from numpy.typing import ArrayLike, NDArray
 
+from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.random_streams import stream
-from ...core.units import ARCSEC, positive_angle
+from ...core.units import ARCSEC, positive_angle, real_array, require_seed
 from ..measure.rho_statistics import RhoStatistics, rho_statistics
 from ..measure.shapes import Shapes, fwhm, measure_shapes
-from ..measure.star_catalogue import StarCutouts
 from ..measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
 from ..psf_model.model import PsfModel
+from ..psf_model.polynomial import as_positions
 from ..simulate.stamps import center_stamps
 
 #: Fewest stars that a model is made of.
@@ -31,6 +33,7 @@ _SKY = 0.4
 _RIM = 2
 
 
+@check_arguments
 @dataclass(frozen=True, eq=False)
 class OwnStars:
     """Stars of an image, the PSF model made from the good ones, and its prediction of each star held out.
@@ -63,7 +66,7 @@ class OwnStars:
     positions: np.ndarray
     snr: np.ndarray
     flags: np.ndarray
-    used: np.ndarray
+    used: NDArray[np.bool_]
     shapes: Shapes
     held_out: Shapes
     stamps: np.ndarray
@@ -127,9 +130,11 @@ class OwnStars:
         return rho_statistics(*places.T, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
 
 
+@check_arguments
 def fit_own_stars(
-    stars: StarCutouts,
-    pixel_scale: Any,
+    stamps: ArrayLike,
+    positions: ArrayLike,
+    pixel_scale: float | Quantity,
     *,
     size: int | None = None,
     min_snr: float = 20.0,
@@ -144,8 +149,8 @@ def fit_own_stars(
 
     Parameters
     ----------
-    stars : StarCutouts
-        Stamps and positions, such as :func:`~pachon.load_stars` reads.
+    stamps, positions : array
+        Stars [n, ny, nx] and places [n, 2], as :func:`~pachon.load_stars` reads them.
     pixel_scale : float or Quantity
         Side of a pixel [rad].
     size : int, optional
@@ -170,27 +175,31 @@ def fit_own_stars(
     DomainError
         If stamps are too small, fewer than five stars are left, or the model cannot be made.
     """
-    stamps, positions = np.array(stars.stamps, dtype=np.float64), np.asarray(stars.positions, dtype=np.float64)
+    images, places = real_array(stamps, "stamps: expected real numbers [n, ny, nx]").copy(), as_positions(positions)
+    if images.ndim != 3 or len(images) != len(places):
+        raise DomainError(
+            f"stamps of shape {images.shape}, {len(places)} positions: expected [n, ny, nx] and as many positions"
+        )
     scale = positive_angle(pixel_scale, "pixel_scale")
     if not (np.isfinite(gain) and gain > 0.0):
         raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
-    side = min(stamps.shape[1:])
+    side = min(images.shape[1:])
     if size is None:
         size = max(side - 2 * _RIM - 1 + (side % 2), 0)
     if size % 2 == 0 or not 9 <= size <= side:
         raise DomainError(f"size = {size}: expected an odd number of pixels from 9 to {side}, the side of the stamps")
-    y, x = np.indices(stamps.shape[1:]) - 0.5 * (np.array(stamps.shape[1:])[:, None, None] - 1.0)
-    sky = stamps[:, np.hypot(x, y) > _SKY * side]
+    y, x = np.indices(images.shape[1:]) - 0.5 * (np.array(images.shape[1:])[:, None, None] - 1.0)
+    sky = images[:, np.hypot(x, y) > _SKY * side]
     middle = np.nanmedian(sky, axis=1)
     if background:
-        stamps -= middle[:, None, None]
+        images -= middle[:, None, None]
     rms = 1.4826 * np.nanmedian(np.abs(sky - middle[:, None]), axis=1)
-    wide = measure_shapes(stamps, scale, 0.25 * side * scale)
-    weight = float(np.nanmedian(fwhm(stamps[wide.usable], scale))) if wide.usable.any() else np.nan
+    wide = measure_shapes(images, scale, 0.25 * side * scale)
+    weight = float(np.nanmedian(fwhm(images[wide.usable], scale))) if wide.usable.any() else np.nan
     if not np.isfinite(weight):
-        raise DomainError(f"none of {len(stamps)} stamps has a star in its middle")
-    first = measure_shapes(stamps, scale, weight)
-    centred = center_stamps(stamps, first.x, first.y, size=size, normalize=False)
+        raise DomainError(f"none of {len(images)} stamps has a star in its middle")
+    first = measure_shapes(images, scale, weight)
+    centred = center_stamps(images, first.x, first.y, size=size, normalize=False)
     shapes = measure_shapes(centred, scale, weight)
     flags = flag_stars(centred, np.where(rms > 0.0, rms, 1.0), gain=gain, saturation=saturation).flags
     flags = np.where(shapes.usable, flags, flags | StarFlag.UNUSABLE)
@@ -202,15 +211,15 @@ def fit_own_stars(
         defaults["gain"] = gain
 
     def fit(chosen: np.ndarray) -> PsfModel:
-        return PsfModel.fit(centred[chosen], positions[chosen], extent=span, **defaults)
+        return PsfModel.fit(centred[chosen], places[chosen], extent=span, **defaults)
 
-    span = _extent(positions[used]) if extent is None else extent
+    span = _extent(places[used]) if extent is None else extent
     which = np.flatnonzero(used)
     predicted = np.empty((len(which), size, size))
-    parts = np.array_split(stream(seed, "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
+    parts = np.array_split(stream(require_seed(seed), "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
     for part in parts:
         rest = np.setdiff1d(np.arange(len(which)), part)
-        predicted[part] = fit(which[rest]).at(positions[which[part]])
+        predicted[part] = fit(which[rest]).at(places[which[part]])
     psf = predicted.mean(axis=0)
     variance = (weight / scale / 2.354820045) ** 2
     deviations = (centred[used] / centred[used].sum(axis=(1, 2), keepdims=True) - psf).reshape(len(which), -1)
@@ -222,7 +231,7 @@ def fit_own_stars(
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
     return OwnStars(
-        fit(which), positions, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight
+        fit(which), places, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight
     )
 
 

@@ -47,6 +47,11 @@ class _Made:
     def make_places(self):
         return np.random.default_rng(1).uniform(-1.0, 1.0, (12, 2))
 
+    def make_own(self):
+        y, x = np.mgrid[-8:9, -8:9]
+        star = 2e3 * np.exp(-0.5 * (x * x + y * y) / 1.6**2)
+        return star + np.random.default_rng(3).normal(size=(12, 17, 17)) * np.sqrt(100.0 + star)
+
     def make_model(self):
         return pachon.PsfModel.fit(self.stamps, self.places, n_components=2, order=1)
 
@@ -236,6 +241,9 @@ def calls(folder):
         "load_stars": (pachon.load_stars, {"catalogue": m.folder / "none.fits", "x": "x", "y": "y", "stamp": "stamp"}),
         "flag_stars": (pachon.flag_stars, {"stamps": m.stamps, "noise": 0.01, "gain": 1.0, "saturation": 10.0,
                        "threshold": 6.0}),
+        "fit_own_stars": (pachon.fit_own_stars, {"stamps": m.own, "positions": m.places,
+                          "pixel_scale": 1e-6, "size": 11, "min_snr": 1.0, "gain": 1.0, "saturation": 1e9,
+                          "background": False, "extent": (-1.0, 1.0, -1.0, 1.0), "seed": 1}),
         "brighter_fatter": (pachon.brighter_fatter, {"images": m.stamps, "electrons": np.full(12, 1e4), "sensor": "itl",
                             "sky": 10.0}),
         "displace_stamps": (pachon.displace_stamps, {"images": m.stamps, "places": m.places * 1e-3, "pixel_size": 1e-5,
@@ -391,6 +399,8 @@ def _methods(m, tel, w, x, y):
         "PsfModel.fit": (pachon.PsfModel.fit, {"stamps": m.stamps, "positions": m.places, "basis": "pca",
                          "interpolation": "polynomial", "weights": np.ones(12), "n_components": 2, "order": 1,
                          "masks": np.zeros((12, 15, 15), bool), "extent": (-1.0, 1.0, -1.0, 1.0), "clip_sigma": 3.0}),
+        "PsfModel.fit kriging": (pachon.PsfModel.fit, {"stamps": 1e4 * m.stamps, "positions": m.places,
+                                 "basis": "pixels", "interpolation": "kriging", "order": 1, "gain": 1.0}),
         "PsfModel.at": (m.model.at, {"positions": m.places[:2]}),
         "PsfModel.draw": (m.model.draw, {"x": 0.0, "y": 0.0}),
         "PsfModel.truncated": (m.model.truncated, {"n_components": 1}),

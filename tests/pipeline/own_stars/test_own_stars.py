@@ -45,7 +45,7 @@ def stars():
 
 @pytest.fixture(scope="module")
 def own(stars):
-    return fit_own_stars(stars, PIXEL)
+    return fit_own_stars(*stars, PIXEL)
 
 
 def test_stars_with_defects_and_faint_ones_are_left_out(own):
@@ -77,7 +77,7 @@ def test_residuals_of_held_out_stars_are_their_noise(own):
 
 
 def test_the_parts_held_out_are_those_of_the_seed(stars, own):
-    again, other = fit_own_stars(stars, PIXEL), fit_own_stars(stars, PIXEL, seed=2)
+    again, other = fit_own_stars(*stars, PIXEL), fit_own_stars(*stars, PIXEL, seed=2)
     assert np.array_equal(again.predicted, own.predicted)
     assert np.array_equal(other.model.at((5.0, 5.0)), own.model.at((5.0, 5.0)))
     assert not np.array_equal(other.predicted, own.predicted)
@@ -95,7 +95,7 @@ def test_names_of_columns_of_sextractor(stars, tmp_path):
     assert np.isnan(found.stamps[3, 0, 0])
     assert np.array_equal(found.stamps[4], stars.stamps[4])
     # A masked pixel takes its star out.
-    assert fit_own_stars(found, PIXEL).flags[3] == StarFlag.UNUSABLE
+    assert fit_own_stars(*found, PIXEL).flags[3] == StarFlag.UNUSABLE
 
 
 @pytest.mark.long
@@ -124,10 +124,10 @@ def test_the_command_leaves_model_picture_and_table(stars, tmp_path, monkeypatch
 )
 def test_bad_values_are_named(stars, change, message):
     with pytest.raises(DomainError, match=message):
-        fit_own_stars(stars, **({"pixel_scale": PIXEL} | change))
+        fit_own_stars(*stars, **({"pixel_scale": PIXEL} | change))
 
 
 def test_stamps_of_noise_are_no_stars():
     noise = np.random.default_rng(1).normal(size=(20, 21, 21))
     with pytest.raises(DomainError, match="stars"):
-        fit_own_stars(StarCutouts(noise, np.random.default_rng(2).uniform(size=(20, 2))), PIXEL)
+        fit_own_stars(noise, np.random.default_rng(2).uniform(size=(20, 2)), PIXEL)
