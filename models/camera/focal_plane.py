@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 # [m], by which rims of tiles of files may lie outside: 0.34 m in a float32 STL are good to 15 nm.
 _MESH_MARGIN = 1e-7
+#: Most cells along a side of a CCD.
+_MOST_CELLS = 1024
 
 
 @check_arguments
@@ -339,7 +341,7 @@ class FocalPlane:
         """
         import trimesh  # half a second
 
-        cells = _cells(cells_per_ccd)
+        cells = require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
         vertices = np.stack(self._nodes(cells)[1:], axis=-1)
         index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
@@ -364,7 +366,7 @@ class FocalPlane:
         ndarray, shape (n_ccd,)
             Upper bound of ``|mesh height - height|`` [m] on each CCD.
         """
-        cell = self.camera.ccd_size / _cells(cells_per_ccd)
+        cell = self.camera.ccd_size / require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
         return 0.25 * self.surfaces.curvature_bound() * cell**2
 
     def to_table(self, cells_per_ccd: int = 32) -> Table:
@@ -381,7 +383,7 @@ class FocalPlane:
             Columns ccd (name), x, y, z [m].
         """
         # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
-        ccd, *points = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
+        ccd, *points = self._nodes(require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS), scale=1.0 - 1e-9)
         from astropy.table import Table
 
         return Table([np.array(self.names)[ccd], *points], names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
@@ -394,11 +396,3 @@ class FocalPlane:
         ccd, dx, dy = ccd.ravel(), dx.ravel(), dy.ravel()
         x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
         return ccd, x, y, self.surfaces.height(ccd, dx, dy)
-
-
-#: Most cells along a side of a CCD.
-_MOST_CELLS = 1024
-
-
-def _cells(cells_per_ccd: int) -> int:
-    return require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)

@@ -251,7 +251,6 @@ class PsfModel:
             q, _ = np.linalg.qr(weighted(design_matrix(self.positions, self.extent, self.order), self.weights))
         return (q**2).sum(axis=1)
 
-    @check_arguments
     def at(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the PSF at positions of any number, [m, ny, nx], unit sum.
 
@@ -265,12 +264,10 @@ class PsfModel:
         """
         return self._combine(self.amplitudes(positions))
 
-    @check_arguments
     def draw(self, x: float, y: float) -> np.ndarray:
         """Evaluate the PSF at one position, [ny, nx], unit sum."""
         return self.at((x, y))[0]
 
-    @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the amplitudes of the components at positions, [m, k]."""
         terms = design_matrix(positions, self.extent, self.order)
@@ -327,7 +324,6 @@ class PsfModel:
             alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
-    @check_arguments
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
         """Return the model as FITS extensions, lossless; :meth:`from_hdus` reads them.
 
@@ -340,7 +336,6 @@ class PsfModel:
         return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
 
     @classmethod
-    @check_arguments
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
         """Read a model from FITS extensions written by :meth:`to_hdus`.
 
