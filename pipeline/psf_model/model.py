@@ -226,10 +226,7 @@ class PsfModel:
 
     @property
     def leave_one_out_curve(self) -> np.ndarray:
-        """Rms over stars and pixels of stamp minus model without that star, by components used, 0 to k: [k + 1].
-
-        As :attr:`leave_one_out_rms`, its last element.
-        """
+        """Rms of stamps minus models without the star, by components used, 0 to k; the last is `leave_one_out_rms`."""
         left_out, own = self._leave_one_out_residuals() ** 2, self.coefficients**2
         gained = np.concatenate([[0.0], np.cumsum((left_out - own).sum(axis=0))])
         total = self.unexplained.sum() + own.sum() + gained
@@ -251,6 +248,7 @@ class PsfModel:
             q, _ = np.linalg.qr(weighted(design_matrix(self.positions, self.extent, self.order), self.weights))
         return (q**2).sum(axis=1)
 
+    @check_arguments
     def at(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the PSF at positions of any number, [m, ny, nx], unit sum.
 
@@ -264,10 +262,12 @@ class PsfModel:
         """
         return self._combine(self.amplitudes(positions))
 
+    @check_arguments
     def draw(self, x: float, y: float) -> np.ndarray:
         """Evaluate the PSF at one position, [ny, nx], unit sum."""
         return self.at((x, y))[0]
 
+    @check_arguments
     def amplitudes(self, positions: ArrayLike) -> np.ndarray:
         """Evaluate the amplitudes of the components at positions, [m, k]."""
         terms = design_matrix(positions, self.extent, self.order)
