@@ -6,7 +6,8 @@ RUN is the folder of a `pachon run` without options: its observed stars, 31 x 31
 noise-free PSFs at holdout positions on the same CCDs. Piff fits the same stamps, with the inverse variance of their
 noise as weights, by PixelGrid of pixels of the same scale and BasisPolynomial of the same order. Both are then drawn at
 the holdout positions, centred, and measured as the noise-free PSFs are. pachon runs without weights, as in Jee & Tyson
-2011, and with the stars' squared S/N as weights, which is nearer to Piff's. The fits are timed alone, from stamps in
+2011, with the stars' squared S/N as weights, which is nearer to Piff's, and by kriging, which has no order to choose.
+The fits are timed alone, from stamps in
 memory to a model in memory, in one process, in turns, one thread.
 """
 
@@ -82,8 +83,8 @@ def main() -> None:
     order, size = arguments.order, arguments.size
     paths = sorted(arguments.run.glob("ccd_*.fits"))[: arguments.ccds]
     print(f"pachon {pachon.__version__}, Piff {piff.__version__}, order {order}, Piff's grid {size} x {size}")
-    print("rms of e and of size, each: pachon without weights, pachon with weights (S/N)^2, Piff")
-    fits = {name: [] for name in ("plain", "weighted", "Piff")}
+    print("rms of e and of size, each: pachon without weights, with weights (S/N)^2, by kriging; Piff")
+    fits = {name: [] for name in ("plain", "weighted", "kriging", "Piff")}
     times = dict.fromkeys(fits, 0.0)
     for path in paths:
         product = read_product(path)
@@ -92,10 +93,12 @@ def main() -> None:
         places = np.stack([product.observed.x, product.observed.y], axis=1)[used]
         elsewhere = np.stack([product.holdout.x, product.holdout.y], axis=1)
         stars, options = piff_stars(product), {"order": order, "extent": product.model.extent}
-        weights = product.observed.snr[used] ** 2
+        weights, electrons = product.observed.snr[used] ** 2, product.observed.electrons[used, None, None]
+        kriged = {"basis": "pixels", "interpolation": "kriging", "extent": product.model.extent}
         jobs = {
             "plain": lambda o=options, s=stamps, p=places: pachon.PsfModel.fit(s, p, **o),
             "weighted": lambda o=options, s=stamps, p=places, w=weights: pachon.PsfModel.fit(s, p, weights=w, **o),
+            "kriging": lambda o=kriged, s=stamps * electrons, p=places: pachon.PsfModel.fit(s, p, **o),
             "Piff": lambda s=stars: fit_piff(s, size, order),
         }
         if path == paths[0]:
@@ -109,7 +112,8 @@ def main() -> None:
         print(f"{product.name:8s} {used.sum():3d} stars: {_row([each[-1] for each in fits.values()])}", flush=True)
     print(f"all: {_row([np.concatenate(each, axis=1) for each in fits.values()])}")
     print("time of a fit: " + ", ".join(f"{name} {1e3 * t / len(paths):.0f} ms" for name, t in times.items()))
-    print(f"Piff's time over pachon's: {times['Piff'] / times['plain']:.0f}, {times['Piff'] / times['weighted']:.0f}")
+    ratios = ", ".join(f"{name} {times['Piff'] / t:.0f}" for name, t in times.items() if name != "Piff")
+    print(f"Piff's time over pachon's: {ratios}")
 
 
 def _row(errors: list[np.ndarray]) -> str:

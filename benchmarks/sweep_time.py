@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 import pachon
+from pachon.core.workers import process_workers
 from pachon.studies.sweep.file import load_sweep
 from pachon.studies.sweep.point import PointMeasurement
 from pachon.studies.sweep.store import SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points
-from pachon.studies.sweep.workers import process_workers
 
 POINTS = int(sys.argv[1]) if len(sys.argv) > 1 else 40
 EXAMPLE = Path(__file__).parents[1] / "studies" / "sweep" / "examples" / "table1.yaml"

@@ -9,10 +9,12 @@ from typing import Annotated, Any
 import typer
 from typer import Option
 
+from ..core.errors import ConfigError
 from .inputs import configured_experiment
 from .interrupt import interruptible
 from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, one_name_list
 from .tables import Rows, plain_table, print_json, wide_console
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 app = typer.Typer()
 
@@ -27,6 +29,12 @@ def run_command(
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     resume: Annotated[bool, Option("--resume", help="Keep the CCDs that are finished, compute the others.")] = False,
     strict: Annotated[bool, Option("--strict", help="End at the first CCD that cannot be modelled.")] = False,
+    part: Annotated[
+        str | None, Option(metavar="I/N", help="Compute the I-th of N parts; all parts share the folder.")
+    ] = None,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
     threads: Threads = None,
@@ -47,6 +55,8 @@ def run_command(
     - `pachon run --ccds R22_S11,R24_S12 --truth-stars 400`
     - `pachon run pachon_run/config.yaml --out again`: the same bytes
     - `pachon run --all --out full --resume`: go on where a run was stopped
+    - `pachon run --all --out full --scheduler tcp://login1:8786`: on a Dask cluster
+    - `pachon run --all --out full --part 3/8`: one of eight jobs of a batch system, with one folder for all
     """
     from ..pipeline.run import run
     from ..pipeline.simulate.ccd_loop import left_out_line
@@ -55,17 +65,49 @@ def run_command(
     experiment = configured_experiment(
         config, ccds=names, seed=seed, stars__truth=truth_stars, stars__observed=observed_stars
     )
-    with interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter:
-        result = run(experiment, out, resume=resume, strict=strict, threads=threads, reporter=reporter)
+    with (
+        interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
+        result = run(
+            experiment,
+            out,
+            resume=resume,
+            strict=strict,
+            workers=maker,
+            part=_part(part),
+            threads=threads,
+            reporter=reporter,
+        )
     if quiet:  # the reporter has printed nothing
         for name, reason in result.not_modelled.items():
             print(f"pachon: {left_out_line(name, reason)}", file=sys.stderr)
         for warning in result.summary.get("warnings", ()):
             print(f"pachon: {warning}", file=sys.stderr)
     if as_json:
-        print_json(result.summary)
+        missing = {"missing": list(result.missing), "not_modelled": result.not_modelled}
+        print_json(result.summary if result.report else missing)
     elif not quiet:
-        _show_run(result, sum(reporter.seconds.values()))
+        if result.report:
+            _show_run(result, sum(reporter.seconds.values()))
+        else:
+            _show_part(result)
+
+
+def _part(text: str | None) -> tuple[int, int]:
+    """Return the two numbers of a part such as 3/8; all is 1/1."""
+    try:
+        number, parts = (1, 1) if text is None else (int(word) for word in text.split("/"))
+    except ValueError:
+        raise ConfigError(f"--part = {text}: expected I/N, such as 3/8") from None
+    return number, parts
+
+
+def _show_part(result: Any) -> None:
+    count = len(result.missing)
+    some = f"{', '.join(result.missing[:3])}{', ...' if count > 3 else ''}"
+    print(f"{len(result.computed)} CCDs computed, {len(result.kept)} were there; {count} are missing: {some}")
+    print("the last part to end writes the report")
 
 
 def _show_run(result: Any, seconds: float) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,14 +9,16 @@ import typer
 from typer import Argument, Option
 
 from ..core.errors import ConfigError
+from ..core.threads import thread_count
 from .default_group import DefaultGroup
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 if TYPE_CHECKING:
     from ..core.progress import Reporter
-    from ..studies.sweep.sweep import MakeWorkers
+    from ..core.workers import MakeWorkers
 
 app = typer.Typer()
 sweep_app = typer.Typer(cls=DefaultGroup, subcommand_metavar="| COMMAND [ARGS]...")
@@ -50,15 +50,17 @@ def sweep_run(
     sweep: Annotated[Path | None, Argument(metavar="SWEEP.yaml", help="Sweep to run.")] = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Store to write; SWEEP.sweep by default.")] = None,
     resume: Annotated[bool, Option("--resume", help="Compute only the points that are missing.")] = False,
-    processes: Annotated[int | None, Option(min=1, help="Processes; one for each processor by default.")] = None,
-    scheduler: Annotated[str | None, Option(metavar="tcp://HOST:PORT", help="Compute on a Dask cluster.")] = None,
-    workers: Annotated[int | None, Option(min=1, help="Start a local Dask cluster with so many workers.")] = None,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     example: Annotated[str | None, Option(metavar="NAME", help="Run a bundled sweep: table1 or table1_small.")] = None,
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a sweep and write its report; the word `run` may be left out.
+
+    Without --processes, --scheduler or --workers there is a process for each processor.
 
     **Examples**
 
@@ -70,12 +72,17 @@ def sweep_run(
     path = sweep or _example(example or "")
     store = out or path.with_suffix(".sweep")
     resumed = f"go on with: pachon sweep {path} -o {store} --resume"
-    with interruptible(quiet, resumed) as reporter, _workers(processes, scheduler, workers, threads, reporter) as maker:
+    if scheduler is None and workers is None and processes is None:
+        processes = thread_count(threads)
+    with (
+        interruptible(quiet, resumed) as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
         outcome = _run(path, store, resume, maker, reporter)
     _show(outcome, as_json, quiet)
 
 
-def _run(path: Path, store: Path, resume: bool, maker: MakeWorkers, reporter: Reporter) -> dict[str, Any]:
+def _run(path: Path, store: Path, resume: bool, maker: MakeWorkers | None, reporter: Reporter) -> dict[str, Any]:
     """Compute the points that are missing, write the report, and return the counts."""
     from ..studies.sweep.file import load_sweep
     from ..studies.sweep.report import write_report
@@ -89,27 +96,6 @@ def _run(path: Path, store: Path, resume: bool, maker: MakeWorkers, reporter: Re
             report = str(write_report(opened, _report_folder(store)))
     counts = {key: getattr(outcome, key) for key in ("points", "kept", "computed", "failed")}
     return {"store": str(store), **counts, "report": report}
-
-
-@contextmanager
-def _workers(
-    processes: int | None, scheduler: str | None, on_dask: int | None, threads: int | None, reporter: Reporter
-) -> Iterator[MakeWorkers]:
-    """Yield the function that makes workers of the function that computes a point."""
-    if sum(option is not None for option in (processes, scheduler, on_dask)) > 1:
-        raise ConfigError("--processes, --scheduler and --workers: expected one of them")
-    from ..core.threads import thread_count
-    from ..studies.sweep.workers import dask_client, dask_workers, local_cluster, process_workers, serial_worker
-
-    if scheduler is not None or on_dask is not None:
-        with local_cluster(on_dask, reporter.line) if scheduler is None else dask_client(scheduler) as client:
-            yield lambda measure: dask_workers(measure, client)
-        return
-    count = thread_count(threads) if processes is None else processes
-    if count == 1:
-        yield lambda measure: serial_worker(measure, threads)
-    else:
-        yield lambda measure: process_workers(measure, count, threads)
 
 
 def _example(name: str) -> Path:

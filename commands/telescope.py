@@ -65,12 +65,13 @@ def info_command(
 def convert_command(
     model: Model,
     out: Annotated[Path, Argument(metavar="OUT", help="File to write: .yaml (ours) or .zmx (Zemax).")],
+    format: Annotated[str, Option(help="Format: pachon, batoid or zemax; by default that of the name.")] = "",
     glass_catalogue: Annotated[
         list[Path] | None, Option(metavar="FILE.agf", help="Glass catalogue, once for each.")
     ] = None,
     lenient: Lenient = False,
 ) -> None:
-    """Write a telescope in another format: a Zemax or CODE V file as ours, or any model as a Zemax file.
+    """Write a telescope in another format: a batoid, Zemax or CODE V file as ours, any model as batoid's or Zemax's.
 
     Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside it.
 
@@ -79,9 +80,10 @@ def convert_command(
     - `pachon convert lens.zmx lens.yaml`
     - `pachon convert lens.zmx lens.yaml --glass-catalogue schott.agf --lenient`
     - `pachon convert lsst_v3.3_r lsst.zmx`
+    - `pachon convert lsst_v3.3_r LSST_r.yaml --format batoid`
     """
     from ..models.io.prescription import save_telescope
 
     telescope = load_model(model, lenient, glass_catalogue or ())
-    save_telescope(telescope, out)
+    save_telescope(telescope, out, format=format)
     print(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")

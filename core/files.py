@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -104,6 +105,21 @@ def publish_new(partial: Path, path: Path) -> None:
         # File systems without hard links, such as FAT.
         with open(path, "xb") as file:
             file.write(partial.read_bytes())
+
+
+@contextmanager
+def marked_folder(folder: Path) -> Iterator[str]:
+    """Put a file of a unique name into a folder, and yield that name: who finds it there sees the same folder.
+
+    The file is a temporary one, which :func:`remove_leftovers` knows.
+    """
+    mark = folder / f".{uuid4().hex}.{_owner(os.getpid())}.partial"
+    write_bytes(mark, b"")
+    try:
+        yield mark.name
+    finally:
+        with suppress(OSError):
+            mark.unlink()
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -73,17 +73,31 @@ class Section(BaseModel):
 
 
 def validated(
-    model: type[Model], content: Any, source: str, error: type[PachonError] = ConfigError, context: Any = None
+    model: type[Model],
+    content: Any,
+    source: str,
+    error: type[PachonError] = ConfigError,
+    context: Any = None,
+    *,
+    drop: Callable[[PachonError], None] | None = None,
 ) -> Model:
     """Return the model of the plain mappings, lists and values of a file, of which `source` is the name in messages.
 
     Raises `error` with the first problem, in one line, if a key is unknown or missing or a value is not as expected.
-    `context` is that of the validators, such as the units of the file.
+    `context` is that of the validators, such as the units of the file. With `drop`, unknown keys are left out of the
+    content, and it is called with the error of each.
     """
-    try:
-        return model.model_validate(content, context=context)
-    except ValidationError as problems:
-        raise _first_problem(problems, content, source, error) from None
+    while True:
+        try:
+            return model.model_validate(content, context=context)
+        except ValidationError as problems:
+            # A misspelt key is the likelier cause of the other problems, so it goes first.
+            first = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
+            found = _in_one_line(first, content, source, error)
+            if drop is None or first["type"] != "unknown_key":
+                raise found from None
+            drop(found)
+            del first["input"][first["ctx"]["key"]]
 
 
 def unknown_key(key: str, known: list[str]) -> PydanticCustomError:
@@ -259,9 +273,7 @@ _EXPECTED = {
 _LIMITS = {"greater_than": ("gt", "above"), "greater_than_equal": ("ge", "from"), "less_than_equal": ("le", "up to")}
 
 
-def _first_problem(problems: ValidationError, content: Any, source: str, error: type[PachonError]) -> PachonError:
-    # A misspelt key is the likelier cause of the other problems, so it goes first.
-    problem = min(problems.errors(include_url=False), key=lambda p: p["type"] != "unknown_key")
+def _in_one_line(problem: Mapping[str, Any], content: Any, source: str, error: type[PachonError]) -> PachonError:
     kind, value, limits = problem["type"], problem["input"], problem.get("ctx", {})
     path = _dotted([*problem["loc"], *filter(None, [limits.get("key")])], content)
     if kind == "unknown_key":

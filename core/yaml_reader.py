@@ -1,7 +1,8 @@
 """Strict reading of YAML files; each problem is an error of one line.
 
 The loader is YAML's safe one; a repeated key, of which YAML takes the last, is an error. So is content too large to be
-a configuration: files of many bytes, deep nesting, aliases that multiply, integers of hundreds of digits.
+a configuration: files of many bytes, deep nesting, aliases that multiply, integers of hundreds of digits. Mappings may
+be merged into others (``<<: *anchor``); they count as the aliases that they are.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ MAX_DEPTH = 50
 MAX_DIGITS = 100
 #: Longest reason of a problem in an error message: some hold a name of the file's.
 _MAX_REASON = 200
+_MERGE = "tag:yaml.org,2002:merge"
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -41,6 +43,8 @@ class _StrictLoader(yaml.SafeLoader):
         self._aliased = 0
         # Size with every alias written out, by the identity of the node.
         self._sizes: dict[int, int] = {}
+        # Identities of the mappings without repeated keys.
+        self._checked: set[int] = set()
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Return the next node; a ComposerError where depth or size exceed their limits."""
@@ -69,6 +73,30 @@ class _StrictLoader(yaml.SafeLoader):
             raise yaml.composer.ComposerError(None, None, text, mark)
         return node
 
+    def check_keys(self, node: yaml.MappingNode) -> None:
+        """Raise a ConstructorError for a key that is no name or occurs twice in a mapping or one merged into it."""
+        # Merging writes the merged keys into the node, so each is checked once, before.
+        if id(node) in self._checked:
+            return
+        self._checked.add(id(node))
+        seen: set[Hashable] = set()
+        for key_node, value_node in node.value:
+            if key_node.tag == _MERGE:
+                key: Any = "<<"
+                parts = value_node.value if isinstance(value_node, yaml.SequenceNode) else [value_node]
+                for part in parts:
+                    if isinstance(part, yaml.MappingNode):
+                        self.check_keys(part)
+            else:
+                key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                text = f"key {cut_short(repr(key))}: expected a name"
+                raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
+            if key in seen:
+                text = f"key {cut_short(repr(key))} occurs twice"
+                raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
+            seen.add(key)
+
 
 def _short_integer(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
     if len(node.value) > MAX_DIGITS:
@@ -78,16 +106,7 @@ def _short_integer(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
 
 
 def _mapping_without_repeats(loader: _StrictLoader, node: yaml.MappingNode) -> dict[Hashable, Any]:
-    seen: set[Hashable] = set()
-    for key_node, _ in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        if not isinstance(key, str):
-            text = f"key {cut_short(repr(key))}: expected a name"
-            raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
-        if key in seen:
-            text = f"key {cut_short(repr(key))} occurs twice"
-            raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
-        seen.add(key)
+    loader.check_keys(node)
     return loader.construct_mapping(node, deep=True)
 
 

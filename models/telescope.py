@@ -39,6 +39,15 @@ def rotation_matrix(tilt: Any) -> np.ndarray:
     return about_x @ about_y @ about_z
 
 
+def rotation_angles(matrix: np.ndarray) -> tuple[float, float, float]:
+    """Return the angles [rad] about x, the new y and the new z of a rotation matrix: the inverse of the above."""
+    about_y = math.asin(max(-1.0, min(1.0, matrix[0, 2])))
+    if abs(matrix[0, 2]) > 1 - 1e-14:
+        # About y by a right angle, x and z turn about the same line: one of them does.
+        return math.atan2(matrix[2, 1], matrix[1, 1]), about_y, 0.0
+    return math.atan2(-matrix[1, 2], matrix[2, 2]), about_y, math.atan2(-matrix[0, 1], matrix[0, 0])
+
+
 @check_arguments
 @dataclass(frozen=True)
 class Telescope:
@@ -168,6 +177,10 @@ class Telescope:
                     f"obstruction {obstruction.name!r} reaches z = {obstruction.height:.6g} m: expected it below "
                     f"launch_distance = {self.launch_distance:.6g} m, where rays start"
                 )
+
+    def __repr__(self) -> str:
+        size, field = f"{self.pupil_diameter:.6g} m", f"{math.degrees(self.field_radius):.6g} deg"
+        return f"<Telescope {self.name}: {len(self.surfaces)} surfaces, pupil {size}, field radius {field}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A mapping proxy cannot be pickled: hand over plain dictionaries.

@@ -1,3 +1,4 @@
+from . import galsim as galsim
 from .core.errors import ConfigError as ConfigError
 from .core.errors import DomainError as DomainError
 from .core.errors import HeightWarning as HeightWarning
@@ -153,6 +154,8 @@ from .pipeline.measure.shapes import measure_shapes as measure_shapes
 from .pipeline.measure.star_catalogue import load_stars as load_stars
 from .pipeline.measure.star_selection import StarFlag as StarFlag
 from .pipeline.measure.star_selection import flag_stars as flag_stars
+from .pipeline.own_stars.own_stars import OwnStars as OwnStars
+from .pipeline.own_stars.own_stars import fit_own_stars as fit_own_stars
 from .pipeline.psf_model.model import PsfModel as PsfModel
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run

@@ -192,14 +192,17 @@ class ReconstructionConfig(Section):
         "pca", description="what stars are described in: pca (eigen-PSFs), pixels (each on its own), shapelets"
     )
     components: Count | None = Field(None, description="components kept on each CCD, 20 by default; none of pixels")
-    interpolation: Literal["polynomial", "gp"] = Field(
-        "polynomial", description="over the CCD: polynomial, gp (Gaussian process over a polynomial trend)"
+    interpolation: Literal["polynomial", "gp", "kriging"] = Field(
+        "polynomial",
+        description="over the CCD: polynomial, gp (Gaussian process over a polynomial trend), kriging (one process and "
+        "trend for all, with the noise of each star)",
     )
     weights: Literal["equal", "snr", "softened"] = Field(
         "equal", description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
     )
     order: Whole | None = Field(
-        None, description="order of the polynomials fitted to the observed stars, 3; 0 under a Gaussian process"
+        None,
+        description="order of the polynomials fitted to the observed stars, 3; under a process 0, in kriging 2",
     )
     truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")

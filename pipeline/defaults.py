@@ -25,7 +25,7 @@ from ..models.telescope import Telescope
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .config import BandName, Configuration
-from .psf_model.fit import COMPONENTS
+from .psf_model.fit import COMPONENTS, ORDERS
 from .psf_model.polynomial import term_count
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
 from .simulate.screen_cover import check_screens
@@ -101,7 +101,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
                 {
                     "weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3,
                     "components": None if config.reconstruction.basis == "pixels" else COMPONENTS,
-                    "order": 3 if config.reconstruction.interpolation == "polynomial" else 0,
+                    "order": ORDERS[config.reconstruction.interpolation],
                 },
             ),
         }
@@ -168,8 +168,10 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
     if fit.basis == "pixels" and fit.components is not None:
         raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
-    if fit.interpolation == "gp" and fit.weights != "equal":
-        raise ConfigError(f"reconstruction.weights = {fit.weights}: expected equal with interpolation = gp")
+    if fit.interpolation != "polynomial" and fit.weights != "equal":
+        raise ConfigError(
+            f"reconstruction.weights = {fit.weights}: expected equal with interpolation = {fit.interpolation}"
+        )
     for kind in ("observed", "truth"):
         count = getattr(stars, kind)
         # The noise-free PSFs are always described by principal components.
@@ -181,7 +183,7 @@ def _check(config: Configuration, telescope: Telescope) -> None:
             )
         key = "order" if kind == "observed" else "truth_order"
         terms = term_count(getattr(fit, key))
-        if terms > count:
+        if terms > count and (kind == "truth" or fit.interpolation != "kriging"):
             raise ConfigError(
                 f"reconstruction.{key} = {getattr(fit, key)}: its {terms} terms need as many stars, "
                 f"stars.{kind} = {count}"

@@ -35,11 +35,19 @@ def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     return max(_REPORT, _BASE + screen_bytes(experiment) + workers * of_worker + stamps)
 
 
-def check_memory(experiment: Experiment, threads: int | None = None) -> None:
-    """Raise ConfigError, with the key that takes most of it, if a run needs more memory than is available."""
+def check_memory(experiment: Experiment, threads: int | None = None, *, copies: int = 1) -> None:
+    """Raise ConfigError, with the key that takes most of it, if a run needs more memory than is available.
+
+    `copies` are the processes of this machine that each hold the whole of it; 0 where all are on others.
+    """
     free, needed = available_bytes(), needed_bytes(experiment, threads)
-    if free is None or needed <= free:
+    if free is None or copies * needed <= free:
         return
+    if needed <= free:
+        raise ConfigError(
+            f"{copies} processes need about {readable(copies * needed)} of memory, {readable(free)} are free; "
+            f"{int(free // needed)} would do"
+        )
     short = f"needs about {readable(needed)} of memory, {readable(free)} are free"
     rest = needed - screen_bytes(experiment)
     stars = experiment.config.stars

@@ -21,17 +21,17 @@ from ..core.products import write_ecsv
 from ..core.progress import Reporter
 from ..core.threads import thread_count
 from ..core.version import VERSION
-from .ccd_product import MODEL_CARD, product_path, read_product, write_product
+from ..core.workers import MakeWorkers
+from .ccd_product import product_path, read_product
+from .ccd_worker import compute_ccds
 from .config import Configuration
 from .experiment import Experiment
 from .focal_plane_stage import apply_focal_plane_model, write_focal_plane_model
 from .measure.summary import correlations, run_metrics
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
-from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of
-from .simulate.ccd_exposure import CcdExposure
+from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of, write_ccd
 from .simulate.ccd_loop import simulate_ccds
-from .simulate.ccd_model import model_ccd
 
 _MESH_CELLS = 16
 
@@ -44,22 +44,25 @@ class RunResult:
     ----------
     folder : Path
         Folder of the products.
-    report : Path
-        Path of the report.
+    report : Path or None
+        Path of the report; None while CCDs of other parts are missing.
     summary : dict
-        The content of ``summary.json``.
+        The content of ``summary.json``; empty without a report.
     kept, computed : tuple of str
         CCDs that were done before, and those done now.
     not_modelled : dict of str to str
         CCDs whose PSF cannot be modelled, each with the reason. They enter no metric.
+    missing : tuple of str
+        CCDs of other parts of the run that are not finished.
     """
 
     folder: Path
-    report: Path
+    report: Path | None
     summary: dict[str, Any]
     kept: tuple[str, ...]
     computed: tuple[str, ...]
     not_modelled: dict[str, str]
+    missing: tuple[str, ...] = ()
 
 
 @check_arguments
@@ -69,13 +72,15 @@ def run(
     *,
     resume: bool = False,
     strict: bool = False,
+    workers: MakeWorkers | None = None,
+    part: tuple[int, int] = (1, 1),
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> RunResult:
     """Simulate the CCDs of a configuration, model their PSFs and write the report.
 
-    Every product but ``timings.json`` has the same bytes whenever, wherever on one machine, and with however many
-    threads the configuration is run; those of a CCD do not depend on the other CCDs of the run.
+    Every product but ``timings.json`` has the same bytes whenever, wherever on one machine, with however many threads
+    and by whatever workers the configuration is run; those of a CCD do not depend on the other CCDs of the run.
 
     Parameters
     ----------
@@ -88,8 +93,14 @@ def run(
     strict : bool
         Whether a CCD whose PSF cannot be modelled ends the run, which keeps what is finished; else it is reported and
         left out.
+    workers : callable, optional
+        Function that makes the workers that compute the CCDs, such as
+        ``lambda compute: process_workers(compute, 4)`` (:mod:`pachon.core.workers`); by default this process.
+    part : (i, n)
+        Compute the i-th of n parts of the CCDs, of 1 to n; parts run side by side, on several machines, in one folder.
+        Finished CCDs are kept, as with `resume`, and the part that ends last writes the report.
     threads : int, optional
-        Number of threads; all processors by default.
+        Number of threads of this process; all processors by default.
     reporter : Reporter, optional
         Progress display; silent by default.
 
@@ -102,25 +113,32 @@ def run(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = config if isinstance(config, Experiment) else Experiment.from_config(config)
     names = experiment.config.ccds or ()
+    number, parts = part
+    if not 1 <= number <= parts <= len(names):
+        raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {len(names)} CCDs")
+    resume = resume or parts > 1
     kept = finished_ccds(folder, experiment) if resume else ()
-    missing = tuple(name for name in names if name not in kept)
+    missing = tuple(name for name in names[number - 1 :: parts] if name not in kept)
     # The report of a finished run needs no screens.
-    if missing:
+    if missing and workers is None:
         check_memory(experiment, threads)
     claim_run(folder, experiment, resume=resume)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     failed: dict[str, str] = {}
-    if missing:
+    if missing and workers is None:
         with experiment.screens(threads, reporter):
-            failed = simulate_ccds(
-                experiment,
-                partial(_write_ccd, experiment, folder),
-                missing,
-                strict=strict,
-                threads=threads,
-                reporter=reporter,
-            ).not_modelled
+            write = partial(write_ccd, experiment, folder)
+            simulated = simulate_ccds(experiment, write, missing, strict=strict, threads=threads, reporter=reporter)
+            failed = simulated.not_modelled
+    elif missing and workers is not None:
+        failed = compute_ccds(experiment, folder, missing, workers, strict=strict, reporter=reporter)
+    computed = tuple(name for name in missing if name not in failed)
+    if parts > 1:
+        done = {*finished_ccds(folder, experiment), *failed}
+        waited = tuple(name for name in names if name not in done)
+        if waited:
+            return RunResult(folder, None, {}, kept, computed, failed, waited)
     names = tuple(name for name in names if name not in failed)
     if not names:
         name, reason = next(iter(failed.items()))
@@ -154,23 +172,7 @@ def run(
         pictures = draw_pictures(experiment, products, correlated)
         write_bytes(report, build_report(experiment, summary, pictures).encode())
     write_json(folder / "timings.json", _timings(reporter, threads))
-    return RunResult(folder, report, summary, kept, tuple(n for n in missing if n not in failed), failed)
-
-
-def _write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
-    """Model one CCD and write its product."""
-    config = experiment.config
-    cards = [
-        ("TELESCOP", experiment.telescope.name, "prescription"),
-        ("FILTER", config.band, "band"),
-        ("EXPTIME", config.atmosphere.exposure_s, "[s] exposure"),
-        ("ENGINE", config.psf.engine, "PSF engine"),
-        ("ATMOSPH", config.atmosphere.enabled, "whether there is an atmosphere"),
-        ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
-    ]
-    if config.reconstruction.model == "focal_plane":
-        cards.append((MODEL_CARD, "ccd", "model of the columns MODEL_E1 and so on"))
-    write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), cards)
+    return RunResult(folder, report, summary, kept, computed, failed)
 
 
 def _write_focal_plane(experiment: Experiment, folder: Path) -> None:

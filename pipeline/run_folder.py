@@ -8,9 +8,11 @@ from ..core.errors import PachonError, ProductError
 from ..core.files import claim_folder
 from ..core.products import Stamp
 from ..core.version import VERSION
-from .ccd_product import product_path, read_product
+from .ccd_product import MODEL_CARD, product_path, read_product, write_product
 from .config import Configuration, differences, load_configuration, to_yaml
 from .experiment import Experiment
+from .simulate.ccd_exposure import CcdExposure
+from .simulate.ccd_model import model_ccd
 
 CONFIG_NAME, SUMMARY_NAME = "config.yaml", "summary.json"
 
@@ -68,3 +70,19 @@ def _is_whole(path: Path, stamp: Stamp) -> bool:
 def stamp_of(experiment: Experiment) -> Stamp:
     """Return the stamp of the products of an experiment."""
     return Stamp(experiment.config_hash, experiment.config.seed)
+
+
+def write_ccd(experiment: Experiment, folder: Path, exposure: CcdExposure) -> None:
+    """Model one CCD and write its product into the folder of a run."""
+    config = experiment.config
+    cards = [
+        ("TELESCOP", experiment.telescope.name, "prescription"),
+        ("FILTER", config.band, "band"),
+        ("EXPTIME", config.atmosphere.exposure_s, "[s] exposure"),
+        ("ENGINE", config.psf.engine, "PSF engine"),
+        ("ATMOSPH", config.atmosphere.enabled, "whether there is an atmosphere"),
+        ("WFWHM", config.reconstruction.weight_fwhm_arcsec, "[arcsec] weight of the moments"),
+    ]
+    if config.reconstruction.model == "focal_plane":
+        cards.append((MODEL_CARD, "ccd", "model of the columns MODEL_E1 and so on"))
+    write_product(folder, model_ccd(experiment, exposure), stamp_of(experiment), cards)

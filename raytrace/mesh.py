@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 import warp as wp
 
 from ..core.arguments import check_arguments
@@ -15,6 +15,9 @@ from ..core.warp_arrays import warp_array
 from ..models.surface import Surface
 from .kernels.mesh import first_facet
 from .pack.meshes import warp_mesh
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: Rays are started this far in front of the nominal surface [m] and followed for twice as far: heights of a focal
 #: plane are micrometres, and single precision resolves 0.1 nm over this distance.

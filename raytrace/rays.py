@@ -193,13 +193,18 @@ def object_points(telescope: Telescope, directions: np.ndarray) -> np.ndarray:
     return directions * (height / directions[:, 2:]) + [0.0, 0.0, telescope.stop_z]
 
 
-def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
-    """Launch plane waves as :func:`launch_bundles`; an object at a finite distance is a DomainError."""
+def require_distant_object(telescope: Telescope) -> None:
+    """Raise a DomainError for an object at a finite distance."""
     if np.isfinite(telescope.object_distance):
         raise DomainError(
             f"{telescope.name}: object at {telescope.object_distance:.6g} m: expected an object at infinity; "
             "rays and wavefronts of single field points can be had, this cannot"
         )
+
+
+def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
+    """Launch plane waves as :func:`launch_bundles`; an object at a finite distance is a DomainError."""
+    require_distant_object(telescope)
     # Components stay contiguous (structure of arrays), as the kernels read them.
     v = np.ascontiguousarray(directions.T)[:, :, None]
     x, y = np.moveaxis(pupil if pupil.ndim == 3 else pupil[None], -1, 0)

@@ -1,3 +1,7 @@
+import socket
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import yaml
@@ -178,3 +182,29 @@ def finished_run(tiny, tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished") / "run"
     run(tiny(), folder, threads=1)
     return folder
+
+
+@pytest.fixture
+def cluster():
+    """A Dask scheduler and two workers of one thread, each a process of its own."""
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+    def scheduler():
+        where = ["--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--no-dashboard"]
+        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", *where], **quiet)
+
+    def worker():
+        how = [address, "--nthreads", "1", "--no-dashboard", "--no-nanny"]
+        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", *how], **quiet)
+
+    running = {"scheduler": scheduler(), "workers": [worker(), worker()]}
+    running["restart"] = lambda: running.update(scheduler=scheduler(), workers=[worker()])
+    running["address"] = address
+    yield running
+    for process in (running["scheduler"], *running["workers"]):
+        process.kill()
+        process.wait()

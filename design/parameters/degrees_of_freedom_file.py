@@ -14,7 +14,8 @@
 
 Radii are in metres; a file of a grid is FITS (:mod:`~pachon.models.io.grid_file`), its path relative to this file. `of`
 is an address, or several with the change of each by one of the degree of freedom: the address's SI unit per SI unit. An
-address that begins with the name of a deformation (`figures`) is a term of it.
+address that begins with the name of a deformation (`figures`) is a term of it. The file ``bend.yaml`` of batoid_rubin's
+bending modes (:mod:`~.bending_folder`) may stand in place of such a file.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from ...models.io.yaml.values import ROWS, Names, Number, PositiveNumber, Text
 from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.modes import GridModes
 from ...models.shapes.shape import Shape
+from .bending_folder import CHOICE, bending_modes
 from .degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
 
 #: Those that come with the package, by the file that they are in.
@@ -44,6 +46,8 @@ BUNDLED = {"lsst": "lsst_degrees_of_freedom.yaml"}
 @check_arguments
 def load_degrees_of_freedom(name_or_path: str | os.PathLike[str]) -> DegreesOfFreedom:
     """Load degrees of freedom that come with the package by name ("lsst"), or a file of them by its path.
+
+    The ``bend.yaml`` of batoid_rubin gives the fifty of Rubin's active optics, with the bending modes of its folder.
 
     Raises
     ------
@@ -56,7 +60,11 @@ def load_degrees_of_freedom(name_or_path: str | os.PathLike[str]) -> DegreesOfFr
     if text not in BUNDLED and Path(text).suffix.lower() not in (".yaml", ".yml"):
         raise unknown_name("degrees of freedom", text, BUNDLED)
     path = DATA / BUNDLED[text] if text in BUNDLED else Path(text)
-    file = validated(DegreesOfFreedomFile, read_mapping(path), str(path), PrescriptionError)
+    content = read_mapping(path)
+    if CHOICE in content:
+        # The motions of M2 and of the camera are the first ten, as in batoid_rubin.
+        return bending_modes(content, path, load_degrees_of_freedom("lsst").members[:10])
+    file = validated(DegreesOfFreedomFile, content, str(path), PrescriptionError)
     members = tuple(DegreeOfFreedom(one.name, one.unit, one.of) for one in file.degrees_of_freedom)
     deformations = []
     for name, section in file.figures.items():

@@ -7,14 +7,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from ...core.arguments import check_arguments
 from ...core.errors import unknown_name
 from ...core.units import plane_points
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
 @check_arguments
@@ -59,6 +62,8 @@ class Camera:
 
     @cached_property
     def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.centers)
 
     def ccd_index(self, name: str) -> int:

@@ -10,25 +10,27 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
-from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, unknown_name
 from ...core.units import metres, plane_points, radians, require_count
-from ..io.heights.file import read_heights
-from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 from .camera import Camera, load_camera
 from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
 from .height_fit import fit_heights, table_column
 
-# Rims of tiles read back from a file land this far [m] outside by rounding (in a float32 STL 0.34 m are good to 15 nm).
+if TYPE_CHECKING:
+    import trimesh
+    from astropy.table import Table
+
+# [m], by which rims of tiles of files may lie outside: 0.34 m in a float32 STL are good to 15 nm.
 _MESH_MARGIN = 1e-7
+#: Most cells along a side of a CCD.
+_MOST_CELLS = 1024
 
 
 @check_arguments
@@ -63,6 +65,11 @@ class FocalPlane:
     budget: HeightBudget | None = None
     seed: int | None = None
     residual: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        measured = f", heights of {self.measured.sum()} measured" if self.measured.any() else ""
+        drawn = "" if self.seed is None else f", seed {self.seed}"
+        return f"<FocalPlane of {self.camera.name}: {len(self.camera)} CCDs{measured}{drawn}>"
 
     @classmethod
     def from_budget(
@@ -129,6 +136,8 @@ class FocalPlane:
         UnknownNameError
             If there is no such camera.
         """
+        from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
+
         heights = bundled_heights(name)
         camera = load_camera(AS_MEASURED[name][0])
         return cls(camera, *heights.on(camera))
@@ -163,6 +172,8 @@ class FocalPlane:
             If none of it lies on a CCD, or a CCD has too few points.
         """
         camera = load_camera(camera)
+        from ..io.heights.file import read_heights
+
         heights = read_heights(Path(path), camera)
         return cls(camera, heights.surfaces, heights.measured, residual=heights.residual)
 
@@ -326,10 +337,11 @@ class FocalPlane:
         -------
         Trimesh
             Vertices [m], z the height; normals along +z. Tiles follow the order of `names` with
-            ``2 * cells_per_ccd**2`` faces each. Between vertices it departs from the surface by at most
-            `facet_error`.
+            ``2 * cells_per_ccd**2`` faces each. Between vertices it departs from the surface by up to `facet_error`.
         """
-        cells = _cells(cells_per_ccd)
+        import trimesh  # half a second
+
+        cells = require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
         vertices = np.stack(self._nodes(cells)[1:], axis=-1)
         index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
@@ -354,7 +366,7 @@ class FocalPlane:
         ndarray, shape (n_ccd,)
             Upper bound of ``|mesh height - height|`` [m] on each CCD.
         """
-        cell = self.camera.ccd_size / _cells(cells_per_ccd)
+        cell = self.camera.ccd_size / require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
         return 0.25 * self.surfaces.curvature_bound() * cell**2
 
     def to_table(self, cells_per_ccd: int = 32) -> Table:
@@ -371,7 +383,9 @@ class FocalPlane:
             Columns ccd (name), x, y, z [m].
         """
         # A part in 1e9 inside the rim, so that no point is lost to rounding when the table is read back.
-        ccd, *points = self._nodes(_cells(cells_per_ccd), scale=1.0 - 1e-9)
+        ccd, *points = self._nodes(require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS), scale=1.0 - 1e-9)
+        from astropy.table import Table
+
         return Table([np.array(self.names)[ccd], *points], names=("ccd", "x", "y", "z"), units=(None, "m", "m", "m"))
 
     def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, ...]:
@@ -382,11 +396,3 @@ class FocalPlane:
         ccd, dx, dy = ccd.ravel(), dx.ravel(), dy.ravel()
         x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
         return ccd, x, y, self.surfaces.height(ccd, dx, dy)
-
-
-#: Most cells along a side of a CCD.
-_MOST_CELLS = 1024
-
-
-def _cells(cells_per_ccd: int) -> int:
-    return require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.table import Table
-from scipy.sparse import csc_array, csr_array
-from scipy.sparse.linalg import splu
 
 from ...core.errors import DomainError
 from ...core.units import metres
 from .camera import Camera
 from .ccd_surfaces import POWERS, CcdSurfaces, spline_weights
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
 
 # Fewest points for a polynomial of each degree; about twice its number of coefficients from the quadratic on.
 _DEGREES = ((20, 3, 10), (9, 2, 6), (3, 1, 3))
@@ -66,14 +66,14 @@ def table_column(table: Any, name: str) -> np.ndarray:
     """Return a column of a table, structured array or mapping in metres; DomainError if it is missing or not finite."""
     if isinstance(table, Mapping):
         columns: Iterable[str] = table.keys()
-    elif isinstance(table, Table):
+    elif hasattr(table, "colnames"):  # astropy's
         columns = table.colnames
     else:
         columns = getattr(getattr(table, "dtype", None), "names", None) or ()
     if name not in columns:
         raise DomainError(f"table of heights: column {name!r} is missing: expected columns x, y, z")
     column = table[name]
-    if isinstance(table, Table) and getattr(column, "unit", None) is not None:
+    if hasattr(table, "colnames") and getattr(column, "unit", None) is not None:
         column = getattr(column, "quantity", column)
     if np.ma.isMaskedArray(column) and np.ma.is_masked(column):
         raise DomainError(f"heights: column {name!r} has masked rows: expected finite numbers")
@@ -101,6 +101,8 @@ def _fit_polynomial(u: np.ndarray, v: np.ndarray, z: np.ndarray, name: str) -> t
 
 def _bending(m: int) -> csc_array:
     """Return the quadratic form of second differences along both sides, plus a tiny ridge, shape (m^2, m^2)."""
+    from scipy.sparse import csc_array
+
     second = np.diff(np.eye(m), 2, axis=0)
     stiffness = second.T @ second
     # The ridge settles the plane that neither bending nor, in an empty corner, the data hold.
@@ -109,6 +111,9 @@ def _bending(m: int) -> csc_array:
 
 
 def _fit_spline(u: np.ndarray, v: np.ndarray, z: np.ndarray, bending: csc_array) -> np.ndarray:
+    from scipy.sparse import csc_array, csr_array
+    from scipy.sparse.linalg import splu
+
     m = math.isqrt(bending.shape[0])
     i, wu = spline_weights(u, m)
     j, wv = spline_weights(v, m)

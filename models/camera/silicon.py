@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import eigh_tridiagonal
 
 from ...core.errors import DomainError
 from ...core.units import length, one_number
@@ -78,6 +77,8 @@ class Silicon:
         It integrates polynomials of the path up to the order ``2 count - 1`` (Golub & Welsch 1969, Math. Comp. 23,
         221).
         """
+        from scipy.linalg import eigh_tridiagonal
+
         length = self.absorption_length(wavelength)
         path = 0.5 * min(self.thickness / length, _ALL_ABSORBED) * (_NODE + 1.0)
         density = _WEIGHT * np.exp(-path)

@@ -10,15 +10,17 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units as u
-from astropy.io import fits
 
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import parsing, require_file, write_bytes
 from ..shapes.grid import GridSag
+
+if TYPE_CHECKING:
+    from astropy.io import fits
 
 
 def read_grid(path: str | os.PathLike[str]) -> GridSag:
@@ -34,17 +36,26 @@ def read_grid(path: str | os.PathLike[str]) -> GridSag:
     PrescriptionError
         If the file cannot be read, has no image of two dimensions, a unit that is no length, or is no valid grid.
     """
-    path = Path(path)
+    header, data = fits_image(Path(path), 2)
+    with error_context(file=path), parsing(path, "cannot be read as FITS", PrescriptionError):
+        x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
+        return GridSag(x, y, data * length_unit(header, "BUNIT"))
+
+
+def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
+    """Return header and float64 data of the first image of a number of dimensions in a FITS file; PrescriptionError."""
+    from astropy.io import fits  # few prescriptions have a grid
+
     require_file(path, PrescriptionError)
     with parsing(path, "cannot be read as FITS", PrescriptionError), open(path, "rb") as file:
         hdus = fits.open(file, memmap=False)
-        images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == 2]
+        images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]
     if not images:
-        raise PrescriptionError("expected a FITS image of two dimensions", file=path)
+        number = {2: "two", 4: "four"}[dimensions]
+        raise PrescriptionError(f"expected a FITS image of {number} dimensions", file=path)
     header, data = images[0]
-    with error_context(file=path), parsing(path, "cannot be read as FITS", PrescriptionError):
-        x, y = _axis(header, 1, data.shape[1]), _axis(header, 2, data.shape[0])
-        return GridSag(x, y, np.asarray(data, dtype=np.float64) * length_unit(header, "BUNIT"))
+    with parsing(path, "cannot be read as FITS", PrescriptionError):
+        return header, np.asarray(data, dtype=np.float64)
 
 
 def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
@@ -55,6 +66,8 @@ def write_grid(grid: GridSag, path: str | os.PathLike[str]) -> None:
     PrescriptionError
         If the file cannot be written.
     """
+    from astropy.io import fits
+
     header = fits.Header()
     for number, (first, step) in enumerate(zip((grid.x[0], grid.y[0]), grid.step, strict=True), start=1):
         header[f"CRPIX{number}"] = 1.0

@@ -34,14 +34,15 @@ from pathlib import Path
 from typing import Any
 
 from ...core.arguments import check_arguments
-from ...core.errors import PrescriptionError, unknown_name
+from ...core.errors import PrescriptionError, check_choice, unknown_name
 from ...core.files import read_bytes, write_bytes
 from ...core.yaml_reader import read_mapping
 from ..mesh_file import files_of_mesh
 from ..telescope import Telescope
+from .batoid import ROOT as BATOID_ROOT
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
-from .yaml.reader import MAX_BYTES, read_telescope
+from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 from .yaml.writer import telescope_to_yaml
 from .zemax.file import read_zemax_file
 from .zemax.reader import read_lens
@@ -84,10 +85,10 @@ def load_telescope(
     Parameters
     ----------
     name_or_path : str or path
-        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, or of a ``.zmx`` (Zemax) or ``.seq``
-        (CODE V) file.
+        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, ours or batoid's, or of a ``.zmx``
+        (Zemax) or ``.seq`` (CODE V) file.
     lenient : bool
-        Of a Zemax or CODE V file: warn about lines that are not understood and go on without them.
+        Of a batoid, Zemax or CODE V file: warn about keys or lines that are not understood and go on without them.
     glass_catalogues : iterable of GlassCatalogue or path
         AGF catalogues to look up the glasses of a Zemax or CODE V file in, first of all; then comes one beside the
         file that has its name and ends in .agf, then the bundled one.
@@ -109,7 +110,13 @@ def load_telescope(
         return _bundled(text)
     path = Path(text)
     if path.suffix.lower() in (".yaml", ".yml"):
-        return read_telescope(path)
+        content = read_mapping(path, max_bytes=MAX_BYTES)
+        if BATOID_ROOT not in content:
+            return telescope_of(content, path)
+        # Imported where it is needed, like the writer: the sections of the format take time to make.
+        from .batoid.reader import batoid_telescope
+
+        return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
         parts = _LENS_FILES[path.suffix.lower()]
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
@@ -162,8 +169,8 @@ def _bundled(name: str) -> Telescope:
 
 
 @check_arguments
-def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
-    """Write a prescription file: YAML, or where the name ends in ``.zmx`` a Zemax lens file.
+def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format: str = "") -> None:
+    """Write a prescription file: YAML, ours or batoid's, or a Zemax lens file.
 
     Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
     it.
@@ -174,17 +181,27 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str]) -> None:
         Prescription to write.
     path : str or path
         File to write; it is replaced as a whole, or left as it was.
+    format : {"", "pachon", "batoid", "zemax"}
+        Format; by default Zemax's where the name ends in ``.zmx``, else ours.
 
     Raises
     ------
+    ConfigError
+        If there is no such format.
     PrescriptionError
         If the file cannot be written, or cannot hold the telescope.
     """
     target = Path(path)
-    if target.suffix.lower() == ".zmx":
+    format = format or ("zemax" if target.suffix.lower() == ".zmx" else "pachon")
+    check_choice("format", format, ("pachon", "batoid", "zemax"))
+    if format == "zemax":
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
             write_bytes(catalogue_path(target), glasses.encode(), PrescriptionError)
-        write_bytes(target, lens.encode(), PrescriptionError)
+    elif format == "batoid":
+        from .batoid.writer import telescope_to_batoid
+
+        lens = telescope_to_batoid(telescope)
     else:
-        write_bytes(target, telescope_to_yaml(telescope).encode(), PrescriptionError)
+        lens = telescope_to_yaml(telescope)
+    write_bytes(target, lens.encode(), PrescriptionError)

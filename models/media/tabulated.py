@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
 from .medium import Medium, wavelengths_within
+
+# A third of a second to import: only where there is such a table.
+if TYPE_CHECKING:
+    from scipy.interpolate import PchipInterpolator
 
 INTERPOLATIONS = ("monotone", "linear")
 
@@ -52,6 +56,8 @@ class TabulatedIndex(Medium):
 
     @cached_property
     def _cubic(self) -> PchipInterpolator:
+        from scipy.interpolate import PchipInterpolator
+
         return PchipInterpolator(self.wavelengths, self.indices)
 
     @property

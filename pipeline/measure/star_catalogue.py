@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,15 @@ from astropy.table import Table
 from ...core.arguments import check_arguments
 from ...core.errors import ProductError
 from ...core.files import parsing, read_bytes
+
+#: Names that SExtractor and the LSST pipelines have for columns, in lower case.
+OTHER_NAMES = {
+    "x": ("xwin_image", "x_image", "xpsf_image", "slot_centroid_x", "base_sdsscentroid_x"),
+    "y": ("ywin_image", "y_image", "ypsf_image", "slot_centroid_y", "base_sdsscentroid_y"),
+    "stamp": ("vignet",),
+}
+# SExtractor's masked pixels are -1e30.
+_MASKED = -1e29
 
 
 class StarCutouts(NamedTuple):
@@ -40,12 +50,13 @@ def load_stars(
     Parameters
     ----------
     catalogue : str or Path
-        The table; of a FITS file its first one. The names of columns may be in any case.
+        The table; of a FITS file its first one with a position. The names of columns may be in any case.
     x, y : str
-        Columns of the positions, in any unit.
+        Columns of the positions, in any unit; for "x" and "y" names of SExtractor and of LSST stand in,
+        :data:`OTHER_NAMES`.
     stamp : str
-        Column of the stamps, [ny, nx] in every row. Where a FITS file has none, its first image of three axes is
-        taken.
+        Column of the stamps, [ny, nx] in every row; VIGNET of SExtractor stands in for "stamp", its masked pixels
+        become NaN. Where a FITS file has none, its first image of three axes is taken.
     images : str or Path, optional
         FITS file whose first image of three axes, [n, ny, nx], holds the stamps in the order of the table.
 
@@ -67,8 +78,10 @@ def load_stars(
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
         if not tables:
             raise ProductError(f"has no table, expected one with columns {x}, {y}", file=path)
+        # SExtractor's LDAC files have a table of the image's header before that of the objects.
         with parsing(path, "damaged or not FITS", ProductError):
-            columns = {name: np.asarray(tables[0].data[name]) for name in tables[0].columns.names}
+            table = next((t for t in tables if _known_as(x, t.columns.names)), tables[0])
+            columns = {name: np.asarray(table.data[name]) for name in table.columns.names}
     elif data.lstrip().startswith(b"# %ECSV"):
         columns = _ecsv(path, data)
     else:
@@ -79,6 +92,7 @@ def load_stars(
         cube = _first_cube(_fits(Path(images), read_bytes(Path(images), ProductError)))
         if cube is None:
             raise ProductError("has no image of three axes, expected the stamps [n, ny, nx]", file=images)
+    x, y, stamp = (_known_as(name, columns) or name for name in (x, y, stamp))
     names = {name.lower(): name for name in columns}
     if cube is None and stamp.lower() not in names and hdus is not None:
         cube = _first_cube(hdus)
@@ -93,7 +107,13 @@ def load_stars(
     stamps = _numbers(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube
     if len(stamps) != len(positions):
         raise ProductError(f"{len(positions)} stars in the table, {len(stamps)} stamps in the images", file=path)
-    return StarCutouts(stamps, positions)
+    return StarCutouts(np.where(stamps < _MASKED, np.nan, stamps), positions)
+
+
+def _known_as(name: str, columns: Iterable[str]) -> str | None:
+    """Return the column of a name, or of another one that programs have for it; None without one."""
+    names = {column.lower(): column for column in columns}
+    return next((names[other] for other in (name.lower(), *OTHER_NAMES.get(name, ())) if other in names), None)
 
 
 def _fits(path: Path, data: bytes) -> fits.HDUList:

@@ -146,3 +146,18 @@ def _rms_width(image: np.ndarray) -> float:
     light /= light.sum()
     x0, y0 = (light * x.ravel()).sum(), (light * y.ravel()).sum()
     return float(np.sqrt(0.5 * (light * ((x.ravel() - x0) ** 2 + (y.ravel() - y0) ** 2)).sum() + 0.25))
+
+
+def elbow_of(eigenvalues: np.ndarray) -> int:
+    """Return the number of falling eigenvalues before they flatten out.
+
+    The index, counted from 0, at which their logarithm lies farthest below the straight line from the first to the
+    middle one (Jee & Tyson 2011, sec. 3, find it by eye). Beyond the middle even pure noise falls steeply, for want of
+    stars. Eigenvalues under 1e-14 of the first are rounding and do not count.
+    """
+    values = eigenvalues[: (len(eigenvalues) + 1) // 2]
+    values = values[values > 1e-14 * values[0]]
+    if len(values) < 3:
+        return len(values)
+    curve = np.log(values)
+    return int(np.argmin(curve - np.linspace(curve[0], curve[-1], len(curve))))

@@ -113,11 +113,13 @@ def check_terms(terms: np.ndarray, order: int, positions: np.ndarray, weights: n
         )
 
 
-def check_apart(positions: np.ndarray) -> None:
+def check_apart(positions: np.ndarray, interpolation: str) -> None:
     """Raise an error for two stars at one position: a noise-free process cannot pass through both."""
     pair = same_place(positions)
     if pair:
-        raise DomainError(f"positions: {_pair_text(positions, pair)}; expected places apart for interpolation = 'gp'")
+        raise DomainError(
+            f"positions: {_pair_text(positions, pair)}; expected places apart for interpolation = {interpolation!r}"
+        )
 
 
 def same_place(positions: np.ndarray) -> tuple[int, int] | None:

@@ -9,7 +9,7 @@ import scipy.linalg
 
 from ...core.errors import ConfigError, DomainError
 from ...core.threads import one_blas_thread
-from . import gaussian_process
+from . import gaussian_process, kriging
 from .basis import BASES
 from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms
 from .description import describe
@@ -17,8 +17,14 @@ from .polynomial import as_positions, design_matrix, mapped
 
 #: Components of principal components and of shapelets where no number is given (Jee & Tyson 2011, sec. 3).
 COMPONENTS = 20
+#: Ways from the stars' coefficients to those of any place.
+INTERPOLATIONS = ("polynomial", "gp", "kriging")
+#: Degree of the polynomials, or of the trend under a process, where none is given.
+ORDERS = {"polynomial": 3, "gp": 0, "kriging": kriging.ORDER}
 #: Most components from which an automatic choice is made.
 _MOST_COMPONENTS = 65
+# Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
+_LEAST_NOISE = 1e-6
 
 
 def fit_fields(
@@ -33,6 +39,7 @@ def fit_fields(
     order: int | None,
     extent: Any,
     scale: float | None,
+    gain: float | None,
     clip_sigma: float | None,
     max_iterations: int,
     replacement: str,
@@ -48,7 +55,7 @@ def fit_fields(
         raise DomainError(f"positions: {len(points)} given, expected one for each of the {n_stars} stamps")
     for option, value, known in (
         ("basis", basis, BASES),
-        ("interpolation", interpolation, ("polynomial", "gp")),
+        ("interpolation", interpolation, INTERPOLATIONS),
         ("replacement", replacement, ("mean", "polynomial")),
     ):
         if value not in known:
@@ -62,16 +69,21 @@ def fit_fields(
     if max_iterations < 1:
         raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
     if order is None:
-        order = 3 if interpolation == "polynomial" else 0
+        order = ORDERS[interpolation]
     star_weights = as_weights(weights, n_stars)
-    if interpolation == "gp":
+    if interpolation != "polynomial":
         if star_weights is not None:
-            raise ConfigError("weights: expected none with interpolation = 'gp', which fits the noise itself")
-        check_apart(points)
+            raise ConfigError(
+                f"weights: expected none with interpolation = {interpolation!r}, which fits the noise itself"
+            )
+        check_apart(points, interpolation)
+    if gain is not None and not (np.isfinite(gain) and gain > 0.0):
+        raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
     span = as_extent(extent, points)
     terms = design_matrix(points, span, order)
     with one_blas_thread():
-        check_terms(terms, order, points, star_weights)
+        if interpolation != "kriging":  # which shrinks terms that the stars do not determine
+            check_terms(terms, order, points, star_weights)
         stars = describe(
             images,
             bad,
@@ -89,6 +101,16 @@ def fit_fields(
             mapped_points = mapped(points, span)
             kernel = gaussian_process.fit_kernels(mapped_points, coefficients, terms, shared=basis == "pixels")
             polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel)
+        elif interpolation == "kriging":
+            mapped_points = mapped(points, span)
+            deviations = coefficients @ stars.basis.vectors
+            numbers, filters = kriging.shape_numbers(stars.basis.mean.reshape(ny, nx), deviations)
+            noise = kriging.star_noise(images, deviations, stars.basis.mean.reshape(ny, nx), filters, gain)
+            noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
+            covariance = kriging.fit_kernel(mapped_points, numbers, noise, terms)
+            star_noise = (noise / np.median(noise, axis=0)).mean(axis=1)
+            polynomial, alpha, _ = kriging.krige(mapped_points, coefficients, terms, covariance, star_noise)
+            kernel, star_weights = np.tile(covariance, (coefficients.shape[1], 1)), 1.0 / star_noise
         else:
             q, r = np.linalg.qr(weighted(terms, star_weights))
             polynomial = scipy.linalg.solve_triangular(r, q.T @ weighted(coefficients, star_weights))

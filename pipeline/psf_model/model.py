@@ -21,7 +21,8 @@ from ...core.errors import ConfigError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.threads import one_blas_thread
 from ...core.version import CREATOR
-from . import gaussian_process
+from . import gaussian_process, kriging
+from .basis import elbow_of
 from .file import model_fields, model_hdus
 from .fit import fit_fields, weighted
 from .polynomial import Extent, design_matrix, mapped
@@ -65,9 +66,11 @@ class PsfModel:
         rms width of the Gaussian under shapelets [pixel]; NaN else.
     weights : array or None
         Of the stars in the polynomials, [n].
+        Under kriging the inverse variances of their noise, in units of the middle star's.
     kernel : array or None
         Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
-        the noise, [k, 3]. None where there are only polynomials.
+        the noise, [k, 3]; under kriging five columns, see :data:`.kriging.COLUMNS`. None where there are only
+        polynomials.
     alpha : array or None
         Dual coefficients of the Gaussian process: inverse covariance times coefficients less trend, [n, k].
     """
@@ -88,6 +91,10 @@ class PsfModel:
     kernel: np.ndarray | None = None
     alpha: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        parts = f"{self.n_components} components ({self.basis}), order {self.order}, {self.n_stars} stars"
+        return f"<PsfModel: {parts}, stamps {self.mean.shape[1]} x {self.mean.shape[0]}>"
+
     @classmethod
     @check_arguments
     def fit(
@@ -96,13 +103,14 @@ class PsfModel:
         positions: ArrayLike,
         *,
         basis: Literal["pca", "pixels", "shapelets"] = "pca",
-        interpolation: Literal["polynomial", "gp"] = "polynomial",
+        interpolation: Literal["polynomial", "gp", "kriging"] = "polynomial",
         weights: ArrayLike | None = None,
         masks: NDArray[np.bool_] | None = None,
         n_components: int | Literal["auto"] | None = None,
         order: int | None = None,
         extent: ArrayLike | None = None,
         scale: float | None = None,
+        gain: float | None = 1.0,
         clip_sigma: float | None = CLIP_SIGMA,
         max_iterations: int = 20,
         replacement: Literal["mean", "polynomial"] = "mean",
@@ -124,7 +132,8 @@ class PsfModel:
             truncate the wings (Jee & Tyson 2011, sec. 3).
         interpolation : str
             ``polynomial``, or ``gp``: a Gaussian process for each component (one for all pixels) over a polynomial
-            trend; needs scikit-learn.
+            trend; needs scikit-learn. ``kriging``: one rule for all pixels, with the noise of each star
+            (:mod:`~.psf_model.kriging`); with ``basis="pixels"`` the best choice where nothing is known.
         weights : array, optional
             [n] of the stars in the polynomials.
         masks : array of bool, optional
@@ -135,12 +144,15 @@ class PsfModel:
             ``auto`` takes :attr:`cross_validated_components` of up to 65; :attr:`elbow` is the alternative. None for
             pixels.
         order : int, optional
-            Largest total degree of the polynomials, 3 where left out; 0 for the trend under a Gaussian process.
+            Largest total degree of the polynomials, 3 where left out; of the trend 0 under a Gaussian process and 2 in
+            kriging, which shrinks it.
         extent : tuple of float, optional
             (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions. Where left out, that of the stars.
         scale : float, optional
             rms width of the Gaussian under the shapelets [pixel]; by default the one with the least residual of the
             stars.
+        gain : float or None
+            Electrons in a unit of the stamps, for the photon noise in kriging; None for none.
         clip_sigma : float or None
             Pixels that deviate by more standard deviations are rejected; None rejects nothing, as befits stars without
             noise.
@@ -170,6 +182,7 @@ class PsfModel:
             order=order,
             extent=extent,
             scale=scale,
+            gain=gain,
             clip_sigma=clip_sigma,
             max_iterations=max_iterations,
             replacement=replacement,
@@ -208,25 +221,12 @@ class PsfModel:
 
     @property
     def elbow(self) -> int:
-        """Number of principal components before the eigenvalues flatten out.
-
-        The index, counted from 0, at which the logarithm of the eigenvalues lies farthest below the straight line
-        from the first to the middle one (Jee & Tyson 2011, sec. 3, find it by eye). Beyond the middle even pure noise
-        falls steeply, for want of stars. Eigenvalues under 1e-14 of the first are rounding and do not count.
-        """
-        values = self.eigenvalues[: (len(self.eigenvalues) + 1) // 2]
-        values = values[values > 1e-14 * values[0]]
-        if len(values) < 3:
-            return len(values)
-        curve = np.log(values)
-        return int(np.argmin(curve - np.linspace(curve[0], curve[-1], len(curve))))
+        """Number of principal components before the eigenvalues flatten out, see :func:`~.basis.elbow_of`."""
+        return elbow_of(self.eigenvalues)
 
     @property
     def leave_one_out_curve(self) -> np.ndarray:
-        """Rms over stars and pixels of stamp minus model without that star, by components used, 0 to k: [k + 1].
-
-        As :attr:`leave_one_out_rms`, its last element.
-        """
+        """Rms of stamps minus models without the star, by components used, 0 to k; the last is `leave_one_out_rms`."""
         left_out, own = self._leave_one_out_residuals() ** 2, self.coefficients**2
         gained = np.concatenate([[0.0], np.cumsum((left_out - own).sum(axis=0))])
         total = self.unexplained.sum() + own.sum() + gained
@@ -276,7 +276,10 @@ class PsfModel:
             result += column[:, None] * row
         if self.kernel is not None and self.alpha is not None:
             points, at = (mapped(p, self.extent) for p in (self.positions, positions))
-            result += gaussian_process.predict(points, at, self.kernel, self.alpha)
+            if self._kriged:
+                result += kriging.predict(points, at, self.kernel[0], self.alpha)
+            else:
+                result += gaussian_process.predict(points, at, self.kernel, self.alpha)
         return result
 
     def reconstruct(self) -> np.ndarray:
@@ -321,7 +324,6 @@ class PsfModel:
             alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
-    @check_arguments
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
         """Return the model as FITS extensions, lossless; :meth:`from_hdus` reads them.
 
@@ -334,7 +336,6 @@ class PsfModel:
         return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
 
     @classmethod
-    @check_arguments
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
         """Read a model from FITS extensions written by :meth:`to_hdus`.
 
@@ -378,10 +379,16 @@ class PsfModel:
             points = mapped(self.positions, self.extent)
             terms = design_matrix(self.positions, self.extent, self.order)
             with one_blas_thread():
+                if self._kriged and self.weights is not None:
+                    return kriging.krige(points, self.coefficients, terms, self.kernel[0], 1.0 / self.weights)[2]
                 return gaussian_process.krige(points, self.coefficients, terms, self.kernel)[2]
         room = 1.0 - self.leverage
         room = np.where(room > 1e-10, room, np.nan)
         return (self.coefficients - self.amplitudes(self.positions)) / room[:, None]
+
+    @property
+    def _kriged(self) -> bool:
+        return self.kernel is not None and self.kernel.shape[1] == kriging.COLUMNS
 
     def _combine(self, amplitudes: np.ndarray) -> np.ndarray:
         """Return mean plus amplitudes times components, one component after the other so that no batch size matters."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.colors import SymLogNorm
@@ -13,38 +15,41 @@ from ..ccd_product import CcdProduct
 from .focal_plane_axes import AWAY, OBSERVED, TRUTH
 from .tables import percent
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+#: Eigen-PSFs in a row.
+_COLUMNS = 7
+
 
 def eigen_psf_plot(product: CcdProduct, noise_free: bool) -> bytes:
     """Draw mean and eigen-PSFs of one CCD, of the noise-free PSFs or the observed stars (Jee & Tyson 2011, Fig. 9)."""
     model = product.noise_free_model if noise_free else product.model
     count = min(model.n_components, 20)
-    columns = 7
-    rows = -(-(count + 1) // columns)
-    extent = _extent(model.mean.shape[0], product.pixel_scale)
+    rows = -(-(count + 1) // _COLUMNS)
+    # Beyond three times the FWHM there is no structure.
+    shown = 3.0 * float(np.nanmedian(product.holdout.fwhm))
     with styled():
-        figure = new_figure(1.75 * columns + 0.6, 1.95 * rows + 0.5)
-        panels = figure.subplots(rows, columns, sharex=True, sharey=True).ravel()
-        for axes in panels[count + 1 :]:
-            axes.set_axis_off()
-        panels[0].imshow(np.sqrt(np.maximum(model.mean, 0.0)), extent=extent, cmap="viridis", vmin=0.0)
-        panels[0].set_title("mean (square root)", fontsize=8)
-        for k, axes in enumerate(panels[1 : count + 1]):
+        figure = new_figure(1.75 * _COLUMNS + 0.6, 1.95 * rows + 0.7)
+        axes = figure.subplots()
+        gallery = StampGallery(axes, model.mean.shape[0], product.pixel_scale, shown, room=0.12)
+        gallery.show(
+            np.sqrt(np.maximum(model.mean, 0.0)), 0, 0, "mean (square root)", cmap="viridis", vmin=0.0, vmax=None
+        )
+        for k in range(count):
             component = model.components[k]
-            edge = float(np.abs(component).max())
-            image = axes.imshow(component / edge, extent=extent, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-            axes.set_title(f"n = {k + 1}: {percent(model.explained_variance[k])}", fontsize=8)
-        # Beyond three times the FWHM there is no structure.
-        shown = min(extent[1], 3.0 * float(np.nanmedian(product.holdout.fwhm)) / ARCSEC)
-        panels[0].set_xlim(-shown, shown)
-        panels[0].set_ylim(-shown, shown)
-        for i, axes in enumerate(panels[: count + 1]):
-            if i % columns == 0:
-                axes.set_ylabel("y [arcsec]")
-            if i + columns > count:
-                axes.set_xlabel("x [arcsec]")
-                axes.tick_params(labelbottom=True)
+            image = gallery.show(
+                component / float(np.abs(component).max()),
+                *divmod(k + 1, _COLUMNS),
+                f"n = {k + 1}: {percent(model.explained_variance[k])}",
+                cmap="RdBu_r",
+                vmin=-1.0,
+                vmax=1.0,
+            )
+        gallery.finish(rows, min(count + 1, _COLUMNS))
         label = "eigen-PSF, each over its largest magnitude"
-        figure.colorbar(image, ax=list(panels), fraction=0.015, pad=0.01, aspect=40, label=label)
+        figure.colorbar(image, ax=axes, fraction=0.015, pad=0.01, aspect=40, label=label)
         kind = "noise-free PSFs" if noise_free else "observed stars"
         figure.suptitle(
             f"{product.name}: mean and eigen-PSFs of {model.n_stars} {kind}; "
@@ -96,11 +101,11 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
     Columns are `per_ccd` stars of each CCD, from the brightest to the faintest.
     """
     chosen = [(p, i) for p in products for i in _bright_to_faint(p, per_ccd)]
-    extent = _extent(products[0].observed_images.shape[1], products[0].pixel_scale)
     with styled():
-        figure = new_figure(1.45 * len(chosen) + 1.3, 5.6)
-        panels = figure.subplots(3, len(chosen), sharex=True, sharey=True, squeeze=False)
-        for column, (product, i) in zip(panels.T, chosen, strict=True):
+        figure = new_figure(1.45 * len(chosen) + 1.3, 5.3)
+        axes = figure.subplots()
+        gallery = StampGallery(axes, products[0].observed_images.shape[1], products[0].pixel_scale)
+        for column, (product, i) in enumerate(chosen):
             stars, position = product.observed, np.array([[product.observed.x[i], product.observed.y[i]]])
             model = product.model.at(position)[0]
             observed = np.asarray(product.observed_images[i], dtype=np.float64)
@@ -108,20 +113,18 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
             sigma = np.sqrt(np.maximum(stars.electrons[i] * model, 0.0) + sky + rms**2)
             left_over = (observed - model) * stars.electrons[i] / sigma
             top = model.max()
-            light = column[0].imshow(_stretched(observed / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
-            column[1].imshow(_stretched(model / top), extent=extent, cmap="viridis", vmin=_LOW, vmax=1.0)
-            noise = column[2].imshow(
-                left_over, extent=extent, cmap="RdBu_r", norm=SymLogNorm(3.0, vmin=-100.0, vmax=100.0)
-            )
-            column[0].set_title(f"{product.name}\n{stars.magnitude[i]:.1f} mag, S/N {stars.snr[i]:.0f}", fontsize=8)
-            column[2].set_xlabel("x [arcsec]")
-        for axes, name in zip(panels[:, 0], ("observed", "model", "observed - model"), strict=True):
-            axes.set_ylabel(f"{name}\ny [arcsec]")
-        label = "over the model's peak (asinh)"
-        bar = figure.colorbar(light, ax=list(panels[:2].flat), fraction=0.02, pad=0.01, aspect=30, label=label)
+            title = f"{product.name}\n{stars.magnitude[i]:.1f} mag, S/N {stars.snr[i]:.0f}"
+            for row, (image, text) in enumerate(((observed, title), (model, ""))):
+                light = gallery.show(stretched(image / top), row, column, text, cmap="viridis", vmin=_LOW, vmax=1.0)
+            residual = SymLogNorm(3.0, vmin=-100.0, vmax=100.0)
+            noise = gallery.show(left_over, 2, column, cmap="RdBu_r", norm=residual)
+        gallery.finish(3, len(chosen), ("observed", "model", "observed - model"))
+        # Beside the two rows, and the one, that they belong to.
+        places = [axes.inset_axes((1.005, low, 0.012, high)) for low, high in ((0.42, 0.58), (0.09, 0.28))]
+        bar = figure.colorbar(light, cax=places[0], label="over the model's peak (asinh)")
         ticks = np.array([0.0, 0.01, 0.1, 0.5, 1.0])
-        bar.set_ticks(_stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
-        bar = figure.colorbar(noise, ax=list(panels[2]), fraction=0.02, pad=0.01, aspect=15, label="pixel noise σ")
+        bar.set_ticks(stretched(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
+        bar = figure.colorbar(noise, cax=places[1], label="pixel noise σ")
         steps = (-100, -30, -10, -3, 0, 3, 10, 30, 100)
         bar.set_ticks(steps, labels=[f"{t}" for t in steps], minor=False)
         bar.ax.minorticks_off()
@@ -131,11 +134,12 @@ def stamps_plot(products: Sequence[CcdProduct], per_ccd: int = 3) -> bytes:
 _SOFTENING = 0.02
 
 
-def _stretched(values: np.ndarray) -> np.ndarray:
+def stretched(values: np.ndarray) -> np.ndarray:
+    """Return values over the peak on the asinh scale of pictures, 1 at 1."""
     return np.arcsinh(np.asarray(values) / _SOFTENING) / np.arcsinh(1.0 / _SOFTENING)
 
 
-_LOW = float(_stretched(np.array(-0.02)))
+_LOW = float(stretched(np.array(-0.02)))
 
 
 def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
@@ -146,6 +150,36 @@ def _bright_to_faint(product: CcdProduct, count: int) -> list[int]:
     return [int(i) for i in ordered[ranks]]
 
 
-def _extent(size: int, pixel_scale: float) -> tuple[float, float, float, float]:
-    half = 0.5 * size * pixel_scale / ARCSEC
-    return -half, half, -half, half
+class StampGallery:
+    """Stamps in rows and columns within one pair of axes: axes of their own would take most of the time of a report."""
+
+    def __init__(self, axes: Axes, size: int, pixel_scale: float, shown: float = math.inf, room: float = 0.0) -> None:
+        """Show the middle of stamps of a size [pixel], out to an angle [rad] from their centres.
+
+        Between rows there is room for a title, in sides of a stamp.
+        """
+        self._axes = axes
+        self._rim = max(0, round(0.5 * size - shown / pixel_scale)) if math.isfinite(shown) else 0
+        self._side = (size - 2 * self._rim) * pixel_scale / ARCSEC
+        self._step, self._down = 1.06 * self._side, -(1.06 + room) * self._side
+
+    def show(self, image: np.ndarray, row: int, column: int, title: str = "", **colours: Any) -> AxesImage:
+        """Draw a stamp, with a title above it."""
+        side, rim, left, bottom = self._side, self._rim, self._step * column, self._down * row
+        self._axes.text(left + 0.5 * side, bottom + 1.02 * side, title, ha="center", va="bottom", fontsize=8)
+        middle = image[rim : len(image) - rim, rim : len(image) - rim]
+        return self._axes.imshow(middle, extent=(left, left + side, bottom, bottom + side), **colours)
+
+    def finish(self, rows: int, columns: int, names: Sequence[str] = ()) -> None:
+        """Set limits, names of rows at the left, and a bar of a round number of arcseconds under the first stamp."""
+        side, axes, bottom = self._side, self._axes, self._down * (rows - 1)
+        for row, name in enumerate(names):
+            y = self._down * row + 0.5 * side
+            axes.text(-0.06 * side, y, name, rotation=90, ha="right", va="center")
+        length = next(n for n in (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01) if n < 0.6 * side)
+        axes.plot([0.0, length], [bottom - 0.06 * side] * 2, "-", color="0.2", linewidth=1.5)
+        axes.text(0.5 * length, bottom - 0.1 * side, f"{length:g} arcsec", ha="center", va="top", fontsize=8)
+        axes.set_xlim(-(0.2 if names else 0.02) * side, self._step * columns)
+        axes.set_ylim(bottom - 0.25 * side, 1.02 * side)
+        axes.set_aspect("equal")
+        axes.set_axis_off()

@@ -56,7 +56,7 @@ def _model_words(fit: ReconstructionConfig) -> str:
     """Return the PSF model in words."""
     described = {"pca": "principal components a CCD", "shapelets": "shapelets a CCD", "pixels": "each pixel on its own"}
     basis = described[fit.basis] if fit.components is None else f"{fit.components} {described[fit.basis]}"
-    process = "a Gaussian process over " if fit.interpolation == "gp" else ""
+    process = {"polynomial": "", "gp": "a Gaussian process over ", "kriging": "kriging over "}[fit.interpolation]
     weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
     whole = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
     return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}{whole}"

@@ -92,8 +92,11 @@ def fit_ccd_model(
     fit, used = experiment.config.reconstruction, observation.used
     least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
     require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
+    images = observation.images[used]
+    if fit.interpolation == "kriging":  # which needs the photons
+        images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
-        observation.images[used],
+        images,
         stars.observed[used],
         basis=fit.basis,
         interpolation=fit.interpolation,

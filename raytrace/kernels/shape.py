@@ -339,8 +339,18 @@ def deformed_distance(
 @wp.func
 def through_screen(n: wp.float64, slope_x: lanes, slope_y: lanes, u: lanes, v: lanes, w: lanes):
     """Directions after a phase screen, n d' = n d + grad(path) in its plane; NaN where no wave travels on."""
-    p = u + slope_x / n
-    q = v + slope_y / n
+    return deflected(u + slope_x / n, v + slope_y / n, w)
+
+
+@wp.func
+def through_screen(n: lanes, slope_x: lanes, slope_y: lanes, u: lanes, v: lanes, w: lanes):  # noqa: F811
+    """Directions after a phase screen of rays of different wavelengths; see above."""
+    return deflected(u + wp.cw_div(slope_x, n), v + wp.cw_div(slope_y, n), w)
+
+
+@wp.func
+def deflected(p: lanes, q: lanes, w: lanes):
+    """Directions of components p and q in a plane, on the side of w; NaN where no wave travels on."""
     root = lanes_sqrt(lanes(ONE) - wp.cw_mul(p, p) - wp.cw_mul(q, q))
     for i in range(LANES):
         root[i] = wp.where(w[i] < ZERO, -root[i], root[i])

@@ -144,3 +144,20 @@ def refracted(mu: wp.float64, u: lanes, v: lanes, w: lanes, nx: lanes, ny: lanes
         root[i] = wp.where(along[i] < ZERO, -root[i], root[i])
     g = wp.cw_div(root - mu * along, square)
     return mu * u + wp.cw_mul(g, nx), mu * v + wp.cw_mul(g, ny), mu * w + wp.cw_mul(g, nz)
+
+
+@wp.func
+def refracted(mu: lanes, u: lanes, v: lanes, w: lanes, nx: lanes, ny: lanes, nz: lanes):  # noqa: F811 - an overload
+    """Directions after refraction of rays of different wavelengths; see above."""
+    along = wp.cw_mul(u, nx) + wp.cw_mul(v, ny) + wp.cw_mul(w, nz)
+    square = wp.cw_mul(nx, nx) + wp.cw_mul(ny, ny) + wp.cw_mul(nz, nz)
+    mu2 = wp.cw_mul(mu, mu)
+    root = lanes_sqrt(wp.cw_mul(lanes(ONE) - mu2, square) + wp.cw_mul(mu2, wp.cw_mul(along, along)))
+    for i in range(LANES):
+        root[i] = wp.where(along[i] < ZERO, -root[i], root[i])
+    g = wp.cw_div(root - wp.cw_mul(mu, along), square)
+    return (
+        wp.cw_mul(mu, u) + wp.cw_mul(g, nx),
+        wp.cw_mul(mu, v) + wp.cw_mul(g, ny),
+        wp.cw_mul(mu, w) + wp.cw_mul(g, nz),
+    )

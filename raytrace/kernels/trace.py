@@ -6,6 +6,8 @@ is of that kind, because it takes registers and prevents the compiler from inlin
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
@@ -50,14 +52,16 @@ FIRST_CURVATURE = wp.constant(18)
 NUMBERS = 19
 # Columns of the table of kinds: interaction, number of aspheric coefficients, whether rotated, whether stopped down
 # (0 no, 1 by a disc or ring, 2 by another aperture), whether obstructions lie on the way to it, whether its shape has
-# parts besides the conic and its even powers (1) or is a mesh (2).
+# parts besides the conic and its even powers (1) or is a mesh (2), which of the distinct media lies before and after.
 INTERACTION = wp.constant(0)
 TERMS = wp.constant(1)
 ROTATED = wp.constant(2)
 STOPPED = wp.constant(3)
 OBSTRUCTED = wp.constant(4)
 DEFORMED = wp.constant(5)
-KINDS = 6
+MEDIUM_BEFORE = wp.constant(6)
+MEDIUM_AFTER = wp.constant(7)
+KINDS = 8
 
 
 @wp.struct
@@ -128,16 +132,18 @@ def statuses(status: lanes):
     return out
 
 
-def surface_loop(special: bool) -> wp.Function:
+def surface_loop(special: bool, chromatic: bool = False) -> wp.Function:
     """Return the loop over the surfaces of a telescope, for plain telescopes or for any.
 
     Plain telescopes have conics with even powers, discs and rings as apertures, no phase screens, no obstructions.
+    The ``indices`` are a row of numbers, before the first surface and after each; in a chromatic loop, where every ray
+    has its own wavelength, packets of indices [medium, packet], and optical paths are left out.
     """
 
     @wp.func
     def through_telescope(
         surfaces: PackedSurfaces,
-        indices: wp.array2d(dtype=wp.float64),
+        indices: Any,
         row: wp.int32,
         x: lanes,
         y: lanes,
@@ -158,8 +164,9 @@ def surface_loop(special: bool) -> wp.Function:
         n_surfaces = surfaces.kinds.shape[0]
         skipped = n_surfaces - out.position.shape[0]
         for s in range(n_surfaces):
-            before = indices[row, s]
-            after = indices[row, s + 1]
+            if wp.static(not chromatic):
+                before = indices[row, s]
+                after = indices[row, s + 1]
             x = x - lanes(surfaces.numbers[s, VERTEX])
             y = y - lanes(surfaces.numbers[s, VERTEX + 1])
             z = z - lanes(surfaces.numbers[s, VERTEX + 2])
@@ -208,7 +215,8 @@ def surface_loop(special: bool) -> wp.Function:
             x = x + wp.cw_mul(t, u)
             y = y + wp.cw_mul(t, v)
             z = z + wp.cw_mul(t, w)
-            path = path + before * t
+            if wp.static(not chromatic):
+                path = path + before * t
 
             if surfaces.kinds[s, STOPPED] == 1:
                 ax = x - lanes(surfaces.numbers[s, APERTURE])
@@ -246,14 +254,25 @@ def surface_loop(special: bool) -> wp.Function:
                 if interaction == MIRROR:
                     u, v, w = reflected(u, v, w, nx, ny, nz)
                 else:
-                    u, v, w = refracted(before / after, u, v, w, nx, ny, nz)
+                    if wp.static(chromatic):
+                        ratio = wp.cw_div(
+                            indices[surfaces.kinds[s, MEDIUM_BEFORE], packet],
+                            indices[surfaces.kinds[s, MEDIUM_AFTER], packet],
+                        )
+                        u, v, w = refracted(ratio, u, v, w, nx, ny, nz)
+                    else:
+                        u, v, w = refracted(before / after, u, v, w, nx, ny, nz)
                     for i in range(LANES):
                         total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
                         status[i] = wp.where(wp.abs(u[i]) < FAR, status[i], total)
             if wp.static(special):
                 if interaction == PHASE:
-                    path = path + part
-                    u, v, w = through_screen(before, part_x, part_y, u, v, w)
+                    if wp.static(chromatic):
+                        n = indices[surfaces.kinds[s, MEDIUM_BEFORE], packet]
+                        u, v, w = through_screen(n, part_x, part_y, u, v, w)
+                    else:
+                        path = path + part
+                        u, v, w = through_screen(before, part_x, part_y, u, v, w)
                     for i in range(LANES):
                         total = wp.where(status[i] <= VIGNETTED, TOTAL_REFLECTION, status[i])
                         status[i] = wp.where(wp.abs(w[i]) < FAR, status[i], total)
@@ -279,8 +298,9 @@ def surface_loop(special: bool) -> wp.Function:
     return through_telescope
 
 
-#: The loop for plain telescopes, and that for any.
+#: The loop for plain telescopes, and that for any; the same for rays of a wavelength each.
 LOOPS = (surface_loop(False), surface_loop(True))
+CHROMATIC_LOOPS = (surface_loop(False, chromatic=True), surface_loop(True, chromatic=True))
 
 
 @kernel_pair

@@ -11,6 +11,7 @@ import warp as wp
 from ...core.launch import start_warp
 from ...core.warp_arrays import warp_array
 from ...models.aperture import Annulus, Aperture, Circle, Complement
+from ...models.media.medium import Medium
 from ...models.shapes.mesh import MeshSurface
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
@@ -47,6 +48,8 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
     coefficients = np.zeros((len(surfaces), max([1, *(len(shape.base.coefficients) for shape in shapes)])))
     blocked = blocked_ways(telescope)
     general: list[Aperture | None] = []
+    media = list(distinct_media(telescope))
+    before = telescope.medium_before
     for row, s in enumerate(surfaces):
         base, terms = shapes[row].base, shapes[row].base.coefficients
         rotated = not np.array_equal(s.matrix, np.eye(3))
@@ -63,7 +66,10 @@ def pack_surfaces(telescope: Telescope, device: str = "cpu") -> Any:
             stopped,
             bool(blocked[row].any()),
             2 if isinstance(s.shape, MeshSurface) else int(bool(shapes[row].parts)),
+            media.index(before),
+            media.index(s.medium_after),
         ]
+        before = s.medium_after
     packed = PackedSurfaces()
     unusual = kinds[:, DEFORMED].any() or kinds[:, OBSTRUCTED].any() or np.any(kinds[:, STOPPED] == 2)
     packed.special = int(unusual or np.any(kinds[:, INTERACTION] == PHASE))
@@ -86,6 +92,11 @@ def leading_surfaces(packed: Any, count: int) -> Any:
     # Kernels pass as many surfaces as there are rows of kinds.
     front.kinds = packed.kinds[:count]
     return front
+
+
+def distinct_media(telescope: Telescope) -> tuple[Medium, ...]:
+    """Return the media of a telescope, each once."""
+    return tuple(dict.fromkeys([telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]))
 
 
 def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from itertools import product
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
 from ...pipeline.psf_model.basis import BASES
-from ...pipeline.psf_model.fit import COMPONENTS
+from ...pipeline.psf_model.fit import COMPONENTS, ORDERS
 from ...pipeline.psf_model.polynomial import term_count
 
 #: Weights of the stars in the polynomials, as for :func:`~.snr_weights` (equal in the paper).
@@ -21,6 +21,10 @@ FOCAL_PLANE = {"no_telescope": "focal plane, no telescope", "focal_plane": "foca
 NOISE_FREE = math.inf
 
 
+#: Interpolations by a process, which have no order here, and their names.
+PROCESSES = {"gp": "Gaussian process", "kriging": "kriging"}
+
+
 @dataclass(frozen=True)
 class Case:
     """Parameters of a PSF model."""
@@ -28,8 +32,8 @@ class Case:
     stars: int  #: stars of a CCD
     snr: float = 30.0  #: S/N of the faintest star; :data:`NOISE_FREE` for stars without noise
     basis: str = "pca"  #: one of :data:`~pachon.pipeline.psf_model.basis.BASES`; moments of a focal-plane model
-    interpolation: str = "equal"  #: one of :data:`POLYNOMIALS` or :data:`FOCAL_PLANE`; gp for a Gaussian process
-    order: int = 3  #: of the polynomials; 0 without them
+    interpolation: str = "equal"  #: one of :data:`POLYNOMIALS`, :data:`PROCESSES`, :data:`FOCAL_PLANE`
+    order: int = 3  #: of the polynomials, or the trend under a process
     components: int = 20  #: of the basis; 0 for pixels, which are all used
 
     @property
@@ -46,7 +50,7 @@ class Case:
             components = min(components, self.stars - 1)
         elif self.basis == "pixels":
             components = 0
-        order = self.order if self.interpolation in POLYNOMIALS else 0
+        order = self.order if self.interpolation in POLYNOMIALS else ORDERS.get(self.interpolation, 0)
         interpolation = self.interpolation
         if self.snr == NOISE_FREE and interpolation in POLYNOMIALS:
             interpolation = "equal"
@@ -55,7 +59,7 @@ class Case:
     def __str__(self) -> str:
         if self.interpolation in FOCAL_PLANE:
             return FOCAL_PLANE[self.interpolation]
-        how = "Gaussian process" if self.interpolation == "gp" else f"order {self.order}, {self.interpolation} weights"
+        how = PROCESSES.get(self.interpolation, f"order {self.order}, {self.interpolation} weights")
         what = self.basis if self.basis == "pixels" else f"{self.components} components of {self.basis}"
         return f"{what}, {how}"
 
@@ -74,8 +78,8 @@ class Plan:
 
     @property
     def without_polynomials(self) -> tuple[str, ...]:
-        """Interpolations that have no order: a Gaussian process, and models of the whole focal plane."""
-        return ("gp", *FOCAL_PLANE) if self.focal_plane else ("gp",)
+        """Interpolations that have no order: processes on each CCD, and models of the whole focal plane."""
+        return (*PROCESSES, *(FOCAL_PLANE if self.focal_plane else ()))
 
     def cases(self) -> tuple[Case, ...]:
         """Return the cases of the study, each once.
@@ -124,7 +128,7 @@ def make_plan(
         config.stars.observed,
         config.stars.snr_min,
         fit.basis,
-        "gp" if fit.interpolation == "gp" else fit.weights,
+        fit.interpolation if fit.interpolation in PROCESSES else fit.weights,
         fit.order or 0,
         fit.components or 0,
     )

@@ -13,14 +13,15 @@ from matplotlib.axes import Axes
 from ...core.plotting import new_figure, png_bytes, styled
 from ...pipeline.psf_model.basis import BASES
 from ...pipeline.report.focal_plane_axes import AWAY, LEFT_OUT, OBSERVED, RESIDUAL, TRUTH
-from .plan import FOCAL_PLANE, NOISE_FREE, POLYNOMIALS, Case
+from .plan import FOCAL_PLANE, NOISE_FREE, POLYNOMIALS, PROCESSES, Case
 from .study import Study
 
 _HOW = {
     "equal": (OBSERVED, "o", "equal weights"),
     "snr": (LEFT_OUT, "s", "weights (S/N)$^2$"),
     "softened": (AWAY, "D", "softened weights"),
-    "gp": ("#2a8a57", "^", "Gaussian process"),
+    "gp": ("#2a8a57", "^", PROCESSES["gp"]),
+    "kriging": ("#7a4fb5", "X", PROCESSES["kriging"]),
     "no_telescope": ("0.5", "P", FOCAL_PLANE["no_telescope"]),
     "focal_plane": ("#c2307f", "v", FOCAL_PLANE["focal_plane"]),
 }

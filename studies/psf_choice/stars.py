@@ -24,7 +24,7 @@ from ...pipeline.simulate.photometry import (
 )
 from ...pipeline.simulate.stamps import observe_stamps
 from ...pipeline.simulate.star_field import make_star_field
-from .plan import NOISE_FREE, Case
+from .plan import NOISE_FREE, PROCESSES, Case
 
 
 @dataclass(frozen=True)
@@ -105,15 +105,21 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
 def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
     """Fit the PSF model of a case to the first stars of a CCD."""
     used = used_stars(case, observed)
+    process = case.interpolation in PROCESSES
+    images = observed.observation.images[used]
+    photons = case.interpolation == "kriging" and case.snr != NOISE_FREE
+    if photons:
+        images = images * observed.electrons[used, None, None]
     return PsfModel.fit(
-        observed.observation.images[used],
+        images,
         ccd.exposure.positions.observed[used],
         basis=case.basis,  # type: ignore[arg-type]
-        interpolation="gp" if case.interpolation == "gp" else "polynomial",
-        weights=None if case.interpolation == "gp" else snr_weights(case.interpolation, observed.snr[used]),
+        interpolation=case.interpolation if process else "polynomial",  # type: ignore[arg-type]
+        weights=None if process else snr_weights(case.interpolation, observed.snr[used]),
         # A star that is not usable costs one principal component.
         n_components=min(case.components, used.sum() - 1) if case.basis == "pca" else case.components or None,
         order=case.order,
+        gain=1.0 if photons else None,
         extent=ccd.exposure.positions.bounds,
         clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers
     )

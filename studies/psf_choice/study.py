@@ -23,7 +23,7 @@ from ...pipeline.focal_plane_psf.model import FocalPlanePsf
 from ...pipeline.memory import check_memory
 from ...pipeline.psf_model.model import PsfModel
 from .focal_plane import fit_focal_plane
-from .plan import FOCAL_PLANE, NOISE_FREE, Case, Plan
+from .plan import FOCAL_PLANE, NOISE_FREE, PROCESSES, Case, Plan
 from .residuals import Residuals, case_metrics, measure_residuals
 from .stars import ObservedCcd, SimulatedCcd, fit, observe, simulate
 
@@ -149,4 +149,4 @@ def _complexity(case: Case) -> tuple[int, int]:
     """Return the sort key of a case: focal-plane models last, then the number of free parameters."""
     components = case.components or 10**6
     last = 1 + [*FOCAL_PLANE].index(case.interpolation) if case.interpolation in FOCAL_PLANE else 0
-    return last, components * (case.stars if case.interpolation == "gp" else case.terms)
+    return last, components * (case.stars if case.interpolation in PROCESSES else case.terms)

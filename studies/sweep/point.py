@@ -15,22 +15,23 @@ from __future__ import annotations
 
 import time
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, PachonError, unknown_name
 from ...core.schema import known_keys
+from ...core.workers import worker_name
 from ...design.parameters.changes import parse_change
 from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.defaults import resolve
 from ...pipeline.experiment import Experiment
+from ...pipeline.kept_screens import with_kept_screens
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
 from .compensation import compensated
 from .file import SweepFile
 from .store import PointResult, SweepPoint
-from .workers import worker_name
 
 _MOTIONS = ("dz_um", "rx_urad", "ry_urad")
 
@@ -53,7 +54,7 @@ class PointMeasurement:
         return PointResult(point.number, metrics, problem, time.perf_counter() - start, worker_name())
 
     def _metrics(self, point: SweepPoint, threads: int) -> dict[str, float]:
-        experiment = _with_screens(point_experiment(self.sweep, point, Path(self.folder)))
+        experiment = with_kept_screens(point_experiment(self.sweep, point, Path(self.folder)))
         experiment, solved = compensated(experiment, self.sweep.compensators, threads)
         scene = Scene(experiment.telescope, experiment, threads=threads)
         metrics: dict[str, float] = {}
@@ -117,26 +118,6 @@ def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> Non
             if point.number not in tried:
                 tried.add(point.number)
                 point_experiment(sweep, point, folder)
-
-
-_kept: list[Experiment] = []
-
-
-def _with_screens(experiment: Experiment) -> Experiment:
-    """Return the experiment with the screens of the previous one, where they are the same: they take seconds."""
-
-    def air(one: Experiment) -> Any:
-        return one.config.seed, one.config.atmosphere, one.config.psf.engine
-
-    if experiment.atmosphere is None or not experiment.screen_kinds:
-        return experiment
-    if _kept and air(_kept[0]) == air(experiment):
-        return replace(experiment, atmosphere=_kept[0].atmosphere)
-    for before in _kept:
-        if before.atmosphere is not None:
-            before.atmosphere.release()
-    _kept[:] = [experiment]
-    return experiment
 
 
 def _set(content: dict[str, Any], path: list[str], value: Any) -> None:

@@ -44,6 +44,11 @@ class SweepPoint:
     parameters: dict[str, Any]
     seed: int
 
+    @property
+    def label(self) -> str:
+        """Name in messages."""
+        return f"point {self.number}"
+
 
 @dataclass(frozen=True)
 class PointResult:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,15 +12,13 @@ from ...core.errors import ConfigError, ProductError
 from ...core.memory import available_bytes, readable
 from ...core.progress import Reporter
 from ...core.random_streams import stream
+from ...core.workers import MakeWorkers, serial_worker
 from ...pipeline.config import Configuration
 from .design import design_points, point_count
 from .file import SweepFile
 from .point import PointMeasurement, check_sweep
 from .store import SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
-from .workers import Measure, Workers, serial_worker
 
-#: Function that makes workers of the function that computes a point.
-MakeWorkers = Callable[[Measure], Workers]
 #: More points than this are a mistake: at a second each they would take a year.
 MOST_POINTS = 30_000_000
 # Size of a point in the store [bytes], and in memory while the design is made.
@@ -46,7 +43,7 @@ def run_sweep(
     *,
     folder: Path | None = None,
     resume: bool = False,
-    workers: MakeWorkers = serial_worker,
+    workers: MakeWorkers | None = None,
     reporter: Reporter | None = None,
 ) -> SweepOutcome:
     """Compute the missing points of a sweep.
@@ -93,7 +90,7 @@ def run_sweep(
         if done:
             reporter.line(f"{len(done)} of {len(points)} points are there already")
         if missing:
-            chosen = workers(PointMeasurement(sweep, str(folder.resolve())))
+            chosen = (workers or serial_worker)(PointMeasurement(sweep, str(folder.resolve())))
             with reporter.stage(f"{sweep.name}: {len(missing)} points, {chosen.description}", len(missing)) as stage:
                 for number, result in enumerate(chosen.results(missing), start=1):
                     # Each point reads the telescope again: one of another telescope is never kept.

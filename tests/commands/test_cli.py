@@ -132,6 +132,24 @@ def test_help_loads_nothing_that_computes():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.parametrize(
+    ("command", "needless"),
+    [
+        (
+            ["info", "lsst_v3.3_r"],
+            ["warp", "trimesh", "scipy.interpolate", "astropy.table", "matplotlib"],
+        ),
+        (["spots", "hsc", "-o", "spots.png"], ["trimesh", "scipy.interpolate", "scipy.sparse", "astropy.table"]),
+    ],
+)
+@pytest.mark.long
+def test_a_command_imports_no_large_library_that_it_does_not_use(command, needless, tmp_path):
+    code = f"import sys; from pachon.commands.cli import main; main({command}); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path,
+                          env={**os.environ, "PYTHONPATH": os.getcwd()}, check=True)  # fmt: skip
+    assert set(needless).isdisjoint(done.stderr.split())
+
+
 def test_screens_too_large_for_the_memory_are_one_line(capsys, in_folder, monkeypatch):
     monkeypatch.setattr(memory, "available_bytes", lambda: 21_000_000_000)
     (in_folder / "mine.yaml").write_text("atmosphere: {screen_size: 65536}\n")

@@ -19,6 +19,16 @@ def test_a_zemax_file_becomes_ours_and_back(tmp_path, capsys):
     assert load_telescope(theirs).surface_names == load_telescope(ours).surface_names
 
 
+def test_a_telescope_becomes_a_file_of_batoid_and_back(tmp_path, capsys):
+    theirs, ours = tmp_path / "theirs.yaml", tmp_path / "ours.yaml"
+    assert main(["convert", "auxtel", str(theirs), "--format", "batoid"]) == 0
+    assert theirs.read_text(encoding="utf-8").startswith("opticalSystem:\n  type: CompoundOptic\n  name: auxtel\n")
+    assert main(["convert", str(theirs), str(ours)]) == 0
+    assert load_telescope(ours).surface_names == load_telescope("auxtel").surface_names
+    assert main(["convert", "auxtel", str(theirs), "--format", "oslo"]) == 2
+    assert "format = 'oslo': expected one of pachon, batoid, zemax" in capsys.readouterr().err
+
+
 def test_lenient_prints_a_line_for_each_thing_left_out(tmp_path, capsys):
     text = (DATA / "lens1.zmx").read_text(encoding="utf-8").replace("  STOP\n", "  STOP\n  NEWK 3\n  ELAP 1 2\n")
     lens = tmp_path / "lens.zmx"

@@ -6,6 +6,7 @@ import numpy as np
 from astropy.io import fits
 
 import pachon
+from pachon.pipeline.measure.star_catalogue import StarCutouts
 
 ROOT = Path(__file__).parents[2]
 WAVELENGTH = 620e-9
@@ -234,6 +235,8 @@ def calls(folder):
         "measure_shapes": (pachon.measure_shapes, {"images": m.stamps, "pixel_scale": 1e-6, "weight_fwhm": 4e-6,
                            "background": 0.0, "max_iterations": 5, "tolerance": 1e-4}),
         "load_stars": (pachon.load_stars, {"catalogue": m.folder / "none.fits", "x": "x", "y": "y", "stamp": "stamp"}),
+        "fit_own_stars": (pachon.fit_own_stars, {"stars": StarCutouts(m.stamps, m.places), "pixel_scale": 1e-6,
+                          "size": 11, "min_snr": 20.0, "gain": 1.0, "background": False, "seed": 1}),
         "flag_stars": (pachon.flag_stars, {"stamps": m.stamps, "noise": 0.01, "gain": 1.0, "saturation": 10.0,
                        "threshold": 6.0}),
         "brighter_fatter": (pachon.brighter_fatter, {"images": m.stamps, "electrons": np.full(12, 1e4), "sensor": "itl",

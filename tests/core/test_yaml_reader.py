@@ -25,6 +25,39 @@ def _aliases(levels):
     return "\n".join(rows)
 
 
+def _merges(levels):
+    rows = ["a0: &a0 {" + ", ".join(f"k{i}: x" for i in range(10)) + "}"]
+    for i in range(1, levels):
+        rows.append(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 10)}]}}")
+    return "\n".join(rows)
+
+
+def test_merged_mappings_give_keys_that_the_mapping_itself_and_earlier_ones_override(tmp_path):
+    path = tmp_path / "merge.yaml"
+    path.write_text(
+        "a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: {y: 7, <<: [{z: 5, x: 4}, *a]}\nd: {<<: &e {<<: *a, x: 9}}\ne: *e"
+    )
+    content = read_mapping(path)
+    assert content["b"] == {"x": 1, "y": 3}
+    assert content["c"] == {"x": 4, "y": 7, "z": 5}
+    assert content["d"] == content["e"] == {"x": 9, "y": 2}
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a: {<<: {k: 1, k: 2}}", "key 'k' occurs twice"),
+        ("a: &a {x: 1}\nb: {<<: *a, <<: *a}", "key '<<' occurs twice"),
+        ("a: {<<: 3}", "expected a mapping or list of mappings for merging"),
+    ],
+)
+def test_wrong_merges_are_refused(tmp_path, text, reason):
+    path = tmp_path / "merge.yaml"
+    path.write_text(text)
+    with pytest.raises(PachonError, match=reason):
+        read_mapping(path)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -34,6 +67,8 @@ def _aliases(levels):
             "more than 1000000 characters",
         ),
         ("a: &a [*a]", r"alias \*a within itself"),
+        ("a: &a {<<: *a}", r"alias \*a within itself"),
+        (_merges(30), "aliases for more than 1000000 characters"),
         ("a: " + "[" * 2000 + "]" * 2000, "more than 50 levels of nesting"),
         ("a: " + "[" * 2000, "more than 50 levels of nesting"),
         ("a: " + "{b: " * 2000 + "1" + "}" * 2000, "more than 50 levels of nesting"),
@@ -51,6 +86,8 @@ def _aliases(levels):
         "laughs",
         "long",
         "itself",
+        "merged itself",
+        "merged laughs",
         "lists",
         "open",
         "maps",

@@ -11,7 +11,7 @@ from astropy.io import fits
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, DomainError, ProductError, UnknownNameError
 from pachon.core.progress import Reporter
-from pachon.pipeline import focal_plane_stage
+from pachon.pipeline import focal_plane_stage, run_folder
 from pachon.pipeline import run as run_module
 from pachon.pipeline.ccd_product import CCD_KINDS, KINDS, of_ccd_model, read_product
 from pachon.pipeline.config import to_yaml
@@ -198,17 +198,17 @@ def test_ccds_computed_apart_make_the_run_of_one_machine(focal_plane_config, tmp
 
 @pytest.mark.long
 def test_a_ccd_that_cannot_be_modelled_is_left_out(focal_plane_config, tmp_path, plane_model, no_report, monkeypatch):
-    real, config = run_module.model_ccd, focal_plane_config(stars__observed=32)
+    real, config = run_folder.model_ccd, focal_plane_config(stars__observed=32)
 
     def fails(experiment, exposure):
         if exposure.name == CCDS[0]:
             raise DomainError("too few stars")
         return real(experiment, exposure)
 
-    monkeypatch.setattr(run_module, "model_ccd", fails)
+    monkeypatch.setattr(run_folder, "model_ccd", fails)
     result = run(config, tmp_path / "out")
     assert result.not_modelled == {CCDS[0]: "too few stars"}
-    monkeypatch.setattr(run_module, "model_ccd", real)
+    monkeypatch.setattr(run_folder, "model_ccd", real)
     run(focal_plane_config(stars__observed=32, ccds=CCDS[1:]), tmp_path / "alone")
     name = f"ccd_{CCDS[1]}.fits"
     assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()

@@ -13,6 +13,7 @@ import yaml
 from pachon.core import files
 from pachon.core.errors import ConfigError, ProductError
 from pachon.core.files import _owner, remove_leftovers, write_new_bytes
+from pachon.core.workers import Workers
 from pachon.imaging import simulate
 from pachon.imaging.config import ImagesConfig
 from pachon.models.io.grid_file import write_grid
@@ -24,7 +25,6 @@ from pachon.pipeline.run_folder import claim_run
 from pachon.studies.sweep.file import load_sweep
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store
 from pachon.studies.sweep.sweep import run_sweep
-from pachon.studies.sweep.workers import Workers
 from pachon.studies.visits import visits
 from pachon.studies.visits.config import VisitsConfig
 from pachon.studies.visits.image_stack import stack_images
@@ -84,7 +84,7 @@ def test_a_sweep_stops_where_its_telescope_is_edited(configuration, edited):
             yield PointResult(point.number, {"fwhm": 1.0}, None, 0.0, "here")
 
     with pytest.raises(ConfigError, match="other file contents") as caught:
-        run_sweep(sweep, folder / "s.db", folder=folder, workers=lambda _: Workers("these", results))
+        run_sweep(sweep, folder / "s.db", folder=folder, workers=lambda _: Workers("these", 1, results))
     assert "\n" not in str(caught.value)
     with SweepStore(folder / "s.db") as store:
         assert store.finished() == {0}

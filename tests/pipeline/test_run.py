@@ -175,14 +175,14 @@ def test_an_error_inside_a_ccd_names_it(tmp_path, monkeypatch, tiny, no_report):
 @pytest.fixture
 def failing_ccd(monkeypatch):
     """Let the first CCD be one that cannot be modelled."""
-    real = run_module.model_ccd
+    real = run_folder.model_ccd
 
     def fails(experiment, exposure):
         if exposure.name == "R22_S11":
             raise DomainError("3 of 12 stars left (9 neighbour): expected at least 5")
         return real(experiment, exposure)
 
-    monkeypatch.setattr(run_module, "model_ccd", fails)
+    monkeypatch.setattr(run_folder, "model_ccd", fails)
     return "3 of 12 stars left (9 neighbour): expected at least 5"
 
 
@@ -210,7 +210,7 @@ def test_a_ccd_that_could_not_be_modelled_is_tried_again(
     finished_run, tmp_path, tiny, no_report, failing_ccd, monkeypatch
 ):
     run(tiny(), tmp_path / "out", threads=1)
-    monkeypatch.setattr(run_module, "model_ccd", model_ccd)
+    monkeypatch.setattr(run_folder, "model_ccd", model_ccd)
     result = run(tiny(), tmp_path / "out", resume=True)
     assert (result.kept, result.computed, result.not_modelled) == (("R24_S12",), ("R22_S11",), {})
     assert contents(tmp_path / "out") == contents(finished_run)

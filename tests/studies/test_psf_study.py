@@ -16,7 +16,7 @@ from pachon.pipeline.psf_model.polynomial import mapped
 from pachon.pipeline.simulate.ccd_exposure import CcdExposure, NoiseFreeStars
 from pachon.pipeline.simulate.ccd_observation import Observation
 from pachon.pipeline.simulate.star_field import make_star_field
-from pachon.studies.psf_choice.plan import NOISE_FREE, Case, Plan, make_plan
+from pachon.studies.psf_choice.plan import NOISE_FREE, PROCESSES, Case, Plan, make_plan
 from pachon.studies.psf_choice.residuals import case_metrics, measure_residuals, noise_law, residual_correlations
 from pachon.studies.psf_choice.stars import SimulatedCcd, fit, observe, simulate
 from pachon.studies.psf_choice.study import Study, study, study_experiment
@@ -225,7 +225,7 @@ def test_every_case_has_figures_or_a_problem(small):
     assert len(result.problems) == 4
     for case, found in result.metrics.items():
         assert np.isfinite(found["rms_e_away"]), case
-        assert np.isnan(found["noise_law_away"]) == (case.interpolation == "gp")
+        assert np.isnan(found["noise_law_away"]) == (case.interpolation in PROCESSES)
 
 
 def test_a_case_is_what_its_parts_give(small, tiny):

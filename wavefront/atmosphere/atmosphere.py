@@ -71,6 +71,13 @@ class Atmosphere(LayerScreens):
     exposure: float
     times: np.ndarray
 
+    def __repr__(self) -> str:
+        air = f"r0 {self.r0:.4g} m, outer scale {self.outer_scale:.4g} m"
+        return (
+            f"<Atmosphere: {len(self.altitudes)} layers, {air}, {self.exposure:.6g} s, "
+            f"seed {self.seed}, epoch {self.epoch}>"
+        )
+
     @classmethod
     @check_arguments
     def from_site(
@@ -238,6 +245,14 @@ class Atmosphere(LayerScreens):
             raise DomainError(f"altitudes = {altitudes!r}: expected {self.layer_count} distances of 0 m or more")
         heights.setflags(write=False)
         return self._with_shared_screens(altitudes=heights)
+
+    def with_screens_of(self, other: Atmosphere) -> Atmosphere:
+        """Return this atmosphere with the screens of another one, stored for both, where they are the same screens."""
+        if not self.has_screens_of(other):
+            return self
+        shared = replace(self)
+        object.__setattr__(shared, "_cache", other._cache)
+        return shared
 
     def _with_shared_screens(self, **changes: Any) -> Atmosphere:
         """Return a changed atmosphere with shared screens: nothing that determines them may change."""

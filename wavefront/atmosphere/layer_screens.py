@@ -189,6 +189,11 @@ class LayerScreens(Layers):
         with _cache_lock:
             self._cache.clear()
 
+    def has_screens_of(self, other: LayerScreens) -> bool:
+        """Return whether all that determines the screens is the same; they are then the same to the last bit."""
+        names = ("weights", *(name for name in LayerScreens.__annotations__ if name != "_cache"))
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+
     def path(self, x: ArrayLike, y: ArrayLike, layer: int, *, scale: str = "low") -> np.ndarray:
         """Return the path [m] through one screen at screen coordinates x, y [m], by plain NumPy; float64.
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.units import angle, length, metres, pure_numbers, radians
+from ...core.units import ARCSEC, angle, length, metres, pure_numbers, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
 from ...models.telescope import Telescope
@@ -61,6 +61,11 @@ class Psfs:
     lit_fraction: np.ndarray
     inside: np.ndarray
     flags: np.ndarray
+
+    def __repr__(self) -> str:
+        waves = [f"{1e9 * w:.6g}" for w in self.wavelengths[:3]] + ["..."] * (len(self.wavelengths) > 3)
+        pixel = f"pixels of {self.pixel_scale / ARCSEC:.4g} arcsec"
+        return f"<Psfs: images {list(self.image.shape)}, {pixel}, {', '.join(waves)} nm>"
 
 
 @check_arguments

@@ -217,7 +217,11 @@ MAX_BYTES = 64_000_000
 
 def read_telescope(path: Path) -> Telescope:
     """Read a prescription file; PrescriptionError of one line with file, key, value and expected value."""
-    content = read_mapping(path, max_bytes=MAX_BYTES)
+    return telescope_of(read_mapping(path, max_bytes=MAX_BYTES), path)
+
+
+def telescope_of(content: dict[str, Any], path: Path) -> Telescope:
+    """Return the telescope of the content of a prescription file; errors as for :func:`read_telescope`."""
     prescription = validated(Prescription, content, str(path), PrescriptionError, {"folder": path.parent})
     with error_context(file=path):
         return prescription.telescope()

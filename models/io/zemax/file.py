@@ -10,7 +10,7 @@ import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ....core.errors import PrescriptionError, PrescriptionWarning
+from ....core.errors import PachonError, PrescriptionError, PrescriptionWarning
 from .text import Record, read_text, records
 
 #: Keywords of the header without effect on rays: notes, names of other files, analysis and display settings,
@@ -39,7 +39,7 @@ class Findings:
 
     lenient: bool = False
 
-    def report(self, error: PrescriptionError, instead: str = "") -> None:
+    def report(self, error: PachonError, instead: str = "") -> None:
         """Raise the error or, if lenient, warn; `instead` is the assumption in its place, for the warning."""
         if not self.lenient:
             raise error

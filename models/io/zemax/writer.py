@@ -20,7 +20,7 @@ from ....core.errors import PrescriptionError
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...surface import Interaction, Surface
-from ...telescope import VACUUM, Telescope
+from ...telescope import VACUUM, Telescope, rotation_angles
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
 from .apertures import aperture_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
@@ -78,7 +78,7 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
         else:
-            values = [x / MM, y / MM, *np.degrees(_tilts(axes))]
+            values = [x / MM, y / MM, *np.degrees(rotation_angles(axes))]
             medium = _glass_line(before, glasses)
             blocks.append([*_break_lines(values, 0), *medium, "DISZ 0"])
             blocks.append([*own, "DISZ 0"])
@@ -95,15 +95,6 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
 def _micrometres(wavelength: float) -> str:
     # The decimal point of the number as written is moved, so that it loads back equal.
     return repr(float(Decimal(repr(float(wavelength))).scaleb(6)))
-
-
-def _tilts(axes: np.ndarray) -> tuple[float, float, float]:
-    """Return the angles [rad] about x, the new y and the new z that make a rotation matrix."""
-    about_y = math.asin(max(-1.0, min(1.0, axes[0, 2])))
-    if abs(axes[0, 2]) > 1 - 1e-14:
-        # About y by a right angle, x and z turn about the same line: one of them does.
-        return math.atan2(axes[2, 1], axes[1, 1]), about_y, 0.0
-    return math.atan2(-axes[1, 2], axes[2, 2]), about_y, math.atan2(-axes[0, 1], axes[0, 0])
 
 
 def _break_lines(values: list[float], order: int) -> list[str]:

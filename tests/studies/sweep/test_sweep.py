@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 from pachon.commands.cli import main
+from pachon.core.dask_cluster import check_versions
 from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.camera import CAMERAS, lsst_camera
 from pachon.models.io.prescription import DATA, load_telescope
@@ -28,7 +28,6 @@ from pachon.studies.sweep.file import load_sweep, read_sweep
 from pachon.studies.sweep.point import point_experiment
 from pachon.studies.sweep.store import SweepPoint, SweepStore
 from pachon.studies.sweep.sweep import check_room
-from pachon.studies.sweep.workers import check_versions
 
 #: All of them need a finished study, of seconds.
 pytestmark = pytest.mark.long
@@ -144,31 +143,6 @@ def test_a_sweep_that_is_killed_three_times_ends_with_the_same_bytes(folder, ref
     assert figures("small.sweep") == reference
 
 
-@pytest.fixture
-def cluster():
-    pytest.importorskip("distributed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-
-    def scheduler():
-        where = ["--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--no-dashboard"]
-        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", *where], **quiet)
-
-    def worker():
-        how = [address, "--nthreads", "1", "--no-dashboard", "--no-nanny"]
-        return subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", *how], **quiet)
-
-    running = {"scheduler": scheduler(), "workers": [worker(), worker()]}
-    running["restart"] = lambda: running.update(scheduler=scheduler(), workers=[worker()])
-    running["address"] = address
-    yield running
-    for process in (running["scheduler"], *running["workers"]):
-        process.kill()
-        process.wait()
-
-
 @pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_its_driver_and_its_scheduler(folder, reference, cluster, capsys):
     command = ("sweep", "small.yaml", "--scheduler", cluster["address"])
@@ -250,7 +224,7 @@ def test_more_points_than_there_is_room_for_are_refused_before_starting(folder):
 
 def test_a_scheduler_that_does_not_answer_is_one_line(folder, capsys, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("pachon.studies.sweep.workers.CONNECT_SECONDS", 1.0)
+    monkeypatch.setattr("pachon.core.dask_cluster.CONNECT_SECONDS", 1.0)
     assert main(["sweep", "small.yaml", "--scheduler", "tcp://127.0.0.1:9"]) == 2
     error = capsys.readouterr().err.strip()
     assert "--scheduler = tcp://127.0.0.1:9: no answer within 1 s" in error

@@ -10,7 +10,7 @@ import pytest
 
 _DRIVER = """
 import os, time
-from pachon.studies.sweep.workers import process_workers
+from pachon.core.workers import process_workers
 
 def wait(point, threads):
     print(os.getpid(), flush=True)

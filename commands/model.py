@@ -1,0 +1,85 @@
+"""The command ``pachon model``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from .interrupt import interruptible
+from .options import Json, Quiet
+from .tables import Rows, print_json
+
+app = typer.Typer()
+
+
+@app.command("model")
+def model_command(
+    stars: Annotated[Path, Argument(metavar="STARS", help="FITS or ECSV table of stars with stamps.")],
+    out: Annotated[Path | None, Option("--out", "-o", help="PSF model to write; STARS_psf.fits by default.")] = None,
+    pixel_arcsec: Annotated[float, Option(help="Side of a pixel [arcsec].")] = 0.2,
+    x: Annotated[str, Option(help="Column of x; names of SExtractor and LSST are known.")] = "x",
+    y: Annotated[str, Option(help="Column of y.")] = "y",
+    stamp: Annotated[str, Option(help="Column of the stamps [ny, nx].")] = "stamp",
+    images: Annotated[Path | None, Option(help="FITS cube of the stamps, where the table has none.")] = None,
+    size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
+    min_snr: Annotated[float, Option(help="Least S/N of a star.")] = 20.0,
+    gain: Annotated[float, Option(help="Electrons in a unit of the stamps.")] = 1.0,
+    saturation: Annotated[float | None, Option(help="Level from which on a pixel is saturated.")] = None,
+    background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
+
+    Stars are centred, those with neighbours, cosmic rays and saturated cores left out, and every pixel is interpolated
+    by kriging, which has nothing to choose. It leaves the model, STARS_psf.fits; a picture beside it, .png; and all
+    stars with their shapes and what the model made without them predicts, .ecsv.
+
+    **Examples**
+
+    - `pachon model stars.fits`: columns x, y, stamp, or x, y and a cube of images
+    - `pachon model sextractor.cat --gain 1.7 --pixel-arcsec 0.263`: XWIN_IMAGE, YWIN_IMAGE, VIGNET
+    - `pachon model stars.ecsv --images stamps.fits --x X --y Y -o psf.fits`
+    """
+    from ..core.files import write_bytes
+    from ..core.table_files import write_table
+    from ..core.units import ARCSEC
+    from ..pipeline.measure.star_catalogue import load_stars
+    from ..pipeline.own_stars.own_stars import fit_own_stars
+    from ..pipeline.own_stars.plots import own_stars_picture
+
+    path = stars.with_name(f"{stars.stem}_psf.fits") if out is None else out
+    with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
+        own = fit_own_stars(
+            load_stars(stars, x=x, y=y, stamp=stamp, images=images),
+            pixel_arcsec * ARCSEC,
+            size=size,
+            min_snr=min_snr,
+            gain=gain,
+            saturation=saturation,
+            background=background,
+        )
+        own.model.write(path)
+        write_bytes(path.with_suffix(".png"), own_stars_picture(own, stars.name))
+        write_table(path.with_suffix(".ecsv"), own.table())
+    found = own.summary()
+    if as_json:
+        print_json({"model": str(path), **found})
+    elif not quiet:
+        flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in found["flagged"].items() if n)
+        rows = [
+            ("stars, used", f"{found['stars']}, {found['used']}"),
+            ("flagged", flagged or "none"),
+            ("S/N, median", f"{found['median_snr']:.0f}"),
+            ("FWHM", f"{found['fwhm_arcsec']:.3g} arcsec"),
+            ("rms of e of the stars", f"{100 * found['rms_e']:.2f} %"),
+            ("... less the model, held out", f"{100 * found['rms_e_held_out']:.2f} %"),
+            ("... of which noise of the stars", f"{100 * found['rms_e_noise']:.2f} %"),
+            ("rms of size less the model, held out", f"{100 * found['rms_size_held_out']:.2f} %"),
+            ("... of which noise of the stars", f"{100 * found['rms_size_noise']:.2f} %"),
+            ("model, picture, stars", f"{path}, .png, .ecsv"),
+        ]
+        Rows(("", ""), rows, left=2).show()

@@ -1,0 +1,46 @@
+"""Options that choose the workers of a long command: processes of this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Option
+
+from ..core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ..core.workers import MakeWorkers
+
+Processes = Annotated[int | None, Option(min=1, help="Compute in so many processes.")]
+Scheduler = Annotated[str | None, Option(metavar="tcp://HOST:PORT", help="Compute on a Dask cluster.")]
+DaskWorkers = Annotated[int | None, Option("--workers", min=1, help="Start a local Dask cluster with so many workers.")]
+
+
+@contextmanager
+def chosen_workers(
+    processes: int | None,
+    scheduler: str | None,
+    dask: int | None,
+    threads: int | None,
+    say: Callable[[str], None],
+) -> Iterator[MakeWorkers | None]:
+    """Yield the function that makes the workers of at most one option; None where none is given."""
+    if sum(option is not None for option in (processes, scheduler, dask)) > 1:
+        raise ConfigError("--processes, --scheduler and --workers: expected one of them")
+    from ..core.dask_cluster import dask_client, dask_workers, local_cluster
+    from ..core.workers import process_workers, serial_worker
+
+    if scheduler is not None:
+        with dask_client(scheduler) as client:
+            yield lambda compute: dask_workers(compute, client)
+    elif dask is not None:
+        with local_cluster(dask, say) as client:
+            yield lambda compute: dask_workers(compute, client, local=True)
+    elif processes is None:
+        yield None
+    elif processes == 1:
+        yield lambda compute: serial_worker(compute, threads)
+    else:
+        yield lambda compute: process_workers(compute, processes, threads)

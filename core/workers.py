@@ -1,0 +1,128 @@
+"""Workers that compute jobs, such as CCDs or points of a sweep: this process, or processes of this machine.
+
+All workers, those of a cluster in :mod:`.dask_cluster` included, call the same function for each job and yield results
+in any order. No result depends on the worker. The threads of each worker are bounded, so that all workers together have
+no more threads than processors.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any, Protocol
+
+from .errors import ProductError
+from .threads import thread_count
+
+
+class Job(Protocol):
+    """Part of a computation, picklable."""
+
+    @property
+    def label(self) -> str:
+        """Name in messages: "point 3", "CCD R22_S11"."""
+
+
+#: Picklable function that does one job on a number of threads and returns its result.
+Compute = Callable[[Any, int], Any]
+#: Jobs handed out ahead of the results, to each worker: none waits, and a cluster never holds all jobs.
+AHEAD = 2
+#: Variables that bound the threads of libraries.
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+#: Time between two looks of a worker at whether its driver lives [s].
+PARENT_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Workers that do jobs.
+
+    `results` yields the result of every job as soon as it is there, in any order, and raises a ProductError if a worker
+    or the connection to it is lost.
+    """
+
+    description: str  #: number and kind
+    processes: int  #: processes of this machine among which its memory is shared; 0 on others
+    results: Callable[[Iterable[Any]], Iterator[Any]]
+
+
+#: Function that makes workers of the function that does a job.
+MakeWorkers = Callable[[Compute], Workers]
+
+
+def serial_worker(compute: Compute, threads: int | None = None) -> Workers:
+    """Return this process as the only worker, with all processors or a number of threads."""
+    count = thread_count(threads)
+    return Workers(f"this process, {count} threads", 1, lambda jobs: (compute(job, count) for job in jobs))
+
+
+def process_workers(compute: Compute, count: int, threads: int | None = None) -> Workers:
+    """Return processes of this machine that share its processors, or a number of threads, evenly.
+
+    `compute` is a function of a module, or a picklable object.
+    """
+    each = max(1, thread_count(threads) // count)
+
+    def results(jobs: Iterable[Any]) -> Iterator[Any]:
+        # A fresh interpreter, not a fork: Warp and OpenMP keep threads that a fork would lose. Variables that bound the
+        # threads of libraries must be set before a worker imports them.
+        with _environment({name: str(each) for name in _THREAD_VARIABLES}):
+            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_begin)
+            waiting: set[Future[Any]] = set()
+            try:
+                for job in jobs:
+                    waiting.add(pool.submit(compute, job, each))
+                    if len(waiting) >= AHEAD * count:
+                        done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                        yield from (future.result() for future in done)
+                while waiting:
+                    done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                    yield from (future.result() for future in done)
+            except BrokenProcessPool:
+                raise ProductError(
+                    "a worker process died, killed or short of memory; what was computed is kept, go on with --resume"
+                ) from None
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+    return Workers(f"{count} processes of {each} thread{'s' * (each > 1)}", count, results)
+
+
+def worker_name() -> str:
+    """Return the name of this worker: machine and process."""
+    return f"{os.uname().nodename if hasattr(os, 'uname') else 'machine'}:{os.getpid()}"
+
+
+def _begin() -> None:
+    """Let Ctrl-C end the process that hands out jobs, not those that do them; these end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent has gone: one that is killed cannot tell its workers."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_SECONDS)
+    os._exit(1)
+
+
+@contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    before: dict[str, Any] = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

@@ -1,0 +1,139 @@
+"""Write a telescope as a YAML file of batoid.
+
+Groups whose surfaces are neighbours become compound optics, as far as they lie within one another; surfaces stand in
+their coordinate systems. What batoid does not have goes under the key ``pachon``, which it ignores.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ....core.errors import PrescriptionError, error_context
+from ...media.medium import Medium
+from ...surface import Interaction, Surface
+from ...telescope import Telescope, rotation_angles
+from . import ROOT
+from .apertures import obscuration_items
+from .media import medium_items
+from .optics import Frame
+from .shapes import surface_items
+
+#: Shifts [m] and rotations [rad] that are rounding of rotation matrices.
+ROUNDING = 1e-15
+_TYPES = {
+    Interaction.MIRROR: "Mirror",
+    Interaction.REFRACT: "RefractiveInterface",
+    Interaction.PASS: "Baffle",
+    Interaction.DETECTOR: "Detector",
+    Interaction.PHASE: "OPDScreen",
+}
+
+
+def telescope_to_batoid(telescope: Telescope) -> str:
+    """Return the text of a batoid file.
+
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in batoid.
+    """
+    t = telescope
+    with error_context(subject=t.name):
+        if t.surfaces[-1].interaction != Interaction.DETECTOR:
+            raise PrescriptionError("a batoid file needs a detector as its last surface")
+        if t.obstructions:
+            raise PrescriptionError(f"obstruction {t.obstructions[0].name}: a batoid file cannot hold meshes")
+        if math.isfinite(t.object_distance):
+            raise PrescriptionError(f"object_distance = {t.object_distance!r}: a batoid file has no object but the sky")
+        nested = _nested_groups(t)
+        system = {
+            "type": "CompoundOptic",
+            "name": t.name,
+            "inMedium": medium_items(t.medium_before),
+            "backDist": t.launch_distance,
+            "sphereRadius": t.reference_sphere_radius,
+            "pupilSize": t.pupil_diameter,
+            "pupilObscuration": t.pupil_obscuration,
+            "stopSurface": {
+                "type": "Interface",
+                "name": "stop",
+                "surface": {"type": "Plane"},
+                "coordSys": {"z": t.stop_z},
+            },
+            "items": _items(t, nested, 0, len(t.surfaces), (np.zeros(3), np.eye(3))),
+        }
+        content = {ROOT: system, "pachon": _extras(t, [name for name in t.groups if name not in nested])}
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+
+
+def _nested_groups(t: Telescope) -> dict[str, tuple[int, int]]:
+    """Return the groups that are compound optics, outer ones first, by first surface and the one after the last."""
+    found: dict[str, tuple[int, int]] = {}
+    for name, members in sorted(t.groups.items(), key=lambda group: -len(group[1])):
+        places = sorted(t.surface_names.index(member) for member in set(members))
+        first, end = places[0], places[-1] + 1
+        apart_or_inside = all(end <= a or b <= first or (a <= first and end <= b) for a, b in found.values())
+        if end - first == len(places) and apart_or_inside:
+            found[name] = (first, end)
+    return found
+
+
+def _items(t: Telescope, groups: dict[str, tuple[int, int]], first: int, end: int, frame: Frame) -> list[Any]:
+    """Return the optics of the surfaces from first to end, within a compound optic of that frame."""
+    items: list[Any] = []
+    while first < end:
+        name = next((n for n, (a, b) in groups.items() if a == first and b <= end), None)
+        if name is None:
+            before = t.surfaces[first - 1].medium_after if first else t.medium_before
+            items.append(_optic(t.surfaces[first], before, frame))
+            first += 1
+            continue
+        pivot, axes = t.group_frames[name]
+        own = np.array(pivot), np.array(axes)
+        inner = {n: span for n, span in groups.items() if n != name}
+        compound = {"type": "CompoundOptic", "name": name, **_coordinate_system(own, frame)}
+        items.append(compound | {"items": _items(t, inner, first, groups[name][1], own)})
+        first = groups[name][1]
+    return items
+
+
+def _optic(surface: Surface, before: Medium, frame: Frame) -> dict[str, Any]:
+    with error_context(subject=f"surface {surface.name}"):
+        items: dict[str, Any] = {"type": _TYPES[surface.interaction], "name": surface.name}
+        items |= _coordinate_system((np.array(surface.vertex), surface.matrix), frame)
+        sag = surface_items(surface.shape)
+        is_screen = surface.interaction == Interaction.PHASE
+        items |= {"surface": {"type": "Plane"}, "screen": sag} if is_screen else {"surface": sag}
+        items |= {"inMedium": medium_items(before), "outMedium": medium_items(surface.medium_after)}
+        if surface.aperture is not None:
+            items["obscuration"] = obscuration_items(surface.aperture)
+    return items
+
+
+def _coordinate_system(own: Frame, outer: Frame) -> dict[str, Any]:
+    """Return the coordinate system of an optic within that of the one around it; empty where they are the same."""
+    shift = outer[1].T @ (own[0] - outer[0])
+    angles = rotation_angles(outer[1].T @ own[1])
+    pairs = [*zip("xyz", shift, strict=True), *zip(("rotX", "rotY", "rotZ"), angles, strict=True)]
+    steps = {key: float(value) for key, value in pairs if abs(value) > ROUNDING}
+    return {"coordSys": steps} if steps else {}
+
+
+def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
+    """Return the section of what batoid does not have."""
+    low, high = t.band or t.wavelength_range
+    frames = {name: t.group_frames[name] for name in groups}
+    extras = {
+        "description": t.description,
+        "source": t.source,
+        "version": t.version,
+        "field": {"radius": t.field_radius, "limit": t.field_limit},
+        "wavelengths": {"range": list(t.wavelength_range), "default": t.default_wavelength, "band": [low, high]},
+        "camera": t.camera,
+        "groups": {
+            name: {"surfaces": list(t.groups[name]), "pivot": list(pivot), "rotation": [list(row) for row in axes]}
+            for name, (pivot, axes) in frames.items()
+        },
+    }
+    return {key: value for key, value in extras.items() if value}

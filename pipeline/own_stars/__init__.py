@@ -1,0 +1,1 @@
+"""PSF models of stars from other programs."""

@@ -1,0 +1,256 @@
+"""From the stars of any image to a PSF model, and how well it predicts stars that were held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.table import Table
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError
+from ...core.random_streams import stream
+from ...core.units import ARCSEC, positive_angle
+from ..measure.rho_statistics import RhoStatistics, rho_statistics
+from ..measure.shapes import Shapes, fwhm, measure_shapes
+from ..measure.star_catalogue import StarCutouts
+from ..measure.star_selection import StarFlag, flag_stars, require_stars
+from ..psf_model import kriging
+from ..psf_model.model import PsfModel
+from ..simulate.stamps import center_stamps
+
+#: Fewest stars that a model is made of.
+FEWEST_STARS = 5
+#: Parts of the stars that are held out one after the other.
+FOLDS = 5
+# Beyond this distance from the centre, as a fraction of the side, a stamp is sky.
+_SKY = 0.4
+# Rim of a stamp that a shift may bring in from the other side [pixel].
+_RIM = 2
+
+
+@dataclass(frozen=True, eq=False)
+class OwnStars:
+    """Stars of an image, the PSF model made from the good ones, and its prediction of each star held out.
+
+    Attributes
+    ----------
+    model : PsfModel
+        Of all stars that are used; positions in the unit of the stars'.
+    positions : ndarray
+        Of all stars, [n, 2].
+    snr : ndarray
+        Signal-to-noise ratio, [n].
+    flags : ndarray
+        :class:`~.StarFlag` bits, [n]; stars without any, and of enough S/N, are used.
+    used : ndarray
+        [n] bool.
+    shapes : Shapes
+        Of the stars, angles in rad.
+    held_out : Shapes
+        Of the model made without the star and others of its part; NaN for stars that are not used.
+    stamps, predicted : ndarray
+        Used stars and the models made without them, unit sum, [n_used, ny, nx].
+    sigma_e, sigma_size : ndarray
+        Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
+    pixel_scale, weight_fwhm : float
+        Of the stamps [rad], and of the weight of the moments [rad].
+    """
+
+    model: PsfModel
+    positions: np.ndarray
+    snr: np.ndarray
+    flags: np.ndarray
+    used: np.ndarray
+    shapes: Shapes
+    held_out: Shapes
+    stamps: np.ndarray
+    predicted: np.ndarray
+    sigma_e: np.ndarray
+    sigma_size: np.ndarray
+    pixel_scale: float
+    weight_fwhm: float
+
+    def table(self) -> Table:
+        """Return all stars with their shapes and residuals."""
+        return Table(
+            {
+                "x": self.positions[:, 0],
+                "y": self.positions[:, 1],
+                "snr": self.snr,
+                "flags": self.flags,
+                "used": self.used,
+                "e1": self.shapes.e1,
+                "e2": self.shapes.e2,
+                "size": self.shapes.size / ARCSEC * u.arcsec,
+                "held_out_e1": self.held_out.e1,
+                "held_out_e2": self.held_out.e2,
+                "held_out_size": self.held_out.size / ARCSEC * u.arcsec,
+            }
+        )
+
+    def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""
+        one, other, used = self.shapes, self.held_out, self.used
+        return (
+            (one.e1 - other.e1)[used],
+            (one.e2 - other.e2)[used],
+            (one.size / other.size - 1.0)[used],
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return numbers of stars, FWHM, and rms residuals at stars that were held out, beside their noise."""
+        d1, d2, size = self.residuals()
+        counts = {str(f.name).lower(): int(((self.flags & f) > 0).sum()) for f in StarFlag if f}
+        return {
+            "stars": len(self.used),
+            "used": int(self.used.sum()),
+            "flagged": counts,
+            "median_snr": float(np.median(self.snr[self.used])),
+            "fwhm_arcsec": float(np.median(fwhm(self.predicted, self.pixel_scale))) / ARCSEC,
+            "rms_e": _rms(self.shapes.e1[self.used], self.shapes.e2[self.used]),
+            "rms_e_held_out": _rms(d1, d2),
+            "rms_e_noise": _rms(self.sigma_e),
+            "rms_size_held_out": _rms(size),
+            "rms_size_noise": _rms(self.sigma_size),
+        }
+
+    def rho_statistics(self, bins: int = 8) -> RhoStatistics:
+        """Return the rho statistics of the held-out residuals; positions must be in pixels of the stamps."""
+        places = (self.positions[self.used] - self.positions[self.used].mean(axis=0)) * self.pixel_scale
+        one, other = (
+            [getattr(s, name)[self.used] for name in ("e1", "e2", "size")] for s in (self.shapes, self.held_out)
+        )
+        longest = float(np.hypot(*np.ptp(places, axis=0)))
+        return rho_statistics(*places.T, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
+
+
+@check_arguments
+def fit_own_stars(
+    stars: StarCutouts,
+    pixel_scale: ArrayLike,
+    *,
+    size: int | None = None,
+    min_snr: float = 20.0,
+    gain: float = 1.0,
+    saturation: float | None = None,
+    background: bool = True,
+    extent: ArrayLike | None = None,
+    seed: int = 1,
+    **options: Any,
+) -> OwnStars:
+    """Centre stars, leave out those with defects, model the PSF, and predict each star from others.
+
+    Parameters
+    ----------
+    stars : StarCutouts
+        Stamps and positions, such as :func:`~pachon.load_stars` reads.
+    pixel_scale : float or Quantity
+        Side of a pixel [rad].
+    size : int, optional
+        Side of the PSF [pixel], odd; the largest that the stamps allow by default.
+    min_snr : float
+        Least S/N of a star.
+    gain : float
+        Electrons in a unit of the stamps.
+    saturation : float, optional
+        Level from which on a pixel is saturated.
+    background : bool
+        Whether to subtract the median of the outer pixels of each stamp.
+    extent : tuple of float, optional
+        (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions; that of the stars by default.
+    seed : int
+        Of the parts that are held out.
+    **options
+        Other options of :meth:`~.PsfModel.fit`; kriging of pixels by default.
+
+    Raises
+    ------
+    DomainError
+        If stamps are too small, fewer than five stars are left, or the model cannot be made.
+    """
+    stamps, positions = np.array(stars.stamps, dtype=np.float64), np.asarray(stars.positions, dtype=np.float64)
+    scale = positive_angle(pixel_scale, "pixel_scale")
+    if not (np.isfinite(gain) and gain > 0.0):
+        raise DomainError(f"gain = {gain}: expected a number of electrons above 0")
+    side = min(stamps.shape[1:])
+    if size is None:
+        size = max(side - 2 * _RIM - 1 + (side % 2), 0)
+    if size % 2 == 0 or not 9 <= size <= side:
+        raise DomainError(f"size = {size}: expected an odd number of pixels from 9 to {side}, the side of the stamps")
+    y, x = np.indices(stamps.shape[1:]) - 0.5 * (np.array(stamps.shape[1:])[:, None, None] - 1.0)
+    sky = stamps[:, np.hypot(x, y) > _SKY * side]
+    middle = np.nanmedian(sky, axis=1)
+    if background:
+        stamps -= middle[:, None, None]
+    rms = 1.4826 * np.nanmedian(np.abs(sky - middle[:, None]), axis=1)
+    wide = measure_shapes(stamps, scale, 0.25 * side * scale)
+    weight = float(np.nanmedian(fwhm(stamps[wide.usable], scale))) if wide.usable.any() else np.nan
+    if not np.isfinite(weight):
+        raise DomainError(f"none of {len(stamps)} stamps has a star in its middle")
+    first = measure_shapes(stamps, scale, weight)
+    centred = center_stamps(stamps, first.x, first.y, size=size, normalize=False)
+    shapes = measure_shapes(centred, scale, weight)
+    flags = flag_stars(centred, np.where(rms > 0.0, rms, 1.0), gain=gain, saturation=saturation).flags
+    flags = np.where(shapes.usable, flags, flags | StarFlag.UNUSABLE)
+    snr = _signal_to_noise(centred, rms, gain)
+    used = (flags == 0) & (snr >= min_snr)
+    require_stars(used, flags, FEWEST_STARS)
+    defaults = {"basis": "pixels", "interpolation": "kriging"} | options
+    if defaults["interpolation"] == "kriging":
+        defaults["gain"] = gain
+
+    def fit(chosen: np.ndarray) -> PsfModel:
+        return PsfModel.fit(centred[chosen], positions[chosen], extent=span, **defaults)
+
+    span = _extent(positions[used]) if extent is None else extent
+    which = np.flatnonzero(used)
+    predicted = np.empty((len(which), size, size))
+    parts = np.array_split(stream(seed, "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
+    for part in parts:
+        rest = np.setdiff1d(np.arange(len(which)), part)
+        predicted[part] = fit(which[rest]).at(positions[which[part]])
+    psf = predicted.mean(axis=0)
+    variance = (weight / scale / 2.354820045) ** 2
+    deviations = (centred[used] / centred[used].sum(axis=(1, 2), keepdims=True) - psf).reshape(len(which), -1)
+    filters = kriging.shape_numbers(psf, deviations, variance)[1]
+    # Shape numbers are twice the changes of e and of the logarithm of the size.
+    sigma = 0.5 * np.sqrt(kriging.star_noise(centred[used], deviations, psf, filters, gain))
+    held_out = _spread(measure_shapes(predicted, scale, weight), used)
+    good = centred[used]
+    stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
+    sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
+    return OwnStars(
+        fit(which), positions, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight
+    )
+
+
+def _rms(*values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
+
+
+def _extent(positions: np.ndarray) -> tuple[float, float, float, float]:
+    (xmin, ymin), (xmax, ymax) = positions.min(axis=0), positions.max(axis=0)
+    return xmin, xmax, ymin, ymax
+
+
+def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:
+    """Return the S/N of PSF photometry, [n], with the median star as the PSF; NaN where there is no light."""
+    flux = stamps.sum(axis=(1, 2))
+    flux = np.where(flux > 0.0, flux, np.nan)
+    psf = np.nanmedian(stamps / flux[:, None, None], axis=0)
+    area = psf.sum() ** 2 / (psf**2).sum()
+    return flux / np.sqrt(flux / gain + area * rms**2)
+
+
+def _spread(shapes: Shapes, used: np.ndarray) -> Shapes:
+    """Return shapes of some stars as those of all, NaN for the others."""
+    values = {}
+    for name, value in vars(shapes).items():
+        whole = np.full(len(used), -1 if value.dtype.kind in "iu" else np.nan, dtype=value.dtype)
+        whole[used] = value
+        values[name] = whole
+    return Shapes(**values)

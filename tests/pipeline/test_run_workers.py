@@ -1,0 +1,186 @@
+"""A run by processes, by a cluster and in parts: the same bytes as one process leaves."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+from pachon.commands.cli import main
+from pachon.core.errors import ConfigError, DomainError, ProductError
+from pachon.core.files import marked_folder
+from pachon.core.workers import Workers, serial_worker
+from pachon.pipeline import memory, run_folder
+from pachon.pipeline import run as run_module
+from pachon.pipeline.ccd_worker import CcdComputation, CcdJob
+from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.kept_screens import with_kept_screens
+from pachon.pipeline.memory import check_memory
+from pachon.pipeline.run import run
+
+
+@pytest.fixture(autouse=True)
+def no_report(monkeypatch, finished_run):
+    """Take the report of the finished run for every other: drawing it takes longest, and others test it."""
+    monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])
+    monkeypatch.setattr(run_module, "build_report", lambda *_: (finished_run / "report.html").read_text())
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "timings.json"}
+
+
+def test_workers_write_the_bytes_of_one_process(finished_run, tmp_path, tiny):
+    result = run(tiny(), tmp_path / "run", workers=serial_worker)
+    assert contents(tmp_path / "run") == contents(finished_run)
+    assert result.computed == ("R22_S11", "R24_S12")
+
+
+def test_a_worker_that_does_not_see_the_folder_sends_its_product(finished_run, tmp_path, tiny):
+    experiment = Experiment.from_config(tiny())
+    computation = CcdComputation(experiment, tmp_path, ".another_mark")
+    result = computation(CcdJob("R24_S12"), 1)
+    assert result.product == (finished_run / "ccd_R24_S12.fits").read_bytes()
+    assert not any(tmp_path.iterdir())
+
+    def far(compute):
+        return Workers("far", 0, lambda jobs: (CcdComputation(experiment, tmp_path, "none")(job, 1) for job in jobs))
+
+    run(tiny(), tmp_path / "run", workers=far)
+    assert contents(tmp_path / "run") == contents(finished_run)
+
+
+def test_parts_share_a_folder_and_the_last_writes_the_report(finished_run, tmp_path, tiny):
+    first = run(tiny(), tmp_path / "run", part=(2, 2))
+    assert (first.computed, first.missing, first.report) == (("R24_S12",), ("R22_S11",), None)
+    assert not (tmp_path / "run" / "summary.json").exists()
+    again = run(tiny(), tmp_path / "run", part=(2, 2))
+    assert (again.computed, again.kept) == ((), ("R24_S12",))
+    last = run(tiny(), tmp_path / "run", part=(1, 2))
+    assert last.report is not None
+    assert contents(tmp_path / "run") == contents(finished_run)
+
+
+@pytest.mark.parametrize("part", [(0, 2), (3, 2), (1, 3), (1, 0)])
+def test_a_part_that_is_none_is_refused(tmp_path, tiny, part):
+    with pytest.raises(DomainError, match=f"part = {part[0]}/{part[1]}: expected i/n"):
+        run(tiny(), tmp_path / "run", part=part)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("text", ["3", "a/b", "1/2/3", "1.5/2"])
+def test_a_part_is_two_numbers(tmp_path, capsys, text):
+    assert main(["run", "--out", str(tmp_path / "run"), "--part", text]) == 2
+    assert capsys.readouterr().err.strip() == f"pachon: error: --part = {text}: expected I/N, such as 3/8"
+
+
+def test_a_ccd_that_cannot_be_modelled_is_left_out_or_ends_the_run(tmp_path, tiny, monkeypatch):
+    real = run_folder.model_ccd
+
+    def fails(experiment, exposure):
+        if exposure.name == "R22_S11":
+            raise DomainError("3 of 12 stars left")
+        return real(experiment, exposure)
+
+    monkeypatch.setattr(run_folder, "model_ccd", fails)
+    result = run(tiny(), tmp_path / "one", workers=serial_worker)
+    assert (result.not_modelled, result.computed) == ({"R22_S11": "3 of 12 stars left"}, ("R24_S12",))
+    with pytest.raises(ProductError, match=r"^CCD R22_S11: 3 of 12 stars left$"):
+        run(tiny(), tmp_path / "two", workers=serial_worker, strict=True)
+
+
+def test_a_product_that_cannot_be_written_ends_the_run_in_one_line(tmp_path, tiny, monkeypatch):
+    def full(*_):
+        raise ProductError("cannot write ccd.fits: No space left on device")
+
+    monkeypatch.setattr(run_folder, "write_product", full)
+    with pytest.raises(ProductError, match=r"^cannot write ccd\.fits: No space left on device$"):
+        run(tiny(), tmp_path / "run", workers=serial_worker)
+
+
+def test_processes_that_do_not_fit_into_memory_are_refused(tiny, monkeypatch):
+    experiment = Experiment.from_config(tiny())
+    monkeypatch.setattr(memory, "available_bytes", lambda: int(2.5 * memory.needed_bytes(experiment, 1)))
+    check_memory(experiment, 1, copies=2)
+    check_memory(experiment, 1, copies=0)
+    with pytest.raises(ConfigError, match=r"^3 processes need about .* of memory, .* are free; 2 would do$"):
+        check_memory(experiment, 1, copies=3)
+
+
+def test_screens_are_kept_where_they_are_the_same_and_freed_where_not(tiny):
+    def kept(**changed):
+        return with_kept_screens(Experiment.from_config(tiny(**changed))).atmosphere
+
+    one, same = kept(), kept(ccds=("R24_S12",), atmosphere__exposure_s=1.0)
+    screens = one.screens("slopes")
+    assert same.screens("slopes") is screens
+    other = kept(seed=2)
+    assert not np.array_equal(other.screens("slopes"), screens)
+    assert same.screens("slopes") is not screens, "freed, and made again"
+
+
+def test_the_mark_of_a_folder_goes_with_its_process(tmp_path):
+    with marked_folder(tmp_path) as mark, marked_folder(tmp_path) as other:
+        assert (tmp_path / mark).is_file()
+        assert mark != other
+    assert not any(tmp_path.iterdir())
+
+
+def start(folder, *options):
+    command = [sys.executable, "-m", "pachon", "run", "small.yaml", "--out", "run", *options]
+    return subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True,
+                            env={**os.environ, "PYTHONPATH": os.getcwd()})  # fmt: skip
+
+
+def wait_for_product(folder, driver):
+    while not any((folder / "run").glob("ccd_*.fits")):
+        assert driver.poll() is None, driver.stderr.read()
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def reference(settings_file, tmp_path):
+    """Six CCDs by one process."""
+    content = yaml.safe_load(settings_file.read_text())
+    content |= {"ccds": ["R22_S11", "R22_S12", "R23_S10", "R23_S11", "R23_S12", "R24_S12"]}
+    content["stars"]["truth"] = 400
+    settings_file.write_text(yaml.safe_dump(content))
+    assert main(["run", str(settings_file), "--out", str(tmp_path / "one"), "--quiet"]) == 0
+    return contents(tmp_path / "one")
+
+
+@pytest.mark.slow
+def test_processes_of_which_one_is_killed_and_the_run_resumed(reference, tmp_path):
+    driver = start(tmp_path, "--processes", "2")
+    wait_for_product(tmp_path, driver)
+    children = subprocess.run(["pgrep", "-P", str(driver.pid)], capture_output=True, text=True, check=True).stdout
+    # The last of the children are the workers; the first may be the resource tracker of multiprocessing.
+    os.kill(int(children.split()[-1]), signal.SIGKILL)
+    said = driver.communicate()[1]
+    assert driver.returncode == 2
+    assert "a worker process died" in said.strip().splitlines()[-1]
+    assert main(["run", str(tmp_path / "small.yaml"), "--out", str(tmp_path / "run"), "--resume", "--quiet"]) == 0
+    made, wanted = contents(tmp_path / "run"), reference
+    assert {k: v for k, v in made.items() if k != "report.html"} == {
+        k: v for k, v in wanted.items() if k != "report.html"
+    }
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_leaves_the_same_bytes(reference, tmp_path, cluster):
+    driver = start(tmp_path, "--scheduler", cluster["address"])
+    wait_for_product(tmp_path, driver)
+    cluster["workers"][0].kill()
+    said = driver.communicate()[1]
+    assert driver.returncode == 0, said
+    made = contents(tmp_path / "run")
+    assert {k: v for k, v in made.items() if k.startswith("ccd_")} == {
+        k: v for k, v in reference.items() if k.startswith("ccd_")
+    }
+    assert made["summary.json"] == reference["summary.json"]
+    shutil.rmtree(tmp_path / "run")
