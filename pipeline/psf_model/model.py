@@ -223,10 +223,7 @@ class PsfModel:
 
     @property
     def leave_one_out_curve(self) -> np.ndarray:
-        """Rms over stars and pixels of stamp minus model without that star, by components used, 0 to k: [k + 1].
-
-        As :attr:`leave_one_out_rms`, its last element.
-        """
+        """Rms of stamps minus models without the star, by components used, 0 to k; the last is `leave_one_out_rms`."""
         left_out, own = self._leave_one_out_residuals() ** 2, self.coefficients**2
         gained = np.concatenate([[0.0], np.cumsum((left_out - own).sum(axis=0))])
         total = self.unexplained.sum() + own.sum() + gained
@@ -322,7 +319,6 @@ class PsfModel:
             alpha=None if self.alpha is None else self.alpha[:, :k],
         )
 
-    @check_arguments
     def to_hdus(self, name: str = "PSF") -> list[fits.ImageHDU | fits.BinTableHDU]:
         """Return the model as FITS extensions, lossless; :meth:`from_hdus` reads them.
 
@@ -335,7 +331,6 @@ class PsfModel:
         return model_hdus({field.name: getattr(self, field.name) for field in fields(self)}, name)
 
     @classmethod
-    @check_arguments
     def from_hdus(cls, hdus: Iterable[Any], name: str = "PSF") -> PsfModel:
         """Read a model from FITS extensions written by :meth:`to_hdus`.
 
