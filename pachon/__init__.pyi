@@ -74,6 +74,7 @@ from .models.aperture import Union as Union
 from .models.aperture import Vane as Vane
 from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
+from .models.camera.corner_rafts import corner_focal_plane as corner_focal_plane
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
 from .models.camera.height_statistics import HeightStatistics as HeightStatistics
@@ -193,6 +194,8 @@ from .testing import assert_matches_baseline as assert_matches_baseline
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
 from .wavefront.chief_rays import fields_at as fields_at
+from .wavefront.corner_stars import CornerStars as CornerStars
+from .wavefront.corner_stars import corner_stars as corner_stars
 from .wavefront.opd import wavefront_opd as wavefront_opd
 from .wavefront.opd import wavefront_opds as wavefront_opds
 from .wavefront.opd_map import OpdMap as OpdMap
