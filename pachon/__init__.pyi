@@ -161,6 +161,8 @@ from .pipeline.sensor.brighter_fatter import brighter_fatter as brighter_fatter
 from .pipeline.sensor.displacement import EdgeRolloff as EdgeRolloff
 from .pipeline.sensor.displacement import TreeRings as TreeRings
 from .pipeline.sensor.displacement import displace_stamps as displace_stamps
+from .pipeline.simulate.donuts import Donuts as Donuts
+from .pipeline.simulate.donuts import draw_donuts as draw_donuts
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus

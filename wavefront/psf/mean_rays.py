@@ -76,7 +76,7 @@ class MeanRaysEngine(FastPsfEngine):
 
 
 def _shared(place: np.ndarray, light: np.ndarray, side: int) -> np.ndarray:
-    """Return rays at places [n, 2] in cells, with their light [n], shared linearly among cells, [side, side] float32."""
+    """Return light [n] of rays at places [n, 2] in cells, shared linearly among the cells, [side, side] float32."""
     shining = light > 0.0
     place, light = place[shining], light[shining]
     corner = place.astype(np.int64)

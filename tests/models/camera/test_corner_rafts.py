@@ -1,4 +1,4 @@
-"""The corner rafts: places and heights of wavefront sensors and guiders against the metrology of the camera as built."""
+"""The corner rafts: places and heights of wavefront sensors and guiders against metrology of the camera as built."""
 
 import numpy as np
 import pytest
