@@ -163,6 +163,10 @@ from .pipeline.sensor.displacement import TreeRings as TreeRings
 from .pipeline.sensor.displacement import displace_stamps as displace_stamps
 from .pipeline.simulate.donuts import Donuts as Donuts
 from .pipeline.simulate.donuts import draw_donuts as draw_donuts
+from .pipeline.wavefront_sensing.degrees import FreedomEstimate as FreedomEstimate
+from .pipeline.wavefront_sensing.fit import fit_donuts as fit_donuts
+from .pipeline.wavefront_sensing.flags import DonutFlag as DonutFlag
+from .pipeline.wavefront_sensing.result import DonutFit as DonutFit
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus

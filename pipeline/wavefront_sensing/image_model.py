@@ -1,0 +1,190 @@
+r"""Image of a star from landing points: spline deposit, transfer functions, exact derivatives.
+
+Light lands at points :math:`x_n` with weights :math:`w_n`. Each point is deposited on a grid as a cubic B-spline; the
+transform of the grid is divided by that of the spline, and multiplied by those of pixel, detector and atmosphere: the
+image at the centres of the pixels, integrated over them. Columns of derivatives go the same way, with the gradient of
+the spline and :math:`w_n\, \partial x_n / \partial a`: they are the derivatives of the image itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import fft
+from scipy.sparse import csc_array
+
+from ...wavefront.psf.image_plane import square_transfer
+from .seeing import Seeing
+
+#: Unknowns of every star before those of its wavefront: flux [electrons], x and y of the chief ray from the centre of
+#: the stamp [pixels], background [electrons a pixel], strength of the turbulence [1/m].
+NUISANCES = ("flux", "x", "y", "background", "strength")
+#: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
+COMPANION = ("ratio", "offset_x", "offset_y")
+FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
+
+
+class ImageGrid:
+    """Grid and transfer functions of the images of one star on stamps of one size.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Pixels of the stamp, (ny, nx).
+    pixel : float
+        Distance between the pixels of the stamp [m].
+    side : float
+        Side of a pixel of the detector [m].
+    seeing : Seeing
+        The long exposure.
+    jacobian : ndarray, shape [2, 2]
+        Detector position by direction cosines [m].
+    blur : float
+        Rms of a Gaussian blur along each axis [m].
+    footprint : ndarray, shape [2, 2]
+        Sides of the image of a cell of the pupil [m], columns of a matrix.
+    oversampling : int
+        Cells of the grid along a pixel.
+    reach : float
+        Distance from the stamp within which light is kept from wrapping around [m].
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        pixel: float,
+        side: float,
+        seeing: Seeing,
+        jacobian: np.ndarray,
+        blur: float,
+        footprint: np.ndarray,
+        oversampling: int,
+        reach: float,
+    ) -> None:
+        self.shape, self.pixel, self._oversampling = shape, pixel, oversampling
+        margin = max(8, math.ceil(reach / pixel))
+        self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
+        #: Place of the centre of the stamp on the grid, (y, x) cells.
+        self._middle = [0.5 * (n - 1) * oversampling for n in shape]
+        turns = [fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])]  # cycles a cell
+        y, x = np.meshgrid(*turns, indexing="ij")
+        self._phase = -2.0 * math.pi * oversampling * np.stack([x, y])  # for shifts in pixels
+        wave = 2.0 * math.pi * oversampling / pixel * np.stack([x, y])  # rad/m
+        baseline = np.hypot(*np.tensordot(jacobian.T, wave, axes=1)) * seeing.wavelength / (2.0 * math.pi)
+        self._exponent = seeing.exponent(baseline)
+        spline = (np.sinc(x) * np.sinc(y)) ** 4
+        cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
+        self._detector = square_transfer(*wave, side) * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0)) * cell / spline
+
+    def _deposit(self, points: np.ndarray, spread: np.ndarray) -> tuple[csc_array, csc_array, csc_array]:
+        """Return the spline and its derivatives along x and y [1/pixel] at points [n, 2] as sparse matrices.
+
+        Spreads [n, 2, 2] of the points, in pixels as they are, change the spline by half its second derivatives.
+        """
+        values, indices = [], []
+        for axis in (0, 1):
+            place = self._middle[1 - axis] + self._oversampling * points[:, axis]
+            low = np.floor(place)
+            t = (place - low)[:, None]
+            powers = np.concatenate([np.ones_like(t), t, t * t, t**3], axis=1)
+            slope, bend = powers[:, :3] @ _SPLINE_SLOPE, powers[:, :2] @ _SPLINE_BEND
+            values.append((powers @ _SPLINE, slope * self._oversampling, bend * self._oversampling**2))
+            indices.append((low.astype(np.int64)[:, None] + np.arange(-1, 3)) % self._size[1 - axis])
+        cells = (indices[1][:, :, None] * self._size[1] + indices[0][:, None, :]).reshape(-1).astype(np.int32)
+        starts = np.arange(0, cells.size + 1, 16, dtype=np.int32)
+        shape = (self._size[0] * self._size[1], len(points))
+
+        def taps(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+            return np.asarray(along_y[:, :, None] * along_x[:, None, :])
+
+        def matrix(values: np.ndarray) -> csc_array:
+            return csc_array((values.astype(np.float32).ravel(), cells, starts), shape=shape)
+
+        (x, dx, ddx), (y, dy, ddy) = values
+        spline = taps(x, y)
+        rim = spread.any(axis=(1, 2))
+        (xx, xy), (_, yy) = np.moveaxis(spread[rim], 0, -1)[..., None, None]
+        spline[rim] += 0.5 * (xx * taps(ddx[rim], y[rim]) + yy * taps(x[rim], ddy[rim])) + xy * taps(dx[rim], dy[rim])
+        return matrix(spline), matrix(taps(dx, y)), matrix(taps(x, dy))
+
+    def _pixels(self, spectra: np.ndarray) -> np.ndarray:
+        """Return the pixels of spectra [ky, kx, n], shape [ny, nx, n]."""
+        images = fft.irfft2(spectra, s=self._size, axes=(0, 1))
+        step = self._oversampling
+        return np.asarray(images[: self.shape[0] * step : step, : self.shape[1] * step : step])
+
+    def evaluate(
+        self,
+        unknowns: np.ndarray,
+        landing: np.ndarray,
+        weights: np.ndarray,
+        spread: np.ndarray,
+        response: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the image and its derivatives.
+
+        Parameters
+        ----------
+        unknowns : ndarray, shape [5] or [8]
+            Values of :data:`NUISANCES`, and of :data:`COMPANION` where there is a second star.
+        landing : ndarray, shape [n, 2]
+            Landing points from that of the chief ray [m].
+        weights : ndarray, shape [n]
+            Fractions of the light.
+        spread : ndarray, shape [n, 2, 2]
+            Second moments of the image of each point, beside the footprint [m^2].
+        response : ndarray, shape [2, n, n_wave], optional
+            Derivatives of the landing points with respect to the unknowns of the wavefront.
+
+        Returns
+        -------
+        image : ndarray, shape [ny, nx]
+            Electrons a pixel.
+        columns : ndarray, shape [ny, nx, n_unknown + n_wave]
+            Derivatives: of the unknowns, then of those of the wavefront. Without a response, no columns.
+        """
+        flux, strength = unknowns[FLUX], unknowns[STRENGTH]
+        value, along_x, along_y = self._deposit(
+            landing / self.pixel + unknowns[[X, Y]], spread / self.pixel**2
+        )
+        light = weights.astype(np.float32)
+        deposits = [value @ light[:, None]]
+        if response is not None:
+            moved = (response / self.pixel * weights[:, None]).astype(np.float32)
+            deposits += [along_x @ light[:, None], along_y @ light[:, None], along_x @ moved[0] + along_y @ moved[1]]
+        grid = np.concatenate(deposits, axis=1).reshape(*self._size, -1)
+        spectra = fft.rfft2(grid, axes=(0, 1))
+        turbulence = self._exponent * strength ** (5.0 / 3.0)
+        spectra *= (self._detector * np.exp(-turbulence)).astype(np.float32)[..., None]
+        star = spectra[..., :1].copy()
+        shift = np.ones((), dtype=np.complex64)
+        if len(unknowns) > RATIO:
+            offset = unknowns[RATIO + 1 :]
+            shift = np.exp(1j * np.tensordot(offset, self._phase, axes=1)).astype(np.complex64)[..., None]
+            spectra *= 1.0 + np.float32(unknowns[RATIO]) * shift
+        if response is None:
+            return flux * self._pixels(spectra[..., :1])[..., 0].astype(np.float64) + unknowns[BACKGROUND], np.empty(
+                (*self.shape, 0)
+            )
+        growth = (5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
+        extra = [-growth * spectra[..., :1]]
+        if len(unknowns) > RATIO:
+            second = star * shift
+            along = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] * second for p in self._phase]
+            extra += [second, *along]
+        pixels = self._pixels(np.concatenate([spectra, *extra], axis=-1)).astype(np.float64)
+        n_wave = response.shape[2]
+        columns = np.empty((*self.shape, len(unknowns) + n_wave))
+        columns[..., FLUX] = pixels[..., 0]
+        columns[..., X : Y + 1] = flux * pixels[..., 1:3]
+        columns[..., BACKGROUND] = 1.0
+        columns[..., STRENGTH : len(unknowns)] = flux * pixels[..., 3 + n_wave :]
+        columns[..., len(unknowns) :] = flux * pixels[..., 3 : 3 + n_wave]
+        return flux * columns[..., FLUX] + unknowns[BACKGROUND], columns
+
+
+# Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.
+_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0
+_SPLINE_SLOPE = _SPLINE[1:] * np.array([[1.0], [2.0], [3.0]])
+_SPLINE_BEND = _SPLINE_SLOPE[1:] * np.array([[1.0], [2.0]])
