@@ -27,7 +27,7 @@ from .turbulence import path_spectrum
 
 # Frequencies times the diameter of the pupil, on a logarithmic scale, and directions over half the plane: enough for
 # the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m after 15 s of 20 m/s.
-_FREQUENCIES, _DIRECTIONS = (0.005, 40.0, 160), 1024
+_FREQUENCIES, _DIRECTIONS = (0.005, 40.0, 100), 768
 # Nodes of the integral over the radius of the pupil.
 _RADII = 60
 # Distance, in outer scales, beyond which the light of two stars crosses independent turbulence.
@@ -78,15 +78,18 @@ def mean_wavefront_covariance(
         seen = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
         apart = altitude * (slopes[:, None] - slopes)
         known: dict[tuple[float, float], np.ndarray] = {}
-        for a, b in np.ndindex(n_star, n_star):
-            distance = apart[a, b]
-            if np.hypot(*distance) > _INDEPENDENT * atmosphere.outer_scale:
-                continue
-            key = (float(distance[0]), float(distance[1]))
-            if key not in known:
-                shifted = transform * (seen * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
-                known[key] = np.tensordot(shifted, transform.conj(), axes=((0, 1), (0, 1))).real
-            covariance[a, :, b] += known[key]
+        for a in range(n_star):
+            for b in range(a, n_star):
+                distance = apart[a, b]
+                if np.hypot(*distance) > _INDEPENDENT * atmosphere.outer_scale:
+                    continue
+                key = (float(distance[0]), float(distance[1]))
+                if key not in known:
+                    shifted = transform * (seen * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
+                    known[key] = np.tensordot(shifted, transform.conj(), axes=((0, 1), (0, 1))).real
+                covariance[a, :, b] += known[key]
+                if a != b:
+                    covariance[b, :, a] += known[key].T
     return covariance
 
 
