@@ -62,7 +62,7 @@ class ImageGrid:
         oversampling: int,
         reach: float,
     ) -> None:
-        self.shape, self.pixel, self._oversampling = shape, pixel, oversampling
+        self.shape, self.pixel, self.footprint, self._oversampling = shape, pixel, footprint, oversampling
         margin = max(8, math.ceil(reach / pixel))
         self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
@@ -102,10 +102,8 @@ class ImageGrid:
             return csc_array((values.astype(np.float32).ravel(), cells, starts), shape=shape)
 
         (x, dx, ddx), (y, dy, ddy) = values
-        spline = taps(x, y)
-        rim = spread.any(axis=(1, 2))
-        (xx, xy), (_, yy) = np.moveaxis(spread[rim], 0, -1)[..., None, None]
-        spline[rim] += 0.5 * (xx * taps(ddx[rim], y[rim]) + yy * taps(x[rim], ddy[rim])) + xy * taps(dx[rim], dy[rim])
+        (xx, xy), (_, yy) = np.moveaxis(spread, 0, -1)[..., None]
+        spline = taps(x + 0.5 * xx * ddx, y) + taps(x, 0.5 * yy * ddy) + taps(xy * dx, dy)
         return matrix(spline), matrix(taps(dx, y)), matrix(taps(x, dy))
 
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:

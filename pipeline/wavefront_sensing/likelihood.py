@@ -69,7 +69,9 @@ class NormalEquations:
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
     rays = stamp.rays
-    model, columns = stamp.grid.evaluate(unknowns, rays.landing(wave), rays.weights, rays.spread, rays.response(wave))
+    landing = rays.landing(wave)
+    points = (landing, rays.weights, rays.spread(landing))
+    model, columns = stamp.grid.evaluate(unknowns, *points, rays.response(wave))
     variance = _variance(stamp, model)[stamp.used]
     residual = (stamp.image - model)[stamp.used]
     scaled = columns[stamp.used] / np.sqrt(variance)[:, None]
@@ -81,7 +83,8 @@ def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> No
 def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:
     """Return the model of a stamp [electrons], shape [ny, nx]."""
     rays = stamp.rays
-    return stamp.grid.evaluate(unknowns, rays.landing(wave), rays.weights, rays.spread)[0]
+    landing = rays.landing(wave)
+    return stamp.grid.evaluate(unknowns, landing, rays.weights, rays.spread(landing))[0]
 
 
 def pulls(stamp: Stamp, model: np.ndarray) -> np.ndarray:
