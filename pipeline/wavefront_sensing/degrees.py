@@ -20,7 +20,7 @@ from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import parallel_rays
 from ...wavefront.chief_rays import image_jacobians
-from .donut_rays import chief_landing, landing_of
+from .donut_rays import chief_landing, landing_of, spread_of
 from .pupil_cells import PupilCells
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class FreedomRays:
         The degrees of freedom.
     at : ndarray, shape [n_freedom]
         Values at which the response is computed.
+    footprint : ndarray, shape [2, 2]
+        Footprint of a cell in the model of the image [m].
     """
 
     def __init__(
@@ -54,9 +56,11 @@ class FreedomRays:
         cells: PupilCells,
         freedoms: DegreesOfFreedom,
         at: np.ndarray,
+        footprint: np.ndarray,
     ) -> None:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths, self._points = direction, wavelengths, cells.points
+        self._cells, self._footprint = cells, footprint
         self.weights = np.outer(wavelength_weights, cells.weights).ravel()
         middle = float(wavelengths[len(wavelengths) // 2])
         self.jacobian = image_jacobians(telescope, direction[None], middle, 1)[0]
@@ -69,7 +73,6 @@ class FreedomRays:
 
         landing = [derivatives(float(w), cells.points) for w in wavelengths]
         self._response = np.concatenate(landing, axis=1) - derivatives(middle, np.zeros((1, 2)))
-        self.spread = np.tile(cells.landing_spread(self.landing(at)[: len(cells)]), (len(wavelengths), 1, 1))
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
@@ -80,6 +83,10 @@ class FreedomRays:
         ]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
         return np.concatenate(places) - chief_landing(changed, self._direction, middle)
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        """Return the spread of the image of each point."""
+        return spread_of(self._cells, landing, self._footprint)
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives at the values of the construction, shape [2, n, n_freedom]."""

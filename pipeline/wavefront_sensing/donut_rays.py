@@ -26,11 +26,13 @@ class LightRays(Protocol):
     """Landing points of one star's light as functions of the unknowns of its wavefront."""
 
     weights: np.ndarray  #: fractions of the light of the points, [n]
-    spread: np.ndarray  #: second moments of the image of a point, beside the footprint of the cells [m^2], [n, 2, 2]
     jacobian: np.ndarray  #: of the chief ray, detector position by direction cosines [m], [2, 2]
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], detector x and y, shape [n, 2]."""
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the derivatives of :meth:`landing` with respect to the unknowns, shape [2, n, n_unknown]."""
@@ -63,7 +65,7 @@ class ZernikeRays:
         noll: np.ndarray,
     ) -> None:
         self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
-        self._points = cells.points
+        self._cells, self._points = cells, cells.points
         self.weights = np.outer(wavelength_weights, cells.weights).ravel()
         middle = float(wavelengths[len(wavelengths) // 2])
         self._chief = chief_landing(telescope, direction, middle)
@@ -73,10 +75,8 @@ class ZernikeRays:
         #: Derivatives of the terms along x and y of the pupil [1/m], [n_term, 2, n_point].
         self._gradients = terms[noll - 1] / radius
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
-        landing = self._landing(middle, np.zeros((1, 2)))
         #: Sides of the image of a cell [m], columns of a matrix.
-        self.footprint = cells.footprint(landing)
-        self.spread = np.tile(cells.landing_spread(landing), (len(wavelengths), 1, 1))
+        self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 2))))
 
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
         """Return detector x and y [m] of rays whose direction cosines are changed by slopes [n, 2] or [1, 2]."""
@@ -99,9 +99,19 @@ class ZernikeRays:
         slopes = -np.einsum("t,tjp->pj", unknowns, self._gradients)
         return np.concatenate([self._landing(float(w), slopes) for w in self._wavelengths]) - self._chief
 
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        """Return the spread of the image of each point; see :class:`LightRays`."""
+        return spread_of(self._cells, landing, self.footprint)
+
     def response(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the response at zero coefficients, the same to 1e-3 for all; see :class:`LightRays`."""
         return self._response
+
+
+def spread_of(cells: PupilCells, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    """Return the spreads [m^2] of the landing points of one or more wavelengths, one after the other."""
+    each = landing.reshape(-1, len(cells), 2)
+    return np.concatenate([cells.spread(one, footprint) for one in each])
 
 
 def landing_of(telescope: Telescope, rays: Rays) -> np.ndarray:

@@ -9,6 +9,7 @@ the spline and :math:`w_n\, \partial x_n / \partial a`: they are the derivatives
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
@@ -23,6 +24,25 @@ NUISANCES = ("flux", "x", "y", "background", "strength")
 #: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
 COMPANION = ("ratio", "offset_x", "offset_y")
 FLUX, X, Y, BACKGROUND, STRENGTH, RATIO = range(6)
+
+
+@dataclass(frozen=True)
+class LandedLight:
+    """Light of a star on its detector.
+
+    Attributes
+    ----------
+    landing : ndarray, shape [n, 2]
+        Landing points from that of the chief ray [m].
+    weights : ndarray, shape [n]
+        Fractions of the light.
+    spread : ndarray, shape [n, 2, 2]
+        Second moments of the image of each point, beside the footprint [m^2].
+    """
+
+    landing: np.ndarray
+    weights: np.ndarray
+    spread: np.ndarray
 
 
 class ImageGrid:
@@ -62,7 +82,7 @@ class ImageGrid:
         oversampling: int,
         reach: float,
     ) -> None:
-        self.shape, self.pixel, self._oversampling = shape, pixel, oversampling
+        self.shape, self.pixel, self.footprint, self._oversampling = shape, pixel, footprint, oversampling
         margin = max(8, math.ceil(reach / pixel))
         self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
@@ -75,7 +95,8 @@ class ImageGrid:
         self._exponent = seeing.exponent(baseline)
         spline = (np.sinc(x) * np.sinc(y)) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
-        self._detector = square_transfer(*wave, side) * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0)) * cell / spline
+        # A cell of the grid holds less light than a pixel.
+        self._detector = oversampling**2 * square_transfer(*wave, side) * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0)) * cell / spline
 
     def _deposit(self, points: np.ndarray, spread: np.ndarray) -> tuple[csc_array, csc_array, csc_array]:
         """Return the spline and its derivatives along x and y [1/pixel] at points [n, 2] as sparse matrices.
@@ -102,10 +123,8 @@ class ImageGrid:
             return csc_array((values.astype(np.float32).ravel(), cells, starts), shape=shape)
 
         (x, dx, ddx), (y, dy, ddy) = values
-        spline = taps(x, y)
-        rim = spread.any(axis=(1, 2))
-        (xx, xy), (_, yy) = np.moveaxis(spread[rim], 0, -1)[..., None, None]
-        spline[rim] += 0.5 * (xx * taps(ddx[rim], y[rim]) + yy * taps(x[rim], ddy[rim])) + xy * taps(dx[rim], dy[rim])
+        (xx, xy), (_, yy) = np.moveaxis(spread, 0, -1)[..., None]
+        spline = taps(x + 0.5 * xx * ddx, y) + taps(x, 0.5 * yy * ddy) + taps(xy * dx, dy)
         return matrix(spline), matrix(taps(dx, y)), matrix(taps(x, dy))
 
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:
@@ -114,74 +133,72 @@ class ImageGrid:
         step = self._oversampling
         return np.asarray(images[: self.shape[0] * step : step, : self.shape[1] * step : step])
 
-    def evaluate(
-        self,
-        unknowns: np.ndarray,
-        landing: np.ndarray,
-        weights: np.ndarray,
-        spread: np.ndarray,
-        response: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def image(self, unknowns: np.ndarray, light: LandedLight) -> np.ndarray:
+        """Return the image [electrons], shape [ny, nx]; arguments as in :meth:`derivatives`."""
+        spectrum, shift = self._spectra(unknowns, light, None)
+        if shift is not None:
+            spectrum *= 1.0 + unknowns[RATIO] * shift
+        return np.asarray(unknowns[FLUX] * self._pixels(spectrum)[..., 0].astype(np.float64) + unknowns[BACKGROUND])
+
+    def derivatives(
+        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the image and its derivatives.
 
         Parameters
         ----------
         unknowns : ndarray, shape [5] or [8]
             Values of :data:`NUISANCES`, and of :data:`COMPANION` where there is a second star.
-        landing : ndarray, shape [n, 2]
-            Landing points from that of the chief ray [m].
-        weights : ndarray, shape [n]
-            Fractions of the light.
-        spread : ndarray, shape [n, 2, 2]
-            Second moments of the image of each point, beside the footprint [m^2].
-        response : ndarray, shape [2, n, n_wave], optional
-            Derivatives of the landing points with respect to the unknowns of the wavefront.
+        light : LandedLight
+            Landing points of the light.
+        response : ndarray, shape [2, n, n_wave]
+            Derivatives of the landing points with respect to the unknowns of the wavefront [m].
 
         Returns
         -------
         image : ndarray, shape [ny, nx]
             Electrons a pixel.
-        columns : ndarray, shape [ny, nx, n_unknown + n_wave]
-            Derivatives: of the unknowns, then of those of the wavefront. Without a response, no columns.
+        columns : ndarray of float32, shape [ny, nx, n_unknown + n_wave]
+            Derivatives by the unknowns, then by those of the wavefront, over their scales.
+        scales : ndarray, shape [n_unknown + n_wave]
+            Scales of the columns.
         """
         flux, strength = unknowns[FLUX], unknowns[STRENGTH]
-        value, along_x, along_y = self._deposit(
-            landing / self.pixel + unknowns[[X, Y]], spread / self.pixel**2
-        )
-        light = weights.astype(np.float32)
-        deposits = [value @ light[:, None]]
-        if response is not None:
-            moved = (response / self.pixel * weights[:, None]).astype(np.float32)
-            deposits += [along_x @ light[:, None], along_y @ light[:, None], along_x @ moved[0] + along_y @ moved[1]]
-        grid = np.concatenate(deposits, axis=1).reshape(*self._size, -1)
-        spectra = fft.rfft2(grid, axes=(0, 1))
-        turbulence = self._exponent * strength ** (5.0 / 3.0)
-        spectra *= (self._detector * np.exp(-turbulence)).astype(np.float32)[..., None]
-        star = spectra[..., :1].copy()
-        shift = np.ones((), dtype=np.complex64)
-        if len(unknowns) > RATIO:
-            offset = unknowns[RATIO + 1 :]
-            shift = np.exp(1j * np.tensordot(offset, self._phase, axes=1)).astype(np.complex64)[..., None]
-            spectra *= 1.0 + np.float32(unknowns[RATIO]) * shift
-        if response is None:
-            return flux * self._pixels(spectra[..., :1])[..., 0].astype(np.float64) + unknowns[BACKGROUND], np.empty(
-                (*self.shape, 0)
-            )
-        growth = (5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
-        extra = [-growth * spectra[..., :1]]
-        if len(unknowns) > RATIO:
+        spectra, shift = self._spectra(unknowns, light, response)
+        star, moved = spectra[..., :1], spectra[..., 1:]
+        extra = []
+        if shift is not None:
             second = star * shift
-            along = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] * second for p in self._phase]
-            extra += [second, *along]
-        pixels = self._pixels(np.concatenate([spectra, *extra], axis=-1)).astype(np.float64)
-        n_wave = response.shape[2]
-        columns = np.empty((*self.shape, len(unknowns) + n_wave))
-        columns[..., FLUX] = pixels[..., 0]
-        columns[..., X : Y + 1] = flux * pixels[..., 1:3]
-        columns[..., BACKGROUND] = 1.0
-        columns[..., STRENGTH : len(unknowns)] = flux * pixels[..., 3 + n_wave :]
-        columns[..., len(unknowns) :] = flux * pixels[..., 3 : 3 + n_wave]
-        return flux * columns[..., FLUX] + unknowns[BACKGROUND], columns
+            turns = [(1j * unknowns[RATIO] * p).astype(np.complex64)[..., None] for p in self._phase]
+            extra = [second, *(turn * second for turn in turns)]
+            both = 1.0 + np.float32(unknowns[RATIO]) * shift
+            star, moved = star * both, moved * both
+        level = np.zeros_like(star)
+        level[0, 0] = self._size[0] * self._size[1]
+        growth = (-5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
+        columns = self._pixels(np.concatenate([star, moved[..., :2], level, growth * star, *extra, moved[..., 2:]], axis=-1))
+        scales = np.full(columns.shape[-1], flux)
+        scales[[FLUX, BACKGROUND]] = 1.0
+        return flux * columns[..., FLUX].astype(np.float64) + unknowns[BACKGROUND], columns, scales
+
+    def _spectra(
+        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return spectra of the star of unit flux, of its derivatives by x, y and wave, and the shift of a second one."""
+        points = light.landing / self.pixel + unknowns[[X, Y]]
+        value, along_x, along_y = self._deposit(points, light.spread / self.pixel**2)
+        weights = light.weights.astype(np.float32)[:, None]
+        deposits = [value @ weights]
+        if response is not None:
+            moved = (response / self.pixel * light.weights[:, None]).astype(np.float32)
+            deposits += [along_x @ weights, along_y @ weights, along_x @ moved[0] + along_y @ moved[1]]
+        spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
+        turbulence = np.exp(-self._exponent * unknowns[STRENGTH] ** (5.0 / 3.0))
+        spectra *= (self._detector * turbulence).astype(np.float32)[..., None]
+        if len(unknowns) <= RATIO:
+            return spectra, None
+        turn = np.exp(1j * np.tensordot(unknowns[RATIO + 1 :], self._phase, axes=1))
+        return spectra, turn.astype(np.complex64)[..., None]
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.

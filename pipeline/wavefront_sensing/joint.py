@@ -91,9 +91,8 @@ def fit_freedoms(
         across = instrument.sampling(light, Pixels(stamp.image, stamp.variance, stamp.used), fwhm).across
         cells = pupil_cells(changed, light.direction, instrument.middle, across)
         weights = instrument.wavelength_weights
-        rays = FreedomRays(
-            light.telescope, light.direction, instrument.wavelengths, weights, cells, freedoms, start
-        )
+        along = (light.direction, instrument.wavelengths, weights, cells)
+        rays = FreedomRays(light.telescope, *along, freedoms, start, stamp.grid.footprint)
         moved.append(replace(star, stamp=replace(stamp, rays=rays)))
     identity = np.repeat(np.eye(len(freedoms))[None], len(stars), axis=0)
     group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .donut_rays import LightRays
-from .image_model import ImageGrid
+from .image_model import ImageGrid, LandedLight
 
 #: Smallest variance of a pixel [electron^2], where model and sky are next to nothing.
 _LEAST_VARIANCE = 1.0
@@ -68,20 +68,25 @@ class NormalEquations:
 
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
-    rays = stamp.rays
-    model, columns = stamp.grid.evaluate(unknowns, rays.landing(wave), rays.weights, rays.spread, rays.response(wave))
+    response = stamp.rays.response(wave)
+    model, columns, scales = stamp.grid.derivatives(unknowns, _landed(stamp, wave), response)
     variance = _variance(stamp, model)[stamp.used]
     residual = (stamp.image - model)[stamp.used]
-    scaled = columns[stamp.used] / np.sqrt(variance)[:, None]
-    weighted = residual / variance
-    gradient = scaled.T @ (weighted * np.sqrt(variance))
-    return NormalEquations(scaled.T @ scaled, gradient, _loss(residual, variance), float(residual @ weighted))
+    root = 1.0 / np.sqrt(variance)
+    scaled = np.multiply(columns[stamp.used], root[:, None])
+    curvature = scaled.T @ scaled * np.outer(scales, scales)
+    gradient = scaled.T @ (residual * root) * scales
+    return NormalEquations(curvature, gradient, _loss(residual, variance), float(residual @ (residual / variance)))
 
 
 def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:
     """Return the model of a stamp [electrons], shape [ny, nx]."""
-    rays = stamp.rays
-    return stamp.grid.evaluate(unknowns, rays.landing(wave), rays.weights, rays.spread)[0]
+    return stamp.grid.image(unknowns, _landed(stamp, wave))
+
+
+def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight:
+    landing = stamp.rays.landing(wave)
+    return LandedLight(landing, stamp.rays.weights, stamp.rays.spread(landing))
 
 
 def pulls(stamp: Stamp, model: np.ndarray) -> np.ndarray:

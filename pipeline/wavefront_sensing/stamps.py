@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 #: A pixel this many standard deviations above its neighbours, and this much brighter, is no part of a donut.
 _SIGMA, _CONTRAST = 8.0, 1.0
 #: Rms of the Gaussian before sampling, in new pixels, and least part of its weight on used pixels.
-_SMOOTHING, _MOSTLY_USED = 0.8, 0.9
+_SMOOTHING, _MOSTLY_USED = 1.0, 0.9
 #: Least part of the squared template that must lie on the stamp.
 _ON_STAMP = 0.1
 
