@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
 from ...core.random_streams import stream
-from ...core.threads import thread_count
 from ...models.telescope import Telescope
 from ...pipeline.simulate.donuts import draw_donuts
 from ...pipeline.wavefront_sensing.fit import fit_donuts
 from ...pipeline.wavefront_sensing.result import DonutFit
-from ...wavefront.aberration import ResidualWavefront
+from ...wavefront.aberration import StarWavefronts
 from .scene import NOLL, AlignmentScene
 
 #: Rms of the charge diffusion [m].
@@ -27,28 +24,30 @@ def expose(scene: AlignmentScene, telescope: Telescope, visit: int, threads: int
     values, vectors = np.linalg.eigh(scene.turbulence)
     wavefronts = (vectors @ (np.sqrt(np.maximum(values, 0.0)) * drawn)).reshape(len(stars), len(NOLL))
 
-    def one(star: int) -> np.ndarray:
-        aberration = ResidualWavefront(wavefronts[star], telescope.pupil_diameter, telescope.pupil_obscuration)
-        return draw_donuts(
-            telescope,
-            stars.fields[star : star + 1],
-            scene.wavelengths,
-            focal_plane=stars.focal_plane,
-            atmosphere=scene.atmosphere,
-            aberration=aberration,
-            electrons=donuts.electrons,
-            sky=donuts.sky,
-            read_noise=donuts.read_noise,
-            second_stars=donuts.second_stars,
-            cosmic_rays=donuts.cosmic_rays,
-            stamp_size=donuts.stamp,
-            diffusion=_DIFFUSION,
-            seed=int(stream(seed, "alignment", "donut", visit, star).integers(2**31)),
-            threads=1,
-        ).images[0]
-
-    with ThreadPoolExecutor(thread_count(threads)) as pool:
-        return np.stack(list(pool.map(one, range(len(stars)))))
+    aberration = StarWavefronts(
+        coefficients=np.zeros(len(NOLL)),
+        pupil_diameter=telescope.pupil_diameter,
+        pupil_obscuration=telescope.pupil_obscuration,
+        stars=wavefronts,
+        slopes=np.tan(stars.fields),
+    )
+    return draw_donuts(
+        telescope,
+        stars.fields,
+        scene.wavelengths,
+        focal_plane=stars.focal_plane,
+        atmosphere=scene.atmosphere,
+        aberration=aberration if scene.config.air.wavefront else None,
+        electrons=donuts.electrons,
+        sky=donuts.sky,
+        read_noise=donuts.read_noise,
+        second_stars=donuts.second_stars,
+        cosmic_rays=donuts.cosmic_rays,
+        stamp_size=donuts.stamp,
+        diffusion=_DIFFUSION,
+        seed=int(stream(seed, "alignment", "donuts", visit).integers(2**31)),
+        threads=threads,
+    ).images
 
 
 def fit(scene: AlignmentScene, images: np.ndarray, threads: int | None = None) -> DonutFit:

@@ -20,8 +20,8 @@ from ...wavefront.request import wavelength_points
 from .config import AlignConfig
 from .field_quality import FieldQuality
 
-#: Noll indices of the wavefront of a donut.
-NOLL = np.arange(4, 23)
+#: Noll indices of the wavefront of a donut: bending modes reach Z23, and what is not fitted moves what is.
+NOLL = np.arange(4, 29)
 
 
 @dataclass(frozen=True, eq=False)
