@@ -11,7 +11,7 @@ from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, STRENGTH, X, Y
 from .light import Instrument, Light
 from .likelihood import Stamp, model_image, pulls
-from .solve import Group, Solution, solve
+from .solve import COARSE, FINE, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, without_cosmic_rays
 
 #: Images wider than this are donuts [pixels].
@@ -20,10 +20,9 @@ SMALLEST_DONUT = 24.0
 _COARSE_DIAMETER = 30.0
 #: Signal over noise of a template that is found.
 _FOUND = 8.0
-#: Gain of twice the logarithm of the likelihood, per unit of chi-square a pixel, of a second star or another focus.
-_GAIN = 100.0
-#: Fraction of chi-square that another focus must remove.
-_OTHER_FOCUS = 0.8
+#: Least gain of twice the logarithm of the likelihood by a second star or another focus, and the largest part of the
+#: misfit that may be left: what turbulence and missing terms of the wavefront do to an image, neither explains.
+_GAIN, _LEFT = 100.0, 0.5
 #: Least flux of a second star over that of the first.
 _LEAST_RATIO = 0.01
 #: Fraction of the light that may fall beside the stamp.
@@ -157,7 +156,8 @@ class _StarFitter:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
         group = Group((scaled.stamp,), self._map, np.zeros(n), self._fixed)
-        return solve(group, [star], np.zeros(n) if shared is None else shared)
+        tolerance = FINE if scaled.pixels.side == 1 else COARSE
+        return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance)
 
     def transferred(self, star: np.ndarray, coarse: Pixels, fine: Pixels) -> np.ndarray:
         """Return the unknowns of a star in other pixels."""
@@ -185,8 +185,7 @@ class _StarFitter:
                 continue
             ratio, offset = second.flux / star[FLUX], (second.x - star[X], second.y - star[Y])
             trial = self.solve(scaled, np.array([*star, ratio, *offset]), shared)
-            gain = best.loss - trial.loss
-            if gain > _GAIN * max(1.0, trial.loss / stamp.used.sum()) and trial.stars[0][RATIO] > _LEAST_RATIO:
+            if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
                 best = trial
         return _brighter_first(best)
 
@@ -196,10 +195,13 @@ class _StarFitter:
         if here.loss / count < 1.5:
             return False
         other = self.stamp(self._light.mirrored(), scaled.pixels)
-        start, found = self.start(other)
-        trial = self.with_companion(other, self.solve(other, start), found)
-        gain = here.loss - trial.loss
-        return gain > _GAIN * max(1.0, trial.loss / count) and trial.loss < _OTHER_FOCUS * here.loss
+        start, _ = self.start(other)
+        return _explains_more(self.solve(other, start), here)
+
+
+def _explains_more(trial: Solution, other: Solution) -> bool:
+    """Return whether a solution is better than another beyond what could be chance or a wavefront without its terms."""
+    return other.loss - trial.loss > _GAIN and trial.loss < _LEFT * other.loss
 
 
 def _brighter_first(solution: Solution) -> Solution:

@@ -19,6 +19,10 @@ from .pupil_cells import pupil_cells
 from .solve import Group, Solution, solve
 from .stamps import Pixels
 
+#: Times that vignetting and response to the degrees of freedom are computed, steps with each, and squared change in
+#: units of the errors, a degree of freedom, that is small enough.
+_OUTER, _INNER, _SETTLED = 4, 6, 1e-3
+
 
 @dataclass(frozen=True)
 class JointFit:
@@ -76,31 +80,35 @@ def fit_freedoms(
     """Fit degrees of freedom of the telescope with Gaussian priors of given standard deviations."""
     telescope, noll = instrument.telescope, instrument.noll
     jmax = int(noll.max())
-    sensitivity = freedoms.sensitivity(telescope, fields, instrument.middle, jmax=jmax, projection=projection)
+    sensitivity = freedoms.sensitivity(telescope, fields, instrument.middle, n_zernike=jmax, projection=projection)
     maps = sensitivity.matrix[:, noll - 1]
     precision = prior**-2.0
-    start = _start(stars, maps, precision)
-    moved = []
-    for star in stars:
-        light, stamp, solution = star.light, star.stamp, star.solution
-        if light is None or stamp is None or solution is None:
-            continue
-        # Vignetting is that of the telescope at the start.
-        changed = freedoms.apply(light.telescope, start)
-        fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
-        across = instrument.sampling(light, Pixels(stamp.image, stamp.variance, stamp.used), fwhm).across
-        cells = pupil_cells(changed, light.direction, instrument.middle, across)
-        weights = instrument.wavelength_weights
-        along = (light.direction, instrument.wavelengths, weights, cells)
-        rays = FreedomRays(light.telescope, *along, freedoms, start, stamp.grid.footprint)
-        moved.append(replace(star, stamp=replace(stamp, rays=rays)))
     identity = np.repeat(np.eye(len(freedoms))[None], len(stars), axis=0)
-    group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed)
-    joint = solve(group, _star_unknowns(stars), start, pool=pool)
+    shared, unknowns = _start(stars, maps, precision), _star_unknowns(stars)
+    for _ in range(_OUTER):
+        moved = [_with_freedoms(instrument, star, freedoms, shared) for star in stars]
+        group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed)
+        joint = solve(group, unknowns, shared, steps=_INNER, pool=pool)
+        change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
+        if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
+            break
     after = freedoms.apply(telescope, joint.shared)
-    found = freedoms.sensitivity(after, fields, instrument.middle, jmax=jmax, projection=projection)
+    found = freedoms.sensitivity(after, fields, instrument.middle, n_zernike=jmax, projection=projection)
     zernikes = (found.zernikes - sensitivity.zernikes)[:, noll - 1]
     return JointFit(tuple(moved), joint, zernikes, found.matrix[:, noll - 1])
+
+
+def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray) -> StarFit:
+    """Return a star whose light depends on degrees of freedom, with vignetting and response at some values."""
+    light, stamp, solution = star.light, star.stamp, star.solution
+    if light is None or stamp is None or solution is None:
+        return star
+    fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+    across = instrument.sampling(light, Pixels(stamp.image, stamp.variance, stamp.used), fwhm).across
+    cells = pupil_cells(freedoms.apply(light.telescope, at), light.direction, instrument.middle, across)
+    waves = (instrument.wavelengths, instrument.wavelength_weights)
+    rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, at, stamp.grid.footprint)
+    return replace(star, stamp=replace(stamp, rays=rays))
 
 
 def _star_unknowns(stars: Sequence[StarFit]) -> list[np.ndarray]:

@@ -12,9 +12,11 @@ from scipy.linalg import cho_factor, cho_solve
 from .image_model import FLUX, RATIO, STRENGTH
 from .likelihood import NormalEquations, Stamp, normal_equations
 
-#: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, ends
-#: the search: it is three hundredths of the standard deviation along its direction.
-_SMALL = 1e-3
+#: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is the
+#: last: a tenth of a standard deviation, of which the step leaves next to nothing.
+FINE, COARSE = 1e-2, 0.3
+#: The same for a search that ran out of steps and is near enough to its end.
+_NEAR = 1.0
 _DAMPING = 1e-3
 _LARGEST_DAMPING = 1e6
 
@@ -85,15 +87,21 @@ class Solution:
 
 
 def solve(
-    group: Group, stars: Sequence[np.ndarray], shared: np.ndarray, *, steps: int = 25, pool: Executor | None = None
+    group: Group,
+    stars: Sequence[np.ndarray],
+    shared: np.ndarray,
+    *,
+    tolerance: float = FINE,
+    steps: int = 25,
+    pool: Executor | None = None,
 ) -> Solution:
-    """Maximise the likelihood from a starting point, by at most so many steps."""
+    """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance."""
     joined = np.concatenate([*stars, shared])
     sizes = [len(s) for s in stars]
     pixels = sum(int(stamp.used.sum()) for stamp in group.stamps)
     held = _held(group, sizes)
     state = _linearize(group, joined, sizes, pool)
-    damping, converged = _DAMPING, False
+    damping, converged, predicted = _DAMPING, False, np.inf
     for _ in range(steps):
         step = np.zeros_like(joined)
         curvature = state.curvature[np.ix_(~held, ~held)]
@@ -102,10 +110,10 @@ def solve(
         normalized[np.diag_indices_from(normalized)] = 1.0 + damping
         step[~held] = _solved(normalized, state.gradient[~held] / scale) / scale
         predicted = float(state.gradient @ step)
-        if predicted < _SMALL * max(1.0, state.loss / pixels):
-            converged = True
-            break
         trial = _bounded(joined + step, sizes, held)
+        if predicted < tolerance * max(1.0, state.loss / pixels):
+            joined, converged = trial, True
+            break
         found = _linearize(group, trial, sizes, pool)
         if found.loss < state.loss:
             joined, state, damping = trial, found, 0.1 * damping
@@ -113,6 +121,7 @@ def solve(
             damping = 10.0 * max(damping, _DAMPING)
             if damping > _LARGEST_DAMPING:
                 break
+    converged = converged or predicted < _NEAR * max(1.0, state.loss / pixels)
     covariance = np.zeros_like(state.curvature)
     free = np.ix_(~held, ~held)
     scale = np.sqrt(np.maximum(np.diag(state.curvature)[~held], 1e-300))
