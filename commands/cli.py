@@ -20,6 +20,7 @@ from typer import Option
 from ..core.errors import PachonError
 from ..core.version import VERSION
 from . import (
+    align,
     baseline,
     camera,
     design,
@@ -112,6 +113,7 @@ for _group in (
     design,
     camera,
     shim,
+    align,
     telescope,
 ):
     app.add_typer(_group.app)

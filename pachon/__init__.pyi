@@ -179,6 +179,10 @@ from .sky.galaxies import Galaxies as Galaxies
 from .sky.mosaic import GalaxyStamps as GalaxyStamps
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
+from .studies.alignment.config import AlignConfig as AlignConfig
+from .studies.alignment.config import load_align_configuration as load_align_configuration
+from .studies.alignment.loop import Alignment as Alignment
+from .studies.alignment.loop import align as align
 from .studies.baseline.baseline import check_baseline as check_baseline
 from .studies.baseline.baseline import make_baseline as make_baseline
 from .studies.baseline.check import BaselineCheck as BaselineCheck

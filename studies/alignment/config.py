@@ -27,7 +27,7 @@ class ErrorsSection(Section):
     """What is wrong with the telescope at first, and how it drifts."""
 
     tolerance_nm: Positive = Field(
-        25.0, description="rms wavefront over the field that the tolerance of each degree of freedom makes [nm]"
+        50.0, description="rms wavefront over the field that the tolerance of each degree of freedom makes [nm]"
     )
     tolerances: dict[str, Positive] = Field(
         default_factory=dict, description="tolerances by name, each in the unit of its degree of freedom"

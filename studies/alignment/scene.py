@@ -71,9 +71,7 @@ class AlignmentScene:
             return corner_stars(telescope, heights=heights, n=donuts.per_sensor)
 
         believed = donuts.heights if donuts.believed_heights is None else donuts.believed_heights
-        return cls(
-            config, telescope, freedoms, waves, atmosphere, on_sensors(donuts.heights), on_sensors(believed)
-        )
+        return cls(config, telescope, freedoms, waves, atmosphere, on_sensors(donuts.heights), on_sensors(believed))
 
     @property
     def wavelength(self) -> float:
