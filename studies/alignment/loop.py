@@ -9,6 +9,7 @@ import numpy as np
 
 from ...core.progress import Reporter
 from ...core.random_streams import stream
+from ...core.threads import one_blas_thread
 from ...pipeline.wavefront_sensing.result import DonutFit
 from .config import AlignConfig
 from .estimator import estimate_state, steady_covariance
@@ -92,7 +93,8 @@ def align(
     state = errors.initial * _normals(config.seed, "initial", 0, n)
     quality, states, estimates, spreads, expected, used, fits = [], [], [], [], [], [], []
     noise = scene.turbulence
-    with reporter.stage("visits", config.visits) as stage:
+    # Bytes must not depend on how BLAS shares sums among threads.
+    with one_blas_thread(), reporter.stage("visits", config.visits) as stage:
         for visit in range(config.visits):
             telescope = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
             quality.append(scene.quality.means(telescope, threads))

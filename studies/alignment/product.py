@@ -47,7 +47,9 @@ def alignment_summary(found: Alignment) -> dict[str, Any]:
 
 def write_alignment(found: Alignment, folder: Path) -> tuple[str, ...]:
     """Write the files of a loop into an existing folder, and return their names."""
-    meta = {"pachon": VERSION, "telescope": found.scene.telescope.name, "seed": found.scene.config.seed}
+    config = found.scene.config
+    meta = {"pachon": VERSION, "telescope": found.scene.telescope.name, "seed": config.seed}
+    meta |= {"degrees_of_freedom": found.scene.freedoms_source}
     visit = np.arange(len(found.visits))
     columns: Columns = {
         "visit": (visit, "", "number of the visit"),
@@ -71,7 +73,7 @@ def write_alignment(found: Alignment, folder: Path) -> tuple[str, ...]:
     for file, draw in pictures.items():
         write_bytes(folder / file, draw(found))
     write_json(folder / "summary.json", {**alignment_summary(found), **meta})
-    write_bytes(folder / "config.yaml", found.scene.config.to_yaml().encode())
+    write_bytes(folder / "config.yaml", config.to_yaml().encode())
     return *tables, *pictures, "summary.json", "config.yaml"
 
 

@@ -31,6 +31,7 @@ class AlignmentScene:
     config: AlignConfig
     telescope: Telescope
     freedoms: DegreesOfFreedom
+    freedoms_source: str  #: their bundled name, or the path of their file
     wavelengths: np.ndarray  #: [n_wave] m
     atmosphere: Atmosphere
     stars: CornerStars  #: on the sensors as they stand
@@ -50,7 +51,8 @@ class AlignmentScene:
         if telescope.camera != "lsst":
             raise ConfigError(f"telescope = {config.telescope}: expected a model with the LSST's camera")
         with error_context(key="degrees_of_freedom"):
-            freedoms = load_degrees_of_freedom(_path(config.degrees_of_freedom, folder))
+            source = _path(config.degrees_of_freedom, folder)
+            freedoms = load_degrees_of_freedom(source)
             freedoms.parameter_matrix(telescope)
         with error_context(key="errors.tolerances"):
             freedoms.vector(config.errors.tolerances)
@@ -71,7 +73,8 @@ class AlignmentScene:
             return corner_stars(telescope, heights=heights, n=donuts.per_sensor)
 
         believed = donuts.heights if donuts.believed_heights is None else donuts.believed_heights
-        return cls(config, telescope, freedoms, waves, atmosphere, on_sensors(donuts.heights), on_sensors(believed))
+        sensors = on_sensors(donuts.heights), on_sensors(believed)
+        return cls(config, telescope, freedoms, source, waves, atmosphere, *sensors)
 
     @property
     def wavelength(self) -> float:
@@ -133,7 +136,5 @@ class AlignmentScene:
 
 
 def _path(name: str, folder: Path | None) -> str:
-    """Return a name, or the path of a file relative to the folder."""
-    if folder is None or not Path(name).suffix or Path(name).is_absolute():
-        return name
-    return str(folder / name) if (folder / name).exists() else name
+    """Return a bundled name as it is, and the path of a file as an absolute one."""
+    return str(((folder or Path()) / name).resolve()) if Path(name).suffix.lower() in (".yaml", ".yml") else name
