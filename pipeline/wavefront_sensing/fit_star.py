@@ -155,7 +155,7 @@ class _StarFitter:
     def solve(self, scaled: _Scaled, star: np.ndarray, shared: np.ndarray | None = None) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((scaled.stamp,), self._map, np.zeros(n), self._fixed)
+        group = Group((scaled.stamp,), self._map, self._instrument.precision[:n], self._fixed)
         tolerance = FINE if scaled.pixels.side == 1 else COARSE
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance)
 

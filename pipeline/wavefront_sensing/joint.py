@@ -62,7 +62,7 @@ def fit_field(
     if len(stars) < terms.shape[1]:
         raise DomainError(f"field_noll: {terms.shape[1]} terms for {len(stars)} usable donuts; expected no more terms")
     maps = np.stack([np.kron(row, np.eye(n_noll)) for row in terms])
-    precision = np.zeros(maps.shape[2])
+    precision = np.tile(instrument.precision, terms.shape[1])
     start = _start(stars, maps, precision)
     group = Group(tuple(s.stamp for s in stars if s.stamp), maps, precision, fixed)
     solution = solve(group, _star_unknowns(stars), start, pool=pool)
