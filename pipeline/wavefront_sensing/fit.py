@@ -16,6 +16,7 @@ from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...design.parameters.tolerances import Tolerance
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
+from ...models.zernike_polynomials import noll_to_nm
 from ...raytrace.rays import field_direction
 from ...wavefront.request import relative_weights, wavelength_points
 from .degrees import FreedomEstimate, prior_spreads
@@ -44,6 +45,7 @@ def fit_donuts(
     pixel_size: ArrayLike = 10e-6,
     sky_variance: ArrayLike = 0.0,
     noll: Iterable[int] = range(4, 23),
+    higher_order: ArrayLike = 0.0,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None,
     field_noll: Iterable[int] | None = None,
@@ -86,6 +88,10 @@ def fit_donuts(
         Variance of sky and readout [electron^2 a pixel].
     noll : iterable of int
         Noll indices of the wavefront, from 4.
+    higher_order : float or Quantity
+        Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
+        what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
+        default) light that they move is taken for low orders, which is worst on an annulus.
     degrees_of_freedom : DegreesOfFreedom, optional
         Fit these degrees of freedom of the telescope to all donuts together, in place of Zernikes of each.
     prior : array_like, mapping or tolerances, optional
@@ -143,6 +149,10 @@ def fit_donuts(
     directions = field_direction(angles[:, 0], angles[:, 1], projection)
     waves = wavelength_points(telescope, wavelength)
     terms = _noll(noll, "noll", 4)
+    size = float(metres(higher_order, "higher_order"))
+    if not (np.isfinite(size) and size >= 0.0):
+        raise DomainError(f"higher_order = {higher_order!r}: expected a length in metres from 0")
+    further = _next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
     field_indices = None if field_noll is None else _noll(field_noll, "field_noll", 1)
     shifts = _each(metres(defocus, "defocus"), count, "defocus")
     known = None if fwhm is None else _each(radians(fwhm, "fwhm"), count, "fwhm")
@@ -167,7 +177,8 @@ def fit_donuts(
         require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres"),
         Seeing(float(waves[len(waves) // 2]), _outer_scale(outer_scale)),
         spread,
-        terms,
+        np.concatenate([terms, further]),
+        np.concatenate([np.zeros(len(terms)), np.full(len(further), size**-2.0 if size else 0.0)]),
         focal_plane,
         None if n_pupil is None else int(n_pupil),
     )
@@ -217,7 +228,7 @@ def fit_donuts(
             )
             solution = result.solution
             estimate = FreedomEstimate(degrees_of_freedom, solution.shared, solution.shared_covariance, spreads)
-    return _collected(instrument, stack, angles, stars, usable, result, estimate, field_indices)
+    return _collected(instrument, terms, stack, angles, stars, usable, result, estimate, field_indices)
 
 
 def _fit_one(
@@ -256,6 +267,7 @@ def _fit_one(
 
 def _collected(
     instrument: Instrument,
+    noll: np.ndarray,
     stack: np.ndarray,
     angles: np.ndarray,
     stars: list[StarFit],
@@ -265,7 +277,7 @@ def _collected(
     field_noll: np.ndarray | None,
 ) -> DonutFit:
     """Return the result of single fits, or of a joint one."""
-    count, n_noll = len(stars), len(instrument.noll)
+    count, n_noll = len(stars), len(noll)
     zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
     values, errors = np.full((2, count, 8), np.nan)
     chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
@@ -284,16 +296,21 @@ def _collected(
         model[i, :ny, :nx] = model_image(stamp, found, solution.waves[place])
         used[i, :ny, :nx] = stamp.used
         if joint is None:
-            zernikes[i], covariance[i] = solution.shared, solution.shared_covariance
+            zernikes[i], covariance[i] = solution.shared[:n_noll], solution.shared_covariance[:n_noll, :n_noll]
         else:
-            along = joint.zernike_map[k]
-            zernikes[i], covariance[i] = joint.zernikes[k], along @ solution.shared_covariance @ along.T
-    double = joint is not None and field_noll is not None
+            along = joint.zernike_map[k, :n_noll]
+            zernikes[i], covariance[i] = joint.zernikes[k, :n_noll], along @ solution.shared_covariance @ along.T
+    double, double_covariance = None, None
+    if joint is not None and field_noll is not None:
+        n_all = len(instrument.noll)
+        kept = (n_all * np.arange(len(field_noll))[:, None] + np.arange(n_noll)).ravel()
+        double = joint.solution.shared[kept].reshape(-1, n_noll)
+        double_covariance = joint.solution.shared_covariance[np.ix_(kept, kept)]
     width = instrument.seeing.fwhm(values[:, STRENGTH])
     return DonutFit(
         zernikes=zernikes,
         covariance=covariance,
-        noll=instrument.noll,
+        noll=noll,
         flux=values[:, FLUX],
         flux_error=errors[:, FLUX],
         center=values[:, [X, Y]],
@@ -313,8 +330,8 @@ def _collected(
         pixel_size=instrument.pixel,
         telescope=instrument.telescope.name,
         obscuration=instrument.telescope.pupil_obscuration,
-        double_zernikes=joint.solution.shared.reshape(-1, n_noll) if joint and double else None,
-        double_zernike_covariance=joint.solution.shared_covariance if joint and double else None,
+        double_zernikes=double,
+        double_zernike_covariance=double_covariance,
         degrees_of_freedom=estimate,
     )
 
@@ -343,6 +360,16 @@ def _noll(values: Iterable[int], name: str, least: int) -> np.ndarray:
     if not listed or any(int(j) != j or j < least for j in listed) or len(set(listed)) != len(listed):
         raise DomainError(f"{name} = {listed}: expected different Noll indices from {least}")
     return np.array(listed, dtype=np.int64)
+
+
+def _next_terms(noll: np.ndarray) -> np.ndarray:
+    """Return the Noll indices of the next radial degree at every azimuthal order of some, without these."""
+    highest: dict[int, int] = {}
+    for n, m in map(noll_to_nm, noll):
+        highest[m] = max(highest.get(m, 0), n)
+    wanted = {(n + 2, m) for m, n in highest.items()}
+    last = (max(highest.values()) + 3) * (max(highest.values()) + 4) // 2
+    return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in wanted and j not in noll], dtype=np.int64)
 
 
 def _each(values: np.ndarray, count: int, name: str) -> np.ndarray:

@@ -155,7 +155,7 @@ class _StarFitter:
     def solve(self, scaled: _Scaled, star: np.ndarray, shared: np.ndarray | None = None) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((scaled.stamp,), self._map, np.zeros(n), self._fixed)
+        group = Group((scaled.stamp,), self._map, self._instrument.precision[:n], self._fixed)
         tolerance = FINE if scaled.pixels.side == 1 else COARSE
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance)
 
@@ -187,7 +187,7 @@ class _StarFitter:
             trial = self.solve(scaled, np.array([*star, ratio, *offset]), shared)
             if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
                 best = trial
-        return _brighter_first(best)
+        return _central_first(best)
 
     def other_focus_is_better(self, scaled: _Scaled, here: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""
@@ -204,10 +204,10 @@ def _explains_more(trial: Solution, other: Solution) -> bool:
     return other.loss - trial.loss > _GAIN and trial.loss < _LEFT * other.loss
 
 
-def _brighter_first(solution: Solution) -> Solution:
-    """Return a solution whose second star is not the brighter one."""
+def _central_first(solution: Solution) -> Solution:
+    """Return a solution whose first star is the one nearer to the centre of the stamp."""
     star = solution.stars[0]
-    if len(star) <= RATIO or star[RATIO] <= 1.0:
+    if len(star) <= RATIO or np.hypot(*star[[X, Y]]) <= np.hypot(*(star[[X, Y]] + star[RATIO + 1 :])):
         return solution
     star = star.copy()
     star[FLUX] *= star[RATIO]

@@ -109,8 +109,8 @@ class ImageGrid:
             low = np.floor(place)
             t = (place - low)[:, None]
             powers = np.concatenate([np.ones_like(t), t, t * t, t**3], axis=1)
-            slope, bend = powers[:, :3] @ _SPLINE_SLOPE, powers[:, :2] @ _SPLINE_BEND
-            values.append((powers @ _SPLINE, slope * self._oversampling, bend * self._oversampling**2))
+            # The spline and its first three derivatives, per pixel.
+            values.append([self._oversampling**k * (powers[:, : 4 - k] @ _SPLINES[k]) for k in range(4)])
             indices.append((low.astype(np.int64)[:, None] + np.arange(-1, 3)) % self._size[1 - axis])
         cells = (indices[1][:, :, None] * self._size[1] + indices[0][:, None, :]).reshape(-1).astype(np.int32)
         starts = np.arange(0, cells.size + 1, 16, dtype=np.int32)
@@ -122,10 +122,15 @@ class ImageGrid:
         def matrix(values: np.ndarray) -> csc_array:
             return csc_array((values.astype(np.float32).ravel(), cells, starts), shape=shape)
 
-        (x, dx, ddx), (y, dy, ddy) = values
+        x, y = values
         (xx, xy), (_, yy) = np.moveaxis(spread, 0, -1)[..., None]
-        spline = taps(x + 0.5 * xx * ddx, y) + taps(x, 0.5 * yy * ddy) + taps(xy * dx, dy)
-        return matrix(spline), matrix(taps(dx, y)), matrix(taps(x, dy))
+
+        def spline(i: int, j: int) -> csc_array:
+            """Return the derivative of order i along x and j along y."""
+            wide_x = x[i] + 0.5 * xx * x[i + 2]
+            return matrix(taps(wide_x, y[j]) + taps(x[i], 0.5 * yy * y[j + 2]) + taps(xy * x[i + 1], y[j + 1]))
+
+        return spline(0, 0), spline(1, 0), spline(0, 1)
 
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:
         """Return the pixels of spectra [ky, kx, n], shape [ny, nx, n]."""
@@ -202,6 +207,6 @@ class ImageGrid:
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.
-_SPLINE = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0
-_SPLINE_SLOPE = _SPLINE[1:] * np.array([[1.0], [2.0], [3.0]])
-_SPLINE_BEND = _SPLINE_SLOPE[1:] * np.array([[1.0], [2.0]])
+_SPLINES = [np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0]
+for _ in range(3):
+    _SPLINES.append(_SPLINES[-1][1:] * np.arange(1, len(_SPLINES[-1]))[:, None])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.errors import DomainError
+from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.zernike_polynomials import annular_zernikes
 from .degrees import FreedomRays
@@ -22,6 +23,7 @@ from .stamps import Pixels
 #: Times that vignetting and response to the degrees of freedom are computed, steps with each, and squared change in
 #: units of the errors, a degree of freedom, that is small enough.
 _OUTER, _INNER, _SETTLED = 4, 6, 1e-3
+_MANY_TERMS = 37
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def fit_field(
     if len(stars) < terms.shape[1]:
         raise DomainError(f"field_noll: {terms.shape[1]} terms for {len(stars)} usable donuts; expected no more terms")
     maps = np.stack([np.kron(row, np.eye(n_noll)) for row in terms])
-    precision = np.zeros(maps.shape[2])
+    precision = np.tile(instrument.precision, terms.shape[1])
     start = _start(stars, maps, precision)
     group = Group(tuple(s.stamp for s in stars if s.stamp), maps, precision, fixed)
     solution = solve(group, _star_unknowns(stars), start, pool=pool)
@@ -92,10 +94,15 @@ def fit_freedoms(
         change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
         if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
             break
+    # Over the whole annulus, vignetted or not: so many terms that no other shows up in those asked for.
+    many = max(jmax, _MANY_TERMS)
     after = freedoms.apply(telescope, joint.shared)
-    found = freedoms.sensitivity(after, fields, instrument.middle, n_zernike=jmax, projection=projection)
-    zernikes = (found.zernikes - sensitivity.zernikes)[:, noll - 1]
-    return JointFit(tuple(moved), joint, zernikes, found.matrix[:, noll - 1])
+    before, found = (
+        wavefront_zernikes(t, fields, instrument.middle, jmax=jmax, projection=projection).coefficients[:, noll - 1]
+        for t in (telescope, after)
+    )
+    response = freedoms.sensitivity(after, fields, instrument.middle, n_zernike=many, projection=projection)
+    return JointFit(tuple(moved), joint, found - before, response.matrix[:, noll - 1])
 
 
 def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray) -> StarFit:

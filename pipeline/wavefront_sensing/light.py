@@ -49,6 +49,8 @@ class Instrument:
         Rms of the charge diffusion along each axis [m].
     noll : ndarray of int
         Noll indices of the wavefront.
+    precision : ndarray, shape [n_noll]
+        Inverse variances of Gaussian priors of the coefficients about zero [1/m^2]; 0 for none.
     focal_plane : FocalPlane or None
         Heights of the CCDs.
     n_pupil : int or None
@@ -62,6 +64,7 @@ class Instrument:
     seeing: Seeing
     diffusion: float
     noll: np.ndarray
+    precision: np.ndarray
     focal_plane: FocalPlane | None
     n_pupil: int | None
 
