@@ -157,7 +157,7 @@ class DegreesOfFreedom:
             raise unknown_name(f"degree of freedom{f' of {self.name}' if self.name else ''}", name, self.names)
         return self.names.index(name)
 
-    def vector(self, values: ArrayLike) -> np.ndarray:
+    def vector(self, values: ArrayLike | Mapping[str, Any]) -> np.ndarray:
         """Return values as a vector, shape [n], each in its unit.
 
         Parameters
@@ -193,7 +193,7 @@ class DegreesOfFreedom:
                 raise DomainError(f"{name} = {float(value)!r}: expected a finite number")
         return vector
 
-    def apply(self, telescope: Telescope, values: ArrayLike) -> Telescope:
+    def apply(self, telescope: Telescope, values: ArrayLike | Mapping[str, Any]) -> Telescope:
         """Return the telescope with a vector of degrees of freedom applied.
 
         Deformations are added to the surfaces first, then other parameters change, then bodies move, groups before
