@@ -18,7 +18,7 @@ from .field_quality import FieldMeans
 from .scene import NOLL, AlignmentScene
 
 # Visits after which the expected state no longer changes.
-_STEADY = 200
+_STEADY = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +121,9 @@ def align(
             covariance = estimate.covariance
             stage.advance()
             stage.step(f"visit {visit}: {1e9 * quality[-1].added:.0f} nm added", visit + 1, config.visits)
-    steady = steady_covariance(
-        np.nan_to_num(noise), scene.sensitivity, errors.initial**2 * np.eye(n), drift, config.control.gain, _STEADY
-    )
+    start = errors.initial**2 * np.eye(n)
+    with one_blas_thread():
+        steady = steady_covariance(np.nan_to_num(noise), scene.sensitivity, start, drift, config.control.gain, _STEADY)
     return Alignment(
         scene=scene,
         designed=scene.quality.means(scene.telescope, threads),

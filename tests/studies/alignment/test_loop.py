@@ -19,7 +19,7 @@ QUIET = {"wavefront": False}
 
 
 def config(**changes):
-    return AlignConfig(**({"visits": 5, "air": QUIET} | changes))
+    return AlignConfig(**({"visits": 4, "air": QUIET} | changes))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_what_is_added_over_the_field_is_what_the_response_expects():
 
 
 @pytest.mark.long
-def test_the_loop_converges_within_five_visits_to_what_it_expects(aligned):
+def test_the_loop_converges_within_two_corrections_to_what_it_expects(aligned):
     added = np.array([v.added for v in aligned.visits])
     assert added[0] > 600e-9
     total = np.array([v.wavefront for v in aligned.visits])
@@ -61,11 +61,10 @@ def test_the_loop_converges_within_five_visits_to_what_it_expects(aligned):
 
 
 @pytest.mark.long
-def test_bytes_depend_on_the_seed_alone(aligned, traced_donuts):
-    again, other = align(config(visits=2), threads=1), align(config(visits=1, seed=2))
+def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
+    again = align(config(visits=2), threads=1)
     assert again.states.tobytes() == aligned.states[:2].tobytes()
     assert again.visits == aligned.visits[:2]
-    assert not np.array_equal(other.states[0], again.states[0])
 
 
 @pytest.mark.long
@@ -107,9 +106,9 @@ def test_bad_files_of_states_are_one_line(tmp_path):
 @pytest.mark.long
 def test_the_command_shows_the_loop(traced_donuts, tmp_path, capsys):
     (tmp_path / "loop.yaml").write_text("air: {wavefront: false}\nvisits: 9\n")
-    arguments = ["align", str(tmp_path / "loop.yaml"), "-n", "2", "-o", str(tmp_path / "out"), "--quiet", "--json"]
+    arguments = ["align", str(tmp_path / "loop.yaml"), "-n", "1", "-o", str(tmp_path / "out"), "--quiet", "--json"]
     assert main(arguments) == 0
-    assert json.loads(capsys.readouterr().out)["visits"] == 2
+    assert json.loads(capsys.readouterr().out)["visits"] == 1
     (tmp_path / "loop.yaml").write_text("donuts: {heights: flat}\n")
     assert main(arguments) == 2
     message = capsys.readouterr().err

