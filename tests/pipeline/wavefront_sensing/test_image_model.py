@@ -30,7 +30,9 @@ def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, 
 @pytest.mark.parametrize("amplitude", [0.0, 200e-9])
 def test_image_is_that_of_brute_force(behind_focus, amplitude):
     wave = amplitude * np.array([1.0, -0.5, 0.7, 0.4, -0.6, 0.3, 0.2, -0.3])
-    expected = donut(behind_focus, FIELD, zernikes=[0.0, 0.0, 0.0, *wave], blur=1.3, shift=(0.3, -0.2), flux=1.0, rays=1200)
+    expected = donut(
+        behind_focus, FIELD, zernikes=[0.0, 0.0, 0.0, *wave], blur=1.3, shift=(0.3, -0.2), flux=1.0, rays=1200
+    )
     stamp = stamp_of(behind_focus, 60, blur=1.3 * PIXEL)
     model = model_image(stamp, np.array([1.0, 0.3, -0.2, 0.0, 0.0]), wave)
     # Bins of a quarter pixel, and one ray more or less in those on the rims.
@@ -93,4 +95,5 @@ def test_cells_measure_areas_and_moments(focused):
     # Mean square radius of the annulus: of the centroids plus that within the cells.
     square = cells.weights @ (x**2 + y**2 + cells.moments[:, 0, 0] + cells.moments[:, 1, 1])
     assert square == pytest.approx(0.5 * (radius**2 + inner**2), rel=2e-4)
-    assert abs(cells.weights @ x) < 1e-4 and abs(cells.weights @ y) < 1e-4
+    assert abs(cells.weights @ x) < 1e-4
+    assert abs(cells.weights @ y) < 1e-4
