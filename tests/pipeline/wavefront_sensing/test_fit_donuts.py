@@ -23,17 +23,20 @@ def wave():
 
 @pytest.fixture(scope="module")
 def clean(behind_focus, wave):
-    return donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(0.7, -1.2), rays=900)
+    return donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(0.7, -1.2))
 
 
 def rss(values):
     return float(np.sqrt((values**2).sum()))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("blur", [0.0, 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("blur", [0.0, 1.5])
 def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
-    image = donut(behind_focus, FIELD, zernikes=wave, blur=blur, shift=(0.7, -1.2), rays=1500)
+    pixel = 10e-6
+    image = donut(
+        behind_focus, FIELD, zernikes=wave, blur=blur, shift=(0.7, -1.2), rays=2500, size=2 * SIZE, pixel=pixel
+    )
     fit = pachon.fit_donuts(
         behind_focus,
         image[None],
@@ -41,11 +44,12 @@ def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
         WAVELENGTH,
         sky_variance=1000.0,
         fwhm=0.0,
-        diffusion=blur * PIXEL,
-        **OPTIONS,
+        diffusion=blur * pixel,
+        pixel_size=pixel,
+        threads=1,
     )
     assert fit.reasons == [""]
-    assert rss(fit.zernikes[0] - wave[3:]) < (0.5e-9 if blur else 2e-9)
+    assert rss(fit.zernikes[0] - wave[3:]) < 2e-9
     np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=2e-3)
     assert fit.flux[0] == pytest.approx(5e6, rel=1e-3)
 
@@ -67,20 +71,22 @@ def test_sign_and_size_are_those_of_the_opd(behind_focus):
     np.testing.assert_allclose(fit.zernikes[0], after - before, atol=5e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_errors_are_those_claimed(behind_focus, wave, clean):
-    draws = np.stack([noisy(clean, 500.0, seed) for seed in range(16)])
-    fit = pachon.fit_donuts(
-        behind_focus, draws, [FIELD] * 16, WAVELENGTH, sky_variance=500.0, fwhm=0.0, diffusion=PIXEL, **OPTIONS
-    )
+    options = {"sky_variance": 500.0, "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    first = pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, **options)
+    # The model itself is drawn: brute force has noise of its own.
+    draws = np.stack([noisy(first.model[0], 500.0, seed) for seed in range(32)])
+    fit = pachon.fit_donuts(behind_focus, draws, [FIELD] * 32, WAVELENGTH, **options)
     assert fit.usable.all()
-    error = fit.zernikes - wave[3:]
+    error = fit.zernikes - first.zernikes
     chi2 = np.einsum("ni,nij,nj->", error, np.linalg.inv(fit.covariance), error) / error.size
-    # 304 squares: 8 % of scatter.
-    assert chi2 == pytest.approx(1.0, abs=0.2)
-    np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.04)
+    # 608 squares: 6 % of scatter.
+    assert chi2 == pytest.approx(1.0, abs=0.15)
+    np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.05)
 
 
+@pytest.mark.long
 def test_large_aberrations_are_found(behind_focus):
     wave = np.zeros(11)
     wave[[3, 4, 6, 7, 10]] = 800e-9, -900e-9, 700e-9, 500e-9, -200e-9
@@ -92,6 +98,7 @@ def test_large_aberrations_are_found(behind_focus):
     assert rss(fit.zernikes[0] - wave[3:]) < 60e-9
 
 
+@pytest.mark.long
 def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     wave = np.zeros(23)
     wave[22] = 60e-9
@@ -114,7 +121,14 @@ def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     assert rss(guarded.zernikes[0]) < 15e-9
 
 
-@pytest.mark.parametrize(("ratio", "offset"), [(0.14, (14.0, 9.0)), (1.0, (-20.0, 12.0)), (0.3, (35.0, -20.0))])
+@pytest.mark.parametrize(
+    ("ratio", "offset"),
+    [
+        pytest.param(0.14, (14.0, 9.0), marks=pytest.mark.long),
+        pytest.param(1.0, (-20.0, 12.0), marks=pytest.mark.slow),
+        pytest.param(0.3, (35.0, -20.0), marks=pytest.mark.slow),
+    ],
+)
 def test_second_stars_are_survived(behind_focus, wave, ratio, offset):
     both = donut(behind_focus, FIELD, zernikes=wave) + ratio * donut(behind_focus, FIELD, zernikes=wave, shift=offset)
     fit = pachon.fit_donuts(
@@ -126,6 +140,7 @@ def test_second_stars_are_survived(behind_focus, wave, ratio, offset):
     assert rss(error) < 4.0 * rss(fit.errors[0])
 
 
+@pytest.mark.long
 def test_cosmic_rays_are_left_out(behind_focus, wave, clean):
     image = noisy(clean, 500.0, 3)
     image[20:50, 40] += 4000.0
@@ -136,6 +151,7 @@ def test_cosmic_rays_are_left_out(behind_focus, wave, clean):
     assert rss(fit.zernikes[0] - wave[3:]) < 2.0 * rss(fit.errors[0])
 
 
+@pytest.mark.long
 def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     sky = noisy(np.zeros_like(clean), 500.0, 5)
     not_finite = clean.copy()
@@ -186,7 +202,7 @@ def test_no_light_passes_a_closed_telescope(behind_focus, clean):
     assert fit.flags.tolist() == [pachon.DonutFlag.NO_LIGHT]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_degrees_of_freedom_of_all_donuts_together(focused):
     freedoms = pachon.load_degrees_of_freedom("lsst").select(
         ["M2_dz", "M2_dx", "M2_ry", "Camera_dz", "Camera_dy", "M1M3_B2", "M1M3_B6"]
@@ -226,7 +242,7 @@ def test_degrees_of_freedom_of_all_donuts_together(focused):
     assert estimate.plot().axes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_double_zernikes_and_stars_in_focus(focused):
     """A wavefront that is linear over the field: donuts on both sides of focus, and a star in focus."""
     fields = np.deg2rad([[0.8, 0.0], [-0.8, 0.0], [0.0, 0.8], [0.3, 0.3]])
@@ -262,6 +278,7 @@ def test_double_zernikes_and_stars_in_focus(focused):
     assert np.isnan(fit.images[3, -1, -1])
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean):
     images = np.stack([noisy(clean, 500.0, seed) for seed in range(3)])
     options = {"pixel_size": PIXEL, "sky_variance": 500.0, "noll": range(4, 12)}
@@ -271,6 +288,7 @@ def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean
     np.testing.assert_array_equal(many.model[1], one.model[0])
 
 
+@pytest.mark.long
 def test_tables_summaries_and_pictures(behind_focus, clean):
     images = np.stack([clean, np.full_like(clean, np.nan)])
     fit = pachon.fit_donuts(
