@@ -197,10 +197,11 @@ def prior_spreads(
     """
     if prior is None:
         return np.asarray(DEFAULT_PRIOR / freedoms.sensitivity(telescope, wavelength=wavelength).rms)
+    if isinstance(prior, Sequence) and prior and isinstance(prior[0], Tolerance):
+        prior = {t.name: t.spread for t in prior if isinstance(t, Tolerance)}
     if isinstance(prior, Mapping):
-        spreads = freedoms.vector(prior)
-    elif isinstance(prior, Sequence) and prior and isinstance(prior[0], Tolerance):
-        spreads = freedoms.vector({t.name: t.spread for t in prior if isinstance(t, Tolerance)})
+        by_name: Any = prior
+        spreads = freedoms.vector(by_name)
     else:
         try:
             spreads = np.array(np.broadcast_to(np.asarray(prior, dtype=np.float64), (len(freedoms),)))

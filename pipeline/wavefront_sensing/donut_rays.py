@@ -71,7 +71,8 @@ class ZernikeRays:
         self._chief = chief_landing(telescope, direction, middle)
         self.jacobian = image_jacobians(telescope, direction[None], middle, 1)[0]
         radius = 0.5 * telescope.pupil_diameter
-        terms = annular_zernike_gradients(int(noll.max()), *(cells.points.T / radius), telescope.pupil_obscuration)
+        x, y = cells.points.T / radius
+        terms = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)
         #: Derivatives of the terms along x and y of the pupil [1/m], [n_term, 2, n_point].
         self._gradients = terms[noll - 1] / radius
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)

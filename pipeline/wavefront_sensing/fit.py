@@ -145,7 +145,9 @@ def fit_donuts(
     count = len(stack)
     angles = np.atleast_2d(radians(fields, "fields"))
     if angles.shape != (count, 2) or not np.isfinite(angles).all():
-        raise DomainError(f"fields of shape {angles.shape}: expected finite angles of {count} images, shape [{count}, 2]")
+        raise DomainError(
+            f"fields of shape {angles.shape}: expected finite angles of {count} images, shape [{count}, 2]"
+        )
     directions = field_direction(angles[:, 0], angles[:, 1], projection)
     waves = wavelength_points(telescope, wavelength)
     terms = _noll(noll, "noll", 4)
@@ -260,9 +262,7 @@ def _fit_one(
         return StarFit(DonutFlag.NO_LIGHT)
     pixels = Pixels(np.where(masked, 0.0, image), variance, ~masked)
     wavefront = not joint or light.diameter > 24.0 * instrument.pixel
-    return fit_star(
-        instrument, light, pixels, strength=strength, fixed_strength=fixed_strength, wavefront=wavefront
-    )
+    return fit_star(instrument, light, pixels, strength=strength, fixed_strength=fixed_strength, wavefront=wavefront)
 
 
 def _collected(
@@ -341,14 +341,15 @@ def _padded(
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Return images as one stack, smaller ones filled up at the end, and their shapes."""
     try:
-        listed = [np.asarray(v, dtype=kind) for v in values]  # type: ignore[union-attr]
+        each: Any = values
+        listed: list[np.ndarray] = [np.asarray(v, dtype=kind) for v in each]
     except (TypeError, ValueError):
         raise DomainError(f"{name}: expected an array of shape [n, ny, nx], or n arrays of two dimensions") from None
     if not listed or any(v.ndim != 2 or min(v.shape) < 8 for v in listed):
         shape = [v.shape for v in listed][:1]
         raise DomainError(f"{name} of shape {shape}: expected [n, ny, nx], stamps of at least 8 pixels a side")
     shapes = [(int(v.shape[0]), int(v.shape[1])) for v in listed]
-    stack = np.full((len(listed), max(s[0] for s in shapes), max(s[1] for s in shapes)), fill, dtype=kind)
+    stack: np.ndarray = np.full((len(listed), max(s[0] for s in shapes), max(s[1] for s in shapes)), fill, dtype=kind)
     for row, one in zip(stack, listed, strict=True):
         row[: one.shape[0], : one.shape[1]] = one
     return stack, shapes

@@ -96,6 +96,9 @@ def fit_star(
     fine = fitter.stamp(light, clean, companion=len(best.stars[0]) > RATIO)
     start = fitter.transferred(best.stars[0], coarse.pixels, fine.pixels)
     solution = fitter.solve(fine, start, best.shared)
+    sharper = fitter.sharper(light, fine, solution)
+    if sharper is not None:
+        fine, solution = sharper, fitter.solve(sharper, solution.stars[0], solution.shared)
     stamp = fine.stamp
     for _ in range(_ROUNDS):
         kept = _clipped(stamp, solution)
@@ -137,6 +140,14 @@ class _StarFitter:
         # Second stars may stand anywhere beside the stamp.
         reach = light.diameter if companion or pixels.side > 1 else 0.0
         return _Scaled(self._instrument.stamp(light, pixels, self._fwhm, reach), pixels)
+
+    def sharper(self, light: Light, scaled: _Scaled, found: Solution) -> _Scaled | None:
+        """Return the stamp with a finer grid where the seeing that was found needs one."""
+        fwhm = float(self._instrument.seeing.fwhm(found.stars[0][STRENGTH]))
+        sampling, grid = self._instrument.sampling(light, scaled.pixels, fwhm), scaled.stamp.grid
+        if sampling.oversampling <= grid.oversampling:
+            return None
+        return _Scaled(self._instrument.stamp(light, scaled.pixels, fwhm, grid.reach), scaled.pixels)
 
     def template(self, scaled: _Scaled) -> np.ndarray:
         """Return the image of a star of unit flux at the centre of the stamp."""

@@ -82,7 +82,8 @@ class ImageGrid:
         oversampling: int,
         reach: float,
     ) -> None:
-        self.shape, self.pixel, self.footprint, self._oversampling = shape, pixel, footprint, oversampling
+        self.shape, self.pixel, self.footprint = shape, pixel, footprint
+        self.oversampling, self.reach = oversampling, reach
         margin = max(8, math.ceil(reach / pixel))
         self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
         #: Place of the centre of the stamp on the grid, (y, x) cells.
@@ -96,7 +97,13 @@ class ImageGrid:
         spline = (np.sinc(x) * np.sinc(y)) ** 4
         cell = np.prod(np.sinc(np.tensordot(footprint.T, wave, axes=1) / (2.0 * math.pi)), axis=0)
         # A cell of the grid holds less light than a pixel.
-        self._detector = oversampling**2 * square_transfer(*wave, side) * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0)) * cell / spline
+        self._detector = (
+            oversampling**2
+            * square_transfer(wave[0], wave[1], side)
+            * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0))
+            * cell
+            / spline
+        )
 
     def _deposit(self, points: np.ndarray, spread: np.ndarray) -> tuple[csc_array, csc_array, csc_array]:
         """Return the spline and its derivatives along x and y [1/pixel] at points [n, 2] as sparse matrices.
@@ -105,12 +112,12 @@ class ImageGrid:
         """
         values, indices = [], []
         for axis in (0, 1):
-            place = self._middle[1 - axis] + self._oversampling * points[:, axis]
+            place = self._middle[1 - axis] + self.oversampling * points[:, axis]
             low = np.floor(place)
             t = (place - low)[:, None]
             powers = np.concatenate([np.ones_like(t), t, t * t, t**3], axis=1)
             # The spline and its first three derivatives, per pixel.
-            values.append([self._oversampling**k * (powers[:, : 4 - k] @ _SPLINES[k]) for k in range(4)])
+            values.append([self.oversampling**k * (powers[:, : 4 - k] @ _SPLINES[k]) for k in range(4)])
             indices.append((low.astype(np.int64)[:, None] + np.arange(-1, 3)) % self._size[1 - axis])
         cells = (indices[1][:, :, None] * self._size[1] + indices[0][:, None, :]).reshape(-1).astype(np.int32)
         starts = np.arange(0, cells.size + 1, 16, dtype=np.int32)
@@ -135,7 +142,7 @@ class ImageGrid:
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:
         """Return the pixels of spectra [ky, kx, n], shape [ny, nx, n]."""
         images = fft.irfft2(spectra, s=self._size, axes=(0, 1))
-        step = self._oversampling
+        step = self.oversampling
         return np.asarray(images[: self.shape[0] * step : step, : self.shape[1] * step : step])
 
     def image(self, unknowns: np.ndarray, light: LandedLight) -> np.ndarray:
@@ -181,7 +188,9 @@ class ImageGrid:
         level = np.zeros_like(star)
         level[0, 0] = self._size[0] * self._size[1]
         growth = (-5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
-        columns = self._pixels(np.concatenate([star, moved[..., :2], level, growth * star, *extra, moved[..., 2:]], axis=-1))
+        columns = self._pixels(
+            np.concatenate([star, moved[..., :2], level, growth * star, *extra, moved[..., 2:]], axis=-1)
+        )
         scales = np.full(columns.shape[-1], flux)
         scales[[FLUX, BACKGROUND]] = 1.0
         return flux * columns[..., FLUX].astype(np.float64) + unknowns[BACKGROUND], columns, scales
@@ -189,7 +198,7 @@ class ImageGrid:
     def _spectra(
         self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return spectra of the star of unit flux, of its derivatives by x, y and wave, and the shift of a second one."""
+        """Return spectra of a star of unit flux and its derivatives by x, y and wave, and the shift of a second one."""
         points = light.landing / self.pixel + unknowns[[X, Y]]
         value, along_x, along_y = self._deposit(points, light.spread / self.pixel**2)
         weights = light.weights.astype(np.float32)[:, None]

@@ -48,10 +48,10 @@ class JointFit:
     zernike_map: np.ndarray
 
 
-def field_terms(field_noll: Sequence[int], fields: np.ndarray, field_radius: float) -> np.ndarray:
+def field_terms(field_noll: np.ndarray, fields: np.ndarray, field_radius: float) -> np.ndarray:
     """Return Zernikes of the field at field angles [n, 2], shape [n, n_term]."""
-    terms = annular_zernikes(max(field_noll), *(fields.T / field_radius))
-    return np.asarray(terms[np.array(field_noll) - 1].T)
+    terms = annular_zernikes(int(field_noll.max()), *(fields.T / field_radius))
+    return np.asarray(terms[field_noll - 1].T)
 
 
 def fit_field(

@@ -10,7 +10,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus, parallel_rays
+from ...raytrace.rays import parallel_rays
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import image_jacobians
 from .donut_rays import ZernikeRays, chief_landing
@@ -93,7 +93,7 @@ class Instrument:
         return Light(telescope, direction, 2.0 * float(np.hypot(*place.T).max()), depth, jacobian)
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
-        """Return the telescope with its detector in the tangent plane of the CCD at the chief ray, moved by a defocus."""
+        """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
         telescope, detector = self.telescope, self.telescope.surfaces[-1]
         height, tilt = defocus, (0.0, 0.0, 0.0)
         place = chief_landing(telescope, direction, self.middle)

@@ -2,8 +2,8 @@
 
 A cell stands for its lit part by area, centroid and second moments. Its image is blurred by the image of a cell of mean
 magnification, the footprint, which one transfer function holds; what its second moments have beyond that, on rims and
-where the magnification is another, is its spread. Cells then cover the image of the lit pupil without gaps or overlap, but
-for the third moments of cells on rims.
+where the magnification is another, is its spread. Cells then cover the image of the lit pupil without gaps or overlap,
+but for the third moments of cells on rims.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ class PupilCells:
         basis, triangle = np.linalg.qr(powers_x[:, p] * powers_y[:, q])
         along_x = p * powers_x[:, np.maximum(p - 1, 0)] * powers_y[:, q]
         along_y = q * powers_x[:, p] * powers_y[:, np.maximum(q - 1, 0)]
-        return basis, np.linalg.solve(triangle.T, np.stack([along_x, along_y]).transpose(0, 2, 1)).transpose(0, 2, 1) / radius
+        return basis, np.linalg.solve(triangle.T, np.stack([along_x, along_y]).transpose(0, 2, 1)).transpose(
+            0, 2, 1
+        ) / radius
 
     def magnification(self, landing: np.ndarray) -> np.ndarray:
         """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
@@ -108,7 +110,8 @@ def _lit_parts(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return lit fractions [n], centroids from the centre [n, 2] and second moments [n, 2, 2], by chords.
 
-    Chords run along x, or along y where ``upright``, across the rim. Rims on them are found between nodes of different status.
+    Chords run along x, or along y where ``upright``, across the rim. Rims on them are found between nodes of different
+    status.
     """
     node = side * np.linspace(-0.5, 0.5, _NODES)
     row = side * ((np.arange(_CHORDS) + 0.5) / _CHORDS - 0.5)

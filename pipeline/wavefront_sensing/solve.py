@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ from scipy.linalg import cho_factor, cho_solve
 from .image_model import FLUX, RATIO, STRENGTH
 from .likelihood import NormalEquations, Stamp, normal_equations
 
-#: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is the
-#: last: a tenth of a standard deviation, of which the step leaves next to nothing.
+#: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
+#: the last: a tenth of a standard deviation, of which the step leaves next to nothing.
 FINE, COARSE = 1e-2, 0.3
 #: The same for a search that ran out of steps and is near enough to its end.
 _NEAR = 1.0
@@ -128,7 +129,7 @@ def solve(
     covariance[free] = np.linalg.pinv(state.curvature[free] / np.outer(scale, scale), hermitian=True)
     covariance[free] /= np.outer(scale, scale)
     bounds = np.cumsum([0, *sizes])
-    found_stars = tuple(joined[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True))
+    found_stars = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
     best = joined[bounds[-1] :]
     waves = tuple(m @ best for m in group.maps)
     return Solution(found_stars, best, waves, covariance, state.chi2, state.loss, converged)

@@ -23,17 +23,20 @@ def wave():
 
 @pytest.fixture(scope="module")
 def clean(behind_focus, wave):
-    return donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(0.7, -1.2), rays=900)
+    return donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(0.7, -1.2))
 
 
 def rss(values):
     return float(np.sqrt((values**2).sum()))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("blur", [0.0, 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("blur", [0.0, 1.5])
 def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
-    image = donut(behind_focus, FIELD, zernikes=wave, blur=blur, shift=(0.7, -1.2), rays=1500)
+    pixel = 10e-6
+    image = donut(
+        behind_focus, FIELD, zernikes=wave, blur=blur, shift=(0.7, -1.2), rays=2500, size=2 * SIZE, pixel=pixel
+    )
     fit = pachon.fit_donuts(
         behind_focus,
         image[None],
@@ -41,11 +44,12 @@ def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
         WAVELENGTH,
         sky_variance=1000.0,
         fwhm=0.0,
-        diffusion=blur * PIXEL,
-        **OPTIONS,
+        diffusion=blur * pixel,
+        pixel_size=pixel,
+        threads=1,
     )
     assert fit.reasons == [""]
-    assert rss(fit.zernikes[0] - wave[3:]) < (0.5e-9 if blur else 2e-9)
+    assert rss(fit.zernikes[0] - wave[3:]) < 2e-9
     np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=2e-3)
     assert fit.flux[0] == pytest.approx(5e6, rel=1e-3)
 
@@ -59,39 +63,57 @@ def test_sign_and_size_are_those_of_the_opd(behind_focus):
         pachon.wavefront_zernikes(t, [FIELD], WAVELENGTH, jmax=22).coefficients[0, 3:] for t in (behind_focus, true)
     )
     image = donut(true, FIELD, blur=1.0, rays=900)
-    fit = pachon.fit_donuts(behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=1000.0, fwhm=0.0, diffusion=PIXEL, **OPTIONS)
+    fit = pachon.fit_donuts(
+        behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=1000.0, fwhm=0.0, diffusion=PIXEL, **OPTIONS
+    )
     assert after[0] - before[0] > 50e-9
-    np.testing.assert_allclose(fit.zernikes[0], after - before, atol=3e-9)
+    # Rims of 900 rays across: a quarter of a standard deviation of the noise that is not there.
+    np.testing.assert_allclose(fit.zernikes[0], after - before, atol=5e-9)
+
+
+@pytest.mark.slow
+def test_errors_are_those_claimed(behind_focus, wave, clean):
+    options = {"sky_variance": 500.0, "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    first = pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, **options)
+    # The model itself is drawn: brute force has noise of its own.
+    draws = np.stack([noisy(first.model[0], 500.0, seed) for seed in range(32)])
+    fit = pachon.fit_donuts(behind_focus, draws, [FIELD] * 32, WAVELENGTH, **options)
+    assert fit.usable.all()
+    error = fit.zernikes - first.zernikes
+    chi2 = np.einsum("ni,nij,nj->", error, np.linalg.inv(fit.covariance), error) / error.size
+    # 608 squares: 6 % of scatter.
+    assert chi2 == pytest.approx(1.0, abs=0.15)
+    np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.05)
 
 
 @pytest.mark.long
-def test_errors_are_those_claimed(behind_focus, wave, clean):
-    draws = np.stack([noisy(clean, 500.0, seed) for seed in range(16)])
-    fit = pachon.fit_donuts(behind_focus, draws, [FIELD] * 16, WAVELENGTH, sky_variance=500.0, fwhm=0.0, diffusion=PIXEL, **OPTIONS)
-    assert fit.usable.all()
-    error = fit.zernikes - wave[3:]
-    chi2 = np.einsum("ni,nij,nj->", error, np.linalg.inv(fit.covariance), error) / error.size
-    # 304 squares: 8 % of scatter.
-    assert chi2 == pytest.approx(1.0, abs=0.2)
-    np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.04)
-
-
 def test_large_aberrations_are_found(behind_focus):
     wave = np.zeros(11)
     wave[[3, 4, 6, 7, 10]] = 800e-9, -900e-9, 700e-9, 500e-9, -200e-9
     image = noisy(donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(2.0, -3.0), size=111), 500.0, 1)
-    fit = pachon.fit_donuts(behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, noll=range(4, 12), **OPTIONS)
+    fit = pachon.fit_donuts(
+        behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, noll=range(4, 12), **OPTIONS
+    )
     assert fit.usable.all()
     assert rss(fit.zernikes[0] - wave[3:]) < 60e-9
 
 
+@pytest.mark.long
 def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     wave = np.zeros(23)
     wave[22] = 60e-9
     image = donut(behind_focus, FIELD, zernikes=wave)
     plain, guarded = (
         pachon.fit_donuts(
-            behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, fwhm=0.0, diffusion=PIXEL, higher_order=rms, **OPTIONS
+            behind_focus,
+            image[None],
+            [FIELD],
+            WAVELENGTH,
+            sky_variance=500.0,
+            fwhm=0.0,
+            diffusion=PIXEL,
+            higher_order=rms,
+            **OPTIONS,
         )
         for rms in (0.0, 50e-9)
     )
@@ -99,16 +121,26 @@ def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     assert rss(guarded.zernikes[0]) < 15e-9
 
 
-@pytest.mark.parametrize(("ratio", "offset"), [(0.14, (14.0, 9.0)), (1.0, (-20.0, 12.0)), (0.3, (35.0, -20.0))])
+@pytest.mark.parametrize(
+    ("ratio", "offset"),
+    [
+        pytest.param(0.14, (14.0, 9.0), marks=pytest.mark.long),
+        pytest.param(1.0, (-20.0, 12.0), marks=pytest.mark.slow),
+        pytest.param(0.3, (35.0, -20.0), marks=pytest.mark.slow),
+    ],
+)
 def test_second_stars_are_survived(behind_focus, wave, ratio, offset):
     both = donut(behind_focus, FIELD, zernikes=wave) + ratio * donut(behind_focus, FIELD, zernikes=wave, shift=offset)
-    fit = pachon.fit_donuts(behind_focus, noisy(both, 500.0, 2)[None], [FIELD], WAVELENGTH, sky_variance=500.0, **OPTIONS)
+    fit = pachon.fit_donuts(
+        behind_focus, noisy(both, 500.0, 2)[None], [FIELD], WAVELENGTH, sky_variance=500.0, **OPTIONS
+    )
     assert fit.reasons == ["blended"]
     assert fit.companion[0, 0] == pytest.approx(ratio, abs=0.02)
     error = fit.zernikes[0] - wave[3:]
     assert rss(error) < 4.0 * rss(fit.errors[0])
 
 
+@pytest.mark.long
 def test_cosmic_rays_are_left_out(behind_focus, wave, clean):
     image = noisy(clean, 500.0, 3)
     image[20:50, 40] += 4000.0
@@ -119,6 +151,7 @@ def test_cosmic_rays_are_left_out(behind_focus, wave, clean):
     assert rss(fit.zernikes[0] - wave[3:]) < 2.0 * rss(fit.errors[0])
 
 
+@pytest.mark.long
 def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     sky = noisy(np.zeros_like(clean), 500.0, 5)
     not_finite = clean.copy()
@@ -151,7 +184,9 @@ def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     ]
     assert flag.TOO_FEW_PHOTONS & fit.flags[7]
     bad = ~fit.usable
-    assert np.isnan(fit.zernikes[bad]).all() and np.isnan(fit.fwhm[bad]).all() and np.isnan(fit.flux[bad]).all()
+    assert np.isnan(fit.zernikes[bad]).all()
+    assert np.isnan(fit.fwhm[bad]).all()
+    assert np.isnan(fit.flux[bad]).all()
 
 
 def test_no_light_passes_a_closed_telescope(behind_focus, clean):
@@ -167,7 +202,7 @@ def test_no_light_passes_a_closed_telescope(behind_focus, clean):
     assert fit.flags.tolist() == [pachon.DonutFlag.NO_LIGHT]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_degrees_of_freedom_of_all_donuts_together(focused):
     freedoms = pachon.load_degrees_of_freedom("lsst").select(
         ["M2_dz", "M2_dx", "M2_ry", "Camera_dz", "Camera_dy", "M1M3_B2", "M1M3_B6"]
@@ -198,14 +233,16 @@ def test_degrees_of_freedom_of_all_donuts_together(focused):
     error = estimate.values - values
     assert error @ np.linalg.solve(estimate.covariance, error) < 20.0  # 7 degrees of freedom; 1 in 200 beyond
     ratio, _ = estimate.combinations()
-    assert ratio[0] < 0.01 and (np.diff(ratio) >= 0.0).all() and ratio[-1] < 1.0
+    assert ratio[0] < 0.01
+    assert (np.diff(ratio) >= 0.0).all()
+    assert ratio[-1] < 1.0
     expected = [pachon.wavefront_zernikes(t, fields, WAVELENGTH, jmax=22).coefficients[:, 3:] for t in (focused, true)]
     assert rss(fit.zernikes - expected[1] + expected[0]) < 4.0 * rss(fit.errors)
     json.dumps(fit.summary())
     assert estimate.plot().axes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_double_zernikes_and_stars_in_focus(focused):
     """A wavefront that is linear over the field: donuts on both sides of focus, and a star in focus."""
     fields = np.deg2rad([[0.8, 0.0], [-0.8, 0.0], [0.0, 0.8], [0.3, 0.3]])
@@ -230,14 +267,18 @@ def test_double_zernikes_and_stars_in_focus(focused):
         defocus=defocus,
         noll=range(4, 12),
         field_noll=[1, 2, 3],
+        fwhm=0.0,
+        diffusion=PIXEL,
         **OPTIONS,
     )
     assert fit.double_zernikes.shape == (3, 8)
     error = (fit.double_zernikes - double[:, 3:]).ravel()
     assert error @ np.linalg.solve(fit.double_zernike_covariance, error) / error.size < 2.5
-    assert fit.images.shape == (4, SIZE, SIZE) and np.isnan(fit.images[3, -1, -1])
+    assert fit.images.shape == (4, SIZE, SIZE)
+    assert np.isnan(fit.images[3, -1, -1])
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean):
     images = np.stack([noisy(clean, 500.0, seed) for seed in range(3)])
     options = {"pixel_size": PIXEL, "sky_variance": 500.0, "noll": range(4, 12)}
@@ -247,11 +288,16 @@ def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean
     np.testing.assert_array_equal(many.model[1], one.model[0])
 
 
+@pytest.mark.long
 def test_tables_summaries_and_pictures(behind_focus, clean):
     images = np.stack([clean, np.full_like(clean, np.nan)])
-    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 2, WAVELENGTH, sky_variance=500.0, noll=range(4, 12), **OPTIONS)
+    fit = pachon.fit_donuts(
+        behind_focus, images, [FIELD] * 2, WAVELENGTH, sky_variance=500.0, noll=range(4, 12), **OPTIONS
+    )
     table = fit.to_table()
-    assert len(table) == 2 and table["Z4"].unit == "nm" and table["reasons"].tolist() == ["", "not finite"]
+    assert len(table) == 2
+    assert table["Z4"].unit == "nm"
+    assert table["reasons"].tolist() == ["", "not finite"]
     text = json.loads(json.dumps(fit.summary(), allow_nan=False))
     assert text["zernike_nm"][1] == [None] * 8
     np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
@@ -279,7 +325,14 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     ],
 )
 def test_bad_arguments(behind_focus, clean, changes, text):
-    arguments = {"images": clean[None], "fields": [FIELD], "wavelength": WAVELENGTH, "noll": [4], "sky_variance": 500.0, **OPTIONS}
+    arguments = {
+        "images": clean[None],
+        "fields": [FIELD],
+        "wavelength": WAVELENGTH,
+        "noll": [4],
+        "sky_variance": 500.0,
+        **OPTIONS,
+    }
     with pytest.raises((DomainError, ConfigError), match=text) as error:
         pachon.fit_donuts(behind_focus, **{**arguments, **changes})
     assert "\n" not in str(error.value)

@@ -26,11 +26,13 @@ def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, 
     return Stamp(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool), grid, rays)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.0, 200e-9])
 def test_image_is_that_of_brute_force(behind_focus, amplitude):
     wave = amplitude * np.array([1.0, -0.5, 0.7, 0.4, -0.6, 0.3, 0.2, -0.3])
-    expected = donut(behind_focus, FIELD, zernikes=[0.0, 0.0, 0.0, *wave], blur=1.3, shift=(0.3, -0.2), flux=1.0, rays=1200)
+    expected = donut(
+        behind_focus, FIELD, zernikes=[0.0, 0.0, 0.0, *wave], blur=1.3, shift=(0.3, -0.2), flux=1.0, rays=1200
+    )
     stamp = stamp_of(behind_focus, 60, blur=1.3 * PIXEL)
     model = model_image(stamp, np.array([1.0, 0.3, -0.2, 0.0, 0.0]), wave)
     # Bins of a quarter pixel, and one ray more or less in those on the rims.
@@ -38,6 +40,7 @@ def test_image_is_that_of_brute_force(behind_focus, amplitude):
     assert model.sum() == pytest.approx(expected.sum(), abs=1e-4)
 
 
+@pytest.mark.long
 def test_coarse_cells_give_the_image_of_fine_ones(behind_focus):
     wave = 200e-9 * np.array([1.0, -0.5, 0.7, 0.4, -0.6, 0.3, 0.2, -0.3])
     star = np.array([1.0, 0.3, -0.2, 0.0, 10.0])
@@ -46,6 +49,7 @@ def test_coarse_cells_give_the_image_of_fine_ones(behind_focus):
     np.testing.assert_allclose(coarse, fine, atol=6e-3 * fine.max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("companion", [(), (0.3, 12.0, -7.5)])
 def test_derivatives_are_central_differences(behind_focus, companion):
     stamp = stamp_of(behind_focus, 80, reach=60 * PIXEL if companion else 0.0)
@@ -67,6 +71,7 @@ def test_derivatives_are_central_differences(behind_focus, companion):
         assert np.linalg.norm(columns[..., k] * scales[k] - expected) < 2e-2 * np.linalg.norm(expected)
 
 
+@pytest.mark.long
 def test_gradient_is_that_of_the_loss(behind_focus):
     star, wave = np.array([1e6, 0.2, 0.1, 3.0, 9.0]), np.zeros(len(NOLL))
     image = model_image(stamp_of(behind_focus, 40), np.array([1.1e6, 0.0, 0.0, 0.0, 9.5]), wave + 20e-9)
@@ -93,4 +98,5 @@ def test_cells_measure_areas_and_moments(focused):
     # Mean square radius of the annulus: of the centroids plus that within the cells.
     square = cells.weights @ (x**2 + y**2 + cells.moments[:, 0, 0] + cells.moments[:, 1, 1])
     assert square == pytest.approx(0.5 * (radius**2 + inner**2), rel=2e-4)
-    assert abs(cells.weights @ x) < 1e-4 and abs(cells.weights @ y) < 1e-4
+    assert abs(cells.weights @ x) < 1e-4
+    assert abs(cells.weights @ y) < 1e-4
