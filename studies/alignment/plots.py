@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, plain_text, png_bytes, styled
 from .loop import Alignment
 
+#: Labels of logarithmic axes, as plain numbers.
+PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 # Donuts of a row of the picture: those of the eight halves.
 _ACROSS = 8
 
@@ -16,7 +19,7 @@ def quality_picture(found: Alignment) -> bytes:
     visit = np.arange(len(found.visits))
     designed = found.designed
     panels = (
-        ("wavefront added over the field [nm rms]", [1e9 * v.added for v in found.visits]),
+        ("wavefront added [nm rms]", [1e9 * v.added for v in found.visits]),
         ("FWHM added [mas]", [1e3 * (v.fwhm - designed.fwhm) for v in found.visits]),
         ("rms ellipticity [1e-3]", [1e3 * v.ellipticity for v in found.visits]),
     )
@@ -26,15 +29,22 @@ def quality_picture(found: Alignment) -> bytes:
         for axes, (label, values) in zip(every, panels, strict=True):
             axes.plot(visit, values, "o-", color=BLUE, markersize=3.0, linewidth=0.8, label="telescope")
             axes.set_ylabel(label)
-        every[0].set_yscale("log")
+        for axes in every[[0, 2]]:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(PLAIN)
+            axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         every[0].plot(visit, 1e9 * found.expected, color=ORANGE, label="expected from the covariance")
         every[0].axhline(1e9 * found.floor, color=GREY, linewidth=0.8, linestyle="--", label="floor")
-        every[1].set_yscale("symlog", linthresh=2.0)
+        every[1].set_yscale("symlog", linthresh=10.0)
+        every[1].yaxis.set_major_formatter(PLAIN)
         every[1].axhline(0.0, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
         every[2].axhline(1e3 * designed.ellipticity, color=GREY, linewidth=0.8, linestyle="--", label="as designed")
         for axes in every:
             axes.legend(fontsize=8)
+        every[1].set_ylim(bottom=-5.0)
         every[2].set_xlabel("visit")
+        every[2].xaxis.set_major_locator(MaxNLocator(integer=True))
         return png_bytes(figure)
 
 
