@@ -54,7 +54,7 @@ def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
     assert fit.flux[0] == pytest.approx(5e6, rel=1e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sign_and_size_are_those_of_the_opd(behind_focus):
     """A moved camera and a bent mirror: the difference of the coefficients of two telescopes."""
     # Less than 2 nm of it is beyond Z22.
