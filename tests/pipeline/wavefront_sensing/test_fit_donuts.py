@@ -336,3 +336,27 @@ def test_bad_arguments(behind_focus, clean, changes, text):
     with pytest.raises((DomainError, ConfigError), match=text) as error:
         pachon.fit_donuts(behind_focus, **{**arguments, **changes})
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.long
+def test_heights_of_ccds_and_several_wavelengths(behind_focus, clean):
+    """A CCD that stands 30 um too high is a detector 30 um farther, whichever argument says so."""
+    options = {"sky_variance": 500.0, "noll": range(4, 9), "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    plane = pachon.FocalPlane.flat("lsst").with_moved("R32", dz=30e-6).with_moved("R33", dz=30e-6)
+    higher, moved, colours = (
+        pachon.fit_donuts(behind_focus, clean[None], [FIELD], w, **{**options, **changes})
+        for w, changes in (
+            (WAVELENGTH, {"focal_plane": plane}),
+            (WAVELENGTH, {"defocus": 30e-6}),
+            ([560e-9, WAVELENGTH, 680e-9], {}),
+        )
+    )
+    np.testing.assert_allclose(higher.zernikes, moved.zernikes, atol=1e-10)
+    # 158 nm of Z4 for 10 um, as batoid has it.
+    nominal = pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, **options)
+    assert nominal.zernikes[0, 0] - higher.zernikes[0, 0] == pytest.approx(3 * 158e-9, rel=0.02)
+    # The LSST's focus differs by some micrometres over the r band.
+    assert rss(colours.zernikes - nominal.zernikes) < 60e-9
+    between = pachon.fields_at(behind_focus, [(0.0635, 0.0)], WAVELENGTH)  # two rafts
+    gap = pachon.fit_donuts(behind_focus, clean[None], between, WAVELENGTH, focal_plane=plane, **options)
+    assert gap.reasons == ["no light"]
