@@ -19,7 +19,6 @@ from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import parallel_rays
-from ...wavefront.chief_rays import image_jacobians
 from .donut_rays import chief_landing, landing_of, spread_of
 from .pupil_cells import PupilCells
 
@@ -63,7 +62,6 @@ class FreedomRays:
         self._cells, self._footprint = cells, footprint
         self.weights = np.outer(wavelength_weights, cells.weights).ravel()
         middle = float(wavelengths[len(wavelengths) // 2])
-        self.jacobian = image_jacobians(telescope, direction[None], middle, 1)[0]
         columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ at)
 
         def derivatives(wavelength: float, points: np.ndarray) -> np.ndarray:

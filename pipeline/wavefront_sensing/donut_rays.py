@@ -18,7 +18,7 @@ from ...models.telescope import Telescope
 from ...models.zernike_polynomials import annular_zernike_gradients
 from ...raytrace.rays import Rays, RayStatus, parallel_rays
 from ...raytrace.trace import trace
-from ...wavefront.chief_rays import JACOBIAN_STEP, image_jacobians
+from ...wavefront.chief_rays import JACOBIAN_STEP
 from .pupil_cells import PupilCells
 
 
@@ -26,7 +26,6 @@ class LightRays(Protocol):
     """Landing points of one star's light as functions of the unknowns of its wavefront."""
 
     weights: np.ndarray  #: fractions of the light of the points, [n]
-    jacobian: np.ndarray  #: of the chief ray, detector position by direction cosines [m], [2, 2]
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], detector x and y, shape [n, 2]."""
@@ -69,7 +68,6 @@ class ZernikeRays:
         self.weights = np.outer(wavelength_weights, cells.weights).ravel()
         middle = float(wavelengths[len(wavelengths) // 2])
         self._chief = chief_landing(telescope, direction, middle)
-        self.jacobian = image_jacobians(telescope, direction[None], middle, 1)[0]
         radius = 0.5 * telescope.pupil_diameter
         x, y = cells.points.T / radius
         terms = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)

@@ -20,7 +20,7 @@ from ...models.zernike_polynomials import noll_to_nm
 from ...raytrace.rays import field_direction
 from ...wavefront.request import relative_weights, wavelength_points
 from .degrees import FreedomEstimate, prior_spreads
-from .fit_star import StarFit, fit_star
+from .fit_star import SMALLEST_DONUT, StarFit, fit_star
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, RATIO, STRENGTH, X, Y
 from .joint import JointFit, field_terms, fit_field, fit_freedoms
@@ -261,7 +261,7 @@ def _fit_one(
     except DomainError:
         return StarFit(DonutFlag.NO_LIGHT)
     pixels = Pixels(np.where(masked, 0.0, image), variance, ~masked)
-    wavefront = not joint or light.diameter > 24.0 * instrument.pixel
+    wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
     return fit_star(instrument, light, pixels, strength=strength, fixed_strength=fixed_strength, wavefront=wavefront)
 
 

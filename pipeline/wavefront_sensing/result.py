@@ -134,7 +134,7 @@ class DonutFit:
         """Return one row a donut, with units: field, flags, Zernikes and their errors, and the star's own unknowns."""
         table = QTable()
         table["field_x"], table["field_y"] = np.rad2deg(self.fields).T * u.deg
-        table["flags"], table["reasons"] = self.flags, self.reasons
+        table["flags"], table["reasons"] = self.flags, [reasons or "ok" for reasons in self.reasons]
         table["flux"], table["flux_err"] = self.flux * u.electron, self.flux_error * u.electron
         for axis, name in enumerate("xy"):
             table[name], table[f"{name}_err"] = self.center[:, axis] * u.pix, self.center_error[:, axis] * u.pix

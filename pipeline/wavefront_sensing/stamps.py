@@ -100,6 +100,8 @@ def match_template(image: np.ndarray, used: np.ndarray, variance: np.ndarray, te
     score = np.where(enough, product / np.sqrt(np.where(enough, overlap, 1.0)), -np.inf)
     row, column = np.unravel_index(int(np.argmax(score)), score.shape)
     flux = float(product[row, column] / overlap[row, column])
-    noise = np.sqrt(float(np.mean(variance)) + max(flux, 0.0) * float((template**2).sum() / template.sum()))
+    # Of the sky and of the star's own light, by the pixels of the template; an image without either has none.
+    own = max(flux, 0.0) * float((template**2).sum() / template.sum())
+    noise = np.sqrt(max(float(np.mean(variance)) + own, 1e-30))
     ny, nx = image.shape
     return Match(float(column - nx + 1), float(row - ny + 1), flux, float(score[row, column] / noise))

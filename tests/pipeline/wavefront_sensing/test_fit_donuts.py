@@ -50,11 +50,11 @@ def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
     )
     assert fit.reasons == [""]
     assert rss(fit.zernikes[0] - wave[3:]) < 2e-9
-    np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=2e-3)
+    np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=4e-3)
     assert fit.flux[0] == pytest.approx(5e6, rel=1e-3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sign_and_size_are_those_of_the_opd(behind_focus):
     """A moved camera and a bent mirror: the difference of the coefficients of two telescopes."""
     # Less than 2 nm of it is beyond Z22.
@@ -297,7 +297,7 @@ def test_tables_summaries_and_pictures(behind_focus, clean):
     table = fit.to_table()
     assert len(table) == 2
     assert table["Z4"].unit == "nm"
-    assert table["reasons"].tolist() == ["", "not finite"]
+    assert table["reasons"].tolist() == ["ok", "not finite"]
     text = json.loads(json.dumps(fit.summary(), allow_nan=False))
     assert text["zernike_nm"][1] == [None] * 8
     np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
@@ -336,3 +336,27 @@ def test_bad_arguments(behind_focus, clean, changes, text):
     with pytest.raises((DomainError, ConfigError), match=text) as error:
         pachon.fit_donuts(behind_focus, **{**arguments, **changes})
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.long
+def test_heights_of_ccds_and_several_wavelengths(behind_focus, clean):
+    """A CCD that stands 30 um too high is a detector 30 um farther, whichever argument says so."""
+    options = {"sky_variance": 500.0, "noll": range(4, 9), "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    plane = pachon.FocalPlane.flat("lsst").with_moved("R32", dz=30e-6).with_moved("R33", dz=30e-6)
+    higher, moved, colours = (
+        pachon.fit_donuts(behind_focus, clean[None], [FIELD], w, **{**options, **changes})
+        for w, changes in (
+            (WAVELENGTH, {"focal_plane": plane}),
+            (WAVELENGTH, {"defocus": 30e-6}),
+            ([560e-9, WAVELENGTH, 680e-9], {}),
+        )
+    )
+    np.testing.assert_allclose(higher.zernikes, moved.zernikes, atol=1e-10)
+    # 158 nm of Z4 for 10 um, as batoid has it.
+    nominal = pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, **options)
+    assert nominal.zernikes[0, 0] - higher.zernikes[0, 0] == pytest.approx(3 * 158e-9, rel=0.02)
+    # The LSST's focus differs by some micrometres over the r band.
+    assert rss(colours.zernikes - nominal.zernikes) < 60e-9
+    between = pachon.fields_at(behind_focus, [(0.0635, 0.0)], WAVELENGTH)  # two rafts
+    gap = pachon.fit_donuts(behind_focus, clean[None], between, WAVELENGTH, focal_plane=plane, **options)
+    assert gap.reasons == ["no light"]

@@ -11,6 +11,7 @@ from pachon.pipeline.wavefront_sensing.pupil_cells import pupil_cells
 from pachon.pipeline.wavefront_sensing.seeing import Seeing
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm
+from pachon.wavefront.chief_rays import image_jacobians
 
 NOLL = np.arange(4, 12)
 FIELD = np.deg2rad([1.2, 0.4])
@@ -20,8 +21,9 @@ def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, 
     direction = field_direction(*FIELD)
     cells = pupil_cells(tel, direction, WAVELENGTH, across)
     rays = ZernikeRays(tel, direction, np.array([WAVELENGTH]), np.ones(1), cells, NOLL)
+    jacobian = image_jacobians(tel, direction[None], WAVELENGTH)[0]
     seeing = Seeing(WAVELENGTH, outer_scale)
-    grid = ImageGrid((size, size), PIXEL, PIXEL, seeing, rays.jacobian, blur, rays.footprint, 1, reach)
+    grid = ImageGrid((size, size), PIXEL, PIXEL, seeing, jacobian, blur, rays.footprint, 1, reach)
     image = np.zeros((size, size)) if image is None else image
     return Stamp(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool), grid, rays)
 
