@@ -20,10 +20,12 @@ from typer import Option
 from ..core.errors import PachonError
 from ..core.version import VERSION
 from . import (
+    align,
     baseline,
     camera,
     design,
     diagnostics,
+    donuts,
     images,
     measure,
     model,
@@ -106,6 +108,7 @@ for _group in (
     model,
     visits,
     stack_images,
+    donuts,
     reproduce,
     diagnostics,
     study,
@@ -114,6 +117,7 @@ for _group in (
     design,
     camera,
     shim,
+    align,
     telescope,
 ):
     app.add_typer(_group.app)

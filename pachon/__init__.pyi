@@ -75,6 +75,7 @@ from .models.aperture import Union as Union
 from .models.aperture import Vane as Vane
 from .models.camera.camera import Camera as Camera
 from .models.camera.camera import lsst_camera as lsst_camera
+from .models.camera.corner_rafts import corner_focal_plane as corner_focal_plane
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
 from .models.camera.height_statistics import HeightStatistics as HeightStatistics
@@ -163,6 +164,12 @@ from .pipeline.sensor.brighter_fatter import brighter_fatter as brighter_fatter
 from .pipeline.sensor.displacement import EdgeRolloff as EdgeRolloff
 from .pipeline.sensor.displacement import TreeRings as TreeRings
 from .pipeline.sensor.displacement import displace_stamps as displace_stamps
+from .pipeline.simulate.donuts import Donuts as Donuts
+from .pipeline.simulate.donuts import draw_donuts as draw_donuts
+from .pipeline.wavefront_sensing.degrees import FreedomEstimate as FreedomEstimate
+from .pipeline.wavefront_sensing.fit import fit_donuts as fit_donuts
+from .pipeline.wavefront_sensing.flags import DonutFlag as DonutFlag
+from .pipeline.wavefront_sensing.result import DonutFit as DonutFit
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus
@@ -175,6 +182,10 @@ from .sky.galaxies import Galaxies as Galaxies
 from .sky.mosaic import GalaxyStamps as GalaxyStamps
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
+from .studies.alignment.config import AlignConfig as AlignConfig
+from .studies.alignment.config import load_align_configuration as load_align_configuration
+from .studies.alignment.loop import Alignment as Alignment
+from .studies.alignment.loop import align as align
 from .studies.baseline.baseline import check_baseline as check_baseline
 from .studies.baseline.baseline import make_baseline as make_baseline
 from .studies.baseline.check import BaselineCheck as BaselineCheck
@@ -196,6 +207,8 @@ from .testing import assert_matches_baseline as assert_matches_baseline
 from .wavefront.aberration import ResidualWavefront as ResidualWavefront
 from .wavefront.atmosphere.atmosphere import Atmosphere as Atmosphere
 from .wavefront.chief_rays import fields_at as fields_at
+from .wavefront.corner_stars import CornerStars as CornerStars
+from .wavefront.corner_stars import corner_stars as corner_stars
 from .wavefront.opd import wavefront_opd as wavefront_opd
 from .wavefront.opd import wavefront_opds as wavefront_opds
 from .wavefront.opd_map import OpdMap as OpdMap

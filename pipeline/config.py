@@ -112,6 +112,9 @@ class ActiveOpticsConfig(Section):
     residual_um: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=2)] = Field(
         0.0, description="rms of the wavefront left over, over pupil and field [um]"
     )
+    states: str | None = Field(
+        None, description="table of states of the telescope (pachon align), of which that of the epoch is taken"
+    )
 
 
 class DetectorConfig(Section):

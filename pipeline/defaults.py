@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from pydantic import BaseModel
 
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, error_context
 from ..core.schema import shown
 from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera, load_camera
@@ -24,6 +24,8 @@ from ..models.site import Site
 from ..models.telescope import Telescope
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
+from .alignment_states import ENDINGS as STATE_ENDINGS
+from .alignment_states import in_state
 from .config import BandName, Configuration
 from .psf_model.fit import COMPONENTS, ORDERS
 from .psf_model.polynomial import term_count
@@ -75,6 +77,9 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if plane.heights is not None:
         heights = _absolute(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
         plane = plane.model_copy(update={"heights": heights})
+    active = config.active_optics
+    if active.states is not None:
+        active = active.model_copy(update={"states": _absolute(active.states, folder, (), STATE_ENDINGS)})
     site = load_site(site_name)
     wavelengths = config.wavelengths_nm
     if wavelengths is None:
@@ -87,6 +92,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "ccds": chosen_ccds(camera, DEFAULT_CCDS if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
             "focal_plane": plane,
+            "active_optics": active,
             "atmosphere": _filled(
                 atmosphere.model_copy(update={"site": site_name}),
                 {"r0_m": float(site.r0), "outer_scale_m": float(site.outer_scale)},
@@ -113,8 +119,13 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
 
 
 def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
-    """Return a telescope with the changes and the rotator angle of a configuration."""
-    return apply_changes(telescope, config.changes).with_rotator(math.radians(config.rotator_deg))
+    """Return a telescope with the changes, the state of the visit and the rotator angle of a configuration."""
+    telescope = apply_changes(telescope, config.changes)
+    states = config.active_optics.states
+    if states is not None:
+        with error_context(key="active_optics.states"):
+            telescope = in_state(telescope, states, config.atmosphere.epoch)
+    return telescope.with_rotator(math.radians(config.rotator_deg))
 
 
 def noise_free_components(config: Configuration) -> int:

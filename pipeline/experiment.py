@@ -34,6 +34,7 @@ from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
 from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
+from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
@@ -227,6 +228,7 @@ class Experiment:
         name = given(self.config.telescope)
         content["telescope"] = name if name in bundled_names() else prescription_digest(name)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
+        content["active_optics"] = hashed_states(content["active_optics"])
         content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())
         return digest(content)
 
@@ -239,6 +241,13 @@ def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
     name = section["heights"]
     rest = {key: value for key, value in section.items() if key != "heights"}
     return rest if name is None else rest | {"heights": _name_or_content(name, tuple(AS_MEASURED), HEIGHT_ENDINGS)}
+
+
+def hashed_states(section: dict[str, Any]) -> dict[str, Any]:
+    """Return the section of the active optics for a hash, as :func:`hashed_heights` does that of the focal plane."""
+    name = section["states"]
+    rest = {key: value for key, value in section.items() if key != "states"}
+    return rest if name is None else rest | {"states": _name_or_content(name, (), STATE_ENDINGS)}
 
 
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:

@@ -174,6 +174,27 @@ class ResidualWavefront:
         return terms(3 + len(self.coefficients), px / radius, py / radius, self.pupil_obscuration)[3:]
 
 
+@dataclass(frozen=True, eq=False)
+class StarWavefronts(ResidualWavefront):
+    """An aberration of its own for each star; a field has that of the star nearest to it.
+
+    Attributes
+    ----------
+    stars : ndarray, shape [n_star, n_term]
+        Coefficients of each star, as those of a :class:`ResidualWavefront`.
+    slopes : ndarray, shape [n_star, 2]
+        Field slopes of the stars [rad].
+    """
+
+    stars: np.ndarray = field(default_factory=lambda: np.zeros((1, 0)))
+    slopes: np.ndarray = field(default_factory=lambda: np.zeros((1, 2)))
+
+    def at(self, slopes: ArrayLike) -> np.ndarray:
+        """Return the coefficients [m] at field slopes [..., 2] of the light's travel, shape [..., n_term]."""
+        apart = np.asarray(slopes, dtype=np.float64)[..., None, :] - self.slopes
+        return np.asarray(self.stars[np.argmin((apart**2).sum(axis=-1), axis=-1)])
+
+
 def _combined(coefficients: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """Return the sum of the terms, always in the same order: a star's bytes must not depend on its neighbours."""
     total = np.zeros(coefficients.shape[:-1] + basis.shape[1:])

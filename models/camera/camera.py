@@ -127,7 +127,53 @@ def lsst_camera() -> Camera:
     )
 
 
-CAMERAS = {"lsst": lsst_camera}
+#: Centres of the sensors of raft R00 of the LSST camera [m]; the other corners are quarter turns of it.
+_CORNER_SENSORS = {
+    "SG0": (-212.238e-3, -258.738e-3),
+    "SG1": (-258.738e-3, -212.238e-3),
+    "SW0": (-214.25e-3, -202.6272e-3),
+    "SW1": (-214.25e-3, -225.8728e-3),
+}
+#: Corner rafts, and the quarter turns from +x towards +y that bring R00 there.
+_CORNER_RAFTS = {"R00": 0, "R04": 1, "R40": 3, "R44": 2}
+
+
+def _corner_camera(name: str, sensors: tuple[str, ...], pixels: int) -> Camera:
+    """Return the sensors of the corner rafts of the LSST camera whose names in their raft are given."""
+    centers = []
+    for turns in _CORNER_RAFTS.values():
+        for sensor in sensors:
+            x, y = _CORNER_SENSORS[sensor]
+            for _ in range(turns):
+                x, y = -y, x
+            centers.append((x, y))
+    return Camera(
+        name=name,
+        ccd_names=tuple(f"{raft}_{sensor}" for raft in _CORNER_RAFTS for sensor in sensors),
+        raft_names=tuple(_CORNER_RAFTS),
+        raft_index=np.repeat(np.arange(len(_CORNER_RAFTS)), len(sensors)),
+        centers=np.array(centers),
+        pixels=pixels,
+        pixel_size=10e-6,
+    )
+
+
+@lru_cache(maxsize=1)
+def lsst_wavefront_camera() -> Camera:
+    """Return the wavefront sensors of the LSST camera, R00_SW0 to R44_SW1.
+
+    CCDs of a camera are square: of each half of 2000 x 4072 pixels these are the middle 2000 x 2000.
+    """
+    return _corner_camera("lsst_wavefront", ("SW0", "SW1"), 2000)
+
+
+@lru_cache(maxsize=1)
+def lsst_guider_camera() -> Camera:
+    """Return the guiders of the LSST camera, R00_SG0 to R44_SG1: of 4072 x 4000 pixels the middle 4000 x 4000."""
+    return _corner_camera("lsst_guider", ("SG0", "SG1"), 4000)
+
+
+CAMERAS = {"lsst": lsst_camera, "lsst_wavefront": lsst_wavefront_camera, "lsst_guider": lsst_guider_camera}
 
 
 def load_camera(camera: str | Camera) -> Camera:

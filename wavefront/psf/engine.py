@@ -20,6 +20,7 @@ from ..aberration import ResidualWavefront
 from ..atmosphere.atmosphere import Atmosphere
 from ..pupil_optics import PupilOptics, trace_pupils
 from .channels import Channels
+from .far_from_focus import check_stamp
 from .image_plane import ImagePlane, focal_length
 
 #: Options of :class:`PsfInputs` that some engines take.
@@ -69,6 +70,25 @@ class Exposed(NamedTuple):
     draw: Callable[[np.ndarray | None], np.ndarray]
     lit_fraction: np.ndarray
     reference_point: np.ndarray
+
+
+def expose_apart(
+    kinds: np.ndarray, expose: Callable[[int, np.ndarray, np.ndarray], Exposed], fields: np.ndarray, offsets: np.ndarray
+) -> Exposed:
+    """Carry stars of several kinds [n_star] to the focal plane: ``expose`` takes a kind, its fields and offsets."""
+    groups = [np.flatnonzero(kinds == kind) for kind in np.unique(kinds)]
+    parts = [expose(int(kinds[stars[0]]), fields[stars], offsets[stars]) for stars in groups]
+    order = np.argsort(np.concatenate(groups))
+
+    def draw(shift: np.ndarray | None) -> np.ndarray:
+        shifts = [None if shift is None else shift[stars] for stars in groups]
+        return np.concatenate([part.draw(moved) for part, moved in zip(parts, shifts, strict=True)])[order]
+
+    return Exposed(
+        draw,
+        np.concatenate([part.lit_fraction for part in parts])[order],
+        np.concatenate([part.reference_point for part in parts])[order],
+    )
 
 
 class PsfEngine(ABC):
@@ -125,7 +145,7 @@ class PsfEngine(ABC):
 
     def _trace(self, fields: np.ndarray, pupil: np.ndarray, threads: int | None) -> PupilOptics:
         given = self._inputs
-        return given.trace(
+        optics = given.trace(
             self._telescope,
             fields,
             self._wavelengths,
@@ -135,6 +155,8 @@ class PsfEngine(ABC):
             threads=threads,
             aberration=given.aberration,
         )
+        check_stamp(optics, given.plane)
+        return optics
 
     def _direction(self, fields: np.ndarray) -> np.ndarray:
         """Return directions in which the light of stars travels, shape [n_star, 3]."""

@@ -32,7 +32,8 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.layer_screens import SLOPE_LAG
 from ..atmosphere.turbulence import coherence, diffraction_otf, slope_variance, structure_function
 from ..pupil_optics import PupilOptics
-from .engine import Exposed, PsfEngine, PsfInputs, metric_of
+from .engine import Exposed, PsfEngine, PsfInputs, expose_apart, metric_of
+from .far_from_focus import finer_sampling
 from .fast_kernels import combine_wavelengths, deposit_rays
 from .image_plane import square_transfer
 from .pupil_lattice import PupilLattice
@@ -47,6 +48,9 @@ GRID_MARGIN, GRID_MARGIN_STILL = 2.0, 1.25
 #: Cells per pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
 #: the mean over many rays; an undisturbed spot may be no larger than one cell of a quarter of a pixel.
 OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
+#: Distance on the CCD of the rays of neighbouring pupil points [pixels], with and without an atmosphere, beyond which a
+#: star counts as far from focus and is drawn with more points, and the largest that it then has.
+RAY_DISTANCE, RAY_DISTANCE_STILL = (1.0, 0.25), (0.25, 0.125)
 # Stars of one batch, fewer where their grids would fill more than this many bytes.
 _BATCH, _BATCH_BYTES = 128, 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 3e-6.
@@ -74,8 +78,9 @@ class FastPsfEngine(PsfEngine):
     options = ("n_pupil", "oversampling")
     screens = ("slopes",)
 
-    def __init__(self, inputs: PsfInputs) -> None:
+    def __init__(self, inputs: PsfInputs, finer: int = 1) -> None:
         super().__init__(inputs)
+        self._finer = finer
         still, n_pupil, oversampling = inputs.atmosphere is None, inputs.n_pupil, inputs.oversampling
         if n_pupil is None:
             n_pupil = PUPIL_POINTS_STILL if still else PUPIL_POINTS
@@ -87,7 +92,7 @@ class FastPsfEngine(PsfEngine):
         self._make_grid()
         self._filter_step, self._filter = self._filter_table()
         n_time = 1 if inputs.atmosphere is None else len(inputs.atmosphere.times)
-        self._turns = self._channels.turns(n_time, -(-len(self._lattice.points) // LANES))
+        self._turns = self._channels.turns(n_time, -(-len(self._points) // LANES))
         if inputs.atmosphere is None:
             self._slopes, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
         else:
@@ -110,7 +115,8 @@ class FastPsfEngine(PsfEngine):
                     f"screen_length = {self._atmosphere.screen_length!r}: expected screens wider than the pupil,"
                     f" {diameter} m"
                 )
-        self._lattice = PupilLattice.fill(diameter, obscuration, spacing)
+        self._lattice = PupilLattice.fill(diameter, obscuration, spacing / self._finer)
+        self._points = self._lattice.points
         self._weights = self._lattice.weights(diameter, obscuration)
 
     def _make_grid(self) -> None:
@@ -134,14 +140,36 @@ class FastPsfEngine(PsfEngine):
         baseline = np.linspace(0.0, longest, _TABLE_SIZE)
         otf = diffraction_otf(baseline, self._diameter, self._obscuration)
         table = np.repeat(otf[None], len(self._wavelengths), axis=0)
-        atmosphere = self._atmosphere
-        if atmosphere is not None:
-            rest = rest_structure_function(baseline, atmosphere.r0, atmosphere.outer_scale, atmosphere.cutoff)
+        rest = self._rest(baseline)
+        if rest is not None:
             table *= coherence(rest, self._wavelengths[:, None])
         return float(baseline[1]), table[self._channels.wave].astype(np.float32)
 
+    def _rest(self, baseline: np.ndarray) -> np.ndarray | None:
+        """Return the structure function of the air beside that of the rays [m^2] at baselines [m], if any."""
+        air = self._atmosphere
+        return None if air is None else rest_structure_function(baseline, air.r0, air.outer_scale, air.cutoff)
+
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
-        optics = self._trace(fields, self._lattice.points, self._threads)
+        optics = self._trace(fields, self._points, self._threads)
+        if self._inputs.n_pupil is None:
+            pixel = self._plane.pixel_size
+            largest, wanted = RAY_DISTANCE_STILL if self._atmosphere is None else RAY_DISTANCE
+            neighbour = 2.0 * self._lattice.spacing / self._diameter
+            finer = finer_sampling(optics, neighbour, largest * pixel, wanted * pixel)
+            if (finer > 1).any():
+                return expose_apart(finer, self._expose_finer, fields, offsets)
+        return self._expose_traced(optics, offsets)
+
+    def _expose_finer(self, finer: int, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        """Carry stars to the focal plane, with pupil points so many times closer."""
+        return FastPsfEngine(self._inputs, finer).expose_as_set(fields, offsets)
+
+    def expose_as_set(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        """Carry stars to the focal plane with this engine's own pupil points, however far from focus they are."""
+        return self._expose_traced(self._trace(fields, self._points, self._threads), offsets)
+
+    def _expose_traced(self, optics: PupilOptics, offsets: np.ndarray) -> Exposed:
         light = optics.lit * self._weights
         deposit = self._deposit(optics, light)
         # One transform a star, so that its bytes do not depend on its neighbours.
@@ -175,14 +203,17 @@ class FastPsfEngine(PsfEngine):
         if atmosphere is None:
             pixel, screen_size, n_layer = 1.0, 1, 0
             start, step = np.zeros((n_star, 1, 2)), np.zeros((1, 2))
+            column = row = np.zeros(len(self._points), dtype=np.int64)
         else:
             pixel, screen_size = atmosphere.screen_pixel, atmosphere.screen_size
             n_layer = atmosphere.layer_count
             start = (
                 atmosphere.pupil_centers(self._direction(optics.fields), atmosphere.times[0]) + self._lattice.origin
             ) / pixel
+            # Points that share a sample of the screens stand around it.
+            start += 0.5 * (1.0 - math.gcd(self._stride, self._finer) / self._finer)
             step = -atmosphere.velocities * (atmosphere.exposure / len(atmosphere.times)) / pixel
-        column, row = self._lattice.column * self._stride, self._lattice.row * self._stride
+            column, row = (line * self._stride // self._finer for line in (self._lattice.column, self._lattice.row))
         lattice = to_packets(row * screen_size + column, np.int32)
         # Rays that were lost have no place to land; they carry no light either.
         lit = optics.lit[:, self._channels.wave, :, None]

@@ -18,6 +18,8 @@ smoothly when the telescope is perturbed. A strip along a rim is as wide as half
 is that of its middle, to first order.
 
 In silicon the rays of a wavelength land at several depths, and their waves are added up before the strips are cut off.
+
+Stars far from focus, donuts, are left to the dense rays of :mod:`.mean_rays`.
 """
 
 from __future__ import annotations
@@ -33,8 +35,9 @@ from ...core.warp_arrays import warp_array
 from ..atmosphere.turbulence import coherence, diffraction_otf, structure_function
 from ..pupil_optics import PupilOptics
 from .clear_pupil import SpokePupil, clear_edges
-from .engine import Exposed, PsfEngine, PsfInputs, metric_of
+from .engine import Exposed, PsfEngine, PsfInputs, expose_apart, metric_of
 from .long_exposure_kernels import place_points, sample_pixels, transform_pupils
+from .mean_rays import MeanRaysEngine, ray_counts
 from .sample_packets import LANES, samples
 
 #: Pupil points by default: 16 spokes of 5 rings.
@@ -151,6 +154,19 @@ class LongExposureEngine(PsfEngine):
 
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
         optics = self._trace(fields, self._pupil.points, self._threads)
+        if self._inputs.n_pupil is None:
+            rays = ray_counts(optics, self._plane.pixel_size)
+            if rays.any():
+                return expose_apart(rays, self._expose_far, fields, offsets)
+        return self._expose_near(optics, offsets)
+
+    def _expose_far(self, rays: int, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
+        """Carry stars far from focus to the focal plane by so many rays; at 0 stars near focus."""
+        if rays:
+            return MeanRaysEngine(self._inputs, rays).expose_as_set(fields, offsets)
+        return self._expose_near(self._trace(fields, self._pupil.points, self._threads), offsets)
+
+    def _expose_near(self, optics: PupilOptics, offsets: np.ndarray) -> Exposed:
         # Apertures cut every wavelength alike but for 3e-4 of the light at the very edge of the LSST's field.
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
         direction = self._direction(optics.fields)

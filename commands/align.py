@@ -1,0 +1,110 @@
+"""The command ``pachon align``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from .interrupt import interruptible
+from .options import Json, Quiet, Threads
+from .tables import Rows, print_json
+
+app = typer.Typer()
+_CAPTION = "Root mean squares over pupil and field; late: the second half of the visits."
+
+
+@app.command("align")
+def align_command(
+    config: Annotated[Path | None, Argument(metavar="CONFIG.yaml", help="Configuration; all has a default.")] = None,
+    visits: Annotated[int | None, Option("--visits", "-n", min=1, help="Number of visits; 20 by default.")] = None,
+    heights: Annotated[str | None, Option(help="Heights of the wavefront sensors: nominal or lsstcam.")] = None,
+    believed_heights: Annotated[
+        str | None, Option(help="Heights that the estimate takes them to have; by default the true ones.")
+    ] = None,
+    gain: Annotated[
+        float | None, Option(help="Fraction of the estimated state that is corrected; 1 by default.")
+    ] = None,
+    seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_align"),
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Keep a telescope aligned by the donuts of its corner rafts, visit after visit.
+
+    Fifty degrees of freedom are off at first and drift. In each visit the eight halves of the wavefront sensors image a
+    star each, through turbulence and with noise; Zernikes are fitted to the donuts, the state is estimated and
+    corrected. Tables of visits, states and estimates (ECSV), summary.json, pictures and the configuration go into one
+    folder. A visit takes some five seconds; a loop is not resumed.
+
+    **Examples**
+
+    - `pachon align`: 20 visits, two minutes
+    - `pachon align -n 100 --heights lsstcam --believed-heights nominal -o ignored`: sensors as built, taken as nominal
+    - `pachon align my_loop.yaml`, where my_loop.yaml may read
+
+        visits: 50
+        errors: {initial: 3, gravity: 0.2}
+        donuts: {electrons: 1e6, second_stars: 0.14}
+        control: {gain: 0.7}
+    """
+    from ..core.files import make_folder
+    from ..pipeline.config import with_options
+    from ..studies.alignment.config import AlignConfig, load_align_configuration
+    from ..studies.alignment.loop import align
+    from ..studies.alignment.product import alignment_summary, write_alignment
+
+    base = AlignConfig() if config is None else load_align_configuration(config)
+    settings = with_options(
+        base,
+        visits=visits,
+        donuts__heights=heights,
+        donuts__believed_heights=believed_heights,
+        control__gain=gain,
+        seed=seed,
+    )
+    make_folder(out)
+    folder = None if config is None else config.parent
+    with interruptible(quiet) as reporter:
+        found = align(settings, folder=folder, threads=threads, reporter=reporter)
+    write_alignment(found, out)
+    summary = alignment_summary(found)
+    if as_json:
+        print_json(summary)
+        return
+    if not quiet:
+        _show(summary)
+    print(f"alignment: {out.resolve()}")
+
+
+def _show(summary: dict[str, Any]) -> None:
+    rows = [
+        (
+            "as designed",
+            f"{summary['designed_wavefront_nm']:.0f}",
+            "0",
+            "0.0",
+            f"{1e3 * summary['designed_rms_e']:.2f}",
+        ),
+        ("floor", f"{summary['floor_wavefront_nm']:.0f}", f"{summary['floor_added_nm']:.0f}", "", ""),
+        (
+            "late visits",
+            f"{summary['late_wavefront_nm']:.0f}",
+            f"{summary['late_added_nm']:.0f}",
+            f"{summary['late_fwhm_added_mas']:.1f}",
+            f"{1e3 * summary['late_rms_e']:.2f}",
+        ),
+        (
+            "worst late visit",
+            f"{summary['late_worst_wavefront_nm']:.0f}",
+            f"{summary['late_worst_added_nm']:.0f}",
+            "",
+            "",
+        ),
+    ]
+    Rows(("", "wavefront [nm]", "added [nm]", "FWHM added [mas]", "rms e [1e-3]"), rows, _CAPTION).show()
+    first = summary["first_visit_within_1.2_floors"]
+    print("not within 1.2 times the floor" if first is None else f"within 1.2 times the floor from visit {first} on")

@@ -1,0 +1,150 @@
+"""The command ``pachon donuts``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer import Argument, Option
+
+from ..core.errors import ConfigError
+from .inputs import load_model
+from .interrupt import interruptible
+from .options import Json, Projection, Quiet, Threads, degrees_pair, picture_kind, wavelength_list
+from .tables import Rows, print_json
+
+if TYPE_CHECKING:
+    from ..pipeline.wavefront_sensing.result import DonutFit
+
+app = typer.Typer()
+
+_CAPTION = (
+    "Wavefront beyond the telescope's own: root of the summed squares of the Zernikes, and its error; the largest "
+    "terms. Positive where the wavefront leads."
+)
+
+
+@app.command("donuts")
+def donuts_command(
+    files: Annotated[list[Path], Argument(metavar="FILE.fits ...", help="Stamps of donuts, or images of CCDs.")],
+    telescope: Annotated[str, Option("--telescope", "-t", help="Bundled model, or path.")] = "lsst_v3.3_r",
+    defocus_um: Annotated[
+        float, Option(help="Shift of the detector along z [um], beside that in the file: 1500 behind the LSST's focus.")
+    ] = 0.0,
+    wavelength_nm: Annotated[
+        list[float] | None,
+        Option("--wavelength-nm", help="Wavelength [nm], once for each; the model's own by default."),
+    ] = None,
+    field_deg: Annotated[
+        str | None, Option("--field-deg", metavar="X,Y", help="Field angle of all stamps [deg], where files have none.")
+    ] = None,
+    positions: Annotated[
+        Path | None, Option(help="Table with field_x, field_y [deg], and for the image of a CCD x, y [pixels].")
+    ] = None,
+    stamp: Annotated[int, Option(min=16, help="Side of the stamps cut from the image of a CCD [pixels].")] = 180,
+    pixel_um: Annotated[float, Option(help="Side of a pixel [um].")] = 10.0,
+    gain: Annotated[float, Option(help="Electrons per unit of the images.")] = 1.0,
+    sky_variance: Annotated[
+        float | None, Option(help="Variance of sky and readout [electron^2]; from the edges of the stamps by default.")
+    ] = None,
+    saturation: Annotated[float | None, Option(help="Level of saturated pixels [electrons].")] = None,
+    terms: Annotated[int, Option("--zernikes", min=4, max=78, help="Highest Noll index.")] = 22,
+    higher_order_nm: Annotated[float, Option(help="Rms of each Zernike of the next radial degree [nm].")] = 10.0,
+    degrees_of_freedom: Annotated[
+        str | None, Option(help="Fit degrees of freedom to all donuts: lsst, or a YAML file.")
+    ] = None,
+    outer_scale_m: Annotated[float, Option(help="Outer scale of the turbulence [m]; inf for Kolmogorov's.")] = 25.0,
+    projection: Projection = "zemax",
+    out: Annotated[Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.")] = None,
+    picture: Annotated[Path | None, Option(help="Picture of the first six donuts: .png, .pdf or .svg.")] = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Measure the wavefront of out-of-focus stars (donuts): annular Zernikes beyond those of the telescope.
+
+    A file holds a cube of stamps and a table with their fields (field_x, field_y [deg], defocus_um), one stamp an
+    extension with keywords FIELD_X, FIELD_Y and DEFOC_UM, or the image of a CCD, with --positions. Stamps have x and y
+    along those of the detector, and no sky. Bad donuts are flagged with the reason.
+
+    **Examples**
+
+    - `pachon donuts donuts.fits --defocus-um 1500 -o wavefronts.ecsv --picture donuts.png`
+    - `pachon donuts corner_*.fits -t rubin_v3.14_i --degrees-of-freedom lsst --json`
+    - `pachon donuts ccd.fits --positions stars.ecsv --stamp 200 --defocus-um -1500`
+    """
+    import numpy as np
+
+    from ..core.files import write_bytes
+    from ..core.plotting import picture_bytes
+    from ..core.table_files import FORMATS, write_table
+    from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+    from ..pipeline.wavefront_sensing.fit import fit_donuts
+    from ..pipeline.wavefront_sensing.stamp_files import border_variance, read_stamps
+
+    kind = picture_kind(picture)
+    if out is not None and out.suffix.lower() not in FORMATS:
+        raise ConfigError(f"--out = {out}: expected a name that ends in {', '.join(FORMATS)}")
+    model = load_model(telescope)
+    freedoms = None if degrees_of_freedom is None else load_degrees_of_freedom(degrees_of_freedom)
+    given = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
+    images, fields, defocus = [], [], []
+    for path in files:
+        stamps = read_stamps(path, positions, stamp)
+        places = given if stamps.fields is None else stamps.fields
+        if places is None:
+            raise ConfigError(
+                "no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg", file=path
+            )
+        images += [gain * image for image in stamps.images]
+        fields.append(np.broadcast_to(places, (len(stamps), 2)))
+        defocus.append(stamps.defocus + 1e-6 * defocus_um)
+    variance = [border_variance(image) for image in images] if sky_variance is None else sky_variance
+    with (
+        interruptible(quiet) as reporter,
+        reporter.stage(f"wavefronts of {len(images)} donuts", total=len(images)) as stage,
+    ):
+        fit = fit_donuts(
+            model,
+            images,
+            np.concatenate(fields),
+            wavelength_list(model, wavelength_nm, None),
+            pixel_size=pixel_um * 1e-6,
+            sky_variance=variance,
+            noll=range(4, terms + 1),
+            higher_order=higher_order_nm * 1e-9,
+            degrees_of_freedom=freedoms,
+            defocus=np.concatenate(defocus),
+            outer_scale=outer_scale_m,
+            saturation=saturation,
+            projection=projection,
+            threads=threads,
+            progress=stage.advance,
+        )
+    if out is not None:
+        write_table(out, fit.to_table())
+    if picture is not None:
+        write_bytes(picture, picture_bytes(fit.plot(), kind))
+    if as_json:
+        print_json(fit.summary())
+    elif not quiet:
+        _show(fit)
+
+
+def _show(fit: DonutFit) -> None:
+    import numpy as np
+
+    rows = []
+    for i, (x, y) in enumerate(np.rad2deg(fit.fields)):
+        if not fit.usable[i]:
+            rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i], *[""] * 5))
+            continue
+        nm, error = fit.zernikes[i] * 1e9, fit.errors[i] * 1e9
+        largest = ", ".join(f"Z{fit.noll[k]} {nm[k]:+.0f}" for k in np.argsort(-np.abs(nm))[:3])
+        seeing = np.rad2deg(fit.fwhm[i]) * 3600.0
+        quality = fit.chi2[i] / fit.n_pixels[i]
+        sizes = f"{np.linalg.norm(nm):.0f}", f"{np.linalg.norm(error):.0f}"
+        rows.append((f"{x:.4g}, {y:.4g}", fit.reasons[i] or "ok", *sizes, largest, f"{seeing:.2f}", f"{quality:.2f}"))
+    headings = ("field [deg]", "flags", "rms [nm]", "error [nm]", "largest [nm]", 'FWHM ["]', "chi2 a pixel")
+    Rows(headings, rows, _CAPTION, left=2).show()

@@ -1,0 +1,109 @@
+"""Simulated donuts: images of stars far from focus, with noise, second stars and cosmic rays, in electrons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.random_streams import stream
+from ...models.telescope import Telescope
+from ...wavefront.atmosphere.atmosphere import Atmosphere
+from ...wavefront.psf.psf import Psfs, make_psfs
+from .photometry import READ_NOISE
+from .stamps import observe_stamps
+from .star_defects import add_defects
+
+#: Pixels on a side of a stamp: a donut of 1.2 mm in pixels of 10 um, and room for the seeing.
+STAMP_SIZE = 181
+
+
+@dataclass(frozen=True, eq=False)
+class Donuts:
+    """Images of stars far from focus.
+
+    Attributes
+    ----------
+    images : ndarray, shape [n_star, ny, nx]
+        Electrons, expected sky subtracted; ``[y, x]`` along the axes of the detector.
+    sky_variance : float
+        Variance of sky and read noise in a pixel [electron^2].
+    psf : Psfs
+        Noise-free stars, of unit sum, with their fields and places.
+    electrons : ndarray, shape [n_star]
+        Electrons of each star, those beside the stamp included.
+    defects : ndarray of int, shape [n_star]
+        :class:`~pachon.StarFlag` bits of second stars and cosmic rays.
+    """
+
+    images: np.ndarray
+    sky_variance: float
+    psf: Psfs
+    electrons: np.ndarray
+    defects: np.ndarray
+
+
+def draw_donuts(
+    telescope: Telescope,
+    fields: ArrayLike,
+    wavelengths: ArrayLike,
+    *,
+    atmosphere: Atmosphere | None = None,
+    electrons: ArrayLike = 1e6,
+    sky: float = 0.0,
+    read_noise: float = READ_NOISE,
+    second_stars: float = 0.0,
+    cosmic_rays: float = 0.0,
+    seed: int = 0,
+    engine: str = "long_exposure",
+    stamp_size: int = STAMP_SIZE,
+    **psf: Any,
+) -> Donuts:
+    """Expose stars far from focus.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope, defocus included: ``telescope.perturbed("Detector", shift=(0, 0, 1.5e-3))``; or in focus, with
+        a ``focal_plane`` that carries the heights, such as that of :func:`~pachon.corner_stars`.
+    fields, wavelengths, atmosphere, engine, stamp_size
+        As in :func:`~pachon.make_psfs`; by default the mean of all turbulence, which needs an atmosphere.
+    electrons : float or array_like, shape [n_star]
+        Electrons of each star.
+    sky, read_noise : float
+        Expected electrons of the sky in a pixel, which are subtracted, and rms noise without light [electrons].
+    second_stars : float
+        Fraction of the stars with a second one of 0.1 to 1 times the light on the stamp.
+    cosmic_rays : float
+        Fraction of the stars crossed by a cosmic ray.
+    seed : int
+        Seed of places within the pixel, noise and defects, not negative. More stars leave the first as they are.
+    **psf
+        Further arguments of :func:`~pachon.make_psfs`. Where it has no ``offsets``, stars stand anywhere within a
+        pixel of the middle one.
+
+    Returns
+    -------
+    Donuts
+
+    Raises
+    ------
+    ConfigError, DomainError
+        As :func:`~pachon.make_psfs`, of a stamp that is too small for the donuts too; or if a number of electrons is
+        negative, or a fraction not from 0 to 1.
+    """
+    angles = np.atleast_2d(np.asarray(fields, dtype=np.float64))
+    if psf.get("offsets") is None:
+        psf["offsets"] = stream(seed, "donuts", "places").uniform(-0.5, 0.5, angles.shape)
+    stars = make_psfs(
+        telescope, fields, wavelengths, atmosphere=atmosphere, engine=engine, stamp_size=stamp_size, **psf
+    )
+    light = np.broadcast_to(np.asarray(electrons, dtype=np.float64), len(stars.image))
+    caught = light * np.minimum(stars.inside, 1.0)
+    stamps = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
+    images, defects = add_defects(
+        stamps, stars.image, stream(seed, "donuts", "defects"), neighbours=second_stars, cosmic_rays=cosmic_rays
+    )
+    return Donuts(images, float(sky + read_noise**2), stars, light.copy(), defects)

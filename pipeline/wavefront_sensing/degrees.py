@@ -1,0 +1,211 @@
+"""Landing points by degrees of freedom of the telescope, and their estimate from all donuts of an exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import ConfigError, DomainError
+from ...core.plotting import BLUE, ORANGE, new_figure, plain_text, styled
+from ...design.optimize.jacobian import ParameterColumns
+from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
+from ...design.parameters.parameters import apply
+from ...design.parameters.tolerances import Tolerance
+from ...models.telescope import Telescope
+from ...raytrace.adjoint.backward_pass import landing_gradient
+from ...raytrace.adjoint.forward_pass import forward_pass
+from ...raytrace.rays import parallel_rays
+from .donut_rays import chief_landing, landing_of, spread_of
+from .pupil_cells import PupilCells
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Rms wavefront over the field that each degree of freedom may make where no prior is given [m].
+DEFAULT_PRIOR = 1e-6
+#: Combinations drawn in a plot.
+_SHOWN = 12
+
+
+class FreedomRays:
+    """Landing points of one star's light by degrees of freedom, each in its unit.
+
+    Parameters
+    ----------
+    telescope, direction, wavelengths, wavelength_weights, cells
+        As in :class:`~pachon.pipeline.wavefront_sensing.donut_rays.ZernikeRays`.
+    freedoms : DegreesOfFreedom
+        The degrees of freedom.
+    at : ndarray, shape [n_freedom]
+        Values at which the response is computed.
+    footprint : ndarray, shape [2, 2]
+        Footprint of a cell in the model of the image [m].
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        direction: np.ndarray,
+        wavelengths: np.ndarray,
+        wavelength_weights: np.ndarray,
+        cells: PupilCells,
+        freedoms: DegreesOfFreedom,
+        at: np.ndarray,
+        footprint: np.ndarray,
+    ) -> None:
+        self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
+        self._direction, self._wavelengths, self._points = direction, wavelengths, cells.points
+        self._cells, self._footprint = cells, footprint
+        self.weights = np.outer(wavelength_weights, cells.weights).ravel()
+        middle = float(wavelengths[len(wavelengths) // 2])
+        columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ at)
+
+        def derivatives(wavelength: float, points: np.ndarray) -> np.ndarray:
+            rays = parallel_rays(columns.telescope, direction[None], wavelength, points)
+            forward = forward_pass(columns.telescope, rays, threads=1)
+            return columns.derivatives(forward, landing_gradient(forward), threads=1) @ self._matrix
+
+        landing = [derivatives(float(w), cells.points) for w in wavelengths]
+        self._response = np.concatenate(landing, axis=1) - derivatives(middle, np.zeros((1, 2)))
+
+    def landing(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
+        changed = apply(self._prepared, dict(zip(self._parameters, self._matrix @ unknowns, strict=True)))
+        places = [
+            landing_of(changed, parallel_rays(changed, self._direction[None], float(w), self._points))
+            for w in self._wavelengths
+        ]
+        middle = float(self._wavelengths[len(self._wavelengths) // 2])
+        return np.concatenate(places) - chief_landing(changed, self._direction, middle)
+
+    def spread(self, landing: np.ndarray) -> np.ndarray:
+        """Return the spread of the image of each point."""
+        return spread_of(self._cells, landing, self._footprint)
+
+    def response(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivatives at the values of the construction, shape [2, n, n_freedom]."""
+        return self._response
+
+
+@dataclass(frozen=True)
+class FreedomEstimate:
+    """Estimate of degrees of freedom from the donuts of one exposure.
+
+    Attributes
+    ----------
+    freedoms : DegreesOfFreedom
+        The degrees of freedom, with ``names``, ``units`` and ``apply(telescope, values)``.
+    values : ndarray, shape [n]
+        Maximum of likelihood times prior, each in its unit: what the telescope has beyond the one believed in.
+    covariance : ndarray, shape [n, n]
+        Posterior covariance, the inverse of Fisher's information plus that of the prior.
+    prior : ndarray, shape [n]
+        Standard deviations of the Gaussian prior about zero.
+    """
+
+    freedoms: DegreesOfFreedom
+    values: np.ndarray
+    covariance: np.ndarray
+    prior: np.ndarray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the order of the vector."""
+        return self.freedoms.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the values."""
+        return self.freedoms.units
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Standard deviations, shape [n]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def combinations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return how well combinations of the degrees of freedom are known, best first.
+
+        Returns
+        -------
+        ratio : ndarray, shape [n]
+            Posterior over prior standard deviation: small where the images determine a combination, 1 where they say
+            nothing about it. Square roots of the eigenvalues of the covariance in units of the prior.
+        vectors : ndarray, shape [n, n]
+            Combinations, one a row, of the degrees of freedom in units of their priors.
+        """
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(self.prior, self.prior))
+        return np.sqrt(np.maximum(values, 0.0)), vectors.T
+
+    def summary(self) -> dict[str, Any]:
+        """Return the estimate by name and unit, of plain numbers and lists."""
+        ratio, vectors = self.combinations()
+        return {
+            "names": list(self.names),
+            "units": list(self.units),
+            "values": self.values.tolist(),
+            "errors": self.errors.tolist(),
+            "prior": self.prior.tolist(),
+            "combinations_posterior_over_prior": ratio.tolist(),
+            "combinations": vectors.tolist(),
+        }
+
+    def plot(self) -> Figure:
+        """Draw the values in units of the priors, how well combinations are known, and the best and worst of these."""
+        ratio, vectors = self.combinations()
+        names = [plain_text(name) for name in self.names]
+        n = len(names)
+        with styled():
+            figure = new_figure(min(14.0, 6.0 + 0.16 * n), 8.0)
+            grid = figure.add_gridspec(2, 2, width_ratios=(2.2, 1.0), height_ratios=(1.0, 1.2))
+            bars, known, table = (figure.add_subplot(grid[k]) for k in ((0, 0), (0, 1), (1, slice(None))))
+            place = np.arange(n)
+            bars.errorbar(place, self.values / self.prior, self.errors / self.prior, fmt="o", color=BLUE, markersize=3)
+            bars.axhline(0.0, color="0.3", linewidth=0.7)
+            bars.set_ylabel("value / prior")
+            size = 8 if n <= 24 else 5
+            bars.set_xticks(place, names, rotation=90, fontsize=size)
+            known.semilogy(place + 1, ratio, "o-", color=ORANGE, markersize=3.5, linewidth=0.9)
+            known.axhline(1.0, color="0.3", linewidth=0.7)
+            known.set(xlabel="combination, best known first", ylabel="posterior / prior standard deviation")
+            count = min(_SHOWN, n)
+            shown = np.unique(np.concatenate([np.arange((count + 1) // 2), np.arange(n - count // 2, n)]))
+            image = table.imshow(vectors[shown], cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto", origin="upper")
+            figure.colorbar(image, ax=table, fraction=0.03, pad=0.01, label="degree of freedom / prior")
+            table.set_xticks(place, names, rotation=90, fontsize=size)
+            table.set_yticks(range(len(shown)), [f"{k + 1}: {ratio[k]:.2g}" for k in shown], fontsize=7)
+            table.set_ylabel("combination: posterior / prior")
+            return figure
+
+
+def prior_spreads(
+    freedoms: DegreesOfFreedom,
+    prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None,
+    telescope: Telescope,
+    wavelength: float,
+) -> np.ndarray:
+    """Return standard deviations of the degrees of freedom, each in its unit, shape [n].
+
+    ``prior`` holds them as a vector, by name, or as tolerances; by default each degree of freedom makes a wavefront of
+    1 um rms over the field.
+    """
+    if prior is None:
+        return np.asarray(DEFAULT_PRIOR / freedoms.sensitivity(telescope, wavelength=wavelength).rms)
+    if isinstance(prior, Sequence) and prior and isinstance(prior[0], Tolerance):
+        prior = {t.name: t.spread for t in prior if isinstance(t, Tolerance)}
+    if isinstance(prior, Mapping):
+        by_name: Any = prior
+        spreads = freedoms.vector(by_name)
+    else:
+        try:
+            spreads = np.array(np.broadcast_to(np.asarray(prior, dtype=np.float64), (len(freedoms),)))
+        except (TypeError, ValueError):
+            raise ConfigError(f"prior: expected {len(freedoms)} standard deviations, or them by name") from None
+    for name, value in zip(freedoms.names, spreads, strict=True):
+        if not (np.isfinite(value) and value > 0.0):
+            raise DomainError(f"prior of {name} = {float(value)!r}: expected a positive standard deviation")
+    return spreads

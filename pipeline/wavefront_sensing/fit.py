@@ -1,0 +1,397 @@
+"""Fit donuts: maximum likelihood of the pixels of out-of-focus stars, with exact ray positions as the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.errors import ConfigError, DomainError
+from ...core.threads import one_blas_thread, thread_count
+from ...core.units import ARCSEC, metres, radians, require_positive
+from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
+from ...design.parameters.tolerances import Tolerance
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...models.zernike_polynomials import noll_to_nm
+from ...raytrace.rays import field_direction
+from ...wavefront.request import relative_weights, wavelength_points
+from .degrees import FreedomEstimate, prior_spreads
+from .fit_star import SMALLEST_DONUT, StarFit, fit_star
+from .flags import DonutFlag
+from .image_model import BACKGROUND, FLUX, RATIO, STRENGTH, X, Y
+from .joint import JointFit, field_terms, fit_field, fit_freedoms
+from .light import Instrument
+from .likelihood import model_image
+from .result import DonutFit
+from .seeing import Seeing
+from .stamps import Pixels
+
+#: Seeing that the search starts from [rad].
+_START_FWHM = 0.8 * ARCSEC
+#: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
+_SATURATED = 0.002
+
+
+def fit_donuts(
+    telescope: Telescope,
+    images: ArrayLike | Sequence[ArrayLike],
+    fields: ArrayLike,
+    wavelength: ArrayLike | None = None,
+    *,
+    pixel_size: ArrayLike = 10e-6,
+    sky_variance: ArrayLike = 0.0,
+    noll: Iterable[int] = range(4, 23),
+    higher_order: ArrayLike = 0.0,
+    degrees_of_freedom: DegreesOfFreedom | None = None,
+    prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None,
+    field_noll: Iterable[int] | None = None,
+    defocus: ArrayLike = 0.0,
+    focal_plane: FocalPlane | None = None,
+    wavelength_weights: ArrayLike | None = None,
+    fwhm: ArrayLike | None = None,
+    outer_scale: float = 25.0,
+    diffusion: ArrayLike = 0.0,
+    mask: ArrayLike | Sequence[ArrayLike] | None = None,
+    saturation: float | None = None,
+    n_pupil: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> DonutFit:
+    r"""Fit the wavefront of out-of-focus stars by maximum likelihood of their pixels.
+
+    The model traces points of the entrance pupil, with all vignetting and spiders, to the detector; the unknown
+    wavefront W turns the light at each point by :math:`-\nabla W`, and the rays are traced again with their own changed
+    directions. Landing points are convolved with the pixel and the mean of turbulence, a long exposure (Roddier 1981,
+    sec. 4). Unknown are also flux, place, background and seeing of each star. Noise is that of the photons of the model
+    and the sky; steps are those of Levenberg and Marquardt.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        Telescope as it is believed to be, defocus included: ``tel.perturbed("Detector", shift=(0, 0, 1.5e-3))`` is
+        behind focus.
+    images : array_like, shape [n, ny, nx], or sequence of n arrays
+        Stamps [electrons], sky subtracted, ``[iy, ix]`` along +y and +x of the detector, each centred on its donut
+        within a few pixels.
+    fields : array_like or Quantity, shape [n, 2]
+        Field angles [rad], of the light's own travel.
+    wavelength : array_like or Quantity, optional
+        Vacuum wavelength [m], or several of them; the telescope's own by default.
+    pixel_size : float or Quantity
+        Side of a pixel [m].
+    sky_variance : float or array, shapes [n] or [n, ny, nx]
+        Variance of sky and readout [electron^2 a pixel].
+    noll : iterable of int
+        Noll indices of the wavefront, from 4.
+    higher_order : float or Quantity
+        Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
+        what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
+        default) light that they move is taken for low orders, which is worst on an annulus.
+    degrees_of_freedom : DegreesOfFreedom, optional
+        Fit these degrees of freedom of the telescope to all donuts together, in place of Zernikes of each.
+    prior : array_like, mapping or tolerances, optional
+        Standard deviations of the degrees of freedom, each in its unit; by default each makes 1 um rms of wavefront
+        over the field.
+    field_noll : iterable of int, optional
+        Fit double Zernikes to all donuts together: Noll indices of terms over the field, from 1.
+    defocus : float or array, shape [n]
+        Shift of the detector of each image along its z, beside that of the telescope [m]: 0 for all in one plane, or
+        1.5 mm and 0 for donuts and in-focus stars, which then share one likelihood.
+    focal_plane : FocalPlane, optional
+        Heights of the CCDs.
+    wavelength_weights : array_like, shape [n_wave], optional
+        Relative amounts of light.
+    fwhm : float, array [n] or Quantity, optional
+        Seeing [rad], if it is known; fitted by default. 0 is no atmosphere.
+    outer_scale : float
+        Outer scale of the turbulence [m]; infinite for Kolmogorov's.
+    diffusion : float or Quantity
+        Rms of the charge diffusion along each axis [m], which the seeing takes up by default.
+    mask : array_like of bool, as `images`, optional
+        True at pixels to leave out.
+    saturation : float, optional
+        Level from which on pixels are saturated [electrons].
+    n_pupil : int, optional
+        Cells across the pupil; by default as many as an image needs.
+    projection : {"zemax", "gnomonic", "postel"}
+        Meaning of the field angles.
+    threads : int, optional
+        Number of threads; all processors by default. Results do not depend on it.
+    progress : callable, optional
+        Called with 1 after each donut.
+
+    Returns
+    -------
+    DonutFit
+
+    Raises
+    ------
+    ConfigError
+        If both kinds of joint fits are asked for, a prior has no degrees of freedom, or an option is malformed.
+    DomainError
+        If an array has the wrong shape, the wavelength is not covered, or a number is outside its range. A bad donut is
+        no error: it is flagged, with NaN for results, and the others go on.
+    """
+    if degrees_of_freedom is not None and field_noll is not None:
+        raise ConfigError("degrees_of_freedom and field_noll are both given: expected one of them")
+    if prior is not None and degrees_of_freedom is None:
+        raise ConfigError("prior: expected degrees_of_freedom with it")
+    stack, shapes = _padded(images, "images", np.float64, np.nan)
+    count = len(stack)
+    angles = np.atleast_2d(radians(fields, "fields"))
+    if angles.shape != (count, 2) or not np.isfinite(angles).all():
+        raise DomainError(
+            f"fields of shape {angles.shape}: expected finite angles of {count} images, shape [{count}, 2]"
+        )
+    directions = field_direction(angles[:, 0], angles[:, 1], projection)
+    waves = wavelength_points(telescope, wavelength)
+    terms = _noll(noll, "noll", 4)
+    size = float(metres(higher_order, "higher_order"))
+    if not (np.isfinite(size) and size >= 0.0):
+        raise DomainError(f"higher_order = {higher_order!r}: expected a length in metres from 0")
+    further = _next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
+    field_indices = None if field_noll is None else _noll(field_noll, "field_noll", 1)
+    shifts = _each(metres(defocus, "defocus"), count, "defocus")
+    known = None if fwhm is None else _each(radians(fwhm, "fwhm"), count, "fwhm")
+    if known is not None and (known < 0.0).any():
+        raise DomainError(f"fwhm = {float(known.min())!r}: expected angles in radians from 0")
+    spread = float(metres(diffusion, "diffusion"))
+    if not (np.isfinite(spread) and spread >= 0.0):
+        raise DomainError(f"diffusion = {diffusion!r}: expected a length in metres from 0")
+    if n_pupil is not None and not (int(n_pupil) == n_pupil and n_pupil >= 8):
+        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 8 cells across the pupil")
+    if saturation is not None:
+        saturation = require_positive(saturation, "saturation", "electrons")
+    variance = _variance(sky_variance, stack.shape)
+    masked = np.zeros(stack.shape, dtype=bool) if mask is None else _padded(mask, "mask", bool, True)[0]
+    if masked.shape != stack.shape:
+        raise DomainError(f"mask of shape {masked.shape}: expected that of the images, {stack.shape}")
+    light = relative_weights(wavelength_weights, len(waves))
+    instrument = Instrument(
+        telescope,
+        waves,
+        light,
+        require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres"),
+        Seeing(float(waves[len(waves) // 2]), _outer_scale(outer_scale)),
+        spread,
+        np.concatenate([terms, further]),
+        np.concatenate([np.zeros(len(terms)), np.full(len(further), size**-2.0 if size else 0.0)]),
+        focal_plane,
+        None if n_pupil is None else int(n_pupil),
+    )
+    joint = degrees_of_freedom is not None or field_indices is not None
+    start = instrument.seeing.strength(_START_FWHM)
+    strengths = np.full(count, start) if known is None else [instrument.seeing.strength(float(v)) for v in known]
+
+    def one(i: int) -> StarFit:
+        found = _fit_one(
+            instrument,
+            stack[i, : shapes[i][0], : shapes[i][1]],
+            variance[i, : shapes[i][0], : shapes[i][1]],
+            masked[i, : shapes[i][0], : shapes[i][1]],
+            angles[i],
+            directions[i],
+            float(shifts[i]),
+            float(strengths[i]),
+            known is not None,
+            joint,
+            saturation,
+        )
+        if progress is not None:
+            progress(1)
+        return found
+
+    with one_blas_thread(), ThreadPoolExecutor(thread_count(threads)) as pool:
+        stars = list(pool.map(one, range(count)))
+        usable = [i for i, star in enumerate(stars) if star.solution is not None and star.flags.usable]
+        result: JointFit | None = None
+        estimate: FreedomEstimate | None = None
+        if joint and not usable:
+            raise DomainError(f"no usable donut: {stars[0].flags.reasons if stars else 'no images'}")
+        if field_indices is not None:
+            basis = field_terms(field_indices, angles[usable], telescope.field_radius)
+            result = fit_field(instrument, [stars[i] for i in usable], basis, known is not None, pool)
+        if degrees_of_freedom is not None:
+            spreads = prior_spreads(degrees_of_freedom, prior, telescope, instrument.middle)
+            result = fit_freedoms(
+                instrument,
+                [stars[i] for i in usable],
+                degrees_of_freedom,
+                spreads,
+                angles[usable],
+                projection,
+                known is not None,
+                pool,
+            )
+            solution = result.solution
+            estimate = FreedomEstimate(degrees_of_freedom, solution.shared, solution.shared_covariance, spreads)
+    return _collected(instrument, terms, stack, angles, stars, usable, result, estimate, field_indices)
+
+
+def _fit_one(
+    instrument: Instrument,
+    image: np.ndarray,
+    variance: np.ndarray,
+    masked: np.ndarray,
+    angles: np.ndarray,
+    direction: np.ndarray,
+    defocus: float,
+    strength: float,
+    fixed_strength: bool,
+    joint: bool,
+    saturation: float | None,
+) -> StarFit:
+    """Fit one star, or say why not."""
+    if not np.isfinite(image[~masked]).all():
+        return StarFit(DonutFlag.NOT_FINITE)
+    if np.hypot(*angles) > instrument.telescope.field_limit * (1.0 + 1e-12):
+        return StarFit(DonutFlag.OUTSIDE_FIELD)
+    if saturation is not None:
+        high = (image >= saturation) & ~masked
+        if high.sum() > max(_SATURATED * image.size, 1.0):
+            return StarFit(DonutFlag.SATURATED)
+        masked = masked | high
+    try:
+        light = instrument.light(direction, defocus)
+    except DomainError:
+        return StarFit(DonutFlag.NO_LIGHT)
+    pixels = Pixels(np.where(masked, 0.0, image), variance, ~masked)
+    wavefront = not joint or light.diameter > SMALLEST_DONUT * instrument.pixel
+    return fit_star(instrument, light, pixels, strength=strength, fixed_strength=fixed_strength, wavefront=wavefront)
+
+
+def _collected(
+    instrument: Instrument,
+    noll: np.ndarray,
+    stack: np.ndarray,
+    angles: np.ndarray,
+    stars: list[StarFit],
+    usable: list[int],
+    joint: JointFit | None,
+    estimate: FreedomEstimate | None,
+    field_noll: np.ndarray | None,
+) -> DonutFit:
+    """Return the result of single fits, or of a joint one."""
+    count, n_noll = len(stars), len(noll)
+    zernikes, covariance = np.full((count, n_noll), np.nan), np.full((count, n_noll, n_noll), np.nan)
+    values, errors = np.full((2, count, 8), np.nan)
+    chi2, n_pixels = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
+    model, used = np.full(stack.shape, np.nan), np.zeros(stack.shape, dtype=bool)
+    for k, i in enumerate(usable):
+        star = stars[i] if joint is None else joint.stars[k]
+        solution, place = (star.solution, 0) if joint is None else (joint.solution, k)
+        stamp = star.stamp
+        if solution is None or stamp is None:
+            continue
+        found = solution.stars[place]
+        values[i, : len(found)] = found
+        errors[i, : len(found)] = np.sqrt(np.diag(solution.star_covariance(place)))
+        chi2[i], n_pixels[i] = solution.chi2[place], stamp.used.sum()
+        ny, nx = stamp.image.shape
+        model[i, :ny, :nx] = model_image(stamp, found, solution.waves[place])
+        used[i, :ny, :nx] = stamp.used
+        if joint is None:
+            zernikes[i], covariance[i] = solution.shared[:n_noll], solution.shared_covariance[:n_noll, :n_noll]
+        else:
+            along = joint.zernike_map[k, :n_noll]
+            zernikes[i], covariance[i] = joint.zernikes[k, :n_noll], along @ solution.shared_covariance @ along.T
+    double, double_covariance = None, None
+    if joint is not None and field_noll is not None:
+        n_all = len(instrument.noll)
+        kept = (n_all * np.arange(len(field_noll))[:, None] + np.arange(n_noll)).ravel()
+        double = joint.solution.shared[kept].reshape(-1, n_noll)
+        double_covariance = joint.solution.shared_covariance[np.ix_(kept, kept)]
+    width = instrument.seeing.fwhm(values[:, STRENGTH])
+    return DonutFit(
+        zernikes=zernikes,
+        covariance=covariance,
+        noll=noll,
+        flux=values[:, FLUX],
+        flux_error=errors[:, FLUX],
+        center=values[:, [X, Y]],
+        center_error=errors[:, [X, Y]],
+        background=values[:, BACKGROUND],
+        fwhm=width,
+        fwhm_error=width * errors[:, STRENGTH] / np.where(values[:, STRENGTH] > 0.0, values[:, STRENGTH], 1.0),
+        chi2=chi2,
+        n_pixels=n_pixels,
+        flags=np.array([int(star.flags) for star in stars], dtype=np.int64),
+        companion=values[:, RATIO:],
+        images=stack,
+        model=model,
+        used=used,
+        fields=angles,
+        wavelengths=instrument.wavelengths,
+        pixel_size=instrument.pixel,
+        telescope=instrument.telescope.name,
+        obscuration=instrument.telescope.pupil_obscuration,
+        double_zernikes=double,
+        double_zernike_covariance=double_covariance,
+        degrees_of_freedom=estimate,
+    )
+
+
+def _padded(
+    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: Any
+) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    """Return images as one stack, smaller ones filled up at the end, and their shapes."""
+    try:
+        each: Any = values
+        listed: list[np.ndarray] = [np.asarray(v, dtype=kind) for v in each]
+    except (TypeError, ValueError):
+        raise DomainError(f"{name}: expected an array of shape [n, ny, nx], or n arrays of two dimensions") from None
+    if not listed or any(v.ndim != 2 or min(v.shape) < 8 for v in listed):
+        shape = [v.shape for v in listed][:1]
+        raise DomainError(f"{name} of shape {shape}: expected [n, ny, nx], stamps of at least 8 pixels a side")
+    shapes = [(int(v.shape[0]), int(v.shape[1])) for v in listed]
+    stack: np.ndarray = np.full((len(listed), max(s[0] for s in shapes), max(s[1] for s in shapes)), fill, dtype=kind)
+    for row, one in zip(stack, listed, strict=True):
+        row[: one.shape[0], : one.shape[1]] = one
+    return stack, shapes
+
+
+def _noll(values: Iterable[int], name: str, least: int) -> np.ndarray:
+    """Return Noll indices as an array, or raise DomainError."""
+    listed = list(values)
+    if not listed or any(int(j) != j or j < least for j in listed) or len(set(listed)) != len(listed):
+        raise DomainError(f"{name} = {listed}: expected different Noll indices from {least}")
+    return np.array(listed, dtype=np.int64)
+
+
+def _next_terms(noll: np.ndarray) -> np.ndarray:
+    """Return the Noll indices of the next radial degree at every azimuthal order of some, without these."""
+    highest: dict[int, int] = {}
+    for n, m in map(noll_to_nm, noll):
+        highest[m] = max(highest.get(m, 0), n)
+    wanted = {(n + 2, m) for m, n in highest.items()}
+    last = (max(highest.values()) + 3) * (max(highest.values()) + 4) // 2
+    return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in wanted and j not in noll], dtype=np.int64)
+
+
+def _each(values: np.ndarray, count: int, name: str) -> np.ndarray:
+    """Return one finite number for each image."""
+    if values.shape not in ((), (count,)) or not np.isfinite(values).all():
+        raise DomainError(f"{name} of shape {values.shape}: expected one finite number, or {count}")
+    return np.broadcast_to(values, (count,))
+
+
+def _variance(values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the variance of sky and readout of every pixel."""
+    variance = np.asarray(values, dtype=np.float64)
+    variance = variance[:, None, None] if variance.ndim == 1 else variance
+    try:
+        variance = np.broadcast_to(variance, shape)
+    except ValueError:
+        raise DomainError(f"sky_variance of shape {np.shape(values)}: expected a number, [n] or {shape}") from None
+    if not (np.isfinite(variance) & (variance >= 0.0)).all():
+        raise DomainError("sky_variance: expected finite numbers from 0 [electron^2]")
+    return variance
+
+
+def _outer_scale(value: float) -> float:
+    return float("inf") if value == float("inf") else require_positive(value, "outer_scale", "metres")

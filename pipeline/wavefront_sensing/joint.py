@@ -1,0 +1,133 @@
+"""Joint fit of all stars of an exposure: double Zernikes over the field, or degrees of freedom of the telescope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...design.metrics.field_zernikes import wavefront_zernikes
+from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
+from ...models.zernike_polynomials import annular_zernikes
+from .degrees import FreedomRays
+from .fit_star import StarFit
+from .image_model import STRENGTH
+from .light import Instrument
+from .pupil_cells import pupil_cells
+from .solve import Group, Solution, solve
+from .stamps import Pixels
+
+#: Times that vignetting and response to the degrees of freedom are computed, steps with each, and squared change in
+#: units of the errors, a degree of freedom, that is small enough.
+_OUTER, _INNER, _SETTLED = 4, 6, 1e-3
+_MANY_TERMS = 37
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Joint solution of the usable stars.
+
+    Attributes
+    ----------
+    stars : tuple of StarFit
+        The usable stars with their last stamps.
+    solution : Solution
+        Unknowns of all stars and the shared ones.
+    zernikes : ndarray, shape [n_star, n_noll]
+        Wavefront of each star [m].
+    zernike_map : ndarray, shape [n_star, n_noll, n_shared]
+        Derivatives of the wavefronts with respect to the shared unknowns.
+    """
+
+    stars: tuple[StarFit, ...]
+    solution: Solution
+    zernikes: np.ndarray
+    zernike_map: np.ndarray
+
+
+def field_terms(field_noll: np.ndarray, fields: np.ndarray, field_radius: float) -> np.ndarray:
+    """Return Zernikes of the field at field angles [n, 2], shape [n, n_term]."""
+    terms = annular_zernikes(int(field_noll.max()), *(fields.T / field_radius))
+    return np.asarray(terms[field_noll - 1].T)
+
+
+def fit_field(
+    instrument: Instrument, stars: Sequence[StarFit], terms: np.ndarray, fixed: bool, pool: Executor | None
+) -> JointFit:
+    """Fit double Zernikes, field terms [n_star, n_term] times those of the pupil."""
+    n_noll = len(instrument.noll)
+    if len(stars) < terms.shape[1]:
+        raise DomainError(f"field_noll: {terms.shape[1]} terms for {len(stars)} usable donuts; expected no more terms")
+    maps = np.stack([np.kron(row, np.eye(n_noll)) for row in terms])
+    precision = np.tile(instrument.precision, terms.shape[1])
+    start = _start(stars, maps, precision)
+    group = Group(tuple(s.stamp for s in stars if s.stamp), maps, precision, fixed)
+    solution = solve(group, _star_unknowns(stars), start, pool=pool)
+    return JointFit(tuple(stars), solution, np.array(solution.waves), maps)
+
+
+def fit_freedoms(
+    instrument: Instrument,
+    stars: Sequence[StarFit],
+    freedoms: DegreesOfFreedom,
+    prior: np.ndarray,
+    fields: np.ndarray,
+    projection: str,
+    fixed: bool,
+    pool: Executor | None,
+) -> JointFit:
+    """Fit degrees of freedom of the telescope with Gaussian priors of given standard deviations."""
+    telescope, noll = instrument.telescope, instrument.noll
+    jmax = int(noll.max())
+    sensitivity = freedoms.sensitivity(telescope, fields, instrument.middle, n_zernike=jmax, projection=projection)
+    maps = sensitivity.matrix[:, noll - 1]
+    precision = prior**-2.0
+    identity = np.repeat(np.eye(len(freedoms))[None], len(stars), axis=0)
+    shared, unknowns = _start(stars, maps, precision), _star_unknowns(stars)
+    for _ in range(_OUTER):
+        moved = [_with_freedoms(instrument, star, freedoms, shared) for star in stars]
+        group = Group(tuple(s.stamp for s in moved if s.stamp), identity, precision, fixed)
+        joint = solve(group, unknowns, shared, steps=_INNER, pool=pool)
+        change, shared, unknowns = joint.shared - shared, joint.shared, list(joint.stars)
+        if float(change @ np.linalg.solve(joint.shared_covariance, change)) < _SETTLED * len(change):
+            break
+    # Over the whole annulus, vignetted or not: so many terms that no other shows up in those asked for.
+    many = max(jmax, _MANY_TERMS)
+    after = freedoms.apply(telescope, joint.shared)
+    before, found = (
+        wavefront_zernikes(t, fields, instrument.middle, jmax=jmax, projection=projection).coefficients[:, noll - 1]
+        for t in (telescope, after)
+    )
+    response = freedoms.sensitivity(after, fields, instrument.middle, n_zernike=many, projection=projection)
+    return JointFit(tuple(moved), joint, found - before, response.matrix[:, noll - 1])
+
+
+def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFreedom, at: np.ndarray) -> StarFit:
+    """Return a star whose light depends on degrees of freedom, with vignetting and response at some values."""
+    light, stamp, solution = star.light, star.stamp, star.solution
+    if light is None or stamp is None or solution is None:
+        return star
+    fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
+    across = instrument.sampling(light, Pixels(stamp.image, stamp.variance, stamp.used), fwhm).across
+    cells = pupil_cells(freedoms.apply(light.telescope, at), light.direction, instrument.middle, across)
+    waves = (instrument.wavelengths, instrument.wavelength_weights)
+    rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, at, stamp.grid.footprint)
+    return replace(star, stamp=replace(stamp, rays=rays))
+
+
+def _star_unknowns(stars: Sequence[StarFit]) -> list[np.ndarray]:
+    return [s.solution.stars[0] for s in stars if s.solution]
+
+
+def _start(stars: Sequence[StarFit], maps: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Return the shared unknowns that fit the stars' own wavefronts best."""
+    curvature, gradient = np.diag(precision), np.zeros(len(precision))
+    for star, one in zip(stars, maps, strict=True):
+        if star.solution is not None and len(star.solution.shared):
+            information = np.linalg.pinv(star.solution.shared_covariance, hermitian=True)
+            curvature = curvature + one.T @ information @ one
+            gradient = gradient + one.T @ information @ star.solution.shared
+    return np.linalg.lstsq(curvature, gradient, rcond=1e-14)[0]

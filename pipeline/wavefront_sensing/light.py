@@ -1,0 +1,192 @@
+"""Light of single stars at their detectors: telescope with the detector in place, size of the image, rays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...models.camera.focal_plane import FocalPlane
+from ...models.telescope import Telescope
+from ...raytrace.rays import parallel_rays
+from ...raytrace.trace import trace
+from ...wavefront.chief_rays import image_jacobians
+from .donut_rays import ZernikeRays, chief_landing
+from .image_model import ImageGrid
+from .likelihood import Stamp
+from .pupil_cells import pupil_cells
+from .seeing import Seeing
+from .stamps import Pixels
+
+#: Cells across the pupil for the size of an image, and the least and most for its model.
+_SURVEY, _FEWEST, _MOST = 24, 48, 400
+#: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
+_SPACING = 0.5
+#: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
+_RESOLVED, _FINEST = 2.2, 3
+_FWHM_PER_RMS = 2.354820045
+#: Steps to a CCD surface along the chief ray.
+_STEPS = 3
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What all stars of a fit share.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        Telescope as it is believed to be.
+    wavelengths, wavelength_weights : ndarray, shape [n_wave]
+        Vacuum wavelengths [m] and fractions of the light.
+    pixel : float
+        Side of a pixel [m].
+    seeing : Seeing
+        The long exposure.
+    diffusion : float
+        Rms of the charge diffusion along each axis [m].
+    noll : ndarray of int
+        Noll indices of the wavefront.
+    precision : ndarray, shape [n_noll]
+        Inverse variances of Gaussian priors of the coefficients about zero [1/m^2]; 0 for none.
+    focal_plane : FocalPlane or None
+        Heights of the CCDs.
+    n_pupil : int or None
+        Cells across the pupil; chosen for each image where None.
+    """
+
+    telescope: Telescope
+    wavelengths: np.ndarray
+    wavelength_weights: np.ndarray
+    pixel: float
+    seeing: Seeing
+    diffusion: float
+    noll: np.ndarray
+    precision: np.ndarray
+    focal_plane: FocalPlane | None
+    n_pupil: int | None
+
+    @property
+    def middle(self) -> float:
+        """Wavelength in the middle of the list [m]."""
+        return float(self.wavelengths[len(self.wavelengths) // 2])
+
+    def light(self, direction: np.ndarray, defocus: float) -> Light:
+        """Return the light of a star that travels along a direction [3], on its detector moved by a defocus [m].
+
+        A chief ray that reaches no CCD, and a dark pupil, are a DomainError.
+        """
+        telescope = self._with_detector(direction, defocus)
+        cells = pupil_cells(telescope, direction, self.middle, _SURVEY)
+        if not len(cells):
+            raise DomainError("no light passes the telescope")
+        end = trace(telescope, parallel_rays(telescope, direction[None], self.middle, cells.points), threads=1)
+        detector = telescope.surfaces[-1]
+        place, travel = detector.to_local(end.position)[:, :2], end.direction @ detector.matrix
+        slopes = travel[:, :2] / travel[:, 2:]
+        place, slopes = (v - cells.weights @ v for v in (place, slopes))
+        # The rays are closest to each other where the detector moved by this distance would be.
+        depth = -float(cells.weights @ (place * slopes).sum(axis=1) / (cells.weights @ (slopes**2).sum(axis=1)))
+        jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
+        return Light(telescope, direction, 2.0 * float(np.hypot(*place.T).max()), depth, jacobian)
+
+    def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
+        """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
+        telescope, detector = self.telescope, self.telescope.surfaces[-1]
+        height, tilt = defocus, (0.0, 0.0, 0.0)
+        place = chief_landing(telescope, direction, self.middle)
+        if self.focal_plane is not None:
+            rays = parallel_rays(telescope, direction[None], self.middle, np.zeros((1, 2)))
+            chief = trace(telescope, rays, threads=1)
+            travel = (chief.direction @ detector.matrix)[0]
+            on_ccd, rise = place, 0.0
+            for _ in range(_STEPS):
+                rise = float(self.focal_plane.height(*on_ccd))
+                if math.isnan(rise):
+                    raise DomainError("the chief ray lands between the CCDs")
+                on_ccd = place + rise * travel[:2] / travel[2]
+            along_x, along_y = self.focal_plane.gradient(*on_ccd)
+            # The CCD's plane where the chief ray of the unmoved detector lands.
+            height += rise + float((place - on_ccd) @ (along_x, along_y))
+            tilt = (float(along_y), -float(along_x), 0.0)
+        if height == 0.0 and not any(tilt):
+            return telescope
+        about = np.asarray(detector.vertex) + detector.matrix @ [*place, 0.0]
+        return telescope.perturbed(detector.name, shift=height * detector.matrix[:, 2], tilt=tilt, about=about)
+
+    def sampling(self, light: Light, pixels: Pixels, fwhm: float) -> Sampling:
+        """Return how finely images of a star in a seeing [rad] are sampled on given pixels."""
+        rms = math.hypot(self.diffusion, pixels.blur * self.pixel)
+        width = math.hypot(fwhm * light.scale, _FWHM_PER_RMS * rms)
+        distance = pixels.side * self.pixel
+        oversampling = min(max(math.ceil(_RESOLVED * distance / max(width, 1e-12)), 1), _FINEST)
+        # A lattice as fine as the grid leaves no pattern where nothing else blurs it.
+        spacing = _SPACING * width if oversampling == 1 else distance / oversampling
+        across = self.n_pupil or min(max(math.ceil(light.diameter / spacing), _FEWEST), _MOST)
+        return Sampling(oversampling, across)
+
+    def stamp(self, light: Light, pixels: Pixels, fwhm: float, reach: float = 0.0) -> Stamp:
+        """Return a stamp with its model: seeing of about a width [rad], light within a reach [m] beside the stamp."""
+        sampling = self.sampling(light, pixels, fwhm)
+        cells = pupil_cells(light.telescope, light.direction, self.middle, sampling.across)
+        waves = (self.wavelengths, self.wavelength_weights)
+        rays = ZernikeRays(light.telescope, light.direction, *waves, cells, self.noll)
+        grid = ImageGrid(
+            (pixels.image.shape[0], pixels.image.shape[1]),
+            self.pixel * pixels.side,
+            self.pixel,
+            self.seeing,
+            light.jacobian,
+            math.hypot(self.diffusion, pixels.blur * self.pixel),
+            rays.footprint,
+            sampling.oversampling,
+            reach,
+        )
+        return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Cells of the image grid along a pixel, and cells of the pupil across its diameter."""
+
+    oversampling: int
+    across: int
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light of one star at its detector.
+
+    Attributes
+    ----------
+    telescope : Telescope
+        Telescope with the detector where the light meets it.
+    direction : ndarray, shape [3]
+        Unit vector along which the light travels.
+    diameter : float
+        Diameter of the geometric image [m].
+    depth : float
+        Distance from the detector to the best focus along the detector's z [m].
+    jacobian : ndarray, shape [2, 2]
+        Derivative of the chief ray's landing point by direction cosines [m].
+    """
+
+    telescope: Telescope
+    direction: np.ndarray
+    diameter: float
+    depth: float
+    jacobian: np.ndarray
+
+    @property
+    def scale(self) -> float:
+        """Distance on the detector over angle on the sky [m]."""
+        return math.sqrt(abs(float(np.linalg.det(self.jacobian))))
+
+    def mirrored(self) -> Light:
+        """Return the light with the detector as far on the other side of the best focus."""
+        detector = self.telescope.surfaces[-1]
+        shift = 2.0 * self.depth * detector.matrix[:, 2]
+        moved = self.telescope.perturbed(detector.name, shift=shift)
+        return replace(self, telescope=moved, depth=-self.depth)

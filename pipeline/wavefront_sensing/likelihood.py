@@ -1,0 +1,109 @@
+r"""Likelihood of the pixels of a donut, and its normal equations.
+
+Counts plus sky have the Poisson distribution of the model plus sky: the logarithm of the likelihood is, up to a
+constant, :math:`\sum (d + s) \ln(m + s) - (m + s)` with data d, model m and sky variance s. Its gradient is
+:math:`\sum A (d - m) / V` with the derivatives A of the model and the variance V = m + s, its expected curvature
+:math:`\sum A A^T / V`, Fisher's information.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .donut_rays import LightRays
+from .image_model import ImageGrid, LandedLight
+
+#: Smallest variance of a pixel [electron^2], where model and sky are next to nothing.
+_LEAST_VARIANCE = 1.0
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """Pixels of one donut and what they are compared with.
+
+    Attributes
+    ----------
+    image : ndarray, shape [ny, nx]
+        Electrons, sky subtracted.
+    variance : ndarray, shape [ny, nx]
+        Variance of sky and readout [electron^2].
+    used : ndarray of bool, shape [ny, nx]
+        Pixels that count.
+    grid : ImageGrid
+        Model of the image.
+    rays : LightRays
+        Landing points of the light.
+    """
+
+    image: np.ndarray
+    variance: np.ndarray
+    used: np.ndarray
+    grid: ImageGrid
+    rays: LightRays
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Curvature and gradient of the logarithm of the likelihood at one point.
+
+    Attributes
+    ----------
+    curvature : ndarray, shape [n, n]
+        Fisher's information of the unknowns of the star and its wavefront.
+    gradient : ndarray, shape [n]
+        Gradient of the logarithm of the likelihood.
+    loss : float
+        Twice the negative logarithm of the likelihood over that of a perfect model: nearly chi-square.
+    chi2 : float
+        Sum of squares of residuals over their variance.
+    """
+
+    curvature: np.ndarray
+    gradient: np.ndarray
+    loss: float
+    chi2: float
+
+
+def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
+    """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
+    response = stamp.rays.response(wave)
+    model, columns, scales = stamp.grid.derivatives(unknowns, _landed(stamp, wave), response)
+    variance = _variance(stamp, model)[stamp.used]
+    residual = (stamp.image - model)[stamp.used]
+    root = 1.0 / np.sqrt(variance)
+    scaled = np.multiply(columns[stamp.used], root[:, None])
+    curvature = scaled.T @ scaled * np.outer(scales, scales)
+    gradient = scaled.T @ (residual * root) * scales
+    return NormalEquations(curvature, gradient, _loss(residual, variance), float(residual @ (residual / variance)))
+
+
+def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndarray:
+    """Return the model of a stamp [electrons], shape [ny, nx]."""
+    return stamp.grid.image(unknowns, _landed(stamp, wave))
+
+
+def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight:
+    landing = stamp.rays.landing(wave)
+    return LandedLight(landing, stamp.rays.weights, stamp.rays.spread(landing))
+
+
+def pulls(stamp: Stamp, model: np.ndarray) -> np.ndarray:
+    """Return residuals over their standard deviations, shape [ny, nx]."""
+    return np.asarray((stamp.image - model) / np.sqrt(_variance(stamp, model)))
+
+
+def _variance(stamp: Stamp, model: np.ndarray) -> np.ndarray:
+    return np.maximum(model + stamp.variance, np.maximum(_LEAST_VARIANCE, 0.1 * stamp.variance))
+
+
+def _loss(residual: np.ndarray, variance: np.ndarray) -> float:
+    """Return twice the sum of v - c + c ln(c / v) with counts c = v + residual; c < 0 by its expansion at c = v."""
+    ratio = residual / variance
+    safe = np.maximum(ratio, -0.9)
+    deviance = variance * ((1.0 + safe) * np.log1p(safe) - safe)
+    # Beyond, on by a parabola with the same value and slope: Poisson counts plus sky come to it through noise alone.
+    beyond = ratio - safe
+    deviance += variance * (np.log1p(safe) * beyond + 0.5 / (1.0 + safe) * beyond**2)
+    return float(2.0 * deviance.sum())

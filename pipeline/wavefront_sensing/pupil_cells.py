@@ -1,0 +1,156 @@
+"""Cells of the entrance pupil: lit areas and centroids of the squares of a lattice.
+
+A cell stands for its lit part by area, centroid and second moments. Its image is blurred by the image of a cell of mean
+magnification, the footprint, which one transfer function holds; what its second moments have beyond that, on rims and
+where the magnification is another, is its spread. Cells then cover the image of the lit pupil without gaps or overlap,
+but for the third moments of cells on rims.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+
+from ...models.telescope import Telescope
+from ...raytrace.rays import RayStatus, parallel_rays
+from ...raytrace.trace import trace
+
+#: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
+_MARGIN = 1.02
+#: Chords of a cell on a rim, nodes along each, and halvings of a piece with a rim: to a 500th of a cell.
+_CHORDS, _NODES, _BISECTIONS = 8, 5, 6
+#: Degree of the polynomials that landing points are differentiated by.
+_DEGREE = 8
+
+
+@dataclass(frozen=True)
+class PupilCells:
+    """Lit cells of the entrance pupil for one direction of the light.
+
+    Attributes
+    ----------
+    points : ndarray, shape [n, 2]
+        Centroids of the lit parts [m], entrance-pupil coordinates.
+    weights : ndarray, shape [n]
+        Fractions of the light; they sum to 1. Empty where no light passes.
+    moments : ndarray, shape [n, 2, 2]
+        Second moments of the lit parts about their centroids [m^2].
+    side : float
+        Side of a cell [m].
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    moments: np.ndarray
+    side: float
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @cached_property
+    def _smooth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal polynomials at the points, [n, m], and their derivatives along x and y [1/m], [2, n, m]."""
+        radius = max(float(np.abs(self.points).max()), self.side)
+        x, y = self.points.T / radius
+        p, q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
+        powers_x, powers_y = (v[:, None] ** np.arange(_DEGREE + 1) for v in (x, y))
+        basis, triangle = np.linalg.qr(powers_x[:, p] * powers_y[:, q])
+        along_x = p * powers_x[:, np.maximum(p - 1, 0)] * powers_y[:, q]
+        along_y = q * powers_x[:, p] * powers_y[:, np.maximum(q - 1, 0)]
+        return basis, np.linalg.solve(triangle.T, np.stack([along_x, along_y]).transpose(0, 2, 1)).transpose(
+            0, 2, 1
+        ) / radius
+
+    def magnification(self, landing: np.ndarray) -> np.ndarray:
+        """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
+        basis, slopes = self._smooth
+        return np.moveaxis(slopes @ (basis.T @ landing), 0, -1)
+
+    def footprint(self, landing: np.ndarray) -> np.ndarray:
+        """Return the sides of the mean image of a cell [m], columns of a matrix [2, 2], from landing points [n, 2]."""
+        return self.side * np.tensordot(self.weights, self.magnification(landing), axes=1)
+
+    def spread(self, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Return second moments of the images of the cells minus those of a footprint [m^2], shape [n, 2, 2]."""
+        magnification = self.magnification(landing)
+        image = magnification @ self.moments @ magnification.transpose(0, 2, 1)
+        return np.asarray(image - footprint @ footprint.T / 12.0)
+
+
+def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, across: int) -> PupilCells:
+    """Return the lit cells of a lattice with so many cells across the pupil, for light of one direction [3]."""
+    side = _MARGIN * telescope.pupil_diameter / across
+    middle = (np.arange(across) - 0.5 * (across - 1)) * side
+
+    def lit(points: np.ndarray) -> np.ndarray:
+        """Return which rays through points [..., 2] pass all apertures."""
+        rays = parallel_rays(telescope, direction[None], wavelength, points.reshape(-1, 2))
+        return (trace(telescope, rays, threads=1).status == RayStatus.OK).reshape(points.shape[:-1])
+
+    centers = np.stack(np.meshgrid(middle, middle), axis=-1)
+    quarter = 0.25 * side * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
+    area = lit(centers[:, :, None] + quarter).mean(axis=2)
+    moments = np.tile(side**2 / 12.0 * np.eye(2), (across, across, 1, 1))
+    rim = (maximum_filter(area, 3, mode="constant") > 0.0) & (minimum_filter(area, 3, mode="constant") < 1.0)
+    if rim.any():
+        smooth = uniform_filter(area, 3, mode="constant")
+        along = np.stack(np.gradient(smooth)[::-1], axis=-1)[rim]
+        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, np.abs(along[:, 1]) > np.abs(along[:, 0]))
+        centers[rim] += offset
+    some = area > 0.0
+    return PupilCells(centers[some], area[some] / max(area.sum(), 1e-300), moments[some], side)
+
+
+def _lit_parts(
+    lit: Callable[[np.ndarray], np.ndarray], centers: np.ndarray, side: float, upright: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return lit fractions [n], centroids from the centre [n, 2] and second moments [n, 2, 2], by chords.
+
+    Chords run along x, or along y where ``upright``, across the rim. Rims on them are found between nodes of different
+    status.
+    """
+    node = side * np.linspace(-0.5, 0.5, _NODES)
+    row = side * ((np.arange(_CHORDS) + 0.5) / _CHORDS - 0.5)
+
+    def places(along: np.ndarray, across: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        offset = np.stack(np.broadcast_arrays(along, across), axis=-1)
+        turned = upright[cell].reshape(-1, *[1] * (offset.ndim - 1))
+        return centers[cell].reshape(-1, *[1] * (offset.ndim - 2), 2) + np.where(turned, offset[..., ::-1], offset)
+
+    every = np.arange(len(centers))
+    across = np.broadcast_to(row[:, None], (len(centers), _CHORDS, _NODES))
+    status = lit(places(np.broadcast_to(node, across.shape), across, every))
+    start, end = np.broadcast_to(node[:-1], (len(centers), _CHORDS, _NODES - 1)), node[1:]
+    low, high = start * np.ones(1), end * np.ones(start.shape)
+    cell, chord, piece = np.nonzero(status[:, :, 1:] != status[:, :, :-1])
+    first, last, begins = node[piece], node[piece + 1], status[cell, chord, piece]
+    for _ in range(_BISECTIONS):
+        half = 0.5 * (first + last)
+        same = lit(places(half, row[chord], cell)) == begins
+        first, last = np.where(same, half, first), np.where(same, last, half)
+    rim = 0.5 * (first + last)
+    low[cell, chord, piece] = np.where(begins, low[cell, chord, piece], rim)
+    high[cell, chord, piece] = np.where(begins, rim, high[cell, chord, piece])
+    length = np.where(status[:, :, 1:] | status[:, :, :-1], high - low, 0.0)
+    middles, rows = 0.5 * (low + high), row[:, None]
+    total = length.sum(axis=(1, 2))
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.asarray((length * values).sum(axis=(1, 2)) / np.where(total > 0.0, total, 1.0))
+
+    u, v = mean(middles), mean(rows)
+    uu = mean(middles**2 + length**2 / 12.0) - u * u
+    vv = mean(rows**2 + (side / _CHORDS) ** 2 / 12.0) - v * v
+    uv = mean(middles * rows) - u * v
+    moments = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-1)
+    offset = np.stack([u, v], axis=-1)
+    turned = upright[:, None]
+    return (
+        total / (side * _CHORDS),
+        np.where(turned, offset[:, ::-1], offset),
+        np.where(turned[:, :, None], moments[:, ::-1, ::-1], moments),
+    )

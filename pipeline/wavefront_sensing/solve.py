@@ -1,0 +1,202 @@
+"""Levenberg-Marquardt steps on the joint likelihood of stars that share the unknowns of their wavefront."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from .image_model import FLUX, RATIO, STRENGTH
+from .likelihood import NormalEquations, Stamp, normal_equations
+
+#: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
+#: the last: a tenth of a standard deviation, of which the step leaves next to nothing.
+FINE, COARSE = 1e-2, 0.3
+#: The same for a search that ran out of steps and is near enough to its end.
+_NEAR = 1.0
+_DAMPING = 1e-3
+_LARGEST_DAMPING = 1e6
+
+
+@dataclass(frozen=True)
+class Group:
+    """Stars whose wavefronts depend on the same unknowns.
+
+    Attributes
+    ----------
+    stamps : tuple of Stamp
+        The stars.
+    maps : ndarray, shape [n_star, n_wave, n_shared]
+        Unknowns of each star's wavefront by the shared ones.
+    precision : ndarray, shape [n_shared]
+        Inverse variances of Gaussian priors about zero; 0 for none.
+    fixed_strength : bool
+        Whether the strengths of the turbulence are held.
+    """
+
+    stamps: tuple[Stamp, ...]
+    maps: np.ndarray
+    precision: np.ndarray
+    fixed_strength: bool = False
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Best unknowns of a group.
+
+    Attributes
+    ----------
+    stars : tuple of ndarray
+        Unknowns of each star.
+    shared : ndarray, shape [n_shared]
+        Shared unknowns of the wavefronts.
+    waves : tuple of ndarray
+        Unknowns of the wavefront of each star.
+    covariance : ndarray
+        Covariance of all, star by star and the shared ones last.
+    chi2 : ndarray, shape [n_star]
+        Sums of squares of the residuals over their variance.
+    loss : float
+        Twice the negative logarithm of likelihood and prior.
+    converged : bool
+        Whether the last step was small enough.
+    """
+
+    stars: tuple[np.ndarray, ...]
+    shared: np.ndarray
+    waves: tuple[np.ndarray, ...]
+    covariance: np.ndarray
+    chi2: np.ndarray
+    loss: float
+    converged: bool
+
+    def star_covariance(self, star: int) -> np.ndarray:
+        """Return the covariance of the unknowns of one star."""
+        first = sum(len(s) for s in self.stars[:star])
+        part = slice(first, first + len(self.stars[star]))
+        return self.covariance[part, part]
+
+    @property
+    def shared_covariance(self) -> np.ndarray:
+        """Covariance of the shared unknowns, shape [n_shared, n_shared]."""
+        first = sum(len(s) for s in self.stars)
+        return self.covariance[first:, first:]
+
+
+def solve(
+    group: Group,
+    stars: Sequence[np.ndarray],
+    shared: np.ndarray,
+    *,
+    tolerance: float = FINE,
+    steps: int = 25,
+    pool: Executor | None = None,
+) -> Solution:
+    """Maximise the likelihood from a starting point, by so many steps or until one is to gain less than a tolerance."""
+    joined = np.concatenate([*stars, shared])
+    sizes = [len(s) for s in stars]
+    pixels = sum(int(stamp.used.sum()) for stamp in group.stamps)
+    held = _held(group, sizes)
+    state = _linearize(group, joined, sizes, pool)
+    damping, converged, predicted = _DAMPING, False, np.inf
+    for _ in range(steps):
+        step = np.zeros_like(joined)
+        curvature = state.curvature[np.ix_(~held, ~held)]
+        scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+        normalized = curvature / np.outer(scale, scale)
+        normalized[np.diag_indices_from(normalized)] = 1.0 + damping
+        step[~held] = _solved(normalized, state.gradient[~held] / scale) / scale
+        predicted = float(state.gradient @ step)
+        trial = _bounded(joined + step, sizes, held)
+        if predicted < tolerance * max(1.0, state.loss / pixels):
+            joined, converged = trial, True
+            break
+        found = _linearize(group, trial, sizes, pool)
+        if found.loss < state.loss:
+            joined, state, damping = trial, found, 0.1 * damping
+        else:
+            damping = 10.0 * max(damping, _DAMPING)
+            if damping > _LARGEST_DAMPING:
+                break
+    converged = converged or predicted < _NEAR * max(1.0, state.loss / pixels)
+    covariance = np.zeros_like(state.curvature)
+    free = np.ix_(~held, ~held)
+    scale = np.sqrt(np.maximum(np.diag(state.curvature)[~held], 1e-300))
+    covariance[free] = np.linalg.pinv(state.curvature[free] / np.outer(scale, scale), hermitian=True)
+    covariance[free] /= np.outer(scale, scale)
+    bounds = np.cumsum([0, *sizes])
+    found_stars = tuple(joined[a:b] for a, b in itertools.pairwise(bounds))
+    best = joined[bounds[-1] :]
+    waves = tuple(m @ best for m in group.maps)
+    return Solution(found_stars, best, waves, covariance, state.chi2, state.loss, converged)
+
+
+@dataclass(frozen=True)
+class _Linearized:
+    curvature: np.ndarray
+    gradient: np.ndarray
+    chi2: np.ndarray
+    loss: float
+
+
+def _held(group: Group, sizes: list[int]) -> np.ndarray:
+    """Return which unknowns are held, shape [n]."""
+    held = np.zeros(sum(sizes) + group.maps.shape[2], dtype=bool)
+    if group.fixed_strength:
+        held[np.cumsum([0, *sizes[:-1]]) + STRENGTH] = True
+    return held
+
+
+def _linearize(group: Group, joined: np.ndarray, sizes: list[int], pool: Executor | None) -> _Linearized:
+    """Accumulate the normal equations of all stars and the prior."""
+    bounds, n_star = np.cumsum([0, *sizes]), sum(sizes)
+    shared = joined[n_star:]
+
+    def one(i: int) -> NormalEquations:
+        return normal_equations(group.stamps[i], joined[bounds[i] : bounds[i + 1]], group.maps[i] @ shared)
+
+    apply: Callable[..., object] = map if pool is None else pool.map
+    found: list[NormalEquations] = list(apply(one, range(len(group.stamps))))  # type: ignore[call-overload]
+    curvature, gradient = np.zeros((len(joined), len(joined))), np.zeros(len(joined))
+    # The prior has a likelihood of its own.
+    curvature[range(n_star, len(joined)), range(n_star, len(joined))] = group.precision
+    gradient[n_star:] = -group.precision * shared
+    for i, equations in enumerate(found):
+        own, size = slice(bounds[i], bounds[i + 1]), sizes[i]
+        inner, cross, outer = (
+            equations.curvature[:size, :size],
+            equations.curvature[:size, size:] @ group.maps[i],
+            group.maps[i].T @ equations.curvature[size:, size:] @ group.maps[i],
+        )
+        curvature[own, own] = inner
+        curvature[own, n_star:] = cross
+        curvature[n_star:, own] = cross.T
+        curvature[n_star:, n_star:] += outer
+        gradient[own] = equations.gradient[:size]
+        gradient[n_star:] += group.maps[i].T @ equations.gradient[size:]
+    loss = sum(e.loss for e in found) + float(group.precision @ shared**2)
+    return _Linearized(curvature, gradient, np.array([e.chi2 for e in found]), loss)
+
+
+def _bounded(joined: np.ndarray, sizes: list[int], held: np.ndarray) -> np.ndarray:
+    """Return unknowns with positive fluxes and turbulence."""
+    starts = np.cumsum([0, *sizes[:-1]])
+    for first, size in zip(starts, sizes, strict=True):
+        joined[first + FLUX] = max(joined[first + FLUX], 1e-3)
+        if not held[first + STRENGTH]:
+            joined[first + STRENGTH] = np.clip(joined[first + STRENGTH], 1e-3, 100.0)
+        if size > RATIO:
+            joined[first + RATIO] = max(joined[first + RATIO], 0.0)
+    return joined
+
+
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a positive definite system; a singular one by least squares."""
+    try:
+        return np.asarray(cho_solve(cho_factor(matrix), right))
+    except np.linalg.LinAlgError:
+        return np.linalg.lstsq(matrix, right, rcond=1e-12)[0]

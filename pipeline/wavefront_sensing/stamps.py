@@ -1,0 +1,107 @@
+"""Pixels of stamps: smoothing, cosmic rays on donuts, and the search for donuts by their template."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter
+from scipy.signal import fftconvolve
+
+#: A pixel this many standard deviations above its neighbours, and this much brighter, is no part of a donut.
+_SIGMA, _CONTRAST = 8.0, 1.0
+#: Rms of the Gaussian before sampling, in new pixels, and least part of its weight on used pixels.
+_SMOOTHING, _MOSTLY_USED = 1.0, 0.9
+#: Least part of the squared template that must lie on the stamp.
+_ON_STAMP = 0.1
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of one stamp.
+
+    Attributes
+    ----------
+    image : ndarray, shape [ny, nx]
+        Electrons; zero where not used.
+    variance : ndarray, shape [ny, nx]
+        Variance of sky and readout [electron^2].
+    used : ndarray of bool, shape [ny, nx]
+        Pixels that count.
+    side : int
+        Distance between pixels, in those of the detector.
+    blur : float
+        Rms of the Gaussian that they were smoothed with, in pixels of the detector.
+    offset : tuple of float
+        Place (x, y) of the centre of the detector's stamp from that of this one, in its own pixels.
+    """
+
+    image: np.ndarray
+    variance: np.ndarray
+    used: np.ndarray
+    side: int = 1
+    blur: float = 0.0
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    def smoothed(self, side: int) -> Pixels:
+        """Return the image smoothed by a Gaussian and sampled at every so many pixels, for a quick first fit.
+
+        Values are those of squares of the new side. So is the variance: the noise of the new pixels is smaller and
+        correlated, and sums of the squares of smooth signals over the variance come out the same.
+        """
+        if side == 1:
+            return self
+        blur = _SMOOTHING * side
+        weight = gaussian_filter(self.used.astype(np.float64), blur, mode="constant")
+        scale = side**2 / np.maximum(weight, 1e-12)
+        count = [(n - 1) // side + 1 for n in self.image.shape]
+        first = [(n - 1 - (m - 1) * side) // 2 for n, m in zip(self.image.shape, count, strict=True)]
+        rows, columns = (slice(a, a + (m - 1) * side + 1, side) for a, m in zip(first, count, strict=True))
+
+        def sampled(values: np.ndarray) -> np.ndarray:
+            return (gaussian_filter(np.where(self.used, values, 0.0), blur, mode="constant") * scale)[rows, columns]
+
+        lost = [
+            (0.5 * (n - 1) - a) / side - 0.5 * (m - 1) for n, a, m in zip(self.image.shape, first, count, strict=True)
+        ]
+        # Near the edges of the stamp and of masked regions values are those of places farther in.
+        used = (weight > _MOSTLY_USED)[rows, columns]
+        offset = (lost[1], lost[0])
+        return Pixels(sampled(self.image), sampled(self.variance), used, side, blur, offset)
+
+
+def without_cosmic_rays(pixels: Pixels) -> Pixels:
+    """Return the pixels of a donut without those far above all of their neighbourhood."""
+    middle = median_filter(pixels.image, 5, mode="nearest")
+    # A donut is as bright nearby as here; a median over its edge is fainter.
+    level = np.maximum(maximum_filter(middle, 5), 0.0)
+    noise = np.sqrt(level + pixels.variance)
+    high = pixels.image > (1.0 + _CONTRAST) * level + _SIGMA * noise
+    used = pixels.used & ~maximum_filter(high, 3)
+    return Pixels(np.where(used, pixels.image, 0.0), pixels.variance, used)
+
+
+@dataclass(frozen=True)
+class Match:
+    """Place where a template fits best: offset (x, y) [pixels], flux [electrons] and signal over noise."""
+
+    x: float
+    y: float
+    flux: float
+    significance: float
+
+
+def match_template(image: np.ndarray, used: np.ndarray, variance: np.ndarray, template: np.ndarray) -> Match:
+    """Return the whole-pixel place of a template of unit flux on an image, and its flux by least squares."""
+    mirrored = template[::-1, ::-1]
+    overlap = fftconvolve(used.astype(np.float64), mirrored**2)
+    product = fftconvolve(np.where(used, image, 0.0), mirrored)
+    enough = overlap > _ON_STAMP * float((template**2).sum())
+    score = np.where(enough, product / np.sqrt(np.where(enough, overlap, 1.0)), -np.inf)
+    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+    flux = float(product[row, column] / overlap[row, column])
+    # Of the sky and of the star's own light, by the pixels of the template; an image without either has none.
+    own = max(flux, 0.0) * float((template**2).sum() / template.sum())
+    noise = np.sqrt(max(float(np.mean(variance)) + own, 1e-30))
+    ny, nx = image.shape
+    return Match(float(column - nx + 1), float(row - ny + 1), flux, float(score[row, column] / noise))

@@ -1,0 +1,152 @@
+"""The active-optics loop: visit after visit the telescope drifts, exposes its donuts, and is corrected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...core.progress import Reporter
+from ...core.random_streams import stream
+from ...core.threads import one_blas_thread
+from ...pipeline.wavefront_sensing.result import DonutFit
+from .config import AlignConfig
+from .estimator import estimate_state, steady_covariance
+from .exposure import expose, fit
+from .field_quality import FieldMeans
+from .scene import NOLL, AlignmentScene
+
+# Visits after which the expected state no longer changes.
+_STEADY = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Visits of a loop. States are in units of the tolerances, in the order of the degrees of freedom.
+
+    Attributes
+    ----------
+    scene : AlignmentScene
+        Telescope, sensors and turbulence.
+    designed : FieldMeans
+        Quality of the telescope as designed.
+    visits : tuple of FieldMeans
+        Quality in each visit.
+    states, estimates : ndarray, shape [n_visit, n]
+        State of the telescope in each visit, and its estimate from the donuts.
+    errors : ndarray, shape [n_visit, n]
+        Expected standard deviations of the states.
+    expected : ndarray, shape [n_visit]
+        Expected rms of the wavefront over the field that misalignment adds [m].
+    floor : float
+        The same for a loop that has run for long: drift of one visit, photons and turbulence [m].
+    donuts : ndarray of int, shape [n_visit]
+        Donuts that were used.
+    first, last : DonutFit
+        Donuts of the first and the last visit.
+    """
+
+    scene: AlignmentScene
+    designed: FieldMeans
+    visits: tuple[FieldMeans, ...]
+    states: np.ndarray
+    estimates: np.ndarray
+    errors: np.ndarray
+    expected: np.ndarray
+    floor: float
+    donuts: np.ndarray
+    first: DonutFit
+    last: DonutFit
+
+
+def align(
+    config: AlignConfig,
+    *,
+    folder: Path | None = None,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> Alignment:
+    """Run an active-optics loop.
+
+    Parameters
+    ----------
+    config : AlignConfig
+        All that decides the loop.
+    folder : Path, optional
+        Folder that relative paths in the configuration start from; the current one by default.
+    threads : int, optional
+        Number of threads; all processors by default. No byte depends on it.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    PachonError
+        If a name does not exist, the models do not fit together, or donuts do not fit on their stamps.
+    """
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    scene = AlignmentScene.of(config, folder)
+    errors, n = config.errors, len(scene.freedoms)
+    drift = np.diag(scene.steps**2)
+    covariance = errors.initial**2 * np.eye(n)
+    state = errors.initial * _normals(config.seed, "initial", 0, n)
+    quality, states, estimates, spreads, expected, used, fits = [], [], [], [], [], [], []
+    noise = scene.turbulence
+    # Bytes must not depend on how BLAS shares sums among threads.
+    with one_blas_thread(), reporter.stage("visits", config.visits) as stage:
+        for visit in range(config.visits):
+            telescope = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
+            quality.append(scene.quality.means(telescope, threads))
+            expected.append(scene.expected_wavefront(covariance))
+            spreads.append(np.sqrt(np.diag(covariance)))
+            found = fit(scene, expose(scene, telescope, visit, threads), threads)
+            rows = np.repeat(found.usable, len(NOLL))
+            noise = scene.turbulence + _photon_noise(found)
+            estimate = estimate_state(
+                found.zernikes.ravel()[rows],
+                noise[np.ix_(rows, rows)],
+                scene.sensitivity[rows],
+                covariance,
+                drift,
+                config.control.gain,
+            )
+            states.append(state)
+            estimates.append(estimate.state)
+            used.append(int(found.usable.sum()))
+            fits.append(found)
+            del fits[1:-1]
+            state = state - config.control.gain * estimate.state
+            state = state + scene.steps * _normals(config.seed, "drift", visit, n)
+            covariance = estimate.covariance
+            stage.advance()
+            stage.step(f"visit {visit}: {1e9 * quality[-1].added:.0f} nm added", visit + 1, config.visits)
+    start = errors.initial**2 * np.eye(n)
+    with one_blas_thread():
+        steady = steady_covariance(np.nan_to_num(noise), scene.sensitivity, start, drift, config.control.gain, _STEADY)
+    return Alignment(
+        scene=scene,
+        designed=scene.quality.means(scene.telescope, threads),
+        visits=tuple(quality),
+        states=np.array(states),
+        estimates=np.array(estimates),
+        errors=np.array(spreads),
+        expected=np.array(expected),
+        floor=scene.expected_wavefront(steady),
+        donuts=np.array(used),
+        first=fits[0],
+        last=fits[-1],
+    )
+
+
+def _normals(seed: int, what: str, visit: int, count: int) -> np.ndarray:
+    return stream(seed, "alignment", what, visit).standard_normal(count)
+
+
+def _photon_noise(found: DonutFit) -> np.ndarray:
+    """Return the covariance of the Zernikes of all donuts by photons [m^2], shape [n_data, n_data]."""
+    n_star, n_noll = found.zernikes.shape
+    out = np.zeros((n_star, n_noll, n_star, n_noll))
+    for star in range(n_star):
+        out[star, :, star] = found.covariance[star]
+    return out.reshape(n_star * n_noll, -1)

@@ -1,0 +1,95 @@
+"""``pachon donuts``: tables, pictures and JSON of FITS stamps, one line for bad input."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+import pachon
+from pachon.commands.cli import main
+
+FIELD = (0.6, 0.9)
+OPTIONS = ["--defocus-um", "1500", "--pixel-um", "20", "--zernikes", "11", "--higher-order-nm", "0"]
+
+
+@pytest.fixture(scope="module")
+def stamp():
+    """A donut of 2e6 electrons from a square lattice of rays, with a camera 10 um too high."""
+    tel = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
+    tel = tel.perturbed("Camera", shift=(0.0, 0.0, 10e-6))
+    x, y = np.meshgrid(*2 * [np.linspace(-4.2, 4.2, 301)])
+    field = np.deg2rad(FIELD)
+    end = pachon.trace(tel, pachon.launch_rays(tel, field, 622e-9, (x, y)))
+    chief = pachon.trace(tel, pachon.launch_rays(tel, field, 622e-9, (0.0, 0.0)))
+    place = (end.position - chief.position)[end.status == 0, :2] / 20e-6
+    place = place + np.random.default_rng(1).normal(scale=1.0, size=place.shape)
+    edges = np.arange(92) - 45.5
+    image = np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0]
+    return np.random.default_rng(2).poisson(2e6 * image / image.sum() + 300.0) - 300.0
+
+
+@pytest.mark.long
+def test_a_cube_with_a_table(tmp_path, monkeypatch, capsys, stamp):
+    monkeypatch.chdir(tmp_path)
+    table = Table({"field_x": [FIELD[0]] * 2, "field_y": [FIELD[1]] * 2})
+    cube = np.stack([stamp, np.zeros_like(stamp)])
+    fits.HDUList([fits.PrimaryHDU(cube), fits.BinTableHDU(table)]).writeto("donuts.fits")
+    assert main(["donuts", "donuts.fits", *OPTIONS, "-o", "out.ecsv", "--picture", "donuts.png", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+    found = Table.read("out.ecsv")
+    # A detector 10 um along +z adds 158 nm of Z4 (batoid too), the lenses that move with it a little.
+    assert found["Z4"][0] == pytest.approx(165.0, abs=20.0)
+    assert found["reasons"].tolist() == ["ok", "no donut, too few photons"]
+    assert np.isnan(found["Z4"][1])
+    assert (tmp_path / "donuts.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.long
+def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, capsys, stamp):
+    monkeypatch.chdir(tmp_path)
+    header = fits.Header({"FIELD_X": FIELD[0], "FIELD_Y": FIELD[1], "DEFOC_UM": 1500.0})
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(stamp, header)]).writeto("stamps.fits")
+    assert main(["donuts", "stamps.fits", *OPTIONS[2:], "--sky-variance", "300", "--json"]) == 0
+    one = json.loads(capsys.readouterr().out)
+    image = np.zeros((150, 160))
+    image[20 : 20 + 91, 40 : 40 + 91] = stamp
+    fits.PrimaryHDU(image).writeto("ccd.fits")
+    Table({"x": [85.0, 1.0], "y": [65.0, 1.0], "field_x": [FIELD[0]] * 2, "field_y": [FIELD[1]] * 2}).write("at.ecsv")
+    arguments = ["donuts", "ccd.fits", *OPTIONS, "--positions", "at.ecsv", "--stamp", "91", "--sky-variance", "300"]
+    assert main([*arguments, "--json"]) == 0
+    cut = json.loads(capsys.readouterr().out)
+    assert cut["zernike_nm"][0] == one["zernike_nm"][0]
+    assert cut["reasons"] == ["", "not finite"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["missing.fits"], "missing.fits: no such file"),
+        (["text.fits"], "text.fits: cannot be read as FITS"),
+        (
+            ["plain.fits"],
+            "plain.fits: no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg",
+        ),
+        (["rows.fits"], "rows.fits: table of 1 rows for 2 stamps: expected one row a stamp"),
+        (["plain.fits", "--field-deg", "1"], "--field-deg = '1': expected two numbers"),
+        (["plain.fits", "-o", "table.txt"], "--out = table.txt: expected a name that ends in"),
+        (["plain.fits", "--picture", "a.gif"], "expected a name that ends in .png"),
+        (["plain.fits", "-t", "no_such_telescope"], "no_such_telescope"),
+        (["plain.fits", "--positions", "text.fits"], "text.fits: cannot be read as a table"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, part):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.fits").write_text("no FITS at all\n")
+    fits.PrimaryHDU(np.zeros((2, 16, 16))).writeto("plain.fits")
+    table = fits.BinTableHDU(Table({"field_x": [0.0], "field_y": [0.0]}))
+    fits.HDUList([fits.PrimaryHDU(np.zeros((2, 16, 16))), table]).writeto("rows.fits")
+    assert main(["donuts", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("pachon: error: ")
+    assert part in captured.err
+    assert captured.err.count("\n") == 1

@@ -1,0 +1,53 @@
+"""A donut of batoid's rays: its wavefront is the difference of batoid's Zernikes, sign and frame included."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import pachon
+
+batoid = pytest.importorskip("batoid")
+
+WAVELENGTH = 622e-9
+PIXEL, SIZE, FINE = 20e-6, 91, 4
+
+
+@pytest.mark.long
+def test_wavefront_of_a_donut_is_that_of_batoid():
+    field = np.deg2rad([0.6, 0.9])
+    behind = batoid.Optic.fromYaml("LSST_r.yaml").withGloballyShiftedOptic("LSST.LSSTCamera.Detector", [0, 0, 1.5e-3])
+    # The sizes of real misalignments; less than a nanometre is beyond Z22.
+    true = behind.withGloballyShiftedOptic("LSST.M2", [1e-4, -5e-5, 5e-6])
+    u = np.linspace(-4.2, 4.2, 701)
+    x, y = (v.ravel() for v in np.meshgrid(u, u))
+    rays = batoid.RayVector.fromStop(
+        x, y, optic=true, wavelength=WAVELENGTH, theta_x=field[0], theta_y=field[1], projection="zemax"
+    )
+    chief = batoid.RayVector.fromStop(
+        0.0, 0.0, optic=true, wavelength=WAVELENGTH, theta_x=field[0], theta_y=field[1], projection="zemax"
+    )
+    true.trace(rays)
+    true.trace(chief)
+    lit = ~rays.vignetted & ~rays.failed
+    place = np.stack([rays.x[lit] - chief.x[0], rays.y[lit] - chief.y[0]]) / PIXEL
+    margin = 8
+    edges = np.arange((SIZE + 2 * margin) * FINE + 1) / FINE - 0.5 * (SIZE + 2 * margin)
+    fine = gaussian_filter(np.histogram2d(place[1], place[0], [edges, edges])[0], FINE)
+    image = fine.reshape(len(fine) // FINE, FINE, -1, FINE).sum(axis=(1, 3))[margin:-margin, margin:-margin]
+    fit = pachon.fit_donuts(
+        pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 1.5e-3)),
+        5e6 * image[None] / lit.sum(),
+        [field],
+        WAVELENGTH,
+        pixel_size=PIXEL,
+        sky_variance=500.0,
+        fwhm=0.0,
+        diffusion=PIXEL,
+    )
+    before, after = (
+        batoid.zernikeGQ(optic, *field, WAVELENGTH, projection="zemax", jmax=37, eps=0.61)[4:23] * WAVELENGTH
+        for optic in (behind, true)
+    )
+    assert np.linalg.norm(after - before) > 60e-9
+    # Rims of 700 rays across, and 3e-3 of the wavefront (docs/donuts.md).
+    assert np.linalg.norm(fit.zernikes[0] - (after - before)) < 6e-9

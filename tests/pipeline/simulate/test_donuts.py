@@ -1,0 +1,51 @@
+"""Simulated donuts: electrons, noise, defects and streams."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import DomainError
+
+LSST = pachon.load_telescope("lsst_v3.3_r").perturbed("Detector", shift=(0.0, 0.0, 0.3e-3))
+FIELDS = np.deg2rad([(0.2, 0.1), (-0.7, 0.9), (1.0, 1.2)])
+OPTIONS = {"atmosphere": pachon.Atmosphere.from_site("cerro_pachon", seed=1), "stamp_size": 61}
+
+
+def draw(**options):
+    return pachon.draw_donuts(LSST, options.pop("fields", FIELDS), [620e-9], **OPTIONS, **options)
+
+
+def test_pixels_scatter_by_photon_sky_and_read_noise():
+    light = np.array([1e5, 2e5, 4e5])
+    donuts = draw(electrons=light, sky=300.0, read_noise=9.0, seed=4)
+    assert donuts.sky_variance == 381.0
+    expected = light[:, None, None] * donuts.psf.inside[:, None, None] * donuts.psf.image
+    pulls = (donuts.images - expected) / np.sqrt(expected + donuts.sky_variance)
+    # 3721 pixels a star: means scatter by 0.016, mean squares by 0.023.
+    assert pulls.mean(axis=(1, 2)) == pytest.approx(0.0, abs=0.06)
+    assert (pulls**2).mean(axis=(1, 2)) == pytest.approx(1.0, abs=0.09)
+    assert np.abs(donuts.psf.offset).max() <= 0.5
+    assert np.unique(donuts.psf.offset).size == 6
+
+
+def test_the_same_seed_draws_the_same_stars_whatever_follows():
+    few, more, other = draw(fields=FIELDS[:2], seed=4), draw(seed=4), draw(seed=5)
+    assert few.images.tobytes() == more.images[:2].tobytes()
+    assert not np.array_equal(other.images, more.images)
+
+
+def test_second_stars_and_cosmic_rays_are_flagged_and_bright():
+    clean = draw(electrons=1e6, seed=2, read_noise=0.0)
+    blended = draw(electrons=1e6, seed=2, read_noise=0.0, second_stars=1.0)
+    struck = draw(electrons=1e6, seed=2, read_noise=0.0, cosmic_rays=1.0)
+    assert (blended.defects == pachon.StarFlag.NEIGHBOUR).all()
+    assert (struck.defects == pachon.StarFlag.COSMIC_RAY).all()
+    added = (blended.images - clean.images).sum(axis=(1, 2))
+    assert (added > 0.03e6).all()  # of 0.1e6 and more, a part may fall beside the stamp
+    assert ((struck.images - clean.images).max(axis=(1, 2)) >= 500.0).all()
+    assert clean.images.sum(axis=(1, 2)) == pytest.approx(1e6 * clean.psf.inside, rel=0.005)
+
+
+def test_stamps_too_small_for_the_donuts_are_refused():
+    with pytest.raises(DomainError, match=r"stamp_size = 21: .* expected at least 3[0-9] pixels"):
+        pachon.draw_donuts(LSST, FIELDS, [620e-9], atmosphere=OPTIONS["atmosphere"], stamp_size=21)

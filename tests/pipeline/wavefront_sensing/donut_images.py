@@ -1,0 +1,65 @@
+"""Donuts by brute force: a dense lattice of rays, turned by a wavefront, binned finely and blurred."""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+import pachon
+from pachon.models.zernike_polynomials import annular_zernike_gradients
+
+WAVELENGTH = 622e-9
+#: Pixels of 20 um keep the tests quick.
+PIXEL, SIZE = 20e-6, 91
+#: Bins along a pixel, so that the blur is nearly that of a continuous image.
+FINE = 4
+
+
+def donut(
+    tel,
+    field,
+    *,
+    zernikes=(),
+    blur=1.0,
+    flux=5e6,
+    shift=(0.0, 0.0),
+    rays=400,
+    size=SIZE,
+    pixel=PIXEL,
+    extra_sky=0,
+):
+    """Image of a star [electrons]: rays through a turned square lattice, with a Gaussian blur [pixels].
+
+    ``zernikes`` are coefficients [m] from j = 1 of a wavefront that leads: an incoming ray turns by minus its gradient.
+    """
+    radius = 0.5 * tel.pupil_diameter
+    angle, half = 0.4567, 1.45
+    u = ((np.arange(rays * half) + 0.5) / (rays * half) * 2.0 - 1.0) * half * radius
+    x, y = (v.ravel() for v in np.meshgrid(u, u))
+    x, y = x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)
+    near = np.hypot(x, y) < 1.02 * radius
+    x, y = x[near], y[near]
+    slope = np.tan(np.asarray(field))
+    light = np.array([*slope, -1.0]) / np.sqrt(1.0 + slope @ slope)
+    cosines = np.tile(light[:2], (len(x), 1))
+    if len(zernikes):
+        terms = annular_zernike_gradients(len(zernikes), x / radius, y / radius, tel.pupil_obscuration)
+        cosines = cosines - np.tensordot(zernikes, terms, axes=1).T / radius
+    direction = np.column_stack([cosines, -np.sqrt(1.0 - (cosines**2).sum(axis=1))])
+    point = np.column_stack([x, y, np.full(len(x), tel.stop_z)])
+    back = (point * direction).sum(axis=1) + tel.launch_distance
+    end = pachon.trace(tel, pachon.Rays(point - direction * back[:, None], direction, np.zeros(len(x)), WAVELENGTH))
+    chief = pachon.trace(tel, pachon.launch_rays(tel, field, WAVELENGTH, (0.0, 0.0)))
+    detector = tel.surfaces[-1]
+    place = (detector.to_local(end.position) - detector.to_local(chief.position))[:, :2] / pixel + np.asarray(shift)
+    place = place[end.status == 0]
+    margin = 8
+    n = size + 2 * margin
+    edges = (np.arange(n * FINE + 1) / FINE) - 0.5 * n
+    fine = np.histogram2d(place[:, 1], place[:, 0], [edges, edges])[0]
+    fine = gaussian_filter(fine, blur * FINE, mode="constant") if blur else fine
+    image = fine.reshape(n, FINE, n, FINE).sum(axis=(1, 3))[margin:-margin, margin:-margin]
+    return flux * image / len(place)
+
+
+def noisy(image, sky, seed):
+    """Poisson noise of star and sky, sky subtracted."""
+    return np.random.default_rng(seed).poisson(np.maximum(image, 0.0) + sky) - float(sky)

@@ -1,0 +1,362 @@
+"""Fits of donuts: accuracy without noise, honest errors with it, joint fits, and other images than donuts."""
+
+import json
+
+import numpy as np
+import pytest
+from donut_images import PIXEL, SIZE, WAVELENGTH, donut, noisy
+
+import pachon
+from pachon.core.errors import ConfigError, DomainError
+
+FIELD = np.deg2rad([0.6, 0.9])
+OPTIONS = {"pixel_size": PIXEL, "threads": 1}
+
+
+@pytest.fixture(scope="module")
+def wave():
+    """Coefficients from j = 1 within the span of Z4 to Z22 [m], 100 nm rms."""
+    values = np.zeros(22)
+    values[3:] = np.random.default_rng(8).normal(size=19)
+    return 100e-9 * values / np.linalg.norm(values)
+
+
+@pytest.fixture(scope="module")
+def clean(behind_focus, wave):
+    return donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(0.7, -1.2))
+
+
+def rss(values):
+    return float(np.sqrt((values**2).sum()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blur", [0.0, 1.5])
+def test_wavefront_without_noise_or_air(behind_focus, wave, blur):
+    pixel = 10e-6
+    image = donut(
+        behind_focus, FIELD, zernikes=wave, blur=blur, shift=(0.7, -1.2), rays=2500, size=2 * SIZE, pixel=pixel
+    )
+    fit = pachon.fit_donuts(
+        behind_focus,
+        image[None],
+        [FIELD],
+        WAVELENGTH,
+        sky_variance=1000.0,
+        fwhm=0.0,
+        diffusion=blur * pixel,
+        pixel_size=pixel,
+        threads=1,
+    )
+    assert fit.reasons == [""]
+    assert rss(fit.zernikes[0] - wave[3:]) < 2e-9
+    np.testing.assert_allclose(fit.center[0], [0.7, -1.2], atol=4e-3)
+    assert fit.flux[0] == pytest.approx(5e6, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_sign_and_size_are_those_of_the_opd(behind_focus):
+    """A moved camera and a bent mirror: the difference of the coefficients of two telescopes."""
+    # Less than 2 nm of it is beyond Z22.
+    true = behind_focus.perturbed("Camera", shift=(0.0, 0.0, 10e-6), tilt=(3e-6, 0.0, 0.0))
+    before, after = (
+        pachon.wavefront_zernikes(t, [FIELD], WAVELENGTH, jmax=22).coefficients[0, 3:] for t in (behind_focus, true)
+    )
+    image = donut(true, FIELD, blur=1.0, rays=900)
+    fit = pachon.fit_donuts(
+        behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=1000.0, fwhm=0.0, diffusion=PIXEL, **OPTIONS
+    )
+    assert after[0] - before[0] > 50e-9
+    # Rims of 900 rays across: a quarter of a standard deviation of the noise that is not there.
+    np.testing.assert_allclose(fit.zernikes[0], after - before, atol=5e-9)
+
+
+@pytest.mark.slow
+def test_errors_are_those_claimed(behind_focus, wave, clean):
+    options = {"sky_variance": 500.0, "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    first = pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, **options)
+    # The model itself is drawn: brute force has noise of its own.
+    draws = np.stack([noisy(first.model[0], 500.0, seed) for seed in range(32)])
+    fit = pachon.fit_donuts(behind_focus, draws, [FIELD] * 32, WAVELENGTH, **options)
+    assert fit.usable.all()
+    error = fit.zernikes - first.zernikes
+    chi2 = np.einsum("ni,nij,nj->", error, np.linalg.inv(fit.covariance), error) / error.size
+    # 608 squares: 6 % of scatter.
+    assert chi2 == pytest.approx(1.0, abs=0.15)
+    np.testing.assert_allclose(fit.chi2 / fit.n_pixels, 1.0, atol=0.05)
+
+
+@pytest.mark.long
+def test_large_aberrations_are_found(behind_focus):
+    wave = np.zeros(11)
+    wave[[3, 4, 6, 7, 10]] = 800e-9, -900e-9, 700e-9, 500e-9, -200e-9
+    image = noisy(donut(behind_focus, FIELD, zernikes=wave, blur=1.0, shift=(2.0, -3.0), size=111), 500.0, 1)
+    fit = pachon.fit_donuts(
+        behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, noll=range(4, 12), **OPTIONS
+    )
+    assert fit.usable.all()
+    assert rss(fit.zernikes[0] - wave[3:]) < 60e-9
+
+
+@pytest.mark.long
+def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
+    wave = np.zeros(23)
+    wave[22] = 60e-9
+    image = donut(behind_focus, FIELD, zernikes=wave)
+    plain, guarded = (
+        pachon.fit_donuts(
+            behind_focus,
+            image[None],
+            [FIELD],
+            WAVELENGTH,
+            sky_variance=500.0,
+            fwhm=0.0,
+            diffusion=PIXEL,
+            higher_order=rms,
+            **OPTIONS,
+        )
+        for rms in (0.0, 50e-9)
+    )
+    assert rss(plain.zernikes[0]) > 100e-9
+    assert rss(guarded.zernikes[0]) < 15e-9
+
+
+@pytest.mark.parametrize(
+    ("ratio", "offset"),
+    [
+        pytest.param(0.14, (14.0, 9.0), marks=pytest.mark.long),
+        pytest.param(1.0, (-20.0, 12.0), marks=pytest.mark.slow),
+        pytest.param(0.3, (35.0, -20.0), marks=pytest.mark.slow),
+    ],
+)
+def test_second_stars_are_survived(behind_focus, wave, ratio, offset):
+    both = donut(behind_focus, FIELD, zernikes=wave) + ratio * donut(behind_focus, FIELD, zernikes=wave, shift=offset)
+    fit = pachon.fit_donuts(
+        behind_focus, noisy(both, 500.0, 2)[None], [FIELD], WAVELENGTH, sky_variance=500.0, **OPTIONS
+    )
+    assert fit.reasons == ["blended"]
+    assert fit.companion[0, 0] == pytest.approx(ratio, abs=0.02)
+    error = fit.zernikes[0] - wave[3:]
+    assert rss(error) < 4.0 * rss(fit.errors[0])
+
+
+@pytest.mark.long
+def test_cosmic_rays_are_left_out(behind_focus, wave, clean):
+    image = noisy(clean, 500.0, 3)
+    image[20:50, 40] += 4000.0
+    image[60, 10:30] += 20000.0
+    fit = pachon.fit_donuts(behind_focus, image[None], [FIELD], WAVELENGTH, sky_variance=500.0, **OPTIONS)
+    assert fit.reasons == ["clipped"]
+    assert not fit.used[0, 60, 12:28].any()
+    assert rss(fit.zernikes[0] - wave[3:]) < 2.0 * rss(fit.errors[0])
+
+
+@pytest.mark.long
+def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
+    sky = noisy(np.zeros_like(clean), 500.0, 5)
+    not_finite = clean.copy()
+    not_finite[5, 5] = np.nan
+    saturated = np.minimum(4.0 * clean, 2.0 * clean.max())
+    wrong_side = donut(focused.perturbed("Detector", shift=(0.0, 0.0, -1.5e-3)), np.deg2rad([0.9, 1.3]))
+    cut_off = np.zeros_like(clean)
+    cut_off[:, :-28] = clean[:, 28:]
+    images = [clean, not_finite, sky, saturated, cut_off, clean, wrong_side, clean * 1e-6]
+    fields = np.array([FIELD] * 8)
+    fields[5] = np.deg2rad([3.0, 1.0])
+    fields[6] = np.deg2rad([0.9, 1.3])
+    fit = pachon.fit_donuts(
+        behind_focus,
+        images,
+        fields,
+        WAVELENGTH,
+        sky_variance=np.array([500.0] * 7 + [1e-4]),
+        saturation=2.0 * clean.max(),
+        **OPTIONS,
+    )
+    flag = pachon.DonutFlag
+    assert fit.flags[1:7].tolist() == [
+        flag.NOT_FINITE,
+        flag.NO_DONUT,
+        flag.SATURATED,
+        flag.CUT_OFF,
+        flag.OUTSIDE_FIELD,
+        flag.DEFOCUS_SIGN,
+    ]
+    assert flag.TOO_FEW_PHOTONS & fit.flags[7]
+    bad = ~fit.usable
+    assert np.isnan(fit.zernikes[bad]).all()
+    assert np.isnan(fit.fwhm[bad]).all()
+    assert np.isnan(fit.flux[bad]).all()
+
+
+def test_no_light_passes_a_closed_telescope(behind_focus, clean):
+    from dataclasses import replace
+
+    closed = replace(
+        behind_focus,
+        surfaces=tuple(
+            replace(s, aperture=pachon.Annulus(1.0, 1.0001)) if s.name == "M1" else s for s in behind_focus.surfaces
+        ),
+    )
+    fit = pachon.fit_donuts(closed, clean[None], [FIELD], WAVELENGTH, **OPTIONS)
+    assert fit.flags.tolist() == [pachon.DonutFlag.NO_LIGHT]
+
+
+@pytest.mark.slow
+def test_degrees_of_freedom_of_all_donuts_together(focused):
+    freedoms = pachon.load_degrees_of_freedom("lsst").select(
+        ["M2_dz", "M2_dx", "M2_ry", "Camera_dz", "Camera_dy", "M1M3_B2", "M1M3_B6"]
+    )
+    values = np.array([10.0, 150.0, 3.0, -8.0, 400.0, 0.1, -0.05])
+    prior = np.array([40.0, 400.0, 10.0, 30.0, 1000.0, 0.3, 0.3])
+    true = freedoms.apply(focused, values)
+    fields = np.deg2rad([[1.15, 1.15], [-1.15, 1.15], [1.15, -1.15], [-1.15, -1.15]])
+    defocus = np.array([1.5e-3, -1.5e-3, -1.5e-3, 1.5e-3])
+    images = np.stack(
+        [
+            noisy(donut(true.perturbed("Detector", shift=(0.0, 0.0, d)), f), 500.0, i)
+            for i, (f, d) in enumerate(zip(fields, defocus, strict=True))
+        ]
+    )
+    fit = pachon.fit_donuts(
+        focused,
+        images,
+        fields,
+        WAVELENGTH,
+        sky_variance=500.0,
+        defocus=defocus,
+        degrees_of_freedom=freedoms,
+        prior=prior,
+        **OPTIONS,
+    )
+    estimate = fit.degrees_of_freedom
+    error = estimate.values - values
+    assert error @ np.linalg.solve(estimate.covariance, error) < 20.0  # 7 degrees of freedom; 1 in 200 beyond
+    ratio, _ = estimate.combinations()
+    assert ratio[0] < 0.01
+    assert (np.diff(ratio) >= 0.0).all()
+    assert ratio[-1] < 1.0
+    expected = [pachon.wavefront_zernikes(t, fields, WAVELENGTH, jmax=22).coefficients[:, 3:] for t in (focused, true)]
+    assert rss(fit.zernikes - expected[1] + expected[0]) < 4.0 * rss(fit.errors)
+    json.dumps(fit.summary())
+    assert estimate.plot().axes
+
+
+@pytest.mark.slow
+def test_double_zernikes_and_stars_in_focus(focused):
+    """A wavefront that is linear over the field: donuts on both sides of focus, and a star in focus."""
+    fields = np.deg2rad([[0.8, 0.0], [-0.8, 0.0], [0.0, 0.8], [0.3, 0.3]])
+    defocus = np.array([1.5e-3, -1.5e-3, 1.5e-3, 0.0])
+    double = np.zeros((3, 11))
+    double[0, [4, 7]], double[1, 3] = (60e-9, -50e-9), 40e-9
+    radius = focused.field_radius
+    over_field = np.stack([np.ones(4), 2.0 * fields[:, 0] / radius, 2.0 * fields[:, 1] / radius])
+    waves = over_field.T @ double
+    images = [
+        noisy(donut(focused.perturbed("Detector", shift=(0.0, 0.0, d)), f, zernikes=w), 500.0, i)
+        for i, (f, d, w) in enumerate(zip(fields, defocus, waves, strict=True))
+    ]
+    # A small stamp does for a star in focus.
+    images[3] = images[3][25:-25, 25:-25]
+    fit = pachon.fit_donuts(
+        focused,
+        images,
+        fields,
+        WAVELENGTH,
+        sky_variance=500.0,
+        defocus=defocus,
+        noll=range(4, 12),
+        field_noll=[1, 2, 3],
+        fwhm=0.0,
+        diffusion=PIXEL,
+        **OPTIONS,
+    )
+    assert fit.double_zernikes.shape == (3, 8)
+    error = (fit.double_zernikes - double[:, 3:]).ravel()
+    assert error @ np.linalg.solve(fit.double_zernike_covariance, error) / error.size < 2.5
+    assert fit.images.shape == (4, SIZE, SIZE)
+    assert np.isnan(fit.images[3, -1, -1])
+
+
+@pytest.mark.long
+def test_results_do_not_depend_on_threads_or_on_other_donuts(behind_focus, clean):
+    images = np.stack([noisy(clean, 500.0, seed) for seed in range(3)])
+    options = {"pixel_size": PIXEL, "sky_variance": 500.0, "noll": range(4, 12)}
+    many = pachon.fit_donuts(behind_focus, images, [FIELD] * 3, WAVELENGTH, threads=2, **options)
+    one = pachon.fit_donuts(behind_focus, images[1:2], [FIELD], WAVELENGTH, threads=1, **options)
+    np.testing.assert_array_equal(many.zernikes[1], one.zernikes[0])
+    np.testing.assert_array_equal(many.model[1], one.model[0])
+
+
+@pytest.mark.long
+def test_tables_summaries_and_pictures(behind_focus, clean):
+    images = np.stack([clean, np.full_like(clean, np.nan)])
+    fit = pachon.fit_donuts(
+        behind_focus, images, [FIELD] * 2, WAVELENGTH, sky_variance=500.0, noll=range(4, 12), **OPTIONS
+    )
+    table = fit.to_table()
+    assert len(table) == 2
+    assert table["Z4"].unit == "nm"
+    assert table["reasons"].tolist() == ["ok", "not finite"]
+    text = json.loads(json.dumps(fit.summary(), allow_nan=False))
+    assert text["zernike_nm"][1] == [None] * 8
+    np.testing.assert_allclose(fit.residuals[0], fit.images[0] - fit.model[0])
+    assert len(fit.plot().axes) >= 7
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"images": np.zeros((3, 4))}, "images of shape"),
+        ({"fields": [[0.0, 0.0], [0.0, 0.0]]}, "fields of shape"),
+        ({"wavelength": 3e-6}, "wavelength"),
+        ({"noll": [3, 4]}, "noll = "),
+        ({"sky_variance": -1.0}, "sky_variance"),
+        ({"sky_variance": np.ones(5)}, "sky_variance of shape"),
+        ({"pixel_size": 0.0}, "pixel_size"),
+        ({"fwhm": -1.0}, "fwhm"),
+        ({"defocus": [1e-3, 1e-3]}, "defocus of shape"),
+        ({"prior": 1.0}, "prior"),
+        ({"field_noll": [1, 2, 3]}, "field_noll: 3 terms for 1"),
+        ({"n_pupil": 3}, "n_pupil"),
+        ({"higher_order": -1.0}, "higher_order"),
+        ({"outer_scale": 0.0}, "outer_scale"),
+        ({"mask": np.zeros((1, 9, 9))}, "mask of shape"),
+    ],
+)
+def test_bad_arguments(behind_focus, clean, changes, text):
+    arguments = {
+        "images": clean[None],
+        "fields": [FIELD],
+        "wavelength": WAVELENGTH,
+        "noll": [4],
+        "sky_variance": 500.0,
+        **OPTIONS,
+    }
+    with pytest.raises((DomainError, ConfigError), match=text) as error:
+        pachon.fit_donuts(behind_focus, **{**arguments, **changes})
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.long
+def test_heights_of_ccds_and_several_wavelengths(behind_focus, clean):
+    """A CCD that stands 30 um too high is a detector 30 um farther, whichever argument says so."""
+    options = {"sky_variance": 500.0, "noll": range(4, 9), "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    plane = pachon.FocalPlane.flat("lsst").with_moved("R32", dz=30e-6).with_moved("R33", dz=30e-6)
+    higher, moved, colours = (
+        pachon.fit_donuts(behind_focus, clean[None], [FIELD], w, **{**options, **changes})
+        for w, changes in (
+            (WAVELENGTH, {"focal_plane": plane}),
+            (WAVELENGTH, {"defocus": 30e-6}),
+            ([560e-9, WAVELENGTH, 680e-9], {}),
+        )
+    )
+    np.testing.assert_allclose(higher.zernikes, moved.zernikes, atol=1e-10)
+    # 158 nm of Z4 for 10 um, as batoid has it.
+    nominal = pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, **options)
+    assert nominal.zernikes[0, 0] - higher.zernikes[0, 0] == pytest.approx(3 * 158e-9, rel=0.02)
+    # The LSST's focus differs by some micrometres over the r band.
+    assert rss(colours.zernikes - nominal.zernikes) < 60e-9
+    between = pachon.fields_at(behind_focus, [(0.0635, 0.0)], WAVELENGTH)  # two rafts
+    gap = pachon.fit_donuts(behind_focus, clean[None], between, WAVELENGTH, focal_plane=plane, **options)
+    assert gap.reasons == ["no light"]

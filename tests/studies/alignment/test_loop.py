@@ -1,0 +1,119 @@
+"""The active-optics loop: convergence, honesty of what it expects, heights, bytes, files."""
+
+import json
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+import pachon
+from pachon.commands.cli import main
+from pachon.core.errors import ConfigError, UnknownNameError
+from pachon.pipeline.experiment import Experiment, hashed_states
+from pachon.studies.alignment.config import AlignConfig, load_align_configuration
+from pachon.studies.alignment.loop import align
+from pachon.studies.alignment.product import write_alignment
+from pachon.studies.alignment.scene import AlignmentScene
+
+QUIET = {"wavefront": False}
+
+
+def config(**changes):
+    return AlignConfig(**({"visits": 4, "air": QUIET} | changes))
+
+
+@pytest.fixture(scope="module")
+def aligned(traced_donuts):
+    return align(config())
+
+
+@pytest.mark.long
+def test_the_sensitivity_is_that_of_traced_wavefronts(donut_zernikes):
+    scene = AlignmentScene.of(config())
+    state = 0.3 * np.random.default_rng(2).normal(size=50)
+    moved = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
+    change = donut_zernikes(moved, scene) - donut_zernikes(scene.telescope, scene)
+    linear = (scene.sensitivity @ state).reshape(change.shape)
+    # 7 nm of 90: the part of the second order, and terms beyond Z28 under vignetting.
+    assert np.sqrt(((change - linear) ** 2).sum(axis=1)).max() < 0.1 * np.sqrt((change**2).sum(axis=1)).min()
+    assert np.sqrt((scene.field_response**2).sum(axis=0)) * scene.tolerances == pytest.approx(50e-9)
+
+
+def test_what_is_added_over_the_field_is_what_the_response_expects():
+    scene = AlignmentScene.of(config())
+    state = 0.3 * np.random.default_rng(5).normal(size=50)
+    moved = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
+    found = scene.quality.means(moved)
+    assert found.added == pytest.approx(scene.expected_wavefront(np.outer(state, state)), rel=0.06)
+    assert scene.quality.means(scene.telescope).added == 0.0
+
+
+@pytest.mark.long
+def test_the_loop_converges_within_two_corrections_to_what_it_expects(aligned):
+    added = np.array([v.added for v in aligned.visits])
+    assert added[0] > 600e-9
+    total = np.array([v.wavefront for v in aligned.visits])
+    assert total[2:].max() < 1.2 * np.hypot(aligned.designed.wavefront, aligned.floor)
+    assert np.sqrt(np.mean(added[2:] ** 2)) == pytest.approx(np.sqrt(np.mean(aligned.expected[2:] ** 2)), rel=0.35)
+    assert aligned.visits[0].fwhm > 1.2 * aligned.designed.fwhm
+    assert aligned.visits[-1].fwhm == pytest.approx(aligned.designed.fwhm, rel=0.01)
+    assert (aligned.donuts == 8).all()
+
+
+@pytest.mark.long
+def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
+    again = align(config(visits=2), threads=1)
+    assert again.states.tobytes() == aligned.states[:2].tobytes()
+    assert again.visits == aligned.visits[:2]
+
+
+@pytest.mark.long
+def test_files_have_the_loop_and_states_go_into_runs(aligned, tmp_path):
+    names = write_alignment(aligned, tmp_path)
+    assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
+    visits = QTable.read(tmp_path / "visits.ecsv")
+    assert visits["added"].to_value("m") == pytest.approx([v.added for v in aligned.visits])
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["first_visit_within_1.2_floors"] <= 2
+    assert load_align_configuration(tmp_path / "config.yaml") == config()
+    states = tmp_path / "states.ecsv"
+    run = {"active_optics": {"states": "states.ecsv"}, "atmosphere": {"epoch": 3}}
+    experiment = Experiment.from_config(pachon.Configuration(**run), tmp_path)
+    scene = aligned.scene
+    expected = scene.freedoms.apply(scene.telescope, aligned.states[3] * scene.tolerances)
+    assert experiment.telescope == expected
+    plain = Experiment.from_config(pachon.Configuration(atmosphere={"epoch": 3}))
+    assert experiment.config_hash != plain.config_hash
+    states.write_text(states.read_text().replace("\n3 ", "\n33 "))
+    with pytest.raises(ConfigError, match=r"active_optics.states: .*states.ecsv: visit = 3: expected one row"):
+        Experiment.from_config(pachon.Configuration(**run), tmp_path)
+
+
+def test_runs_without_states_keep_their_hash():
+    assert hashed_states({"residual_um": 0.2, "states": None}) == {"residual_um": 0.2}
+
+
+def test_bad_files_of_states_are_one_line(tmp_path):
+    (tmp_path / "states.ecsv").write_text("nothing\n")
+    run = pachon.Configuration(active_optics={"states": "states.ecsv"})
+    with pytest.raises(ConfigError, match=r"active_optics.states: .*states.ecsv: expected a table of states"):
+        Experiment.from_config(run, tmp_path)
+    QTable({"visit": [0], "M2_dw": [1.0]}).write(tmp_path / "states.ecsv", overwrite=True)
+    with pytest.raises(UnknownNameError, match="M2_dw"):
+        Experiment.from_config(run, tmp_path)
+
+
+@pytest.mark.long
+def test_the_command_shows_the_loop(traced_donuts, tmp_path, capsys):
+    (tmp_path / "loop.yaml").write_text("air: {wavefront: false}\nvisits: 9\n")
+    arguments = ["align", str(tmp_path / "loop.yaml"), "-n", "1", "-o", str(tmp_path / "out"), "--quiet", "--json"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["visits"] == 1
+    (tmp_path / "loop.yaml").write_text("donuts: {heights: flat}\n")
+    assert main(arguments) == 2
+    message = capsys.readouterr().err
+    assert "donuts.heights" in message
+    assert message.count("\n") == 1
+    (tmp_path / "loop.yaml").write_text("telescope: hsc\n")
+    assert main(arguments) == 2
+    assert "telescope = hsc: expected a model with the LSST's camera" in capsys.readouterr().err

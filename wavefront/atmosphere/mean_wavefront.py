@@ -1,0 +1,114 @@
+r"""The wavefront that turbulence leaves in the mean of an exposure: covariances of its Zernikes over the field.
+
+Layers drift across the pupil, and the mean of the path over an exposure of length T has Zernike coefficients
+
+.. math:: c_j = \int \hat\psi(\nu) \, Q_j(\nu) \, \mathrm{sinc}(\nu \cdot v T) \, e^{2 \pi i \nu \cdot x} \, d^2\nu,
+
+with the transform Q of a Zernike over the annulus and the place x where the light of a star crosses the layer. With the
+von Karman spectrum W the covariances of two stars, whose light crosses at a distance d, are
+
+.. math:: \langle c_i c_j \rangle = \sum_{layers} w \int W Q_i Q_j^* \, \mathrm{sinc}^2(\nu \cdot v T)
+          \, e^{-2 \pi i \nu \cdot d} \, d^2\nu.
+
+At T = 0 these are the coefficients of Noll (1976, J. Opt. Soc. Am. 66, 207); beyond the time in which the wind crosses
+the pupil they fall as 1/T. This is what a single donut cannot tell from the wavefront of the telescope.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import jv
+
+from ...core.errors import DomainError
+from ...models.zernike_polynomials import annular_zernikes, noll_to_nm
+from .atmosphere import Atmosphere
+from .turbulence import path_spectrum
+
+# Frequencies times the diameter of the pupil, on a logarithmic scale, and directions over half the plane: enough for
+# the narrow lobe of a long exposure, which is 1/300 rad wide at 1 cycle/m after 15 s of 20 m/s.
+_FREQUENCIES, _DIRECTIONS = (0.005, 40.0, 100), 768
+# Nodes of the integral over the radius of the pupil.
+_RADII = 60
+# Distance, in outer scales, beyond which the light of two stars crosses independent turbulence.
+_INDEPENDENT = 5.0
+
+
+def mean_wavefront_covariance(
+    atmosphere: Atmosphere, fields: ArrayLike, noll: ArrayLike, diameter: float, obscuration: float
+) -> np.ndarray:
+    """Return the covariance of the Zernikes of the mean wavefront of an exposure [m^2].
+
+    Parameters
+    ----------
+    atmosphere : Atmosphere
+        Layers, winds, Fried parameter, outer scale and exposure time; its screens are not used.
+    fields : array_like, shape [n_star, 2]
+        Field slopes of the stars (tx, ty) [rad].
+    noll : array_like of int, shape [n_noll]
+        Noll indices, from 4.
+    diameter, obscuration : float
+        Outer diameter of the entrance pupil [m], and its linear obscuration.
+
+    Returns
+    -------
+    ndarray, shape [n_star, n_noll, n_star, n_noll]
+        Stars whose light crosses a layer more than five outer scales apart share nothing of it.
+
+    Raises
+    ------
+    DomainError
+        If there are no Noll indices, or one is below 4.
+    """
+    indices = np.atleast_1d(np.asarray(noll, dtype=np.int64))
+    if not indices.size or indices.min() < 4:
+        raise DomainError(f"noll = {indices.tolist()}: expected Noll indices from 4")
+    slopes = np.atleast_2d(np.asarray(fields, dtype=np.float64))
+    low, high, count = _FREQUENCIES
+    frequency = np.geomspace(low, high, count) / diameter
+    angle = np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
+    transform = _transforms(indices, 0.5 * diameter * frequency, angle, obscuration)
+    plane = frequency[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    # The other half of the plane is the complex conjugate.
+    area = 2.0 * (np.log(high / low) / (count - 1)) * (np.pi / _DIRECTIONS) * frequency**2
+    power = area * path_spectrum(frequency, atmosphere.r0, atmosphere.outer_scale)
+    n_star, n_noll = len(slopes), len(indices)
+    covariance = np.zeros((n_star, n_noll, n_star, n_noll))
+    for altitude, weight, velocity in zip(atmosphere.altitudes, atmosphere.weights, atmosphere.velocities, strict=True):
+        seen = weight * power[:, None] * np.sinc(plane @ (velocity * atmosphere.exposure)) ** 2
+        apart = altitude * (slopes[:, None] - slopes)
+        known: dict[tuple[float, float], np.ndarray] = {}
+        for a in range(n_star):
+            for b in range(a, n_star):
+                distance = apart[a, b]
+                if np.hypot(*distance) > _INDEPENDENT * atmosphere.outer_scale:
+                    continue
+                key = (float(distance[0]), float(distance[1]))
+                if key not in known:
+                    shifted = transform * (seen * np.exp(-2j * np.pi * (plane @ distance)))[..., None]
+                    known[key] = np.tensordot(shifted, transform.conj(), axes=((0, 1), (0, 1))).real
+                covariance[a, :, b] += known[key]
+                if a != b:
+                    covariance[b, :, a] += known[key].T
+    return covariance
+
+
+def _transforms(indices: np.ndarray, frequency: np.ndarray, angle: np.ndarray, obscuration: float) -> np.ndarray:
+    """Return means over the annulus of Zernikes times a plane wave, shape [n_frequency, n_angle, n_noll].
+
+    Frequencies are in cycles per radius of the pupil.
+    """
+    node, weight = np.polynomial.legendre.leggauss(_RADII)
+    radius = 0.5 * ((1.0 - obscuration) * node + 1.0 + obscuration)
+    weight = weight * (1.0 - obscuration) * radius / (1.0 - obscuration**2)
+    out = np.empty((len(frequency), len(angle), len(indices)), dtype=np.complex128)
+    for k, j in enumerate(indices):
+        _, m = noll_to_nm(int(j))
+        order = abs(m)
+        # Along this direction the cosine or the sine of the Zernike is 1.
+        crest = 0.0 if m >= 0 else 0.5 * np.pi / order
+        radial = annular_zernikes(int(j), radius * np.cos(crest), radius * np.sin(crest), obscuration)[-1]
+        wave = jv(order, 2.0 * np.pi * np.outer(frequency, radius))
+        around = np.cos(order * angle) if m >= 0 else np.sin(order * angle)
+        out[:, :, k] = 1j**order * (wave @ (weight * radial))[:, None] * around
+    return out

@@ -1,0 +1,59 @@
+"""Stars far from focus: how large their images are, and how finely their pupils must be sampled.
+
+A pupil point stands for the light of the pupil around it. In focus all rays land together, and some hundred points are
+enough; 1.5 mm from focus they would make a ring of dots. How far apart the rays of neighbouring points land follows
+from the traced rays of the star itself, so its sampling, like its image, does not depend on other stars.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ..pupil_optics import PupilOptics
+from .image_plane import ImagePlane
+
+#: Largest part of the light of the optics alone that may fall beside a stamp.
+LARGEST_LOSS = 0.05
+
+
+def blur_radii(optics: PupilOptics) -> np.ndarray:
+    """Return the rms distance of a star's rays from its reference point [m], 0 for a dark star, shape [n_star]."""
+    square = (optics.displacement.astype(np.float64) ** 2).sum(axis=-1)
+    total = np.sum(square, axis=(1, 2), where=optics.lit)
+    return np.asarray(np.sqrt(total / np.maximum(optics.lit.sum(axis=(1, 2)), 1)))
+
+
+def finer_sampling(optics: PupilOptics, neighbour: float, largest: float, wanted: float) -> np.ndarray:
+    """Return by what power of two the pupil of each star must be sampled more finely, 1 for stars near focus, [n_star].
+
+    Parameters
+    ----------
+    optics : PupilOptics
+        Rays of the stars.
+    neighbour : float
+        Distance of neighbouring points over the radius of the pupil.
+    largest, wanted : float
+        Distance of the rays of neighbouring points [m] from which on a star counts as far from focus, and that which
+        its rays then have at most.
+    """
+    distance = neighbour * blur_radii(optics)
+    power = np.ceil(np.log2(np.maximum(distance / wanted, 1.0))).astype(np.int64)
+    return np.where(distance > largest, 2**power, 1)
+
+
+def check_stamp(optics: PupilOptics, plane: ImagePlane) -> None:
+    """Raise a DomainError if a star's rays fall beside its stamp, where an engine would fold or lose their light."""
+    half = 0.5 * plane.side
+    beside = (np.abs(optics.displacement) > half).any(axis=-1) & optics.lit
+    lit = optics.lit.sum(axis=(1, 2))
+    lost = beside.sum(axis=(1, 2)) / np.maximum(lit, 1)
+    if (lost > LARGEST_LOSS).any():
+        star = int(np.argmax(lost))
+        reach = np.max(np.abs(optics.displacement[star]), where=optics.lit[star, ..., None], initial=0.0)
+        needed = 2 * int(np.ceil(1.1 * reach / plane.pixel_size)) + 1
+        x, y = np.rad2deg(optics.fields[star])
+        raise DomainError(
+            f"stamp_size = {plane.stamp_size}: {100.0 * lost[star]:.0f} % of the light of the star at field ({x:.4g}, "
+            f"{y:.4g}) deg falls beside the stamp; expected at least {needed} pixels"
+        )
