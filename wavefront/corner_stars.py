@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import DomainError
-from ..core.units import metres
+from ..core.arguments import check_arguments
+from ..core.units import length, require_count
 from ..models.camera.corner_rafts import corner_focal_plane
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
@@ -64,6 +64,7 @@ class CornerStars:
         return self.telescope.perturbed(detector.name, shift=shift, tilt=tilt, about=point)
 
 
+@check_arguments
 def corner_stars(
     telescope: Telescope,
     *,
@@ -100,9 +101,8 @@ def corner_stars(
         If ``n`` is not a whole number of at least 1, the wavelength is not positive, or a sensor lies outside the
         field of the telescope.
     """
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
-        raise DomainError(f"n = {n!r}: expected a whole number of at least 1", key="n")
-    light = telescope.default_wavelength if wavelength is None else float(metres(wavelength, "wavelength"))
+    n = require_count(n, "n", 1)
+    light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     plane = corner_focal_plane(kind, heights)
     camera = plane.camera
     inner = camera.half_size - _MARGIN

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.errors import check_choice
 from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 from .camera import Camera, load_camera
@@ -20,6 +21,7 @@ WAVEFRONT_OFFSET = 1.5e-3
 _CAMERAS = {"wavefront": "lsst_wavefront", "guider": "lsst_guider"}
 
 
+@check_arguments
 def corner_focal_plane(kind: str = "wavefront", heights: str = "nominal") -> FocalPlane:
     """Return the focal plane of the sensors in the corners of the LSST camera.
 

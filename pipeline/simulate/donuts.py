@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...core.arguments import check_arguments
 from ...core.random_streams import stream
+from ...core.units import for_each, pure_numbers, radians, require_seed
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.psf.psf import Psfs, make_psfs
@@ -45,6 +47,7 @@ class Donuts:
     defects: np.ndarray
 
 
+@check_arguments
 def draw_donuts(
     telescope: Telescope,
     fields: ArrayLike,
@@ -94,13 +97,14 @@ def draw_donuts(
         As :func:`~pachon.make_psfs`, of a stamp that is too small for the donuts too; or if a number of electrons is
         negative, or a fraction not from 0 to 1.
     """
-    angles = np.atleast_2d(np.asarray(fields, dtype=np.float64))
+    seed = require_seed(seed)
+    angles = np.atleast_2d(radians(fields, "fields"))
     if psf.get("offsets") is None:
         psf["offsets"] = stream(seed, "donuts", "places").uniform(-0.5, 0.5, angles.shape)
     stars = make_psfs(
         telescope, fields, wavelengths, atmosphere=atmosphere, engine=engine, stamp_size=stamp_size, **psf
     )
-    light = np.broadcast_to(np.asarray(electrons, dtype=np.float64), len(stars.image))
+    light = for_each(pure_numbers(electrons, "electrons"), len(stars.image), "electrons")
     caught = light * np.minimum(stars.inside, 1.0)
     stamps = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
     images, defects = add_defects(

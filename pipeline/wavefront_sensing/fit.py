@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.errors import ConfigError, DomainError
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, DomainError, shown
 from ...core.threads import one_blas_thread, thread_count
-from ...core.units import ARCSEC, metres, radians, require_positive
+from ...core.units import ARCSEC, length, metres, pure_numbers, radians, require_count, require_positive
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...design.parameters.tolerances import Tolerance
 from ...models.camera.focal_plane import FocalPlane
@@ -32,10 +33,13 @@ from .stamps import Pixels
 
 #: Seeing that the search starts from [rad].
 _START_FWHM = 0.8 * ARCSEC
+# Largest seeing [rad], defocus of an image [m], spread or wavefront [m], and cells across the pupil.
+_MOST_FWHM, _MOST_DEFOCUS, _MOST_LENGTH, _MOST_CELLS = 60.0 * ARCSEC, 0.1, 1e-3, 2000
 #: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
 _SATURATED = 0.002
 
 
+@check_arguments
 def fit_donuts(
     telescope: Telescope,
     images: ArrayLike | Sequence[ArrayLike],
@@ -151,20 +155,17 @@ def fit_donuts(
     directions = field_direction(angles[:, 0], angles[:, 1], projection)
     waves = wavelength_points(telescope, wavelength)
     terms = _noll(noll, "noll", 4)
-    size = float(metres(higher_order, "higher_order"))
-    if not (np.isfinite(size) and size >= 0.0):
-        raise DomainError(f"higher_order = {higher_order!r}: expected a length in metres from 0")
+    size = _length(higher_order, "higher_order")
     further = _next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
     field_indices = None if field_noll is None else _noll(field_noll, "field_noll", 1)
     shifts = _each(metres(defocus, "defocus"), count, "defocus")
+    if (np.abs(shifts) > _MOST_DEFOCUS).any():
+        raise DomainError(f"defocus: expected at most {_MOST_DEFOCUS:g} m on either side")
     known = None if fwhm is None else _each(radians(fwhm, "fwhm"), count, "fwhm")
-    if known is not None and (known < 0.0).any():
-        raise DomainError(f"fwhm = {float(known.min())!r}: expected angles in radians from 0")
-    spread = float(metres(diffusion, "diffusion"))
-    if not (np.isfinite(spread) and spread >= 0.0):
-        raise DomainError(f"diffusion = {diffusion!r}: expected a length in metres from 0")
-    if n_pupil is not None and not (int(n_pupil) == n_pupil and n_pupil >= 8):
-        raise DomainError(f"n_pupil = {n_pupil!r}: expected a whole number of at least 8 cells across the pupil")
+    if known is not None and not ((known >= 0.0) & (known < _MOST_FWHM)).all():
+        raise DomainError(f"fwhm = {shown(fwhm)}: expected angles from 0 to {_MOST_FWHM:g} rad")
+    spread = _length(diffusion, "diffusion")
+    cells = None if n_pupil is None else require_count(n_pupil, "n_pupil", 8, _MOST_CELLS)
     if saturation is not None:
         saturation = require_positive(saturation, "saturation", "electrons")
     variance = _variance(sky_variance, stack.shape)
@@ -182,7 +183,7 @@ def fit_donuts(
         np.concatenate([terms, further]),
         np.concatenate([np.zeros(len(terms)), np.full(len(further), size**-2.0 if size else 0.0)]),
         focal_plane,
-        None if n_pupil is None else int(n_pupil),
+        cells,
     )
     joint = degrees_of_freedom is not None or field_indices is not None
     start = instrument.seeing.strength(_START_FWHM)
@@ -382,7 +383,7 @@ def _each(values: np.ndarray, count: int, name: str) -> np.ndarray:
 
 def _variance(values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """Return the variance of sky and readout of every pixel."""
-    variance = np.asarray(values, dtype=np.float64)
+    variance = pure_numbers(values, "sky_variance")
     variance = variance[:, None, None] if variance.ndim == 1 else variance
     try:
         variance = np.broadcast_to(variance, shape)
@@ -391,6 +392,14 @@ def _variance(values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     if not (np.isfinite(variance) & (variance >= 0.0)).all():
         raise DomainError("sky_variance: expected finite numbers from 0 [electron^2]")
     return variance
+
+
+def _length(value: ArrayLike, name: str) -> float:
+    """Return a length [m] of zero or more, and less than would leave the detector."""
+    size = length(value, name)
+    if not 0.0 <= size <= _MOST_LENGTH:
+        raise DomainError(f"{name} = {shown(value)}: expected a length from 0 to {_MOST_LENGTH:g} m")
+    return size
 
 
 def _outer_scale(value: float) -> float:

@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
+from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from ...core.schema import Count, NotNegative, Positive, Section, Switch, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
@@ -95,6 +96,7 @@ class AlignConfig(Section):
         return section_yaml(self, "All that decides this loop.")
 
 
+@check_arguments
 def load_align_configuration(path: Path) -> AlignConfig:
     """Read a configuration of the loop.
 

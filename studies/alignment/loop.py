@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...core.arguments import check_arguments
 from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.threads import one_blas_thread
@@ -60,6 +61,7 @@ class Alignment:
     last: DonutFit
 
 
+@check_arguments
 def align(
     config: AlignConfig,
     *,

@@ -52,6 +52,14 @@ class _Made:
         star = 2e3 * np.exp(-0.5 * (x * x + y * y) / 1.6**2)
         return star + np.random.default_rng(3).normal(size=(12, 17, 17)) * np.sqrt(100.0 + star)
 
+    def make_defocused(self):
+        return self.lsst.perturbed("Detector", shift=(0.0, 0.0, 1.5e-3))
+
+    def make_donuts(self):
+        tiny = {"stamp_size": 60, "pixel_size": 30e-6, "electrons": 1e6, "sky": 10.0}
+        air = pachon.Atmosphere.from_site("cerro_pachon", seed=2, screen_size=512, screen_length=40.0, exposure=0.1)
+        return pachon.draw_donuts(self.defocused, [(0.005, 0.005)], 622e-9, atmosphere=air, **tiny)
+
     def make_model(self):
         return pachon.PsfModel.fit(self.stamps, self.places, n_components=2, order=1)
 
@@ -241,6 +249,19 @@ def calls(folder):
         "load_stars": (pachon.load_stars, {"catalogue": m.folder / "none.fits", "x": "x", "y": "y", "stamp": "stamp"}),
         "flag_stars": (pachon.flag_stars, {"stamps": m.stamps, "noise": 0.01, "gain": 1.0, "saturation": 10.0,
                        "threshold": 6.0}),
+        "corner_focal_plane": (pachon.corner_focal_plane, {"kind": "guider", "heights": "nominal"}),
+        "corner_stars": (pachon.corner_stars, {"telescope": m.lsst, "kind": "guider", "heights": "nominal", "n": 1,
+                         "wavelength": 622e-9}),
+        "draw_donuts": (pachon.draw_donuts, {"telescope": m.defocused, "fields": [(0.005, 0.005)],
+                        "wavelengths": 622e-9, "atmosphere": None, "electrons": 1e6, "sky": 10.0, "read_noise": 5.0,
+                        "second_stars": 0.0, "cosmic_rays": 0.0, "seed": 1, "engine": "fast", "stamp_size": 160}),
+        "fit_donuts": (pachon.fit_donuts, {"telescope": m.defocused, "images": m.donuts.images,
+                       "fields": [(0.005, 0.005)], "wavelength": 622e-9, "pixel_size": 30e-6, "sky_variance": 10.0,
+                       "noll": (4, 5), "higher_order": 0.0, "prior": None, "field_noll": None, "defocus": 0.0,
+                       "wavelength_weights": None, "fwhm": 3e-6, "outer_scale": 25.0, "diffusion": 0.0, "mask": None,
+                       "saturation": None, "n_pupil": 60, "projection": "zemax", "threads": 1}),
+        "align": (pachon.align, {"config": 5}),
+        "load_align_configuration": (pachon.load_align_configuration, {"path": m.folder / "none.yaml"}),
         "fit_own_stars": (pachon.fit_own_stars, {"stamps": m.own, "positions": m.places,
                           "pixel_scale": 1e-6, "size": 11, "min_snr": 1.0, "gain": 1.0, "saturation": 1e9,
                           "background": False, "extent": (-1.0, 1.0, -1.0, 1.0), "seed": 1}),
