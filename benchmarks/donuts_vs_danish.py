@@ -198,8 +198,8 @@ def main() -> None:
         print(f"{line}  {fit.flags[0]!s}", flush=True)
         table.append(row)
     columns = np.array(table).T
-    print(f"\npachon: median {np.median(columns[0]):.1f}, worst {columns[0].max():.1f} nm", end="")
-    print(f", {np.median(columns[2]):.2f} s a donut; limit {np.median(columns[1]):.1f} nm (medians)")
+    print(f"\npachon: median {np.nanmedian(columns[0]):.1f}, worst {np.nanmax(columns[0]):.1f} nm", end="")
+    print(f", {np.median(columns[2]):.2f} s a donut; limit {np.nanmedian(columns[1]):.1f} nm (medians)")
     if not options.no_danish:
         print(f"danish: median {np.median(columns[3]):.1f}, worst {columns[3].max():.1f} nm", end="")
         print(f", {np.median(columns[4]):.2f} s a donut: {np.median(columns[4] / columns[2]):.0f} times pachon's")
