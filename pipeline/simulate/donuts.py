@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError, shown
 from ...core.random_streams import stream
 from ...core.units import for_each, pure_numbers, radians, require_seed
 from ...models.telescope import Telescope
@@ -20,6 +21,8 @@ from .star_defects import add_defects
 
 #: Pixels on a side of a stamp: a donut of 1.2 mm in pixels of 10 um, and room for the seeing.
 STAMP_SIZE = 181
+# More do not fit into the counts of the noise.
+_MOST_ELECTRONS = 1e15
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +108,9 @@ def draw_donuts(
         telescope, fields, wavelengths, atmosphere=atmosphere, engine=engine, stamp_size=stamp_size, **psf
     )
     light = for_each(pure_numbers(electrons, "electrons"), len(stars.image), "electrons")
+    for name, value in (("electrons", light), ("sky", sky), ("read_noise", read_noise)):
+        if not np.all((np.asarray(value) >= 0.0) & (np.asarray(value) <= _MOST_ELECTRONS)):
+            raise DomainError(f"{name} = {shown(value)}: expected 0 to {_MOST_ELECTRONS:g} electrons", key=name)
     caught = light * np.minimum(stars.inside, 1.0)
     stamps = observe_stamps(stars.image, caught, sky, read_noise, stream(seed, "donuts", "noise"))
     images, defects = add_defects(

@@ -12,18 +12,26 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, shown
 from ...core.threads import one_blas_thread, thread_count
-from ...core.units import ARCSEC, length, metres, pure_numbers, radians, require_count, require_positive
+from ...core.units import ARCSEC, metres, radians, require_count, require_positive
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...design.parameters.tolerances import Tolerance
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
-from ...models.zernike_polynomials import noll_to_nm
 from ...raytrace.rays import field_direction
 from ...wavefront.request import relative_weights, wavelength_points
 from .degrees import FreedomEstimate, prior_spreads
 from .fit_star import SMALLEST_DONUT, StarFit, fit_star
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, RATIO, STRENGTH, X, Y
+from .inputs import (
+    next_terms,
+    noll_indices,
+    one_for_each,
+    outer_scale_of,
+    padded,
+    sky_variances,
+    small_length,
+)
 from .joint import JointFit, field_terms, fit_field, fit_freedoms
 from .light import Instrument
 from .likelihood import model_image
@@ -33,8 +41,8 @@ from .stamps import Pixels
 
 #: Seeing that the search starts from [rad].
 _START_FWHM = 0.8 * ARCSEC
-# Largest seeing [rad], defocus of an image [m], spread or wavefront [m], and cells across the pupil.
-_MOST_FWHM, _MOST_DEFOCUS, _MOST_LENGTH, _MOST_CELLS = 60.0 * ARCSEC, 0.1, 1e-3, 2000
+# Largest seeing [rad], defocus of an image [m], and number of cells across the pupil.
+_MOST_FWHM, _MOST_DEFOCUS, _MOST_CELLS = 60.0 * ARCSEC, 0.1, 2000
 #: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
 _SATURATED = 0.002
 
@@ -145,7 +153,7 @@ def fit_donuts(
         raise ConfigError("degrees_of_freedom and field_noll are both given: expected one of them")
     if prior is not None and degrees_of_freedom is None:
         raise ConfigError("prior: expected degrees_of_freedom with it")
-    stack, shapes = _padded(images, "images", np.float64, np.nan)
+    stack, shapes = padded(images, "images", np.float64, np.nan)
     count = len(stack)
     angles = np.atleast_2d(radians(fields, "fields"))
     if angles.shape != (count, 2) or not np.isfinite(angles).all():
@@ -154,22 +162,22 @@ def fit_donuts(
         )
     directions = field_direction(angles[:, 0], angles[:, 1], projection)
     waves = wavelength_points(telescope, wavelength)
-    terms = _noll(noll, "noll", 4)
-    size = _length(higher_order, "higher_order")
-    further = _next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
-    field_indices = None if field_noll is None else _noll(field_noll, "field_noll", 1)
-    shifts = _each(metres(defocus, "defocus"), count, "defocus")
+    terms = noll_indices(noll, "noll", 4)
+    size = small_length(higher_order, "higher_order")
+    further = next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
+    field_indices = None if field_noll is None else noll_indices(field_noll, "field_noll", 1)
+    shifts = one_for_each(metres(defocus, "defocus"), count, "defocus")
     if (np.abs(shifts) > _MOST_DEFOCUS).any():
         raise DomainError(f"defocus: expected at most {_MOST_DEFOCUS:g} m on either side")
-    known = None if fwhm is None else _each(radians(fwhm, "fwhm"), count, "fwhm")
+    known = None if fwhm is None else one_for_each(radians(fwhm, "fwhm"), count, "fwhm")
     if known is not None and not ((known >= 0.0) & (known < _MOST_FWHM)).all():
         raise DomainError(f"fwhm = {shown(fwhm)}: expected angles from 0 to {_MOST_FWHM:g} rad")
-    spread = _length(diffusion, "diffusion")
+    spread = small_length(diffusion, "diffusion")
     cells = None if n_pupil is None else require_count(n_pupil, "n_pupil", 8, _MOST_CELLS)
     if saturation is not None:
         saturation = require_positive(saturation, "saturation", "electrons")
-    variance = _variance(sky_variance, stack.shape)
-    masked = np.zeros(stack.shape, dtype=bool) if mask is None else _padded(mask, "mask", bool, True)[0]
+    variance = sky_variances(sky_variance, stack.shape)
+    masked = np.zeros(stack.shape, dtype=bool) if mask is None else padded(mask, "mask", bool, True)[0]
     if masked.shape != stack.shape:
         raise DomainError(f"mask of shape {masked.shape}: expected that of the images, {stack.shape}")
     light = relative_weights(wavelength_weights, len(waves))
@@ -178,7 +186,7 @@ def fit_donuts(
         waves,
         light,
         require_positive(metres(pixel_size, "pixel_size"), "pixel_size", "metres"),
-        Seeing(float(waves[len(waves) // 2]), _outer_scale(outer_scale)),
+        Seeing(float(waves[len(waves) // 2]), outer_scale_of(outer_scale)),
         spread,
         np.concatenate([terms, further]),
         np.concatenate([np.zeros(len(terms)), np.full(len(further), size**-2.0 if size else 0.0)]),
@@ -335,72 +343,3 @@ def _collected(
         double_zernike_covariance=double_covariance,
         degrees_of_freedom=estimate,
     )
-
-
-def _padded(
-    values: ArrayLike | Sequence[ArrayLike], name: str, kind: type, fill: Any
-) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Return images as one stack, smaller ones filled up at the end, and their shapes."""
-    try:
-        each: Any = values
-        listed: list[np.ndarray] = [np.asarray(v, dtype=kind) for v in each]
-    except (TypeError, ValueError):
-        raise DomainError(f"{name}: expected an array of shape [n, ny, nx], or n arrays of two dimensions") from None
-    if not listed or any(v.ndim != 2 or min(v.shape) < 8 for v in listed):
-        shape = [v.shape for v in listed][:1]
-        raise DomainError(f"{name} of shape {shape}: expected [n, ny, nx], stamps of at least 8 pixels a side")
-    shapes = [(int(v.shape[0]), int(v.shape[1])) for v in listed]
-    stack: np.ndarray = np.full((len(listed), max(s[0] for s in shapes), max(s[1] for s in shapes)), fill, dtype=kind)
-    for row, one in zip(stack, listed, strict=True):
-        row[: one.shape[0], : one.shape[1]] = one
-    return stack, shapes
-
-
-def _noll(values: Iterable[int], name: str, least: int) -> np.ndarray:
-    """Return Noll indices as an array, or raise DomainError."""
-    listed = list(values)
-    if not listed or any(int(j) != j or j < least for j in listed) or len(set(listed)) != len(listed):
-        raise DomainError(f"{name} = {listed}: expected different Noll indices from {least}")
-    return np.array(listed, dtype=np.int64)
-
-
-def _next_terms(noll: np.ndarray) -> np.ndarray:
-    """Return the Noll indices of the next radial degree at every azimuthal order of some, without these."""
-    highest: dict[int, int] = {}
-    for n, m in map(noll_to_nm, noll):
-        highest[m] = max(highest.get(m, 0), n)
-    wanted = {(n + 2, m) for m, n in highest.items()}
-    last = (max(highest.values()) + 3) * (max(highest.values()) + 4) // 2
-    return np.array([j for j in range(1, last + 1) if noll_to_nm(j) in wanted and j not in noll], dtype=np.int64)
-
-
-def _each(values: np.ndarray, count: int, name: str) -> np.ndarray:
-    """Return one finite number for each image."""
-    if values.shape not in ((), (count,)) or not np.isfinite(values).all():
-        raise DomainError(f"{name} of shape {values.shape}: expected one finite number, or {count}")
-    return np.broadcast_to(values, (count,))
-
-
-def _variance(values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the variance of sky and readout of every pixel."""
-    variance = pure_numbers(values, "sky_variance")
-    variance = variance[:, None, None] if variance.ndim == 1 else variance
-    try:
-        variance = np.broadcast_to(variance, shape)
-    except ValueError:
-        raise DomainError(f"sky_variance of shape {np.shape(values)}: expected a number, [n] or {shape}") from None
-    if not (np.isfinite(variance) & (variance >= 0.0)).all():
-        raise DomainError("sky_variance: expected finite numbers from 0 [electron^2]")
-    return variance
-
-
-def _length(value: ArrayLike, name: str) -> float:
-    """Return a length [m] of zero or more, and less than would leave the detector."""
-    size = length(value, name)
-    if not 0.0 <= size <= _MOST_LENGTH:
-        raise DomainError(f"{name} = {shown(value)}: expected a length from 0 to {_MOST_LENGTH:g} m")
-    return size
-
-
-def _outer_scale(value: float) -> float:
-    return float("inf") if value == float("inf") else require_positive(value, "outer_scale", "metres")
