@@ -130,7 +130,12 @@ def read_pupil(
     distance = file.surfaces[0].number("DISZ", math.inf, infinite=True) * unit
     # Lens files write "at infinity" as a distance of 1e10 units too.
     distance = math.inf if distance >= 1e9 * unit else distance
-    diameter = _pupil_diameter(header, surfaces, unit, scale, focal_length, distance + pupil_z, findings)
+    line = header.last("FTYP")
+    if line is not None and line.number(1, 0.0) == 1 and math.isfinite(distance):
+        findings.note(line.problem(f"{line.shown}: a telecentric object space is not read"), "the stop limits the rays")
+    diameter = _pupil_diameter(
+        header, surfaces, unit, scale, focal_length, wavelength, distance, distance + pupil_z, findings
+    )
     chief, chief_slope = surfaces.trace(-pupil_z, 1.0, wavelength)
     # From the exit pupil to the image; where that is infinite or nothing, the focal length.
     candidates = (float(chief[-1]) / chief_slope if chief_slope else math.inf, focal_length, 1.0)
@@ -146,6 +151,8 @@ def _pupil_diameter(
     unit: float,
     scale: float,
     focal_length: float,
+    wavelength: float,
+    object_distance: float,
     distance: float,
     findings: Findings,
 ) -> float:
@@ -159,7 +166,13 @@ def _pupil_diameter(
         if keyword == "ENPD":
             found[keyword] = value * unit
         elif keyword == "FNUM":
-            found[keyword] = abs(focal_length) / value if value > 0 else 0.0
+            if line.number(1, 0.0) == 1 and math.isfinite(object_distance):
+                # The paraxial working f-number, 1 / (2 n u): of the cone of light from the object to the image.
+                _, slope = surfaces.trace(object_distance, 1.0, wavelength)
+                cone = abs(slope * float(surfaces.rows[-1][2].index(wavelength)))
+                found[keyword] = abs(distance) / (value * cone) if value > 0 and cone > 0 else 0.0
+            else:
+                found[keyword] = abs(focal_length) / value if value > 0 else 0.0
         elif keyword == "FLOA":
             found[keyword] = 2 * surfaces.stop_radius / abs(scale)
         elif math.isfinite(distance) and 0 < value < 1:
