@@ -197,7 +197,7 @@ class _LensReader:
             interaction, after = Interaction.DETECTOR, self.medium
         else:
             interaction = Interaction.PASS if after == self.medium else Interaction.REFRACT
-        self.paraxial.add(shape.curvature, self.medium, after, mirror=mirror)
+        self.paraxial.add(shape.curvatures, self.medium, after, mirror=mirror)
         self.medium = after
         x, y, z = (float(v) for v in self.origin)
         self.surfaces.append(

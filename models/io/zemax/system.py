@@ -59,17 +59,20 @@ def read_wavelengths(header: Block) -> Wavelengths:
 
 @dataclass
 class ParaxialSurfaces:
-    """Surfaces of the paraxial trace: curvatures [1/m], media, mirrors and the distance to the next [m]."""
+    """Surfaces of the paraxial trace: curvatures [1/m], media, mirrors and the distance to the next [m].
 
-    rows: list[tuple[float, Medium, Medium, bool]] = field(default_factory=list)
+    Like Zemax it traces in the plane x = 0; where no surface is curved there, in the plane y = 0.
+    """
+
+    rows: list[tuple[tuple[float, float], Medium, Medium, bool]] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
     stop: int = 0
     stop_radius: float = 0.0
     _ahead: float = 0.0
 
-    def add(self, curvature: float, before: Medium, after: Medium, *, mirror: bool) -> None:
-        """Add a surface."""
-        self.rows.append((curvature, before, after, mirror))
+    def add(self, curvatures: tuple[float, float], before: Medium, after: Medium, *, mirror: bool) -> None:
+        """Add a surface of given curvatures along x and y."""
+        self.rows.append((curvatures, before, after, mirror))
         self.distances.append(self._ahead)
         self._ahead = 0.0
 
@@ -85,12 +88,13 @@ class ParaxialSurfaces:
         """Return the heights [m] at the surfaces, and the last slope, of a ray by its first height [m] and slope."""
         heights = []
         n = float(self.rows[0][1].index(wavelength))
-        for (curvature, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
+        axis = 1 if any(curvatures[1] for curvatures, *_ in self.rows) else 0
+        for (curvatures, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
             height += slope * distance
             heights.append(height)
             glass = float(after.index(wavelength))
             n_after = -n if mirror else math.copysign(glass, n)
-            slope = (n * slope - height * curvature * (n_after - n)) / n_after
+            slope = (n * slope - height * curvatures[axis] * (n_after - n)) / n_after
             n = n_after
         return np.array(heights), slope
 

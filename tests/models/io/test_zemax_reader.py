@@ -553,3 +553,10 @@ def test_a_telecentric_object_space_is_said(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_telescope(written(tmp_path, MIRROR.replace("FTYP 0 0", "FTYP 0 1")))
+
+
+def test_the_f_number_of_a_cylinder_is_that_of_its_curved_section(tmp_path):
+    """One mirror of 1 m radius along y, flat along x, at f/5: f = 500 mm, D = 100 mm."""
+    cylinder = "  TYPE BICONICX\n  PARM 1 0\n  PARM 2 0\n  CURV -0.001"
+    text = MIRROR.replace("  TYPE STANDARD\n  CURV -0.001", cylinder).replace("ENPD 100", "FNUM 5 0")
+    assert load_telescope(written(tmp_path, text)).pupil_diameter == pytest.approx(0.1, rel=1e-14)
