@@ -28,7 +28,7 @@ FIELDS = {
     "XIM": ("XFLN", 2), "YIM": ("YFLN", 2), "XRI": ("XFLN", 3), "YRI": ("YFLN", 3),
 }  # fmt: skip
 #: System apertures; the f-number is that of the image space at the conjugates of the lens, Zemax's FNUM 1.
-APERTURES = {"EPD": ("ENPD",), "FNO": ("FNUM", 1), "NAO": ("OBNA",)}
+APERTURES = {"EPD": ("ENPD",), "FNO": ("FNUM", "1"), "NAO": ("OBNA",)}
 SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "REF", "PRV", *APERTURES, *FIELDS))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
