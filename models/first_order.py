@@ -7,7 +7,8 @@ negative after an odd number of mirrors, and so is the index ``n``. At each surf
 
 Seidel sums follow Welford, "Aberrations of Optical Systems" (1986), chapter 8, with ``A = n (h c + u)`` of the marginal
 ray, ``B`` the same of the chief ray, ``H = n (u hb - ub h)`` and the aspheric term ``a = k c^3 + 8 a_4``. Of shapes
-without symmetry of revolution the mean over azimuth counts.
+without symmetry of revolution the mean over azimuth counts; but the first-order properties of cylinders and toroids are
+those of the plane x = 0, like Zemax's, or of the plane y = 0 where all surfaces are flat there.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         If no surface acts, one is decentred or tilted, the wavelength is not covered, or there is no focus.
     """
     radius = 0.5 * telescope.pupil_diameter
-    trace = _trace(telescope, wavelength, 1.0)
+    trace = _trace(telescope, wavelength, 1.0, section=True)
     last_z = trace.surfaces[-1].vertex[2]
     n, (h, hb), (u, ub) = float(trace.n_after[-1]), map(float, trace.h[-1]), map(float, trace.u_after[-1])
     power = -n * u / (abs(float(trace.n[0])) * radius)
@@ -190,8 +191,11 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
 
 
-def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
-    """Trace the ray at the rim of the pupil, parallel to the axis, and one through its centre with a slope."""
+def _trace(telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False) -> _Trace:
+    """Trace the ray at the rim of the pupil, parallel to the axis, and one through its centre with a slope.
+
+    Curvatures are means over azimuth, or with ``section`` those in the plane x = 0 (y = 0 where all are flat there).
+    """
     w = length(telescope.default_wavelength if wavelength is None else wavelength, "wavelength")
     telescope.check_wavelength(w)
     surfaces = tuple(s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT))
@@ -201,7 +205,10 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
         axis = surface.matrix[:, 2]
         if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:
             raise DomainError(f"surface {surface.name} of {telescope.name}: expected one on the axis, not perturbed")
-    curvature = np.array([-s.shape.curvature for s in surfaces])
+    curvature = -np.array([s.shape.curvature for s in surfaces])
+    if section:
+        along_x, along_y = -np.array([_curvatures(s) for s in surfaces]).T
+        curvature = along_y if along_y.any() else along_x
     h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([0.0, slope])
     z, index = telescope.stop_z, float(telescope.medium_before.index(w))
     rows = []
@@ -214,3 +221,13 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float) -> _Trace:
         rows.append((index, index_after, h, u, u_after))
         index, u, z = index_after, u_after, surface.vertex[2]
     return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in zip(*rows, strict=True)))
+
+
+def _curvatures(surface: Surface) -> tuple[float, float]:
+    """Return the curvatures [1/m] of a surface on the axis along x and y of the telescope."""
+    own = surface.shape.curvatures
+    if own[0] == own[1]:
+        return own
+    # Euler's theorem: squares of the cosines between the axes weight the curvatures of the surface.
+    along_x, along_y = surface.matrix[:2, :2] ** 2 @ np.array(own)
+    return float(along_x), float(along_y)

@@ -19,6 +19,7 @@ from ..raytrace.trace import trace
 from .chief_rays import image_jacobians, reference_rays
 from .opd_map import OpdMap, OpdMaps
 from .opd_packets import traced_opds
+from .pupil_grid import pupil_grid
 from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
 from .request import Request
@@ -58,7 +59,9 @@ def wavefront_opd(
     pupil : (px, py), optional
         Entrance-pupil coordinates [m], arrays of one shape.
     grid : int, optional
-        In place of ``pupil``: cells across the pupil diameter of a square grid. 64 when neither is given.
+        In place of ``pupil``: cells across the pupil diameter of a square grid. 64 when neither is given. Points of
+        the grid outside the pupil are dark (:func:`~pachon.wavefront.pupil_grid.pupil_grid`); those of ``pupil`` are
+        taken as given.
     reference : {"chief", "mean"}
         "chief": sphere and zero of the path at the chief ray. "mean": sphere about the mean landing point of the
         lit rays, zero at their mean path.
@@ -86,7 +89,7 @@ def wavefront_opd(
     """
     if reference not in ("chief", "mean"):
         raise ConfigError(f"reference = {reference!r}: expected 'chief' or 'mean'")
-    x, y = _pupil_points(telescope, pupil, grid)
+    x, y, inside = _pupil_points(telescope, pupil, grid)
     radius = _sphere_radius(telescope, sphere_radius)
     request = Request.of(telescope, field, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     if len(request.fields) != 1:
@@ -94,7 +97,7 @@ def wavefront_opd(
     w, index = request.wavelength, refractive_indices(telescope, request.wavelength)[-2]
     rays = request.launch(w, np.stack([x.ravel(), y.ravel()], axis=-1))
     end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
-    lit = (end.status == RayStatus.OK) | (end.status == RayStatus.GAP)
+    lit = inside.ravel() & ((end.status == RayStatus.OK) | (end.status == RayStatus.GAP))
     if reference == "chief":
         sphere = _spheres(request, radius, focal_plane)[0]
         center = sphere[:3]
@@ -163,11 +166,12 @@ def wavefront_opds(
         If a field or the wavelength lies outside what the telescope covers, or a chief ray does not reach the image or
         lands between the CCDs.
     """
-    x, y = _pupil_points(telescope, pupil, grid)
+    x, y, inside = _pupil_points(telescope, pupil, grid)
     radius = _sphere_radius(telescope, sphere_radius)
     request = Request.of(telescope, fields, wavelength, sampling=CHIEF_RAY, projection=projection, threads=threads)
     spheres = _spheres(request, radius, focal_plane)
     value = traced_opds(request, x.ravel(), y.ravel(), spheres, radius, progress).reshape(-1, *x.shape)
+    value[:, ~inside] = np.nan
     return OpdMaps(
         value=value if silicon is None else value + _silicon_opd(request, silicon, x, y),
         x=x,
@@ -185,17 +189,14 @@ _MOST_ACROSS = 8192
 
 def _pupil_points(
     telescope: Telescope, pupil: tuple[ArrayLike, ArrayLike] | None, grid: int | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return entrance-pupil coordinates [m] as given, or centres of n x n cells of a square, [y, x] order."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return entrance-pupil coordinates [m], as given or of a grid, and whether they lie in the pupil."""
     if pupil is not None and grid is not None:
         raise ConfigError("pupil and grid are both given: expected one of them")
     if pupil is None:
-        n = 64 if grid is None else require_count(grid, "grid", 2, _MOST_ACROSS)
-        u = ((np.arange(n) + 0.5) / n - 0.5) * telescope.pupil_diameter
-        x, y = np.meshgrid(u, u)
-    else:
-        x, y = (np.array(v) for v in pupil_points(pupil))
-    return x, y
+        return pupil_grid(telescope, 64 if grid is None else require_count(grid, "grid", 2, _MOST_ACROSS))
+    x, y = (np.array(v) for v in pupil_points(pupil))
+    return x, y, np.ones(x.shape, dtype=bool)
 
 
 def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -102,12 +102,17 @@ def spiral_annulus(radius: float, obscuration: float, count: int) -> PupilSampli
     return PupilSampling(_polar(radius * np.sqrt(square), angle), np.ones(count))
 
 
+def annulus_contains(x: np.ndarray, y: np.ndarray, inner: float, outer: float = 1.0) -> np.ndarray:
+    """Return whether points lie in an annulus, its rims included."""
+    return np.asarray((x**2 + y**2 <= outer**2) & (x**2 + y**2 >= inner**2))
+
+
 def square_annulus(radius: float, obscuration: float, across: int) -> PupilSampling:
     """Return points of equal weight: centres of the cells of a square lattice, where they lie in an annulus."""
     _check_counts(obscuration, across=across)
     u = (2.0 * np.arange(across) + 1.0) / across - 1.0
     x, y = np.meshgrid(u, u)
-    inside = (x**2 + y**2 <= 1.0) & (x**2 + y**2 >= obscuration**2)
+    inside = annulus_contains(x, y, obscuration)
     points = radius * np.stack([x[inside], y[inside]], axis=-1)
     if not len(points):
         raise DomainError(f"across = {across}: expected more points for an obscuration of {obscuration:g}")

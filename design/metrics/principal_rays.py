@@ -136,6 +136,10 @@ class PrincipalRays(FieldResult):
             return self._titled(figure, f"chief and marginal rays, {self._nanometres()}")
 
 
+#: Slope of the rays over the pupil [rad] below which light is parallel: what is left is rounding.
+PARALLEL = 1e-12
+
+
 @check_arguments
 def principal_rays(
     telescope: Telescope,
@@ -215,7 +219,10 @@ def principal_rays_of(request: Request) -> PrincipalRays:
 
 
 def _focal_ratios(request: Request, axes: np.ndarray) -> np.ndarray:
-    """Return focal ratios [n_field, 2] along axes [n_field, 2, 2] of the pupil; NaN where no light arrives."""
+    """Return focal ratios [n_field, 2] along axes [n_field, 2, 2] of the pupil.
+
+    NaN where no light arrives, infinite where it is parallel.
+    """
     weights, unit = request.pupil.weights, request.unit_pupil
     bundles = request.bundles(request.wavelength)
     ratios = np.full((len(request.fields), 2), np.nan)
@@ -224,5 +231,7 @@ def _focal_ratios(request: Request, axes: np.ndarray) -> np.ndarray:
         root = np.sqrt(weights[lit])[:, None]
         slopes, _, rank, _ = np.linalg.lstsq(plane * root, bundles.direction[i, lit, :2] * root, rcond=None)
         if rank == 3:
-            ratios[i] = 1.0 / (2.0 * bundles.index * np.linalg.norm(axes[i] @ slopes[1:], axis=-1))
+            cone = np.linalg.norm(axes[i] @ slopes[1:], axis=-1)
+            with np.errstate(divide="ignore"):
+                ratios[i] = 1.0 / (2.0 * bundles.index * np.where(cone < PARALLEL, 0.0, cone))
     return ratios

@@ -203,7 +203,7 @@ def spot_diagram(request: Request, reference: str = "centroid") -> SpotDiagram:
         weight=np.where(lit, request.weights[:, None] * request.pupil.weights, 0.0),
         reference_point=chief,
         plate_scale=principal.mean_plate_scale,
-        airy_radius=1.22 * request.middle * principal.mean_f_number,
+        airy_radius=1.22 * request.middle * np.where(np.isinf(ratio := principal.mean_f_number), np.nan, ratio),
     )
     if reference == "chief":
         return diagram

@@ -23,7 +23,7 @@ from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..drawing import FEW, field_colors, field_text, finish_axes, legend_below
 from ..result import FieldResult
-from .principal_rays import principal_rays_of
+from .principal_rays import PARALLEL, principal_rays_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,7 +128,7 @@ def through_focus(
     Raises
     ------
     DomainError
-        If heights do not ascend, or no light of a field reaches the detector.
+        If heights do not ascend, no light of a field reaches the detector, or it arrives parallel.
     """
     request = Request.of(
         telescope,
@@ -142,6 +142,9 @@ def through_focus(
     )
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     square = _mean_squares(request, bundles)
+    parallel = np.sqrt(square[:, 2]) < PARALLEL
+    if parallel.any():
+        raise DomainError(f"{field_label(request.fields[parallel][0])}: the light is parallel; expected a focus")
     best = -square[:, 1] / (2.0 * square[:, 2])
     total = square.sum(axis=0)
     common = float(-total[1] / (2.0 * total[2]))

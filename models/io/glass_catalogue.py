@@ -71,6 +71,7 @@ class GlassCatalogue:
 
     def __init__(self, glasses: Mapping[str, Glass], source: str) -> None:
         self._glasses = dict(glasses)
+        self._without_hyphens = {name.replace("-", ""): name for name in self._glasses}
         self.source = source
 
     @classmethod
@@ -111,6 +112,10 @@ class GlassCatalogue:
 
     def __len__(self) -> int:
         return len(self._glasses)
+
+    def spelling(self, name: str) -> str | None:
+        """Return the name here of a glass, which may be written without its hyphens (CODE V: NBK7); None if unknown."""
+        return name.upper() if name in self else self._without_hyphens.get(name.upper())
 
     def entry(self, name: str) -> Glass:
         """Return the entry of a glass.

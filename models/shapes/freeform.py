@@ -133,7 +133,11 @@ class _TwoRadii(Shape):
 
     @property
     def curvature(self) -> float:
-        return 0.5 * (1.0 / self.radius_x + 1.0 / self.radius_y)
+        return sum(self.curvatures) / 2
+
+    @property
+    def curvatures(self) -> tuple[float, float]:
+        return 1.0 / self.radius_x, 1.0 / self.radius_y
 
     @property
     def parameters(self) -> dict[str, float]:

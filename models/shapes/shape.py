@@ -94,6 +94,11 @@ class Shape(ABC):
         """Paraxial curvature at the vertex [1/m], the mean over azimuth."""
 
     @property
+    def curvatures(self) -> tuple[float, float]:
+        """Paraxial curvatures along x and y [1/m]; of shapes other than cylinders and toroids both are the mean."""
+        return self.curvature, self.curvature
+
+    @property
     @abstractmethod
     def fourth_order(self) -> float:
         """Coefficient of r^4 of the sag less that of the sphere of the same curvature [m^-3], mean over azimuth.
@@ -328,6 +333,11 @@ class Sum(Shape):
     @property
     def curvature(self) -> float:  # noqa: D102
         return sum(part.curvature for part in self.parts)
+
+    @property
+    def curvatures(self) -> tuple[float, float]:  # noqa: D102
+        along_x, along_y = zip(*(part.curvatures for part in self.parts), strict=True)
+        return sum(along_x), sum(along_y)
 
     @property
     def fourth_order(self) -> float:  # noqa: D102

@@ -1,9 +1,12 @@
 """Telescopes whose images are known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pachon.models.aperture import Circle
+from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
@@ -38,6 +41,25 @@ def paraboloid():
             field_limit=float(np.deg2rad(2.0)),
             wavelength_range=(3e-7, 1e-6),
             default_wavelength=5e-7,
+        )
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def afocal(paraboloid):
+    """``afocal(fold)``: a plate of glass, or a flat mirror, 20 mm across and without power; a detector behind it."""
+
+    def build(fold):
+        glass = ConstantIndex(1.5)
+        plate = (
+            Surface("front", Interaction.REFRACT, Plane(), (0.0, 0.0, 0.0), glass),
+            Surface("back", Interaction.REFRACT, Plane(), (0.0, 0.0, -0.01), VACUUM),
+        )
+        mirror = (Surface("fold", Interaction.MIRROR, Plane(), (0.0, 0.0, 0.0), VACUUM),)
+        detector = Surface("detector", Interaction.DETECTOR, Plane(), (0.0, 0.0, 0.2 if fold else -0.2), VACUUM)
+        return replace(
+            paraboloid(), surfaces=(*(mirror if fold else plate), detector), pupil_diameter=0.02, launch_distance=1.0
         )
 
     return build

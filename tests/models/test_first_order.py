@@ -8,7 +8,8 @@ from pachon.core.errors import DomainError
 from pachon.models.first_order import first_order, footprints, seidel_sums
 from pachon.models.io.prescription import load_telescope
 from pachon.models.media.medium import ConstantIndex
-from pachon.models.shapes.shape import Conic, EvenAsphere, Plane
+from pachon.models.shapes.freeform import Biconic
+from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sum
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM, Telescope
 
@@ -203,3 +204,30 @@ def test_what_has_no_first_order_figures_is_refused():
     for function in (first_order, seidel_sums):
         with pytest.raises(DomainError, match="at least one mirror or lens surface"):
             function(detector_alone)
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["curved along y", "curved along x"])
+def test_a_cylindrical_lens(turned):
+    """A cylinder has the focal length of its one curvature, by the lens maker's equation, not twice that."""
+    shape = Biconic(np.inf, -0.1) if not turned else Biconic(-0.1, np.inf)
+    base = telescope_of([(0.0, -0.1, 0.0, 1.5), (-0.01, np.inf, 0.0, 1.0)], stop_z=0.0, diameter=0.01)
+    front, back = base.surfaces
+    lens = replace(base, surfaces=(replace(front, shape=shape), back))
+    found = first_order(lens)
+    assert found.focal_length == pytest.approx(0.2, rel=1e-14)
+    assert found.back_focus == pytest.approx(0.2 - 0.01 / 1.5, rel=1e-13)
+    # The same lens, turned about the axis by a right angle.
+    quarter = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    again = replace(lens, surfaces=(replace(front, shape=shape, rotation=quarter), back))
+    assert first_order(again).focal_length == pytest.approx(0.2, rel=1e-13)
+
+
+def test_a_toroid_has_the_focal_length_of_the_plane_of_zemax():
+    """Curvatures along y count where both act; turned by 45 degrees about the axis, their mean (Euler)."""
+    base = telescope_of([(0.0, 0.2, 0.0, None)], stop_z=0.0, diameter=0.01)
+    for part in (Biconic(0.4, 0.2), Sum((Biconic(0.4, np.inf), Biconic(np.inf, 0.2)))):
+        mirror = replace(base.surfaces[0], shape=part)
+        assert first_order(replace(base, surfaces=(mirror,))).focal_length == pytest.approx(0.1, rel=1e-14)
+    c = np.sqrt(0.5)
+    turned = replace(mirror, rotation=((c, -c, 0.0), (c, c, 0.0), (0.0, 0.0, 1.0)))
+    assert first_order(replace(base, surfaces=(turned,))).focal_length == pytest.approx(0.5 / 3.75, rel=1e-14)

@@ -1,10 +1,11 @@
 """Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
-Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, the surfaces SO S SI
-(radius or curvature, thickness, glass), RDY CUY THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE
-YDE ZDE ADE BDE CDE with DAR and BEN, CIR (OBS) and REX REY with ADX ADY. ADE and BDE are left-handed, CDE is
-right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
-(N-BK7_SCHOTT), REFL, or a number (517642).
+Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, before the surfaces or
+after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY THI GLA, STO, SLB, SPH CON
+ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS, HOL) and REX REY with ADX
+ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is right-handed (CODE V reference
+manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name (NBK7_SCHOTT), REFL, or a number
+(517642). Solves are passed over where their solution stands in the file.
 """
 
 from __future__ import annotations
@@ -15,24 +16,41 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ....core.errors import PrescriptionError
+from ...media.medium import Medium
+from ...media.tabulated import TabulatedIndex
 from ..zemax.file import Block, Findings, ZemaxFile
 from ..zemax.text import Record, read_text
 
-UNITS = {"M": "MM", "C": "CM", "I": "IN"}
+UNITS = {"M": "MM", "MM": "MM", "C": "CM", "CM": "CM", "I": "IN", "IN": "IN"}
 FIELDS = {
     "XAN": ("XFLN", 0), "YAN": ("YFLN", 0), "XOB": ("XFLN", 1), "YOB": ("YFLN", 1),
     "XIM": ("XFLN", 2), "YIM": ("YFLN", 2), "XRI": ("XFLN", 3), "YRI": ("YFLN", 3),
 }  # fmt: skip
-APERTURES = {"EPD": "ENPD", "FNO": "FNUM", "NAO": "OBNA"}
+#: System apertures; the f-number is that of the image space at the conjugates of the lens, Zemax's FNUM 1.
+APERTURES = {"EPD": ("ENPD",), "FNO": ("FNUM", "1"), "NAO": ("OBNA",)}
+SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "REF", "PRV", *APERTURES, *FIELDS))
+LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
+#: Surfaces that are not read.
+REFUSED = {
+    "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
+    "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
+}  # fmt: skip
 #: Commands without effect on rays: names, variables and couplings, weights, vignetting factors of the beams,
 #: solves, whose solution stands in the file, and drawing.
 _IGNORED = """
-LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC WTW WTF VUX VLX VUY VLY PIM CUM
+LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC WTW WTF VUX VLX VUY VLY CUM
 UMY SPH CON ASP RDM WTX WTY VIE DRA COM CUX THM GLC TEM PRE CRA
+POL CLS WID
 """
 IGNORED = frozenset(_IGNORED.split())
 INFINITE = 1e10
+#: Values of surfaces that other surfaces may pick up, by command.
+PICKED = {k: k for k in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", *POWERS)} | {
+    "CUY": "CURV",
+    "RDY": "CURV",
+}
 
 
 def read_codev_file(path: Path, findings: Findings) -> ZemaxFile:
@@ -65,32 +83,53 @@ class _Translation:
         self.header = Block(str(path))
         self.surfaces: list[Block] = []
         self.values: list[dict[str, float]] = []
-        self.radii = True
+        self.radii = False
         self.field_type = 0.0
         self.waves: list[float] = []
+        self.pick_ups: list[Record] = []
+        self.private: dict[str, Medium] = {}
+        self.private_waves: tuple[float, ...] | None = None
 
     def file(self) -> ZemaxFile:
         """Return the parts of the Zemax file."""
-        current = -1
-        for command in _commands(self.path):
-            if command.keyword in ("SO", "SI") or re.fullmatch(r"S\d*", command.keyword):
+        current, imaged = -1, False
+        # CODE V takes curvatures unless RDM says otherwise, wherever it stands.
+        commands = [replace(c, keyword=LONG_NAMES.get(c.keyword, c.keyword)) for c in _commands(self.path)]
+        modes = [c.words for c in commands if c.keyword == "RDM"]
+        self.radii = bool(modes) and not (modes[-1] and modes[-1][0].upper().startswith("N"))
+        for command in commands:
+            if self.private_waves is not None:
+                self._private(command)
+            elif command.keyword in ("SO", "SI") or re.fullmatch(r"S\d*", command.keyword):
                 self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
                 self.values.append({})
-                current = len(self.surfaces) - 1
+                current, imaged = len(self.surfaces) - 1, command.keyword == "SI"
                 self._start(replace(command, place=f"surface {current}"))
-            elif self.surfaces:
+            elif command.keyword in SYSTEM or not self.surfaces:
+                self._system(command)
+            elif command.keyword == "PIK":
+                self.pick_ups.append(command)
+            else:
                 chosen = current
                 if command.words and re.fullmatch(r"[Ss](\d+|[OoIi])", command.words[0]):
                     chosen = self._number(command)
                     command = replace(command, words=command.words[1:])
                 self._surface(replace(command, place=f"surface {chosen}"), chosen)
-            else:
-                self._system(command)
+        if self.surfaces and not imaged:
+            # A lens that ends without SI has its image at the thickness of the last surface.
+            self.surfaces.append(Block(str(self.path), f"surface {len(self.surfaces)}"))
+            self.values.append({"CURV": 0.0})
         if len(self.surfaces) < 3:
             raise self.header.problem(f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
+        for command in self.pick_ups:
+            self._pick_up(command)
+        self._check_solves()
+        if not any(line.keyword == "STOP" for block in self.surfaces for line in block.lines):
+            # Where a file names no stop, it is the first surface.
+            self.surfaces[1].lines.append(self._record(1, "STOP"))
         words = (repr(self.field_type), "0", "0", str(len(self.waves)))
         self.header.lines.append(Record(str(self.path), 1, "", "FTYP", words, ""))
-        return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)))
+        return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private)
 
     def _number(self, command: Record) -> int:
         word = command.words[0][1:].upper()
@@ -107,16 +146,19 @@ class _Translation:
             self.header.lines.append(replace(command, keyword=keyword, words=tuple(map(str, values))))
 
         if key == "RDM":
-            self.radii = not (words and words[0].upper() == "N")
+            return
+        if key == "PRV":
+            self.private_waves = ()
         elif key == "DIM":
             unit = (words or ("M",))[0].upper()
             if unit not in UNITS:
                 raise command.error(f"one of {', '.join(UNITS)}")
             self.header.lines.append(replace(command, keyword="UNIT", words=(UNITS[unit],), text=UNITS[unit]))
-        elif key in ("TITLE", "TIT"):
+        elif key == "TIT":
             self.header.lines.append(replace(command, keyword="NAME", text=command.text.strip("'\" ")))
         elif key in APERTURES:
-            add(APERTURES[key], command.number(0))
+            keyword, *flag = APERTURES[key]
+            add(keyword, command.number(0), *flag)
         elif key == "WL":
             self.waves = [command.number(i) / 1e3 for i in range(len(words))]
             for i, wave in enumerate(self.waves, start=1):
@@ -152,7 +194,7 @@ class _Translation:
             index, abbe = (found[1], found[2]) if found[1] else (found[3], found[4])
             words = (name, "1", "0", repr(1 + float(f"0.{index}")), repr(float(abbe) / 10 ** (len(abbe) - 2)))
         else:
-            words = (name.split("_")[0],)
+            words = (name.strip("'").split("_")[0],)
         self.surfaces[number].lines.append(replace(command, keyword="GLAS", words=words))
 
     def _surface(self, command: Record, number: int) -> None:
@@ -167,14 +209,70 @@ class _Translation:
             block.lines.append(replace(command, keyword=keyword, text=command.text.strip("'\" ")))
         elif key in ("THI", "K", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "REX", "REY", "ADX", "ADY", *POWERS):
             values[key] = command.number(0)
-        elif key in ("DAR", "BEN"):
+        elif key in ("DAR", "BEN", "REV"):
             values[key] = 1.0
         elif key == "CIR":
-            obscures = bool(words) and words[0].upper() == "OBS"
-            radius = command.number(1 if obscures else 0)
-            block.lines.append(replace(command, keyword="OBSC" if obscures else "CLAP", words=("0", repr(radius))))
+            # Labels (L'A') name apertures; of several the last of a kind counts.
+            names = [w.upper() for w in words if w.isalpha() or w[:2].upper() in ("L'", 'L"')]
+            radius = replace(command, words=words[len(names) :]).number(0)
+            kinds = [n for n in names if n.isalpha()] or ["CLR"]
+            if kinds[0] not in ("CLR", "OBS", "HOL", "EDG") or kinds[1:]:
+                raise command.error("CIR with one of CLR, OBS, HOL, EDG")
+            # An edge is where the glass ends and stops nothing; light that falls into a hole is lost.
+            if kinds[0] != "EDG":
+                values["CLEAR" if kinds[0] == "CLR" else "OBSCURED"] = radius
+        elif key == "CUF":
+            if command.number(0):
+                self.findings.report(command.problem(f"{command.shown}: Fresnel surfaces are not read"))
+        elif key in REFUSED:
+            self.findings.report(command.problem(f"{command.shown}: {REFUSED[key]} are not read"))
+        elif key == "PIM":
+            values["PIM"] = command.line
         elif key not in IGNORED:
             self.findings.report(command.problem(f"{command.shown}: this command is not understood"))
+
+    def _private(self, command: Record) -> None:
+        """Read a line of the private catalogue: wavelengths PWL [nm], then a name and indices, up to END."""
+        assert self.private_waves is not None
+        if command.keyword == "END":
+            self.private_waves = None
+            return
+        numbers = [command.number(i) for i in range(len(command.words))]
+        if command.keyword == "PWL":
+            self.private_waves = tuple(v / 1e9 for v in numbers)
+            return
+        if len(numbers) != len(self.private_waves):
+            raise command.error(f"{len(self.private_waves)} indices, one for each wavelength of PWL")
+        name = command.keyword.strip("'")
+        table = sorted(zip(self.private_waves, numbers, strict=True))
+        waves, indices = zip(*table, strict=True) if table else ((), ())
+        try:
+            self.private[name] = TabulatedIndex(waves, indices, name=name)
+        except PrescriptionError as error:
+            raise command.problem(f"glass {name}: {error}") from None
+
+    def _pick_up(self, command: Record) -> None:
+        """Take over a value of another surface: ``PIK THI S3 Z1 THI S2 Z1 scale offset``."""
+        words = [w.upper() for w in command.words if not re.fullmatch(r"[Zz]\d+", w)]
+        if len(words) < 4 or words[0] != words[2] or words[0] not in PICKED:
+            self.findings.report(command.problem(f"{command.shown}: only pick-ups of the same value are read"))
+            return
+        target, source = (self._number(replace(command, words=(words[i],))) for i in (1, 3))
+        rest = replace(command, words=tuple(words[4:]))
+        scale, offset, key = rest.number(0, 1.0), rest.number(1, 0.0), PICKED[words[0]]
+        value = self.values[source].get(key, 0.0)
+        if words[0] == "RDY" and (scale != 1.0 or offset):
+            radius = scale / value + offset if value else 0.0
+            self.values[target][key] = 1.0 / radius if radius else 0.0
+        else:
+            self.values[target][key] = scale * value + offset
+
+    def _check_solves(self) -> None:
+        """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""
+        for number, values in enumerate(self.values[:-1]):
+            if "PIM" in values and not values.get("THI"):
+                line = Record(str(self.path), int(values["PIM"]), f"surface {number}", "PIM", (), "")
+                raise line.problem("PIM: expected the thickness of the solve in the file; it is 0")
 
     def _blocks(self) -> list[Block]:
         """Return the surfaces, with coordinate breaks between them where they are tilted or decentred."""
@@ -188,6 +286,10 @@ class _Translation:
             kind = "EVENASPH" if any(values.get(p) for p in POWERS) else "STANDARD"
             lines: list[tuple[Any, ...]] = [("TYPE", kind), ("CURV", values["CURV"]), ("CONI", values.get("K", 0.0))]
             lines += [("PARM", i, values.get(p, 0.0)) for i, p in enumerate(POWERS, start=2) if values.get(p)]
+            if "CLEAR" in values:
+                lines.append(("CLAP", values.get("OBSCURED", 0.0), values["CLEAR"]))
+            elif "OBSCURED" in values:
+                lines.append(("OBSC", 0.0, values["OBSCURED"]))
             if "REX" in values or "REY" in values:
                 lines.append(("SQAP", values.get("REX", 0.0), values.get("REY", 0.0)))
             if values.get("ADX") or values.get("ADY"):
@@ -198,7 +300,7 @@ class _Translation:
             depth = values.get("ZDE", 0.0)
             moved = any(tilts) or any(shift) or depth
             after: list[Block] = []
-            if moved and values.get("DAR"):
+            if moved and (values.get("DAR") or values.get("REV")):
                 back = [*(-v for v in (*shift, *tilts)), 1]
                 after = [self._break(number, back, 0.0), self._break(number, [0.0] * 6, thickness - depth)]
                 distance = 0.0
@@ -206,7 +308,7 @@ class _Translation:
                 if tilts[2]:
                     raise block.problem(f"BEN with CDE {values['CDE']:g}: not understood")
                 after, distance = [self._break(number, [0, 0, *tilts, 0], thickness)], 0.0
-            if moved:
+            if moved and not values.get("REV"):
                 blocks += [self._break(number, [0.0] * 6, depth), self._break(number, [*shift, *tilts, 0], 0.0)]
             if not last and not block.all("COMM"):
                 block.lines.append(self._record(number, "COMM", f"S{number}"))

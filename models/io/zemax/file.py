@@ -7,10 +7,12 @@ and whose lines are indented, and by merit function, tolerances and configuratio
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ....core.errors import PachonError, PrescriptionError, PrescriptionWarning
+from ...media.medium import Medium
 from .text import Record, read_text, records
 
 #: Keywords of the header without effect on rays: notes, names of other files, analysis and display settings,
@@ -18,14 +20,14 @@ from .text import Record, read_text, records
 _HEADER = """
 VERS MODE NAME AUTH NOTE IWDP PFIL LANG GFAC GCAT RAIM PUSH SDMA OMMA ROPD HYPR PICB FWGN FWGT FCOM VDXN VDYN VCXN
 VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDSX VDSY WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EERA OPDX PUPD EFFL DMFS CONF
-PMAG TOTR TRAC MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE
+PMAG TOTR TRAC MNCA MNEA MNCG MNEG MXCA MXCG RGLA TCMM ISNA STAG SSAG XPIX YPIX FTIT DFLT RSCE DBDT STUD
 """
 #: Keywords of a surface without effect on rays: comments, coatings, scatter, drawing and tolerancing settings,
 #: automatic semi-diameters, and solves, variables and pick-ups, whose solution stands in the file.
 _SURFACE = """
 COMM SSID SLAB HIDE MIRR POPS COAT FIMP SCAT STRE MEMA DIAM EDGE TCED TCEC TCMM EXPN LBLK CHZN BORE PICK CCOM VCUR
 VDSZ VPAR VCON VGLA VXDT VDIA PZUP PCUP PPAR PXDT PCOP PDIA PGLA PKUP CPKP MAZH MARG CHAZ CHAA POSI COMP CURF GLCZ
-RSCE TRAC FNOT BRKS SPAC ROWC SCOL
+RSCE TRAC FNOT BRKS SPAC ROWC SCOL STUD OEMA
 """
 #: Keywords that only stand after the surfaces, for files without indentation.
 TRAILER = ("BLNK", "TOL", "MNUM", "MOFF")
@@ -43,6 +45,10 @@ class Findings:
         """Raise the error or, if lenient, warn; `instead` is the assumption in its place, for the warning."""
         if not self.lenient:
             raise error
+        self.note(error, instead)
+
+    def note(self, error: PachonError, instead: str = "") -> None:
+        """Warn of what is read in another way, `instead`, in either mode."""
         warnings.warn(f"{error}; {instead}" if instead else str(error), PrescriptionWarning, stacklevel=2)
 
 
@@ -96,12 +102,16 @@ class Block:
 
 @dataclass
 class ZemaxFile:
-    """Parts of a lens file: lines before the surfaces, surfaces from the object to the image, lines after."""
+    """Parts of a lens file: lines before the surfaces, surfaces from the object to the image, lines after.
+
+    `glasses` are those that the file itself defines, by name in capitals.
+    """
 
     path: Path
     header: Block
     surfaces: list[Block]
     trailer: Block
+    glasses: Mapping[str, Medium] = field(default_factory=dict)
 
 
 def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:

@@ -34,6 +34,10 @@ from .system import UNITS, ParaxialSurfaces, read_pupil, read_wavelengths
 
 #: Comment of the plane that the writer puts in front to carry the entrance pupil.
 PUPIL_COMMENT = "pachon entrance pupil"
+#: Name of a glass without a name.
+NO_NAME = "___BLANK"
+#: Index and Abbe number that Zemax writes behind the name of a catalogue glass, whatever the glass.
+PLACEHOLDER = (1.5, 40.0)
 
 
 def read_lens(
@@ -193,7 +197,7 @@ class _LensReader:
             interaction, after = Interaction.DETECTOR, self.medium
         else:
             interaction = Interaction.PASS if after == self.medium else Interaction.REFRACT
-        self.paraxial.add(shape.curvature, self.medium, after, mirror=mirror)
+        self.paraxial.add(shape.curvatures, self.medium, after, mirror=mirror)
         self.medium = after
         x, y, z = (float(v) for v in self.origin)
         self.surfaces.append(
@@ -221,14 +225,21 @@ class _LensReader:
         name = line.words[0].upper()
         if name == "MIRROR":
             return True, none
+        if name in self.file.glasses:
+            return False, self.file.glasses[name]
         nd, vd, deviation = line.number(3, 0.0), line.number(4, 0.0), line.number(5, 0.0)
-        # The second word: 1 is a model glass, defined by the numbers that follow and not by its name.
-        model = line.number(1, 0.0) == 1 and nd > 1
+        # The second word: 1 is a model glass, defined by the numbers that follow and not by its name; 2 a glass picked
+        # up from another surface, a model glass too where it has no name.
+        solve = line.number(1, 0.0)
+        model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
         for catalogue in self.catalogues:
-            if name in catalogue and not model:
-                return False, catalogue[name]
+            known = catalogue.spelling(name)
+            if known is not None and not model:
+                return False, catalogue[known]
         if not model:
             error = line.problem(f"{line.shown}: the glass is in no catalogue")
+            if nd <= 1 or (nd, vd) == PLACEHOLDER:
+                raise error
             self.findings.report(error, "taken as a model glass of its indices")
         try:
             return False, replace(model_glass(nd, vd, deviation), name=name)

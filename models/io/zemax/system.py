@@ -59,17 +59,20 @@ def read_wavelengths(header: Block) -> Wavelengths:
 
 @dataclass
 class ParaxialSurfaces:
-    """Surfaces of the paraxial trace: curvatures [1/m], media, mirrors and the distance to the next [m]."""
+    """Surfaces of the paraxial trace: curvatures [1/m], media, mirrors and the distance to the next [m].
 
-    rows: list[tuple[float, Medium, Medium, bool]] = field(default_factory=list)
+    Like Zemax it traces in the plane x = 0; where no surface is curved there, in the plane y = 0.
+    """
+
+    rows: list[tuple[tuple[float, float], Medium, Medium, bool]] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
     stop: int = 0
     stop_radius: float = 0.0
     _ahead: float = 0.0
 
-    def add(self, curvature: float, before: Medium, after: Medium, *, mirror: bool) -> None:
-        """Add a surface."""
-        self.rows.append((curvature, before, after, mirror))
+    def add(self, curvatures: tuple[float, float], before: Medium, after: Medium, *, mirror: bool) -> None:
+        """Add a surface of given curvatures along x and y."""
+        self.rows.append((curvatures, before, after, mirror))
         self.distances.append(self._ahead)
         self._ahead = 0.0
 
@@ -85,12 +88,13 @@ class ParaxialSurfaces:
         """Return the heights [m] at the surfaces, and the last slope, of a ray by its first height [m] and slope."""
         heights = []
         n = float(self.rows[0][1].index(wavelength))
-        for (curvature, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
+        axis = 1 if any(curvatures[1] for curvatures, *_ in self.rows) else 0
+        for (curvatures, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
             height += slope * distance
             heights.append(height)
             glass = float(after.index(wavelength))
             n_after = -n if mirror else math.copysign(glass, n)
-            slope = (n * slope - height * curvature * (n_after - n)) / n_after
+            slope = (n * slope - height * curvatures[axis] * (n_after - n)) / n_after
             n = n_after
         return np.array(heights), slope
 
@@ -130,7 +134,12 @@ def read_pupil(
     distance = file.surfaces[0].number("DISZ", math.inf, infinite=True) * unit
     # Lens files write "at infinity" as a distance of 1e10 units too.
     distance = math.inf if distance >= 1e9 * unit else distance
-    diameter = _pupil_diameter(header, surfaces, unit, scale, focal_length, distance + pupil_z, findings)
+    line = header.last("FTYP")
+    if line is not None and line.number(1, 0.0) == 1 and math.isfinite(distance):
+        findings.note(line.problem(f"{line.shown}: a telecentric object space is not read"), "the stop limits the rays")
+    diameter = _pupil_diameter(
+        header, surfaces, unit, scale, focal_length, wavelength, distance, distance + pupil_z, findings
+    )
     chief, chief_slope = surfaces.trace(-pupil_z, 1.0, wavelength)
     # From the exit pupil to the image; where that is infinite or nothing, the focal length.
     candidates = (float(chief[-1]) / chief_slope if chief_slope else math.inf, focal_length, 1.0)
@@ -146,6 +155,8 @@ def _pupil_diameter(
     unit: float,
     scale: float,
     focal_length: float,
+    wavelength: float,
+    object_distance: float,
     distance: float,
     findings: Findings,
 ) -> float:
@@ -159,7 +170,13 @@ def _pupil_diameter(
         if keyword == "ENPD":
             found[keyword] = value * unit
         elif keyword == "FNUM":
-            found[keyword] = abs(focal_length) / value if value > 0 else 0.0
+            if line.number(1, 0.0) == 1 and math.isfinite(object_distance):
+                # The paraxial working f-number, 1 / (2 n u): of the cone of light from the object to the image.
+                _, slope = surfaces.trace(object_distance, 1.0, wavelength)
+                cone = abs(slope * float(surfaces.rows[-1][2].index(wavelength)))
+                found[keyword] = abs(distance) / (value * cone) if value > 0 and cone > 0 else 0.0
+            else:
+                found[keyword] = abs(focal_length) / value if value > 0 else 0.0
         elif keyword == "FLOA":
             found[keyword] = 2 * surfaces.stop_radius / abs(scale)
         elif math.isfinite(distance) and 0 < value < 1:

@@ -105,3 +105,10 @@ def test_a_chief_ray_that_does_not_arrive_is_one_line(lsst_r):
     lost = lsst_r.perturbed("M3", shift=(20.0, 0.0, 0.0))
     with pytest.raises(DomainError, match=r"field = \(0, 0\) deg: the chief ray does not reach the detector"):
         principal_rays(lost, [[0.0, 0.0]])
+
+
+@pytest.mark.parametrize("fold", [False, True], ids=["plate", "fold mirror"])
+def test_parallel_light_has_an_infinite_focal_ratio(afocal, fold):
+    found = principal_rays(afocal(fold), np.deg2rad([[0.0, 0.0], [0.1, 0.3]]))
+    assert np.isposinf(found.f_number).all()
+    assert found.exit_pupil_diameter == pytest.approx(0.02, rel=1e-4)

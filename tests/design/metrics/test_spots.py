@@ -183,3 +183,12 @@ def test_bad_input_is_refused(lsst_r):
     with pytest.raises(DomainError, match="fraction = 1"):
         spots(lsst_r).radius_holding(1)
     assert field_points(lsst_r, (0.0, 0.01)).shape == (1, 2)
+
+
+@pytest.mark.parametrize("fold", [False, True], ids=["plate", "fold mirror"])
+def test_parallel_light_has_spots_as_large_as_the_pupil_and_no_airy_disc(afocal, fold):
+    diagram = pachon.spots(afocal(fold), [[0.0, 0.0], [0.0, 0.004]])
+    # The rms radius of a disc; off the axis the light comes to the detector no larger across.
+    assert diagram.rms_radius == pytest.approx(0.01 * np.sqrt(0.5), rel=1e-4)
+    assert np.isnan(diagram.airy_radius).all()
+    assert diagram.plot().axes

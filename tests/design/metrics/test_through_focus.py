@@ -77,3 +77,9 @@ def test_bad_input_is_refused(lsst_r, paraboloid):
     dark = paraboloid(baffle=(4.0, 0.01))
     with pytest.raises(DomainError, match=r"field = \(0, 1.9\) deg: no light reaches the detector"):
         through_focus(dark, np.deg2rad([[0.0, 1.9]]))
+
+
+@pytest.mark.parametrize("fold", [False, True], ids=["plate", "fold mirror"])
+def test_parallel_light_has_no_focus(afocal, fold):
+    with pytest.raises(DomainError, match=r"field = \(0, 0.1\) deg: the light is parallel; expected a focus"):
+        through_focus(afocal(fold), np.deg2rad([[0.0, 0.1]]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PrescriptionError, PrescriptionWarning
-from pachon.models.aperture import Circle, Complement, Rectangle
+from pachon.models.aperture import Annulus, Circle, Complement, Rectangle
 from pachon.models.first_order import first_order
 from pachon.models.io.prescription import load_telescope
 from pachon.models.shapes.shape import EvenAsphere
@@ -49,7 +49,7 @@ def written(tmp_path, text, name="lens.seq"):
 
 
 def test_a_triplet(tmp_path):
-    telescope = load_telescope(written(tmp_path, TRIPLET.replace("NSK16", "N-SK16")))
+    telescope = load_telescope(written(tmp_path, TRIPLET))
     zemax = load_telescope(DATA / "lens1.zmx")
     assert telescope.description == "Cooke; f/3"
     assert telescope.default_wavelength == pytest.approx(587.5618e-9, rel=1e-12)
@@ -142,19 +142,24 @@ def test_surfaces_may_be_named_by_number(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("DIM   M", "DIM   K", "line 5: DIM K: expected one of M, C, I"),
+        ("DIM   M", "DIM   K", "line 5: DIM K: expected one of M, MM, C, CM, I, IN"),
         ("EPD   8", "EPX   8", "line 4: EPX .*this command is not understood"),
-        ("  STO", "  DIF GRT", "surface 5: DIF GRT: this command is not understood"),
+        ("  STO", "  DIF GRT", "surface 5: DIF GRT: diffractive surfaces are not read"),
         ("  STO", "  STO\n  ADE x", "surface 5: ADE x: expected a number in place of 'x'"),
         ("  STO", "  STO\n  THI S77 3", "THI S77 3: expected a surface from 0"),
-        ("  STO", "", "no surface is the stop"),
+        ("  STO", "  CUF 0.1", "surface 5: CUF 0.1: Fresnel surfaces are not read"),
+        ("  STO", "  CIR ODD 3", "surface 5: CIR ODD 3: expected CIR with one of CLR, OBS, HOL, EDG"),
+        ("GO", "PIK RDY S3 Z1 THI S2 Z1\nGO", "PIK RDY S3 Z1 THI S2 Z1: only pick-ups of the same value"),
+        ("SI    0.0 0.0", "THI S7 0; PIM\nSI 0 0", "PIM: expected the thickness of the solve in the file"),
+        ("WL    656", "PRV\nPWL 700 600\n'E48' 1.5\nEND\nWL    656", "'E48' 1.5: expected 2 indices"),
+        ("WL    656", "PRV\nPWL 700\n'E48' 1.5\nEND\nWL    656", "glass E48: wavelengths = .*at least two"),
         ("N-LAK9_SCHOTT", "N-LAX9_SCHOTT", "GLAS N-LAX9: the glass is in no catalogue"),
         ("REF   2", "REF   5", "PWAV 5: expected 1 to 3"),
         ("SO    0.0 0.1e14", "SO    0.0 nan", "surface 0: SO 0.0 nan: expected a number"),
     ],
 )
 def test_what_is_not_understood_is_one_line(tmp_path, old, new, expected):
-    text = TRIPLET.replace("NSK16", "N-SK16")
+    text = TRIPLET
     assert old in text
     path = written(tmp_path, text.replace(old, new, 1))
     with pytest.raises(PrescriptionError, match=expected) as error:
@@ -164,7 +169,7 @@ def test_what_is_not_understood_is_one_line(tmp_path, old, new, expected):
 
 
 def test_lenient_warns(tmp_path):
-    text = TRIPLET.replace("NSK16", "N-SK16").replace("  STO", "  STO; XYZ 3")
+    text = TRIPLET.replace("  STO", "  STO; XYZ 3")
     with pytest.warns(PrescriptionWarning, match="surface 5: XYZ 3: this command is not understood"):
         load_telescope(written(tmp_path, text), lenient=True)
 
@@ -172,3 +177,86 @@ def test_lenient_warns(tmp_path):
 def test_a_file_without_surfaces_is_refused(tmp_path):
     with pytest.raises(PrescriptionError, match="0 surfaces: expected SO"):
         load_telescope(written(tmp_path, "RDM\nEPD 3\n"))
+
+
+def test_without_rdm_curvatures_are_read(tmp_path):
+    """CODE V's default; with RDM after the surfaces they are radii."""
+    lens = "LEN\nEPD 1\nWL 550\nYAN 0\nSO 0 1e13\nS 0.1 1 NBK7_SCHOTT\nSTO\nS -0.05 15\nSI 0 0\n"
+    for text, curvatures in ((lens, (100.0, -50.0)), (lens + "RDM\n", (1e4, -2e4)), (lens + "RDM N\n", (100.0, -50.0))):
+        telescope = load_telescope(written(tmp_path, text))
+        # Turned by half a turn about y.
+        assert [-s.shape.curvature for s in telescope.surfaces[:2]] == pytest.approx(curvatures, rel=1e-14)
+
+
+LANDSCAPE = """tit 'Landscape lens'
+so 0. 1.0e+10
+s 0. 1.664
+s -0.2 0.22 nbk7_schott ! radius 5
+  cir edg 0.5
+s -0.387040626 10.150245
+  cir 0.7; cir obs L'A' 0.1
+si 0 0
+epd 1.0; dim mm
+wl 587.5618
+yim 0 3
+"""
+
+
+def test_system_data_may_follow_the_surfaces(tmp_path):
+    telescope = load_telescope(written(tmp_path, LANDSCAPE))
+    # The lens maker's equation of a thick lens, with Schott's nd of N-BK7; curvatures [1/mm].
+    n, c1, c2, d = 1.5168, -0.2, -0.387040626, 0.22
+    power = (n - 1) * (c1 - c2 + (n - 1) * d * c1 * c2 / n)
+    assert first_order(telescope).focal_length == pytest.approx(1e-3 / power, rel=1e-5)
+    assert telescope.pupil_diameter == pytest.approx(1e-3, rel=1e-15)
+    # No stop is named: the first surface is. An edge stops nothing.
+    assert telescope.stop_z == pytest.approx(telescope.surfaces[0].vertex[2], abs=1e-15)
+    assert [s.aperture for s in telescope.surfaces] == [None, None, Annulus(1e-4, 7e-4), None]
+    # Without SI the image stands behind the last surface.
+    without = load_telescope(written(tmp_path, LANDSCAPE.replace("si 0 0\n", "")))
+    assert without.surfaces[-1] == telescope.surfaces[-1]
+
+
+def test_f_numbers_are_those_of_the_cone_to_the_image(tmp_path):
+    """One to one: the object 2f in front of a thin lens of f = 100 mm, at f/5 in the image: D = 200 mm / 5."""
+    lens = "RDM\nFNO 5\nWL 587.5618\nYOB 0\nSO 0 200\nS 100 1e-6 500000.500000\nSTO\nS -100 200\nSI 0 0\n"
+    telescope = load_telescope(written(tmp_path, lens))
+    # The lens is 1 nm thick.
+    assert telescope.pupil_diameter == pytest.approx(40e-3, rel=1e-7)
+
+
+def test_reversed_decentres_undo_others(tmp_path):
+    """To one side and back, in two legs of 2 sqrt(2) mm at 45 degrees: 2 mm across, 2 mm along."""
+    text = (
+        "EPD 1\nWL 550\nYAN 0\nSO 0 1e11\nS 0 3\nS 0 2.8284271247461903\nYDE 2; ADE 45\nS 0 3\nREV; ADE 45\n"
+        "S 0 2.8284271247461903\nADE -45\nS 0 0\nREV; ADE -45; YDE 2\nS 0 3\nSI 0 0\n"
+    )
+    telescope = load_telescope(written(tmp_path, text))
+    y = [1e3 * s.vertex[1] for s in telescope.surfaces]
+    z = [1e3 * (telescope.surfaces[0].vertex[2] - s.vertex[2]) for s in telescope.surfaces]
+    # ADE is left-handed about x: it turns +z towards +y.
+    assert y == pytest.approx([0, 2, 4, 4, 2, 0, 0], abs=1e-14)
+    assert z == pytest.approx([0, 3, 5, 8, 10, 10, 13], abs=1e-13)
+    # A reversed surface itself stands in the frame before it.
+    tilts = [np.rad2deg(np.arcsin(s.matrix[1, 2])) for s in telescope.surfaces]
+    assert np.abs(tilts) == pytest.approx([0, 45, 45, 45, 45, 0, 0], abs=1e-12)
+    assert tilts[1] == pytest.approx(tilts[2], rel=1e-14)
+    assert tilts[3] == pytest.approx(-tilts[2], rel=1e-14)
+
+
+def test_pick_ups_take_the_value_of_the_other_surface(tmp_path):
+    text = TRIPLET.replace("GO", "PIK RDY S7 Z1 RDY S1 Z1 -1.0\nPIK THI S4 Z1 THI S2 Z1 2.0 0.5\nGO")
+    telescope = load_telescope(written(tmp_path, text))
+    one, seven = telescope.surface("S1").shape.curvature, telescope.surface("S7").shape.curvature
+    assert seven == pytest.approx(-one, rel=1e-15)
+    z = [telescope.surface(name).vertex[2] for name in ("S4", "S5")]
+    assert z[0] - z[1] == pytest.approx((2 * 2.6377501487731934 + 0.5) * 1e-3, rel=1e-13)
+
+
+def test_private_glasses(tmp_path):
+    catalogue = "PRV\n PWL 700.0 600.0&\n 500.0 450.0\n 'E48' 1.52 1.525&\n 1.533 1.54\nEND\nWL "
+    text = TRIPLET.replace("WL ", catalogue).replace("NSK16_SCHOTT", "'E48'")
+    glass = load_telescope(written(tmp_path, text)).surface("S1").medium_after
+    assert [float(glass.index(w * 1e-9)) for w in (450, 500, 600, 700)] == pytest.approx(
+        [1.54, 1.533, 1.525, 1.52], rel=1e-15
+    )

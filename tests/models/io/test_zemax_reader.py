@@ -406,6 +406,7 @@ def test_lenient_warns_of_each_thing_left_out(tmp_path):
 def test_real_files_load_without_leniency_or_warning(path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*FTYP 3 1 3 1 0 0 0: a telecentric object space is not read")
         telescope = load_telescope(path)
     assert telescope.surfaces[-1].interaction == Interaction.DETECTOR
 
@@ -520,3 +521,42 @@ def test_mutilated_files_end_in_one_line_and_nothing_else(tmp_path, path):
             refused.append(str(error))
     assert 0 < len(refused) < 40
     assert [text for text in refused if not text.startswith(str(broken)) or "\n" in text] == []
+
+
+def test_a_picked_up_model_glass(tmp_path):
+    text = MIRROR.replace(
+        "  DISZ 400", "  GLAS ___BLANK 2 1 1.489 57.4 0 0 0 0 0 0\n  STUD 1\n  OEMA 2 0 0\n  DISZ 400"
+    )
+    text = text.replace("GLAS MIRROR 0 0 1.5 40", "GLAS BK7 0 0 1.5 40").replace("MODE SEQ", "MODE SEQ\nDBDT 1 2")
+    glass = load_telescope(written(tmp_path, text)).surfaces[0].medium_after
+    d, f, c = (float(glass.index(w)) for w in (0.5875618e-6, 0.4861327e-6, 0.6562725e-6))
+    assert (d, (d - 1) / (f - c)) == pytest.approx((1.489, 57.4), rel=1e-10)
+
+
+@pytest.mark.parametrize("figures", ["0 0 1.5 40 0", "0 0 1.50E+00 4.00E+01 0", "0 0 0 0 0", ""])
+def test_placeholders_behind_an_unknown_glass_are_no_indices(tmp_path, figures):
+    """Zemax writes 1.5 and 40 behind every name: taken for indices they made another lens."""
+    path = written(tmp_path, MIRROR.replace("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0", f"GLAS NONESUCH {figures}"))
+    for lenient in (False, True):
+        with pytest.raises(PrescriptionError, match=r"surface 2: GLAS NONESUCH.*: the glass is in no catalogue"):
+            load_telescope(path, lenient=lenient)
+
+
+def test_a_telecentric_object_space_is_said(tmp_path):
+    text = MIRROR.replace("FTYP 0 0", "FTYP 1 1").replace("DISZ INFINITY", "DISZ 1600")
+    path = written(tmp_path, text)
+    with pytest.warns(
+        PrescriptionWarning, match=r"FTYP 1 1 .*: a telecentric .* is not read; the stop limits the rays"
+    ):
+        load_telescope(path)
+    # Of an object at infinity it means nothing.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_telescope(written(tmp_path, MIRROR.replace("FTYP 0 0", "FTYP 0 1")))
+
+
+def test_the_f_number_of_a_cylinder_is_that_of_its_curved_section(tmp_path):
+    """One mirror of 1 m radius along y, flat along x, at f/5: f = 500 mm, D = 100 mm."""
+    cylinder = "  TYPE BICONICX\n  PARM 1 0\n  PARM 2 0\n  CURV -0.001"
+    text = MIRROR.replace("  TYPE STANDARD\n  CURV -0.001", cylinder).replace("ENPD 100", "FNUM 5 0")
+    assert load_telescope(written(tmp_path, text)).pupil_diameter == pytest.approx(0.1, rel=1e-14)
