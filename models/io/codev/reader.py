@@ -212,7 +212,7 @@ class _Translation:
         elif key in ("DAR", "BEN", "REV"):
             values[key] = 1.0
         elif key == "CIR":
-            # Labels (L'A') name apertures; of several the last of a kind counts.
+            # Labels (L'A') tell several apertures of a kind apart; one of each kind is read.
             names = [w.upper() for w in words if w.isalpha() or w[:2].upper() in ("L'", 'L"')]
             radius = replace(command, words=words[len(names) :]).number(0)
             kinds = [n for n in names if n.isalpha()] or ["CLR"]
@@ -220,7 +220,11 @@ class _Translation:
                 raise command.error("CIR with one of CLR, OBS, HOL, EDG")
             # An edge is where the glass ends and stops nothing; light that falls into a hole is lost.
             if kinds[0] != "EDG":
-                values["CLEAR" if kinds[0] == "CLR" else "OBSCURED"] = radius
+                name = "CLEAR" if kinds[0] == "CLR" else "OBSCURED"
+                if name in values and (kinds[0] == "HOL" or not all(n.isalpha() for n in names)):
+                    text = f"{command.shown}: one aperture and one obscuration of a surface are read"
+                    self.findings.report(command.problem(text))
+                values[name] = radius
         elif key == "CUF":
             if command.number(0):
                 self.findings.report(command.problem(f"{command.shown}: Fresnel surfaces are not read"))

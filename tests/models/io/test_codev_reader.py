@@ -149,6 +149,7 @@ def test_surfaces_may_be_named_by_number(tmp_path):
         ("  STO", "  STO\n  THI S77 3", "THI S77 3: expected a surface from 0"),
         ("  STO", "  CUF 0.1", "surface 5: CUF 0.1: Fresnel surfaces are not read"),
         ("  STO", "  CIR ODD 3", "surface 5: CIR ODD 3: expected CIR with one of CLR, OBS, HOL, EDG"),
+        ("  STO", "  CIR 1; CIR L'B' 2", "surface 5: CIR L'B' 2: one aperture and one obscuration"),
         ("GO", "PIK RDY S3 Z1 THI S2 Z1\nGO", "PIK RDY S3 Z1 THI S2 Z1: only pick-ups of the same value"),
         ("SI    0.0 0.0", "THI S7 0; PIM\nSI 0 0", "PIM: expected the thickness of the solve in the file"),
         ("WL    656", "PRV\nPWL 700 600\n'E48' 1.5\nEND\nWL    656", "'E48' 1.5: expected 2 indices"),
