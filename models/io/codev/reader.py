@@ -121,6 +121,7 @@ class _Translation:
             self.values.append({"CURV": 0.0})
         if len(self.surfaces) < 3:
             raise self.header.problem(f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
+        self._check_curvatures()
         for command in self.pick_ups:
             self._pick_up(command)
         self._check_solves()
@@ -175,7 +176,7 @@ class _Translation:
         """Read the line that begins a surface: radius or curvature, thickness, glass."""
         values = self.values[-1]
         values["CURV"] = self._curvature(command, 0, radius=self.radii) if command.words else 0.0
-        values["THI"] = command.number(1, 0.0)
+        values["THI"] = command.number(1, 0.0, infinite=len(self.surfaces) == 1)
         if len(command.words) > 2:
             self._glass(command, command.words[2], len(self.surfaces) - 1)
 
@@ -270,6 +271,16 @@ class _Translation:
             self.values[target][key] = 1.0 / radius if radius else 0.0
         else:
             self.values[target][key] = scale * value + offset
+
+    def _check_curvatures(self) -> None:
+        """Refuse a file whose first curved surface would not reach the rim of the pupil: radii that lack RDM."""
+        diameter = self.header.number("ENPD", 0.0)
+        curvature = next((v["CURV"] for v in self.values[1:] if v["CURV"]), 0.0)
+        if not self.radii and 0.5 * diameter * abs(curvature) > 1.0:
+            raise self.header.problem(
+                f"curvature {curvature:g}: a sphere smaller than the entrance pupil of {diameter:g}; "
+                "expected RDM where surfaces have radii"
+            )
 
     def _check_solves(self) -> None:
         """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""
