@@ -33,8 +33,8 @@ def pupil_grid(telescope: Telescope, across: int) -> tuple[np.ndarray, np.ndarra
     x, y : ndarray, shape [across, across]
         Centres of the cells [m], in [y, x] order.
     inside : ndarray of bool, shape [across, across]
-        Mask of the cells of the pupil. A rim of the pupil is where the surfaces of the telescope stop the light; where
-        light on the axis passes them beyond the stated radius, the rim is a circle of that radius.
+        Mask of the cells of the pupil. A rim of the pupil is where the surfaces of the telescope stop the light on the
+        axis; where they do not, it is a circle of the stated radius.
 
     Raises
     ------
@@ -53,13 +53,18 @@ def pupil_grid(telescope: Telescope, across: int) -> tuple[np.ndarray, np.ndarra
 
 @lru_cache(maxsize=64)
 def _stated_rims(telescope: Telescope) -> tuple[bool, bool]:
-    """Return whether light on the axis passes beyond the stated outer and within the stated inner rim."""
+    """Return whether the outer and the inner rim are the stated ones, and not where surfaces stop the light.
+
+    A surface is the rim where light on the axis passes on one side of the stated rim and not on the other.
+    """
     if not telescope.obstructions and all(s.aperture is None for s in telescope.surfaces):
         return True, True
     request = Request.of(telescope, (0.0, 0.0), sampling=CHIEF_RAY, threads=1)
     # Not along the axes, where spider vanes lie.
     angle = (np.arange(_PROBES) + 0.25) * (2.0 * np.pi / _PROBES)
     circle = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    points = np.concatenate([(1.0 + _BEYOND) * circle, (1.0 - _BEYOND) * telescope.pupil_obscuration * circle])
-    lit = trace(telescope, request.launch(request.wavelength, points), threads=1).status == RayStatus.OK
-    return bool(lit[:_PROBES].any()), bool(lit[_PROBES:].any())
+    rims = np.array([1.0, telescope.pupil_obscuration])[:, None]
+    points = (rims * [1.0 + _BEYOND, 1.0 - _BEYOND])[..., None, None] * circle
+    end = trace(telescope, request.launch(request.wavelength, points.reshape(-1, 2)), threads=1)
+    (beyond, inside), (around, hole) = (end.status == RayStatus.OK).reshape(2, 2, _PROBES).any(axis=-1)
+    return bool(beyond or not inside), bool(hole or not around)

@@ -47,7 +47,8 @@ class SpotDiagram(FieldResult):
     plate_scale : ndarray, shape [n_field]
         Angle on the sky over length on the detector at each field [rad/m].
     airy_radius : ndarray, shape [n_field]
-        Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m].
+        Radius of the first dark ring of a clear circular pupil, 1.22 wavelengths times the focal ratio [m]; NaN for
+        parallel light.
     """
 
     displacement: np.ndarray

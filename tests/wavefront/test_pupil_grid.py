@@ -71,6 +71,13 @@ def test_wide_apertures_leave_the_stated_pupil(tmp_path):
     check_samplings(telescope, (0.0, np.deg2rad(0.3)), 28)
 
 
+def test_surfaces_that_stop_all_light_of_the_axis_are_no_rim(tmp_path):
+    """Off-axis systems are dark at the centre of the field: the pupil is the stated one."""
+    telescope = paraboloid(tmp_path, "{diameter: 0.4, obscuration: 0.4}", ", annulus: [0.5, 0.6]")
+    x, y, inside = pupil_grid(telescope, 20)
+    assert np.array_equal(inside, (np.hypot(x, y) <= 0.2) & (np.hypot(x, y) >= 0.08))
+
+
 def test_surfaces_that_stop_the_light_are_the_rim(tmp_path, lsst_r):
     """Where surfaces stop the light, the whole square is traced and they alone decide."""
     ring = paraboloid(tmp_path, "{diameter: 0.4, obscuration: 0.4}", ", annulus: [0.081, 0.2]")

@@ -121,6 +121,7 @@ class _Translation:
             self.values.append({"CURV": 0.0})
         if len(self.surfaces) < 3:
             raise self.header.problem(f"{len(self.surfaces)} surfaces: expected SO, one S or more, and SI")
+        self._check_curvatures()
         for command in self.pick_ups:
             self._pick_up(command)
         self._check_solves()
@@ -175,7 +176,7 @@ class _Translation:
         """Read the line that begins a surface: radius or curvature, thickness, glass."""
         values = self.values[-1]
         values["CURV"] = self._curvature(command, 0, radius=self.radii) if command.words else 0.0
-        values["THI"] = command.number(1, 0.0)
+        values["THI"] = command.number(1, 0.0, infinite=len(self.surfaces) == 1)
         if len(command.words) > 2:
             self._glass(command, command.words[2], len(self.surfaces) - 1)
 
@@ -212,7 +213,7 @@ class _Translation:
         elif key in ("DAR", "BEN", "REV"):
             values[key] = 1.0
         elif key == "CIR":
-            # Labels (L'A') name apertures; of several the last of a kind counts.
+            # Labels (L'A') tell several apertures of a kind apart; one of each kind is read.
             names = [w.upper() for w in words if w.isalpha() or w[:2].upper() in ("L'", 'L"')]
             radius = replace(command, words=words[len(names) :]).number(0)
             kinds = [n for n in names if n.isalpha()] or ["CLR"]
@@ -220,7 +221,11 @@ class _Translation:
                 raise command.error("CIR with one of CLR, OBS, HOL, EDG")
             # An edge is where the glass ends and stops nothing; light that falls into a hole is lost.
             if kinds[0] != "EDG":
-                values["CLEAR" if kinds[0] == "CLR" else "OBSCURED"] = radius
+                name = "CLEAR" if kinds[0] == "CLR" else "OBSCURED"
+                if name in values and (kinds[0] == "HOL" or not all(n.isalpha() for n in names)):
+                    text = f"{command.shown}: one aperture and one obscuration of a surface are read"
+                    self.findings.report(command.problem(text))
+                values[name] = radius
         elif key == "CUF":
             if command.number(0):
                 self.findings.report(command.problem(f"{command.shown}: Fresnel surfaces are not read"))
@@ -266,6 +271,16 @@ class _Translation:
             self.values[target][key] = 1.0 / radius if radius else 0.0
         else:
             self.values[target][key] = scale * value + offset
+
+    def _check_curvatures(self) -> None:
+        """Refuse a file whose first curved surface would not reach the rim of the pupil: radii that lack RDM."""
+        diameter = self.header.number("ENPD", 0.0)
+        curvature = next((v["CURV"] for v in self.values[1:] if v["CURV"]), 0.0)
+        if not self.radii and 0.5 * diameter * abs(curvature) > 1.0:
+            raise self.header.problem(
+                f"curvature {curvature:g}: a sphere smaller than the entrance pupil of {diameter:g}; "
+                "expected RDM where surfaces have radii"
+            )
 
     def _check_solves(self) -> None:
         """Refuse a paraxial image solve (PIM) whose solution does not stand in the file."""

@@ -147,8 +147,10 @@ def test_surfaces_may_be_named_by_number(tmp_path):
         ("  STO", "  DIF GRT", "surface 5: DIF GRT: diffractive surfaces are not read"),
         ("  STO", "  STO\n  ADE x", "surface 5: ADE x: expected a number in place of 'x'"),
         ("  STO", "  STO\n  THI S77 3", "THI S77 3: expected a surface from 0"),
+        ("RDM;LEN", "LEN", "curvature 12.4398: a sphere smaller than the entrance pupil of 8.33333; expected RDM"),
         ("  STO", "  CUF 0.1", "surface 5: CUF 0.1: Fresnel surfaces are not read"),
         ("  STO", "  CIR ODD 3", "surface 5: CIR ODD 3: expected CIR with one of CLR, OBS, HOL, EDG"),
+        ("  STO", "  CIR 1; CIR L'B' 2", "surface 5: CIR L'B' 2: one aperture and one obscuration"),
         ("GO", "PIK RDY S3 Z1 THI S2 Z1\nGO", "PIK RDY S3 Z1 THI S2 Z1: only pick-ups of the same value"),
         ("SI    0.0 0.0", "THI S7 0; PIM\nSI 0 0", "PIM: expected the thickness of the solve in the file"),
         ("WL    656", "PRV\nPWL 700 600\n'E48' 1.5\nEND\nWL    656", "'E48' 1.5: expected 2 indices"),
@@ -260,3 +262,8 @@ def test_private_glasses(tmp_path):
     assert [float(glass.index(w * 1e-9)) for w in (450, 500, 600, 700)] == pytest.approx(
         [1.54, 1.533, 1.525, 1.52], rel=1e-15
     )
+
+
+def test_an_object_at_infinity_may_be_written_so(tmp_path):
+    telescope = load_telescope(written(tmp_path, TRIPLET.replace("SO    0.0 0.1e14", "SO 0.0 inf")))
+    assert telescope == load_telescope(written(tmp_path, TRIPLET))
