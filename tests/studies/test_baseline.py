@@ -478,6 +478,7 @@ def run_pytest(folder, *arguments):
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_pytest_collects_baselines(mine):
     shutil.move(mine / "rays.json", mine / "telescope.baseline.json")
     done = run_pytest(mine, "-v")

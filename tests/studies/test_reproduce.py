@@ -78,6 +78,7 @@ def few_galaxies(monkeypatch):
     monkeypatch.setattr("pachon.studies.reproduce.visits._FAINTEST", 25.0)
 
 
+@pytest.mark.slow
 def test_figures_of_visits_are_those_of_their_folder(few_galaxies, tmp_path):
     bench = Bench(TINY, tmp_path, threads=2)
     summary = reproduce(["fig10", "fig15", "fig16", "fig17", "fig18"], bench)["figures"]

@@ -76,7 +76,7 @@ def best_possible(exposure):
     return weights.T @ (exposure.values - exposure.optics)[s] - (exposure.truth - exposure.optics)[h]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["model", "blind"])
 def test_holdout_positions_are_predicted(which, exposure, request):
     left, _ = at_holdout(request.getfixturevalue(which), exposure)
@@ -142,7 +142,7 @@ def test_known_heights_are_kept(exposure, few, lsst_r, wavelengths):
     np.testing.assert_allclose(model.heights.height(x, y), exposure.plane.height(x, y), atol=20e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_wrong_telescope_has_less_evidence(aligned, exposure, few, lsst_r, wavelengths):
     wrong = FocalPlanePsf.fit(
         exposure.stars(few),

@@ -325,7 +325,7 @@ def test_bad_layers_scales_and_sites_are_named():
         Atmosphere.from_site("cerro_pacho", 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_full_size_screens_follow_theory():
     """The default grids, 8192 x 8192 over 1.3 km and 3072 x 3072 over 43 m, without noise."""
     atmosphere = Atmosphere.from_site("cerro_pachon", 2, fixed_modulus=True)

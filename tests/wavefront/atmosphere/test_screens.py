@@ -96,7 +96,7 @@ def test_random_screens_follow_theory():
     np.testing.assert_allclose(ratio, 1.0, atol=0.03)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_long_exposure_image_of_random_screens():
     """The mean of exp(i k dpsi) over Gaussian screens is exp(-D/2), and its image is as wide as theory says."""
     pixel, size, wavelength, count = 0.08, 2048, 600e-9, 8

@@ -216,7 +216,7 @@ def test_an_image_on_the_axis_is_round(lsst_r):
     np.testing.assert_allclose(moments(image)[0], 0.0, atol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mean_of_many_exposures_of_the_fast_engine(polynomial_pupil):
     """Defocused and comatic, so that the optics share in the width and the shape."""
     telescope = polynomial_pupil(defocus=1.2e-6, coma=0.8e-6)

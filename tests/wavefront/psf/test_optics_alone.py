@@ -46,7 +46,7 @@ def rms(values):
     return np.sqrt(np.mean(np.abs(values) ** 2))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_ellipticity_jumps_at_ccd_borders_and_only_there(ellipticity, borders):
     here, across, within = borders
     heights = pachon.FocalPlane.from_budget("lsst", seed=1)

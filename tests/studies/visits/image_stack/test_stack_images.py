@@ -98,7 +98,7 @@ def files(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.glob("images/*.fits"))}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interrupted_stack_ends_with_the_same_bytes(visits_folder, monkeypatch, tmp_path_factory):
     settings = SMALL.model_copy(update={"tiles": 2})
     whole = tmp_path_factory.mktemp("whole")
