@@ -1,4 +1,4 @@
-"""What turbulence adds to the wavefront of a single donut, through screens, against the exposure time.
+"""Wavefront error of a single donut by turbulence, through screens, against the exposure time.
 
 Run: python benchmarks/donuts_in_turbulence.py [epochs]
 

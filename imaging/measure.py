@@ -29,7 +29,7 @@ _MATCH = 3.0
 
 @dataclass(frozen=True, eq=False)
 class ImageCatalogue:
-    """What is measured on one image.
+    """Objects, stars, PSF and galaxies measured on one image.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ class CcdJob:
 
 @dataclass(frozen=True)
 class CcdResult:
-    """What a worker returns of a CCD."""
+    """Result of one CCD, as a worker returns it."""
 
     name: str
     product: bytes | None = None  #: the file, of a worker that does not see the folder of the run

@@ -126,17 +126,19 @@ def run(
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     failed: dict[str, str] = {}
-    if missing and workers is None:
+    if missing and workers is not None:
+        failed = compute_ccds(experiment, folder, missing, workers, strict=strict, reporter=reporter)
+    elif missing:
         with experiment.screens(threads, reporter):
             write = partial(write_ccd, experiment, folder)
             simulated = simulate_ccds(experiment, write, missing, strict=strict, threads=threads, reporter=reporter)
             failed = simulated.not_modelled
-    elif missing and workers is not None:
-        failed = compute_ccds(experiment, folder, missing, workers, strict=strict, reporter=reporter)
     computed = tuple(name for name in missing if name not in failed)
     if parts > 1:
-        done = {*finished_ccds(folder, experiment), *failed}
-        waited = tuple(name for name in names if name not in done)
+        # Other parts may have ended meanwhile.
+        left = [name for name in names if name not in (*kept, *missing)]
+        finished = finished_ccds(folder, experiment, left)
+        waited = tuple(name for name in left if name not in finished)
         if waited:
             return RunResult(folder, None, {}, kept, computed, failed, waited)
     names = tuple(name for name in names if name not in failed)

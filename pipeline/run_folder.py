@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..core.errors import PachonError, ProductError
@@ -53,10 +54,10 @@ def _refuse_other(folder: Path, before: Configuration, now: Configuration, resum
         )
 
 
-def finished_ccds(folder: Path, experiment: Experiment) -> tuple[str, ...]:
-    """Return the CCDs of a run with complete products of this configuration."""
-    stamp = stamp_of(experiment)
-    return tuple(name for name in experiment.config.ccds or () if _is_whole(product_path(folder, name), stamp))
+def finished_ccds(folder: Path, experiment: Experiment, names: Iterable[str] | None = None) -> tuple[str, ...]:
+    """Return the CCDs of a run, or those among some names, with complete products of this configuration."""
+    stamp, names = stamp_of(experiment), (experiment.config.ccds or ()) if names is None else names
+    return tuple(name for name in names if _is_whole(product_path(folder, name), stamp))
 
 
 def _is_whole(path: Path, stamp: Stamp) -> bool:

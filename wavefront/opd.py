@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
-from ..core.units import length, require_count
+from ..core.units import length
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
@@ -183,10 +183,6 @@ def wavefront_opds(
     )
 
 
-#: Most points along a side of a map.
-_MOST_ACROSS = 8192
-
-
 def _pupil_points(
     telescope: Telescope, pupil: tuple[ArrayLike, ArrayLike] | None, grid: int | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -194,7 +190,7 @@ def _pupil_points(
     if pupil is not None and grid is not None:
         raise ConfigError("pupil and grid are both given: expected one of them")
     if pupil is None:
-        return pupil_grid(telescope, 64 if grid is None else require_count(grid, "grid", 2, _MOST_ACROSS))
+        return pupil_grid(telescope, 64 if grid is None else grid)
     x, y = (np.array(v) for v in pupil_points(pupil))
     return x, y, np.ones(x.shape, dtype=bool)
 

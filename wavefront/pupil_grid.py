@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..core.errors import DomainError
+from ..core.units import require_count
 from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus
 from ..raytrace.trace import trace
@@ -16,6 +16,8 @@ from .request import Request
 #: Distance of the probes from the stated rims, of their radius: farther than perturbed surfaces move the light.
 _BEYOND = 0.02
 _PROBES = 16
+#: Most points along a side of a map.
+_MOST_ACROSS = 8192
 
 
 def pupil_grid(telescope: Telescope, across: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -41,10 +43,9 @@ def pupil_grid(telescope: Telescope, across: int) -> tuple[np.ndarray, np.ndarra
     DomainError
         If ``across`` is not a whole number of at least 2.
     """
-    if int(across) != across or across < 2:
-        raise DomainError(f"grid = {across!r}: expected a whole number of at least 2 points across the pupil")
+    across = require_count(across, "grid", 2, _MOST_ACROSS)
     radius, obscuration = 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration
-    u = ((np.arange(int(across)) + 0.5) / int(across) - 0.5) * telescope.pupil_diameter
+    u = ((np.arange(across) + 0.5) / across - 0.5) * telescope.pupil_diameter
     x, y = np.meshgrid(u, u)
     stated_outer, stated_inner = _stated_rims(telescope)
     inner, outer = obscuration if stated_inner else 0.0, 1.0 if stated_outer else np.inf

@@ -19,6 +19,7 @@ from ..measure.rho_statistics import RhoStatistics, rho_statistics
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import StarFlag, flag_stars, require_stars
 from ..psf_model import kriging
+from ..psf_model.checks import as_extent
 from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
 from ..simulate.stamps import center_stamps
@@ -213,7 +214,7 @@ def fit_own_stars(
     def fit(chosen: np.ndarray) -> PsfModel:
         return PsfModel.fit(centred[chosen], places[chosen], extent=span, **defaults)
 
-    span = _extent(places[used]) if extent is None else extent
+    span = as_extent(extent, places[used])
     which = np.flatnonzero(used)
     predicted = np.empty((len(which), size, size))
     parts = np.array_split(stream(require_seed(seed), "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
@@ -237,11 +238,6 @@ def fit_own_stars(
 
 def _rms(*values: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))
-
-
-def _extent(positions: np.ndarray) -> tuple[float, float, float, float]:
-    (xmin, ymin), (xmax, ymax) = positions.min(axis=0), positions.max(axis=0)
-    return xmin, xmax, ymin, ymax
 
 
 def _signal_to_noise(stamps: np.ndarray, rms: np.ndarray, gain: float) -> np.ndarray:

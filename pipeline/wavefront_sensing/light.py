@@ -27,13 +27,11 @@ _SPACING = 0.5
 #: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
 _RESOLVED, _FINEST = 2.2, 3
 _FWHM_PER_RMS = 2.354820045
-#: Steps to a CCD surface along the chief ray.
-_STEPS = 3
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """What all stars of a fit share.
+    """Telescope, detector and seeing, common to all stars of a fit.
 
     Attributes
     ----------
@@ -99,17 +97,13 @@ class Instrument:
         place = chief_landing(telescope, direction, self.middle)
         if self.focal_plane is not None:
             rays = parallel_rays(telescope, direction[None], self.middle, np.zeros((1, 2)))
-            chief = trace(telescope, rays, threads=1)
-            travel = (chief.direction @ detector.matrix)[0]
-            on_ccd, rise = place, 0.0
-            for _ in range(_STEPS):
-                rise = float(self.focal_plane.height(*on_ccd))
-                if math.isnan(rise):
-                    raise DomainError("the chief ray lands between the CCDs")
-                on_ccd = place + rise * travel[:2] / travel[2]
+            chief = trace(telescope, rays, focal_plane=self.focal_plane, threads=1)
+            if chief.ccd is None or chief.ccd[0] < 0:
+                raise DomainError("the chief ray lands between the CCDs")
+            *on_ccd, rise = detector.to_local(chief.position)[0]
             along_x, along_y = self.focal_plane.gradient(*on_ccd)
             # The CCD's plane where the chief ray of the unmoved detector lands.
-            height += rise + float((place - on_ccd) @ (along_x, along_y))
+            height += float(rise + (place - on_ccd) @ (along_x, along_y))
             tilt = (float(along_y), -float(along_x), 0.0)
         if height == 0.0 and not any(tilt):
             return telescope

@@ -25,7 +25,7 @@ Heights = Literal["nominal", "lsstcam"]
 
 
 class ErrorsSection(Section):
-    """What is wrong with the telescope at first, and how it drifts."""
+    """Misalignment of the telescope before the first visit, and its drifts."""
 
     tolerance_nm: Positive = Field(
         50.0, description="rms wavefront over the field that the tolerance of each degree of freedom makes [nm]"
@@ -71,7 +71,7 @@ class AirSection(Section):
 
 
 class ControlSection(Section):
-    """How the telescope is corrected."""
+    """Correction of the telescope."""
 
     gain: Annotated[float, BeforeValidator(plain_number), Field(strict=True, gt=0, le=1)] = Field(
         1.0, description="fraction of the estimated state that is taken off"

@@ -1,4 +1,4 @@
-"""What does not change from visit to visit: telescope, degrees of freedom, sensors, turbulence, tolerances."""
+"""The constants of a loop: telescope, degrees of freedom, sensors, turbulence, tolerances."""
 
 from __future__ import annotations
 

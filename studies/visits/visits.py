@@ -33,7 +33,7 @@ SUMS_NAME = "sums.fits"
 
 @dataclass(frozen=True, eq=False)
 class StackResult:
-    """What :func:`stack_visits` leaves.
+    """Products of :func:`stack_visits`.
 
     Attributes
     ----------

@@ -14,7 +14,7 @@ from ....pipeline.config import section_yaml
 
 
 class ImageStackConfig(Section):
-    """What is drawn and stacked; the visits are those of their folder."""
+    """Galaxies, tiles and noise of stacked images; the visits are those of their folder."""
 
     faintest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=15, le=30)] | None = Field(
         None, description="faintest galaxy [AB mag]; by default as bright as a star of S/N 4 in the stack of all visits"

@@ -32,7 +32,7 @@ _LEAST_DEPTH = 2
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """What all visits look at.
+    """Stars and galaxies of the sky, the same in all visits.
 
     Attributes
     ----------
