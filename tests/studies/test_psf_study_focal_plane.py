@@ -77,6 +77,7 @@ def test_metrics_are_those_of_one_model_of_all_ccds(small):
         assert found["lost"] == 0.0
 
 
+@pytest.mark.slow
 def test_other_models_are_as_without_it(small, focal_plane_config):
     _, result = small
     config = focal_plane_config(reconstruction__model="ccd")

@@ -91,7 +91,7 @@ def test_holdout_positions_are_predicted(which, exposure, request):
 # Chi-square of 135 holdout positions, correlated within streaks: about 50 independent ones, sqrt(2 / 50) = 20 %, and
 # the covariance itself is fitted. Two sigma on either side.
 @pytest.mark.long
-@pytest.mark.parametrize("which", ["model", "blind"])
+@pytest.mark.parametrize("which", [pytest.param("model", marks=pytest.mark.slow), "blind"])
 @pytest.mark.parametrize("shape", range(3))
 def test_predicted_uncertainties_are_those_of_the_holdout_positions(which, shape, exposure, request):
     left, sigma = at_holdout(request.getfixturevalue(which), exposure)
@@ -100,23 +100,23 @@ def test_predicted_uncertainties_are_those_of_the_holdout_positions(which, shape
 
 
 @pytest.mark.long
-def test_the_fit_agrees_with_its_stars(model, blind, exposure):
-    for fit in (model, blind):
-        assert fit.used.all()
-        assert len(fit.used) == exposure.first.sum()
-        assert fit.field.data.values.shape == (360, 3)
-        # 360 stars: 1 / sqrt(180) = 7 % and the fitted hyperparameters: 3 sigma are 20 %.
-        assert all(0.8 < v < 1.2 for v in fit.chi2.values())
-        # Predictions from the other stars differ from the star by its noise and by more; those with it by less.
-        left = values(fit.leave_one_out) - exposure.values[exposure.first]
-        assert (rms(left) > 1e-3).all()
-        assert not any("noise" in w for w in fit.warnings)
-    assert np.isnan(blind.evidence)
-    assert blind.heights is None
+@pytest.mark.parametrize("which", [pytest.param("model", marks=pytest.mark.slow), "blind"])
+def test_the_fit_agrees_with_its_stars(which, exposure, request):
+    fit = request.getfixturevalue(which)
+    assert fit.used.all()
+    assert len(fit.used) == exposure.first.sum()
+    assert fit.field.data.values.shape == (360, 3)
+    # 360 stars: 1 / sqrt(180) = 7 % and the fitted hyperparameters: 3 sigma are 20 %.
+    assert all(0.8 < v < 1.2 for v in fit.chi2.values())
+    # Predictions from the other stars differ from the star by its noise and by more; those with it by less.
+    left = values(fit.leave_one_out) - exposure.values[exposure.first]
+    assert (rms(left) > 1e-3).all()
+    assert not any("noise" in w for w in fit.warnings)
+    assert (fit.heights is None) == np.isnan(fit.evidence) == (which == "blind")
 
 
 @pytest.mark.long
-def test_a_planted_height_is_found(model, exposure):
+def test_a_planted_height_is_found(aligned, exposure):
     own = exposure.camera.ccd_index(PLANTED)
     others = np.arange(9) != own
     grid = np.linspace(-0.9, 0.9, 7) * exposure.camera.half_size
@@ -130,7 +130,7 @@ def test_a_planted_height_is_found(model, exposure):
     # 0.4 % on a CCD of 3 x 1 streaks; 3 um is a third of what was planted.
     truth = above(exposure.plane)
     assert truth > 4 * UM
-    assert above(model.heights) == pytest.approx(truth, abs=3 * UM)
+    assert above(aligned.heights) == pytest.approx(truth, abs=3 * UM)
 
 
 @pytest.mark.long
@@ -370,7 +370,7 @@ def test_outliers_are_left_out(exposure, few):
     np.testing.assert_array_equal(np.flatnonzero(~model.used), [17])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_rotated_camera_is_fitted_as_any_other(aligned, exposure, few, lsst_r, wavelengths, tmp_path):
     # Axially symmetric optics: in the camera's own axes the stars are those of the camera that is not rotated.
     rotated = FocalPlanePsf.fit(

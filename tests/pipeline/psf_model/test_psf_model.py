@@ -283,7 +283,9 @@ def test_splitting_changes_no_byte(basis, interpolation):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("options", [{"basis": "shapelets"}, {"interpolation": "gp"}, {"masks": True}])
+@pytest.mark.parametrize(
+    "options", [pytest.param({"basis": "shapelets"}, marks=pytest.mark.slow), {"interpolation": "gp"}, {"masks": True}]
+)
 def test_bytes_do_not_depend_on_blas_threads(options):
     if "interpolation" in options:
         pytest.importorskip("sklearn")

@@ -265,6 +265,7 @@ def test_sweep_files_may_name_the_file_of_their_configuration(folder):
     assert load_sweep(folder / "two.yaml").base == {"seed": 5, "ccds": ["R22_S11"]}
 
 
+@pytest.mark.slow
 def test_a_wavelength_is_a_parameter(folder):
     text = "base: {ccds: [R22_S11], stars: {truth: 12}, psf: {engine: long_exposure}, reconstruction: {components: 5, "
     text += (

@@ -100,6 +100,7 @@ def test_an_interrupted_stack_goes_on_to_the_same_bytes(stacked, visits_config, 
     assert content(tmp_path) == content(folder)
 
 
+@pytest.mark.slow
 def test_more_visits_join_a_finished_stack(stacked, visits_config, tmp_path):
     _, folder = stacked
     stack_visits(visits_config(count=1), tmp_path, threads=1)

@@ -61,7 +61,7 @@ def test_stars_share_the_ground_layer_and_nothing_far_apart():
     assert np.linalg.eigvalsh(whole).min() > -1e-6 * np.linalg.eigvalsh(whole).max()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_frozen_screens_drawn_and_averaged_have_these_variances():
     # Screens of one layer by brute force: random modes of the spectrum on a periodic grid, moved along x.
     pixel, size, wind, exposure, n_screen = 0.2, 512, 8.0, 2.0, 20
