@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ...core.buffers import empty
 from ...core.launch import FORWARD_OPTIONS
+from ...core.warp_arrays import warp_array
 
 wp.set_module_options(FORWARD_OPTIONS)
 
@@ -56,9 +58,10 @@ class RayPackets:
 def ray_packets(n_surface: int = 0, n_packet: int = 0) -> Any:
     """Return unset :class:`RayPackets` for a number of surfaces and of packets."""
     packets = RayPackets()
-    packets.position, packets.direction = (wp.empty((n_surface, 3, n_packet), dtype=lanes, device="cpu") for _ in "pd")
-    packets.path = wp.empty((n_surface, n_packet), dtype=lanes, device="cpu")
-    packets.status = wp.empty((n_surface, n_packet), dtype=lane_flags, device="cpu")
+    vectors, numbers = (n_surface, 3, n_packet, LANES), (n_surface, n_packet, LANES)
+    packets.position, packets.direction = (warp_array(empty(vectors), lanes) for _ in "pd")
+    packets.path = warp_array(empty(numbers), lanes)
+    packets.status = warp_array(empty(numbers, np.int32), lane_flags)
     return packets
 
 
