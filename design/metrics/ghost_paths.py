@@ -1,34 +1,24 @@
-"""Ghost paths: light that two surfaces reflect, as telescopes with the surfaces in the order of the light.
+"""Paths of ghosts: light that is reflected at two surfaces, with what each surface reflects and transmits.
 
 A surface that transmits light also reflects a little of it, and so does the detector. Light that is reflected at a
-surface, goes back, and is reflected again at an earlier one, arrives at the detector out of focus. The list of surfaces
-in the order in which the light meets them is a telescope like any other, for the ordinary trace.
+surface, goes back, and is reflected again at an earlier one, arrives at the detector out of focus. Each stretch of such
+a path is a telescope like any other, for the ordinary trace; stretches that several ghosts share are traced once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...core.errors import DomainError, unknown_name
+from ...models.media.medium import Medium
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
 from ...raytrace.rays import Rays, RayStatus
 from ...raytrace.trace import trace
-
-
-@dataclass(frozen=True)
-class GhostPath:
-    """One path with two reflections: at `first`, then at `second`, which stands before it in the telescope."""
-
-    first: str
-    second: str
-    telescope: Telescope  #: surfaces in the order of the light; those that it meets again are named "#2", "#3"
-    source: tuple[int, ...]  #: index of each of them in the real telescope
-    reflecting: tuple[bool, ...]  #: whether each reflects the light without being a mirror
 
 
 def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
@@ -40,40 +30,6 @@ def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
     last = len(telescope.surfaces) - 1
     ends = [*lenses, last] if telescope.surfaces[last].interaction == Interaction.DETECTOR else lenses
     return [(j, i) for j in ends for i in lenses if i < j]
-
-
-def ghost_path(telescope: Telescope, first: int, second: int) -> GhostPath:
-    """Return the path of light that is reflected at two surfaces, by their indices; the first may be the detector."""
-    surfaces = telescope.surfaces
-    if not 0 <= second < first < len(surfaces):
-        raise DomainError(
-            f"first = {first}, second = {second}: expected 0 <= second < first < {len(surfaces)}, places of surfaces"
-        )
-    for place in (first, second):
-        if surfaces[place].interaction not in (Interaction.REFRACT, Interaction.DETECTOR):
-            raise DomainError(f"surface {surfaces[place].name!r}: expected a lens surface or the detector for a ghost")
-    before = [telescope.medium_before, *(s.medium_after for s in surfaces)]
-    turn = 2 * first - second
-    source = (*range(first), *range(first, second, -1), *range(second, len(surfaces)))
-    path: list[Surface] = []
-    for k, place in enumerate(source):
-        surface, times = surfaces[place], source[: k + 1].count(place)
-        path.append(
-            replace(
-                surface,
-                name=surface.name + (f"#{times}" if times > 1 else ""),
-                interaction=Interaction.MIRROR if k in (first, turn) else surface.interaction,
-                # From the first reflection to the second, light goes back: into the medium in front of a surface.
-                medium_after=before[place] if first <= k < turn else before[place + 1],
-            )
-        )
-    return GhostPath(
-        first=surfaces[first].name,
-        second=surfaces[second].name,
-        telescope=replace(telescope, surfaces=tuple(path), groups={}, group_frames={}),
-        source=source,
-        reflecting=tuple(k in (first, turn) for k in range(len(path))),
-    )
 
 
 def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.ndarray:
@@ -118,46 +74,125 @@ class Coatings:
 
 @dataclass(frozen=True)
 class GhostLight:
-    """Rays of one path on the detector: positions and directions in its own frame, and their light."""
+    """Rays of one ghost on the detector, those that carry light.
 
-    path: GhostPath
+    Attributes
+    ----------
+    first, second : str
+        Names of the surfaces that reflect the light; empty for the star itself.
+    position : ndarray, shape [n, 2]
+        In the frame of the detector [m].
+    direction : ndarray, shape [n, 3]
+        In the same frame.
+    weight : ndarray, shape [n]
+        Light of each ray; that of a ray in front of the telescope is 1.
+    """
+
+    first: str
+    second: str
     position: np.ndarray
     direction: np.ndarray
     weight: np.ndarray
 
 
-def follow(path: GhostPath, start: Rays, coatings: Coatings, threads: int | None) -> GhostLight:
-    """Trace rays along one path, with the light that each surface reflects or transmits."""
-    telescope = path.telescope
-    met = trace(telescope, start, "all", threads=threads)
-    index = refractive_indices(telescope, start.wavelength)
-    weight = (met[-1].status == RayStatus.OK).astype(np.float64)
-    coming = start.direction
-    for k, (surface, place) in enumerate(zip(telescope.surfaces, path.source, strict=True)):
-        going = met[k].direction
-        if path.reflecting[k]:
-            # A mirror changes a direction by twice the cosine of incidence along the normal.
-            cosine = 0.5 * np.linalg.norm(going - coming, axis=-1)
-            weight *= coatings.at(place, cosine, index[k], _other_index(path, k, index))
-        elif surface.interaction == Interaction.REFRACT:
-            normal = index[k + 1] * going - index[k] * coming
-            length = np.linalg.norm(normal, axis=-1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                # Between media of equal index the normal is undefined, and nothing is reflected.
-                cosine = np.where(length > 1e-12, (coming * normal).sum(axis=-1) / length, 1.0)
-            weight *= 1.0 - coatings.at(place, cosine, index[k], index[k + 1])
-        coming = going
-    detector = telescope.surfaces[-1]
-    lit = weight > 0
-    return GhostLight(
-        path, detector.to_local(met[-1].position[lit])[:, :2], met[-1].direction[lit] @ detector.matrix, weight[lit]
-    )
+@dataclass(frozen=True)
+class _Beam:
+    """Rays that carry light after a surface: positions [m] and directions [n, 3], telescope frame, and their light."""
+
+    position: np.ndarray
+    direction: np.ndarray
+    weight: np.ndarray
 
 
-def _other_index(path: GhostPath, k: int, index: np.ndarray) -> float:
-    """Return the index behind a reflecting surface, from where the path crosses that surface."""
-    place = path.source[k]
-    for other, met in enumerate(path.source):
-        if met == place and other != k:
-            return float(index[other + 1] if other > k else index[other])
-    return float(index[k])
+class GhostTrace:
+    """Light of one star along its own path and those of its ghosts."""
+
+    def __init__(self, telescope: Telescope, start: Rays, coatings: Coatings, threads: int | None) -> None:
+        self._telescope, self._coatings, self._threads = telescope, coatings, threads
+        self._wavelength = start.wavelength
+        self._media: list[Medium] = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
+        self._index = refractive_indices(telescope, start.wavelength)
+        beam = _Beam(start.position, start.direction, np.ones(len(start)))
+        self._forward = list(self._through(range(len(telescope.surfaces)), beam))
+
+    def star(self) -> GhostLight:
+        """Return the light that arrives without reflections."""
+        return self._landing("", "", self._forward[-1])
+
+    def ghosts(self) -> Iterator[GhostLight]:
+        """Yield the ghosts of :func:`ghost_pairs`, in that order."""
+        names = self._telescope.surface_names
+        seconds: dict[int, list[int]] = {}
+        for first, second in ghost_pairs(self._telescope):
+            seconds.setdefault(first, []).append(second)
+        for first, of_first in seconds.items():
+            back = [*range(first, min(of_first), -1)]
+            # Light behind each surface on the way back, by its index.
+            behind = dict(zip(back, self._through(back, self._forward[first - 1], backward=True), strict=True))
+            for second in of_first:
+                *_, end = self._through(range(second, len(names)), behind[second + 1], reflected=True)
+                yield self._landing(names[first], names[second], end)
+
+    def _through(
+        self, places: Sequence[int], beam: _Beam, *, backward: bool = False, reflected: bool = False
+    ) -> Iterator[_Beam]:
+        """Yield the light after each of the surfaces at these places, in the order in which the light meets them.
+
+        The first of them reflects it, where it is to go backward or has gone backward and is to be `reflected`.
+        """
+        turns = backward or reflected
+        behind, before = (0, 1) if backward else (1, 0)
+        surfaces = [replace(self._telescope.surfaces[p], medium_after=self._media[p + behind]) for p in places]
+        if turns:
+            surfaces[0] = replace(surfaces[0], interaction=Interaction.MIRROR)
+        lit = beam.weight > 0.0
+        weight, coming = beam.weight[lit], beam.direction[lit]
+        rays = Rays(beam.position[lit], coming, np.zeros(len(weight)), self._wavelength)
+        stretch = self._stretch(surfaces, self._media[places[0] + (behind if turns else before)])
+        for k, met in enumerate(trace(stretch, rays, "all", threads=self._threads)):
+            place, n, n_behind = places[k], self._index[places[k] + before], self._index[places[k] + behind]
+            # Cosine of the angle by which the surface turns the ray.
+            turn = np.einsum("ij,ij->j", coming.T, met.direction.T)
+            if turns and k == 0:
+                cosine = np.sqrt(np.maximum(0.5 * (1.0 - turn), 0.0))
+                weight = weight * self._coatings.at(place, cosine, n_behind, n)
+            elif surfaces[k].interaction == Interaction.REFRACT:
+                weight = weight * (1.0 - self._coatings.at(place, _incidence(turn, n, n_behind), n, n_behind))
+            weight = np.where(met.status == RayStatus.OK, weight, 0.0)
+            coming = met.direction
+            yield _Beam(met.position, coming, weight)
+
+    def _stretch(self, surfaces: list[Surface], medium_before: Medium) -> Telescope:
+        """Return the telescope of one stretch of a path, with the obstructions that lie on it."""
+        names = {s.name for s in surfaces}
+        obstructions = []
+        for obstruction in self._telescope.obstructions:
+            if obstruction.before is None:
+                obstructions.append(obstruction)
+            elif met := tuple(name for name in obstruction.before if name in names):
+                obstructions.append(replace(obstruction, before=met))
+        return replace(
+            self._telescope,
+            surfaces=tuple(surfaces),
+            medium_before=medium_before,
+            groups={},
+            group_frames={},
+            obstructions=tuple(obstructions),
+        )
+
+    def _landing(self, first: str, second: str, beam: _Beam) -> GhostLight:
+        detector, lit = self._telescope.surfaces[-1], beam.weight > 0.0
+        position = detector.to_local(beam.position[lit])[:, :2]
+        return GhostLight(first, second, position, beam.direction[lit] @ detector.matrix, beam.weight[lit])
+
+
+def _incidence(turn: np.ndarray, n: float, n_behind: float) -> np.ndarray:
+    """Return cosines of incidence, from the cosines of the angles by which rays are turned between two indices.
+
+    Snell's law in vectors: n' times the direction behind the surface less n times that in front lies along the normal.
+    """
+    if n == n_behind:
+        # No normal is to be had, and nothing is reflected.
+        return np.ones_like(turn)
+    normal = np.sqrt(n * n + n_behind * n_behind - 2.0 * n * n_behind * turn)
+    return np.abs(n_behind * turn - n) / normal

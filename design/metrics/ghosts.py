@@ -22,7 +22,7 @@ from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import draw_circle, field_text, panels_of
 from ..result import FieldResult
-from .ghost_paths import Coatings, GhostLight, GhostPath, follow, ghost_pairs, ghost_path
+from .ghost_paths import Coatings, GhostLight, GhostTrace, ghost_pairs
 from .principal_rays import principal_rays_of
 from .spots import holding_radius
 
@@ -207,21 +207,19 @@ def ghosts(
         telescope, where, wavelength, sampling="spiral", n_pupil=n_pupil, projection=projection, threads=threads
     )
     coatings = Coatings(telescope, reflectivity, detector_reflectivity)
-    pairs = ghost_pairs(telescope)
-    if not pairs:
+    if not ghost_pairs(telescope):
         raise DomainError(
             f"{telescope.name}: expected at least one lens surface and another, or a detector, for ghosts"
         )
-    start = request.launch(request.wavelength)
-    nothing = GhostPath("", "", telescope, tuple(range(len(telescope.surfaces))), (False,) * len(telescope.surfaces))
-    image = follow(nothing, start, coatings, threads)
+    light = GhostTrace(telescope, request.launch(request.wavelength), coatings, threads)
+    image = light.star()
     if not image.weight.sum() > 0:
         raise DomainError(f"{field_label(request.fields[0])}: the star does not reach the detector")
     direct = float(image.weight.sum())
     star = np.average(image.position, axis=0, weights=image.weight)
     landings = []
-    for first, second in pairs:
-        landings.append(follow(ghost_path(telescope, first, second), start, coatings, threads))
+    for landing in light.ghosts():
+        landings.append(landing)
         if progress is not None:
             progress(1)
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
@@ -263,8 +261,8 @@ def _measure(landing: GhostLight, direct: float) -> Ghost:
     edges = centroid[:, None] + half[:, None] * np.linspace(-1.0, 1.0, cells + 1)
     irradiance = _irradiance(landing, *edges) / direct
     return Ghost(
-        first=landing.path.first,
-        second=landing.path.second,
+        first=landing.first,
+        second=landing.second,
         flux=float(landing.weight.sum()) / direct,
         # Mean over nine cells: the number of rays in a single one is uncertain by a tenth and more.
         peak=float(uniform_filter(irradiance, 3, mode="constant").max()),
