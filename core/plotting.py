@@ -6,7 +6,7 @@ import io
 import logging
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from .errors import ConfigError
+from .errors import ConfigError, DomainError, shown
 
 # Matplotlib takes a third of a second to import: only where something is drawn.
 if TYPE_CHECKING:
@@ -57,14 +57,50 @@ def new_figure(width: float, height: float, layout: Literal["constrained", "comp
     return figure
 
 
-def picture_bytes(figure: Figure, kind: str) -> bytes:
+def figure_at(ax: Axes | Figure | None, width: float, height: float) -> Figure:
+    """Return where a picture of several panels is drawn.
+
+    That is a new figure of a size in inches, the given figure or subfigure, or the place of the given axes, which are
+    removed: a subfigure takes their cell of the grid.
+
+    Raises
+    ------
+    DomainError
+        If ``ax`` is none of these, or axes that stand in no grid of subplots.
+    """
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+    if ax is None:
+        return new_figure(width, height)
+    if isinstance(ax, FigureBase):
+        return cast("Figure", ax)
+    cell = ax.get_subplotspec() if isinstance(ax, Axes) else None
+    if cell is None:
+        raise DomainError(f"ax = {shown(ax)}: expected Axes of a grid of subplots, a Figure or a SubFigure", key="ax")
+    parent: Any = ax.get_figure(root=False)
+    ax.remove()
+    return cast("Figure", parent.add_subfigure(cell))
+
+
+def axes_at(ax: Axes | Figure | None, width: float, height: float) -> tuple[Figure, Axes]:
+    """Return where a picture of one panel is drawn: figure and axes, the given ones if they are axes."""
+    from matplotlib.axes import Axes
+
+    if isinstance(ax, Axes):
+        return cast("Figure", ax.get_figure(root=False)), ax
+    figure = figure_at(ax, width, height)
+    return figure, figure.subplots()
+
+
+def picture_bytes(figure: Figure, kind: str, dpi: int = _DPI) -> bytes:
     """Return a figure as the bytes of a png, pdf or svg file, without the date and the version of what drew it."""
     if kind not in _NAMELESS:
         raise ConfigError(f"picture format {kind!r}: expected one of {', '.join(_NAMELESS)}")
     buffer = io.BytesIO()
     # Ticks are made, and take their style, when a figure is drawn.
     with styled():
-        figure.savefig(buffer, format=kind, dpi=_DPI, metadata=_NAMELESS[kind])
+        figure.savefig(buffer, format=kind, dpi=dpi, metadata=_NAMELESS[kind])
     return buffer.getvalue()
 
 

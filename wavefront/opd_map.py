@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.plotting import BLUE, figure_of, new_figure, plain_text, styled
+from ..core.plotting import BLUE, figure_at, figure_of, plain_text, styled
 from ..models.zernike_polynomials import NOLL_NAMES
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class OpdMap(_PupilMaps):
         return self.value - plane @ terms
 
     @check_arguments
-    def plot(self, zernikes: ZernikeFit | None = None, name: str = "") -> Figure:
+    def plot(self, zernikes: ZernikeFit | None = None, name: str = "", *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the map in nanometres and waves, with and without piston and tilt, and Zernike terms as bars.
 
         The title contains the ``name`` of the telescope. A map that is not on a square grid or has no lit point raises
@@ -94,7 +94,7 @@ class OpdMap(_PupilMaps):
             raise DomainError(f"opd of shape {self.value.shape}: expected one on a square grid to draw")
         tx, ty = np.rad2deg(self.field)
         with styled():
-            figure = new_figure(11.0, 5.6 if zernikes is None else 9.0)
+            figure = figure_at(ax, 11.0, 5.6 if zernikes is None else 9.0)
             rows = [["map", "rest"]] if zernikes is None else [["map", "rest"], ["bars", "bars"]]
             panels: dict[str, Axes] = figure.subplot_mosaic(rows, height_ratios=(1.0, 0.55)[: len(rows)])
             _draw_map(panels["map"], self, self.value, "as traced: against the reference ray")
