@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
 
 from .errors import ConfigError, DomainError, shown
 
@@ -30,6 +33,8 @@ _STYLE = {
     "svg.hashsalt": "pachon",
 }
 _DPI = 150
+#: Stamps of one picture.
+_STAMPS = 6
 #: Metadata of each format, left out: equal pictures have equal bytes.
 _NAMELESS: dict[str, dict[str, Any]] = {
     "png": {"Software": None},
@@ -91,6 +96,23 @@ def axes_at(ax: Axes | Figure | None, width: float, height: float) -> tuple[Figu
         return cast("Figure", ax.get_figure(root=False)), ax
     figure = figure_at(ax, width, height)
     return figure, figure.subplots()
+
+
+def draw_stamps(ax: Axes | Figure | None, images: np.ndarray, pixel: float, titles: Sequence[str]) -> Figure:
+    """Draw the first six stamps, shape [n, ny, nx], each from zero to its peak; pixels of some arc seconds."""
+    count = min(len(images), _STAMPS)
+    with styled():
+        figure = figure_at(ax, max(2.1 * count, 4.2), 2.6)
+        row = figure.subplots(1, count, squeeze=False)[0]
+        half = 0.5 * pixel * images.shape[-1]
+        for axes, image, title in zip(row, images, titles, strict=False):
+            # The square root shows the wings.
+            shown = np.sqrt(np.maximum(image, 0.0))
+            axes.imshow(shown, extent=(-half, half, -half, half), cmap="inferno", vmin=0.0)
+            axes.set_title(plain_text(title), fontsize=8.5)
+            axes.set_xlabel("x [arcsec]")
+        row[0].set_ylabel("y [arcsec], square root of the light")
+        return figure
 
 
 def picture_bytes(figure: Figure, kind: str, dpi: int = _DPI) -> bytes:

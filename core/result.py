@@ -83,13 +83,14 @@ class Result:
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name: what holds for all rows, and the median of each column of numbers."""
-        columns = {k: np.asarray(v) for k, v in self._columns().items()}
+        table = self.to_table()
+        columns = {name: np.asarray(table[name]) for name in table.colnames}
         medians = {
             f"median_{name}": np.nanmedian(values, axis=0)
             for name, values in columns.items()
             if values.dtype.kind in "iuf" and np.isfinite(values).any()
         }
-        return {**self._meta(), "rows": len(next(iter(columns.values()))), **medians}
+        return {**self._meta(), "rows": len(table), **medians}
 
     def _described(self, name: str) -> Description:
         own = described(type(self), name)
@@ -146,6 +147,27 @@ class Result:
             else:
                 parts.append(f'<img style="max-width:100%" src="{_data_url(picture)}" alt="{type(self).__name__}">')
         return "\n".join(parts)
+
+
+class Values(Result):
+    """Base of results that are a few numbers: a table of one row, a column for each field."""
+
+    def _label(self) -> str:
+        few = [*self._values().items()][:_NAMED]
+        return ", ".join(f"{name} {_cell(value)}" for name, value in few)
+
+    def _columns(self) -> dict[str, Any]:
+        return {name: [value] for name, value in self._values().items()}
+
+    def _meta(self) -> dict[str, Any]:
+        return {}
+
+    def _summary(self) -> dict[str, Any]:
+        return self._values()
+
+    def _values(self) -> dict[str, Any]:
+        assert is_dataclass(self)
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 def described(kind: type, name: str) -> Description:

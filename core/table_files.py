@@ -50,15 +50,19 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
         with warnings.catch_warnings():
             # Long keywords become HIERARCH cards; units that FITS lacks, such as electron, are kept for astropy.
             warnings.simplefilter("ignore", AstropyUserWarning)
-            hdus = fits.HDUList([fits.PrimaryHDU(), fits.table_to_hdu(table)])
+            table.write(data, format="fits")
+        if not images:
+            return data.getvalue()
+        hdus = fits.open(io.BytesIO(data.getvalue()))
         for name, (values, unit, meaning) in images.items():
             hdu = fits.ImageHDU(values.astype(np.uint8) if values.dtype.kind == "b" else values, name=name)
             if unit:
                 hdu.header["BUNIT"] = unit
             hdu.header["COMMENT"] = card_text(meaning)
             hdus.append(hdu)
-        hdus.writeto(data)
-        return data.getvalue()
+        whole = io.BytesIO()
+        hdus.writeto(whole)
+        return whole.getvalue()
     try:
         import pyarrow
         from pyarrow import parquet

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import parsing, require_file
+from ...core.result import Result
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from ..measure.shapes import Shapes, measure_shapes
@@ -49,7 +50,7 @@ class CcdStars(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FocalPlaneStars:
+class FocalPlaneStars(Result):
     """Stars of one exposure.
 
     Attributes
@@ -71,6 +72,8 @@ class FocalPlaneStars:
     pixels : bool
         Whether positions are in pixels.
     """
+
+    _table = ("ccd", "x", "y", "values", "noise", "usable")
 
     ccd: tuple[str, ...]
     x: np.ndarray
