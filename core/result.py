@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
-import re
 from base64 import b64encode
-from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from .arguments import check_arguments
+from .docstrings import Description, described
 from .errors import PachonError
 from .files import plain_values
 
@@ -26,19 +23,6 @@ if TYPE_CHECKING:
 _ROWS, _NAMED = 8, 6
 #: Dots per inch of pictures in notebooks.
 _DPI = 72
-_SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", flags=re.M)
-_ENTRY = re.compile(r"^(\w[\w, ]*) : .*$", flags=re.M)
-_SHAPE = re.compile(r",? (?:of )?(?:same )?(?:shape )?\[(?:n|n[xy]|n_\w+|k|\d+)(?:, [^]]*)?\](?: bool)?")
-_MARKUP = re.compile(r":\w+:`[~.]*([^`]*)`|``?([^`]*)``?")
-#: Names of units in docstrings that astropy spells in another way.
-_SPELLINGS = (("electrons", "electron"), ("pixels", "pixel"), ("cycles", "1"), (" a ", "/"))
-
-
-class Description(NamedTuple):
-    """Meaning of an attribute, from the docstrings of its class."""
-
-    unit: str  #: as astropy parses it; empty for pure numbers
-    text: str  #: its first sentence
 
 
 class Result:
@@ -168,49 +152,6 @@ class Values(Result):
     def _values(self) -> dict[str, Any]:
         assert is_dataclass(self)
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-
-def described(kind: type, name: str) -> Description:
-    """Return unit and meaning of an attribute of a class, from its property or the lists of attributes."""
-    member = inspect.getattr_static(kind, name, None)
-    text = inspect.getdoc(member) if isinstance(member, (property, functools.cached_property)) else None
-    if text is None:
-        lists = (_listed(base) for base in kind.__mro__ if base.__doc__)
-        text = next((entries[name] for entries in lists if name in entries), "")
-    return Description(_unit_of(text), _first_sentence(text))
-
-
-def _listed(kind: type) -> Mapping[str, str]:
-    """Return the entries of the sections Attributes and Parameters of a class's docstring."""
-    found = {}
-    sections = _SECTION.split(inspect.cleandoc(kind.__doc__ or ""))
-    for title, body in zip(sections[1::2], sections[2::2], strict=True):
-        if title in ("Attributes", "Parameters"):
-            entries = _ENTRY.split(body)
-            for names, meaning in zip(entries[1::2], entries[2::2], strict=True):
-                found.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
-    return found
-
-
-def _first_sentence(text: str) -> str:
-    sentence = re.split(r"(?<=[^.][\w\])])\. |\n\n", text)[0]
-    return _MARKUP.sub(r"\1\2", _SHAPE.sub("", " ".join(sentence.split()))).rstrip(".")
-
-
-@functools.cache
-def _unit_of(text: str) -> str:
-    """Return the first unit in square brackets, as astropy spells it; empty where there is none."""
-    from astropy import units as u
-
-    for found in re.findall(r"\[([^][]*[A-Za-z][^][]*)\]", _SHAPE.sub("", text)):
-        for said, spelt in _SPELLINGS:
-            found = found.replace(said, spelt)
-        for candidate in (found, found.split()[0]):
-            try:
-                return str(u.Unit(candidate).to_string())
-            except ValueError:
-                continue
-    return ""
 
 
 def html_table(table: QTable, rows: int = _ROWS) -> str:

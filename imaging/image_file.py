@@ -11,9 +11,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from ..core.arguments import check_arguments
+from ..core.docstrings import Description
 from ..core.errors import ProductError
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
-from ..core.result import Description, Result
+from ..core.result import Result
 from .exposure import MASK_BITS
 
 #: Columns of the table of objects: unit and description.

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.arguments import check_arguments
+from ..core.docstrings import Description, described
 from ..core.errors import DomainError
 from ..core.plotting import BLUE, axes_at, figure_at, figure_of, plain_text, styled
-from ..core.result import Description, Result, described
+from ..core.result import Result
 from ..models.zernike_polynomials import NOLL_NAMES
 
 if TYPE_CHECKING:

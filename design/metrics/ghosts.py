@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description, described
 from ...core.errors import DomainError
 from ...core.plotting import RED, figure_at, plain_text, styled
-from ...core.result import Description, described
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description, described
 from ...core.errors import DomainError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
-from ...core.result import Description, Result, described
+from ...core.result import Result
 from ...core.units import length, positive_angle
 from ...core.version import CREATOR
 from ...models.camera.camera import Camera

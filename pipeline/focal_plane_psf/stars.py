@@ -129,6 +129,17 @@ class FocalPlaneStars(Result):
     ) -> FocalPlaneStars:
         """Take stars from a table, structured array or mapping.
 
+        Parameters
+        ----------
+        table : table, structured array or mapping
+            Columns as below.
+        stamps : array, optional
+            Images of the stars, [n, ny, nx].
+        pixel_scale, weight_fwhm : float
+            Pixel of the stamps, and weight of the moments [rad].
+
+        Notes
+        -----
         Columns, in any case: ``ccd`` (name), ``x``, ``y`` (lengths [m], other units are honoured; ``pix``: pixels of
         the CCD); ``e1``, ``e2``, ``size`` ([rad] or with a unit), or stamps, in a column ``stamp`` or as `stamps` [n,
         ny, nx] with `pixel_scale` [rad]; ``snr``, or ``e1_noise``, ``e2_noise`` and ``size_noise`` (relative). Stars

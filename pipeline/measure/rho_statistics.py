@@ -27,9 +27,10 @@ from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description
 from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, axes_at, styled
-from ...core.result import Description, Result
+from ...core.result import Result
 from ...core.units import real_array
 from .correlation import Correlation, draw_correlation_axes, shear_correlation
 

@@ -12,9 +12,10 @@ import numpy as np
 from astropy.table import Table
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description
 from ...core.errors import ProductError
 from ...core.products import Columns, described_table
-from ...core.result import Description, Result
+from ...core.result import Result
 from ...core.table_files import write_table
 from ..metrics.stars import STARS
 from .store import SweepStore, readable_rows
