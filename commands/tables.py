@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -48,6 +49,24 @@ class Rows:
         console.print(table)
         if self.caption:
             console.print(self.caption, style="dim", width=100)
+
+
+def numbers_of(summary: dict[str, Any]) -> dict[str, Any]:
+    """Return a summary with lists of numbers as arrays, and NaN where there is no number."""
+    return {key: _numbers(value) for key, value in summary.items()}
+
+
+def _numbers(value: Any) -> Any:
+    if value is None:
+        return math.nan
+    if not isinstance(value, list):
+        return value
+    import numpy as np
+
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return value
 
 
 def print_json(content: Any) -> None:

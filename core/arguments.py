@@ -16,8 +16,9 @@ import numpy as np
 from astropy import units as u
 from numpy.typing import ArrayLike, NDArray
 
+from .docstrings import described
 from .errors import ConfigError, DomainError, PachonError, shown
-from .units import real_numbers
+from .units import has_unit, in_unit, real_numbers
 
 Target = TypeVar("Target", bound=Callable[..., Any])
 #: Function of an argument's name and value: the value as the callee takes it, or a _MismatchError.
@@ -40,23 +41,24 @@ def check_arguments(target: Target) -> Target:
     A value of the wrong kind is a DomainError, or a ConfigError where one of several words is expected; it names
     argument, value and what was expected. Checked are numbers, texts, paths, functions, classes, and sequences and
     mappings of them. Arguments annotated as arrays take real numbers: no boolean values, texts, times, complex numbers
-    or objects. Masked ones become NaN; quantities keep their unit.
+    or objects. Masked ones become NaN; quantities keep their unit. A quantity where plain numbers are expected is
+    converted to the unit in square brackets of the docstring.
 
     Names of arguments are checked by Python (TypeError); shapes, ranges and NaN by the function itself.
     """
     if not inspect.isclass(target):
-        return cast(Target, _checked(target))
+        return cast(Target, _checked(target, target))
     for name, member in list(vars(target).items()):
         if name.startswith("_") and name != "__init__":
             continue
         if isinstance(member, (classmethod, staticmethod)):
-            setattr(target, name, type(member)(_checked(member.__func__)))
+            setattr(target, name, type(member)(_checked(member.__func__, member)))
         elif inspect.isfunction(member):
-            setattr(target, name, _checked(member))
+            setattr(target, name, _checked(member, target if name == "__init__" else member))
     return target
 
 
-def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any]:
     parameters = [p for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     if all(p.annotation is p.empty for p in parameters):
         return function
@@ -78,11 +80,25 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
                 if (check := known.get(name)) is not None:
                     options[name] = check(name, value)
         except _MismatchError as problem:
+            name = problem.name.partition("[")[0]
+            # Most calls come without quantities: what they cost is paid here, where plain numbers were expected.
+            if has_unit(problem.value) and (unit := described(documented, name).unit):
+                if name in options:
+                    options[name] = _plain_numbers(options[name], unit, name)
+                else:
+                    at = [*known].index(name)
+                    args = (*args[:at], _plain_numbers(args[at], unit, name), *args[at + 1 :])
+                return checked(*args, **options)
             text = f"{problem.name} = {shown(problem.value)}: expected {problem.expected}"
             raise problem.error(text, key=problem.name) from None
         return function(*given, **options)
 
     return checked
+
+
+def _plain_numbers(value: Any, unit: str, name: str) -> Any:
+    """Return a quantity, or a sequence of them, as plain numbers in a unit; an array where it is one."""
+    return in_unit(value, u.Unit(unit), name).tolist()
 
 
 def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | None:
@@ -129,7 +145,10 @@ def _check_of(kind: Any) -> _Check | None:
         return lambda name, value: Path(_path(name, value))
     if origin is Any or not inspect.isclass(origin) or getattr(origin, "_is_protocol", False):
         return None
-    return _plain((origin,), f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}")
+    expected = f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}"
+    # Names are easily taken for the objects that a function loads by them.
+    loader = getattr(origin, "LOADER", "")
+    return _plain((origin,), f"{expected}, as of {loader}" if loader else expected)
 
 
 #: Classes of values that plain annotations allow, and what is expected.

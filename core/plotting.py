@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from .errors import ConfigError
+import numpy as np
+
+from .errors import ConfigError, DomainError, shown
 
 # Matplotlib takes a third of a second to import: only where something is drawn.
 if TYPE_CHECKING:
@@ -30,6 +33,8 @@ _STYLE = {
     "svg.hashsalt": "pachon",
 }
 _DPI = 150
+#: Stamps of one picture.
+_STAMPS = 6
 #: Metadata of each format, left out: equal pictures have equal bytes.
 _NAMELESS: dict[str, dict[str, Any]] = {
     "png": {"Software": None},
@@ -57,14 +62,67 @@ def new_figure(width: float, height: float, layout: Literal["constrained", "comp
     return figure
 
 
-def picture_bytes(figure: Figure, kind: str) -> bytes:
+def figure_at(ax: Axes | Figure | None, width: float, height: float) -> Figure:
+    """Return where a picture of several panels is drawn.
+
+    That is a new figure of a size in inches, the given figure or subfigure, or the place of the given axes, which are
+    removed: a subfigure takes their cell of the grid.
+
+    Raises
+    ------
+    DomainError
+        If ``ax`` is none of these, or axes that stand in no grid of subplots.
+    """
+    from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
+
+    if ax is None:
+        return new_figure(width, height)
+    if isinstance(ax, FigureBase):
+        return cast("Figure", ax)
+    cell = ax.get_subplotspec() if isinstance(ax, Axes) else None
+    if cell is None:
+        raise DomainError(f"ax = {shown(ax)}: expected Axes of a grid of subplots, a Figure or a SubFigure", key="ax")
+    parent: Any = ax.get_figure(root=False)
+    ax.remove()
+    return cast("Figure", parent.add_subfigure(cell))
+
+
+def axes_at(ax: Axes | Figure | None, width: float, height: float) -> tuple[Figure, Axes]:
+    """Return where a picture of one panel is drawn: figure and axes, the given ones if they are axes."""
+    from matplotlib.axes import Axes
+
+    if isinstance(ax, Axes):
+        return cast("Figure", ax.get_figure(root=False)), ax
+    figure = figure_at(ax, width, height)
+    return figure, figure.subplots()
+
+
+def draw_stamps(ax: Axes | Figure | None, images: np.ndarray, pixel: float, titles: Sequence[str]) -> Figure:
+    """Draw the first six stamps, shape [n, ny, nx], each from zero to its peak; pixels of some arc seconds."""
+    count = min(len(images), _STAMPS)
+    with styled():
+        figure = figure_at(ax, max(2.1 * count, 4.2), 2.6)
+        row = figure.subplots(1, count, squeeze=False)[0]
+        half = 0.5 * pixel * images.shape[-1]
+        for axes, image, title in zip(row, images, titles, strict=False):
+            # The square root shows the wings.
+            shown = np.sqrt(np.maximum(image, 0.0))
+            axes.imshow(shown, extent=(-half, half, -half, half), cmap="inferno", vmin=0.0)
+            axes.set_title(plain_text(title), fontsize=8.5)
+            axes.set_xlabel("x [arcsec]")
+        row[0].set_ylabel("y [arcsec], square root of the light")
+        return figure
+
+
+def picture_bytes(figure: Figure, kind: str, dpi: int = _DPI) -> bytes:
     """Return a figure as the bytes of a png, pdf or svg file, without the date and the version of what drew it."""
     if kind not in _NAMELESS:
         raise ConfigError(f"picture format {kind!r}: expected one of {', '.join(_NAMELESS)}")
     buffer = io.BytesIO()
     # Ticks are made, and take their style, when a figure is drawn.
     with styled():
-        figure.savefig(buffer, format=kind, dpi=_DPI, metadata=_NAMELESS[kind])
+        figure.savefig(buffer, format=kind, dpi=dpi, metadata=_NAMELESS[kind])
     return buffer.getvalue()
 
 

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import io
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
+from astropy.io import fits
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 
 from .errors import ConfigError
 from .files import write_bytes
+from .products import card_text
 
 #: Formats of astropy, or Parquet, by the ending of the file.
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
+#: Values, unit in FITS notation and description.
+Described = tuple[np.ndarray, str, str]
 
 
-def write_table(path: Path, table: Table) -> None:
+def write_table(path: Path, table: Table, images: Mapping[str, Described] = MappingProxyType({})) -> None:
     """Write a table in the format of the file's ending; Parquet takes the columns alone, and needs ``pyarrow``.
+
+    Images, arrays with unit and description by name, become extensions of FITS files; others leave them out.
 
     Raises
     ------
@@ -27,18 +37,32 @@ def write_table(path: Path, table: Table) -> None:
     """
     if path.suffix.lower() not in FORMATS:
         raise ConfigError(f"expected a file that ends in {', '.join(FORMATS)}", file=path)
-    write_bytes(path, _encoded(table, FORMATS[path.suffix.lower()], path))
+    write_bytes(path, _encoded(table, FORMATS[path.suffix.lower()], path, images))
 
 
-def _encoded(table: Table, kind: str, path: Path) -> bytes:
+def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described]) -> bytes:
     if kind.startswith("ascii"):
         text = io.StringIO()
         table.write(text, format=kind)
         return text.getvalue().encode()
     data = io.BytesIO()
     if kind == "fits":
-        table.write(data, format="fits")
-        return data.getvalue()
+        with warnings.catch_warnings():
+            # Long keywords become HIERARCH cards; units that FITS lacks, such as electron, are kept for astropy.
+            warnings.simplefilter("ignore", AstropyUserWarning)
+            table.write(data, format="fits")
+        if not images:
+            return data.getvalue()
+        hdus = fits.open(io.BytesIO(data.getvalue()))
+        for name, (values, unit, meaning) in images.items():
+            hdu = fits.ImageHDU(values.astype(np.uint8) if values.dtype.kind == "b" else values, name=name)
+            if unit:
+                hdu.header["BUNIT"] = unit
+            hdu.header["COMMENT"] = card_text(meaning)
+            hdus.append(hdu)
+        whole = io.BytesIO()
+        hdus.writeto(whole)
+        return whole.getvalue()
     try:
         import pyarrow
         from pyarrow import parquet
@@ -47,3 +71,19 @@ def _encoded(table: Table, kind: str, path: Path) -> bytes:
     arrays = {name: pyarrow.array(np.asarray(table[name]).tolist()) for name in table.colnames}
     parquet.write_table(pyarrow.table(arrays), data)
     return data.getvalue()
+
+
+def flat_table(table: Table) -> Table:
+    """Return a table as CSV and Parquet hold it: one number or text a cell, units in the names of columns."""
+    flat = Table()
+    for name in table.colnames:
+        column = table[name]
+        unit = f" [{column.unit}]" if getattr(column, "unit", None) else ""
+        values = np.asarray(column)
+        if values.ndim == 1:
+            flat[name + unit] = values
+            continue
+        values = values.reshape(len(values), -1)
+        for k in range(values.shape[1]):
+            flat[f"{name}_{k}{unit}"] = values[:, k]
+    return flat

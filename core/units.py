@@ -45,13 +45,21 @@ def real_numbers(values: Any) -> Any:
     return values if values.dtype.kind in "iuf" else None
 
 
-def _si(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
+def has_unit(value: Any) -> bool:
+    """Return whether a value is a quantity, a column with a unit, or a sequence of them."""
+    if isinstance(value, (tuple, list)):
+        return any(map(has_unit, value))
+    return getattr(value, "unit", None) is not None
+
+
+def in_unit(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
+    """Return numbers in a unit, or quantities that convert to it, as a float64 array."""
     numbers = real_numbers(value)
     # The text is made where it is needed: that of a large array takes longer than many a trace.
     if numbers is None:
         raise DomainError(f"{name} = {shown(value)}: expected a number in {unit} or a quantity")
     if isinstance(numbers, list):
-        numbers = [_si(v, unit, name) for v in numbers]
+        numbers = [in_unit(v, unit, name) for v in numbers]
     elif hasattr(numbers, "unit") and (isinstance(numbers, u.Quantity) or unit != u.dimensionless_unscaled):
         # The unit of a column of pure numbers, such as pixels or magnitudes, says what they count.
         try:
@@ -75,7 +83,7 @@ def real_array(values: Any, expectation: str) -> np.ndarray:
 def pure_numbers(values: Any, name: str) -> np.ndarray:
     """Return real numbers without a unit as a float64 array."""
     try:
-        return _si(values, u.dimensionless_unscaled, name)
+        return in_unit(values, u.dimensionless_unscaled, name)
     except DomainError:
         raise DomainError(f"{name} = {shown(values)}: expected real numbers without a unit") from None
 
@@ -94,7 +102,7 @@ def require_positive(value: Any, name: str, unit: str = "") -> float:
 
 def radians(value: Any, name: str) -> np.ndarray:
     """Return an angle in radians as a float64 array; plain numbers are radians already."""
-    return _si(value, u.rad, name)
+    return in_unit(value, u.rad, name)
 
 
 def positive_angle(value: Any, name: str) -> float:
@@ -104,7 +112,7 @@ def positive_angle(value: Any, name: str) -> float:
 
 def metres(value: Any, name: str) -> np.ndarray:
     """Return a length in metres as a float64 array; plain numbers are metres already."""
-    return _si(value, u.m, name)
+    return in_unit(value, u.m, name)
 
 
 def length(value: Any, name: str) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.plotting import new_figure
+from ..core.plotting import figure_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,10 +56,10 @@ def panels_of(parent: Figure | SubFigure, count: int, rows: int, columns: int, *
     return list(panels[:count])
 
 
-def panel_grid(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels of a size [inches], and the axes in use."""
+def panel_grid(ax: Axes | Figure | None, count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure, new or at ``ax``, with panels of a size [inches], and the axes in use."""
     rows, columns = grid_shape(count)
-    figure = new_figure(max(columns * width, 4.5), rows * height + 0.6)
+    figure = figure_at(ax, max(columns * width, 4.5), rows * height + 0.6)
     return figure, panels_of(figure, count, rows, columns)
 
 

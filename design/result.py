@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from ..core.plotting import plain_text
+from ..core.result import Result
 from ..wavefront.request import Request
 
 if TYPE_CHECKING:
@@ -15,10 +16,25 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FieldResult:
+class FieldResult(Result):
     """Base of results over field points: telescope, field points, wavelengths and pupil points of the computation."""
 
+    _table: ClassVar[tuple[str, ...]] = ("fields",)
+
     request: Request
+
+    def _label(self) -> str:
+        count = len(self.fields)
+        return f"{self.telescope}, {count} field{'s' * (count != 1)}, {self._nanometres()}"
+
+    def _meta(self) -> dict[str, Any]:
+        return {"telescope": self.telescope, "wavelength_nm": self.wavelengths * 1e9, **super()._meta()}
+
+    def _along(self, name: str, *values: str) -> dict[str, Any]:
+        """Return columns of a row for each field and value of an attribute, with others [n_field, n_value]."""
+        axis = getattr(self, name)
+        rows = {"fields": np.repeat(self.fields, len(axis), axis=0), name: np.tile(axis, len(self.fields))}
+        return rows | {v: getattr(self, v).ravel() for v in values}
 
     @property
     def telescope(self) -> str:

@@ -11,8 +11,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from ..core.arguments import check_arguments
+from ..core.docstrings import Description
 from ..core.errors import ProductError
 from ..core.products import Columns, Stamp, column, read_fits, table_hdu, write_fits
+from ..core.result import Result
 from .exposure import MASK_BITS
 
 #: Columns of the table of objects: unit and description.
@@ -34,7 +36,7 @@ OBJECT_COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class CcdImage:
+class CcdImage(Result):
     """Image of a CCD, or of a part of it.
 
     Attributes
@@ -65,6 +67,16 @@ class CcdImage:
     objects: dict[str, np.ndarray] = field(default_factory=dict)
     stamp: Stamp | None = None
     mask_bits: dict[int, str] = field(default_factory=MASK_BITS.copy)
+
+    def _label(self) -> str:
+        ny, nx = self.image.shape
+        return f"{self.name}, {nx} x {ny} pixels, {len(self.objects.get('X', ()))} objects"
+
+    def _columns(self) -> dict[str, Any]:
+        return {name: self.objects.get(name, np.empty(0)) for name in OBJECT_COLUMNS}
+
+    def _described(self, name: str) -> Description:
+        return Description(*OBJECT_COLUMNS[name])
 
     @property
     def wcs(self) -> WCS:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import QTable, Table
 
 from ..core.arguments import check_arguments
 from ..core.errors import PachonError
 from ..core.products import described_table
+from ..core.result import Result
 from ..core.version import VERSION
 from ..pipeline.catalogue.detect import detect_objects
 from ..pipeline.catalogue.fit_galaxies import fit_galaxies
@@ -28,7 +29,7 @@ _MATCH = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class ImageCatalogue:
+class ImageCatalogue(Result):
     """Objects, stars, PSF and galaxies measured on one image.
 
     Attributes
@@ -56,6 +57,17 @@ class ImageCatalogue:
     galaxies: np.ndarray
     fits: GalaxyFits
     usable: np.ndarray
+
+    def _label(self) -> str:
+        count, stars = len(self.objects), len(self.stars)
+        return f"{self.image.name}, {count} objects, {stars} stars, {int(self.usable.sum())} usable galaxies"
+
+    def _summary(self) -> dict[str, Any]:
+        return self.metrics()
+
+    def to_table(self) -> QTable:
+        """Return the galaxies of :meth:`table`."""
+        return QTable(self.table())
 
     def table(self) -> Table:
         """Return the galaxies as a table with sky positions, magnitudes, shapes and their errors."""

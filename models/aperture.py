@@ -47,7 +47,15 @@ def _rotated(x: np.ndarray, y: np.ndarray, angle: float) -> tuple[np.ndarray, np
 @check_arguments
 @dataclass(frozen=True)
 class Circle(Region):
-    """Disc of a radius [m] about a centre x, y [m]; its rim is outside."""
+    """Disc; its rim is outside.
+
+    Parameters
+    ----------
+    radius : float
+        Radius [m].
+    x, y : float
+        Centre [m].
+    """
 
     radius: float
     x: float = 0.0
@@ -67,7 +75,15 @@ class Circle(Region):
 @check_arguments
 @dataclass(frozen=True)
 class Annulus(Region):
-    """Ring between two radii [m] about a centre x, y [m]; its inner rim is inside, its outer rim outside."""
+    """Ring; its inner rim is inside, its outer rim outside.
+
+    Parameters
+    ----------
+    inner, outer : float
+        Radii [m].
+    x, y : float
+        Centre [m].
+    """
 
     inner: float
     outer: float
@@ -89,9 +105,16 @@ class Annulus(Region):
 @check_arguments
 @dataclass(frozen=True)
 class Rectangle(Region):
-    """Rectangle of a width and height [m] about a centre x, y [m], without rim.
+    """Rectangle without rim.
 
-    It is rotated by an angle [rad] from x towards y.
+    Parameters
+    ----------
+    width, height : float
+        Sides [m].
+    x, y : float
+        Centre [m].
+    angle : float
+        Angle of the first side from x towards y [rad].
     """
 
     width: float
@@ -118,9 +141,18 @@ class Rectangle(Region):
 @check_arguments
 @dataclass(frozen=True)
 class Vane(Region):
-    """Strip of a width [m] from a point x, y [m] outwards, at an angle [rad] from x towards y; endless, without rims.
+    """Strip from a point outwards; endless, without rims.
 
-    With ``both_ways`` it extends to the other side of the point too.
+    Parameters
+    ----------
+    width : float
+        Width [m].
+    x, y : float
+        The point [m].
+    angle : float
+        Direction from x towards y [rad].
+    both_ways : bool
+        Whether it extends to the other side of the point too.
     """
 
     width: float
@@ -145,9 +177,14 @@ class Vane(Region):
 @check_arguments
 @dataclass(frozen=True)
 class Polygon(Region):
-    """Polygon of at least three corners (x, y) [m], in either sense; the last is joined to the first.
+    """Polygon, in either sense; the last corner is joined to the first.
 
     Of two polygons that share an edge, one contains it.
+
+    Parameters
+    ----------
+    corners : tuple of tuple of float
+        At least three corners (x, y) [m].
     """
 
     corners: tuple[tuple[float, float], ...]

@@ -22,13 +22,14 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
+from ..core.result import Result, Values
 from ..core.units import ARCSEC, length
 from .surface import Interaction, Surface
 from .telescope import Telescope
 
 
 @dataclass(frozen=True)
-class FirstOrder:
+class FirstOrder(Values):
     """First-order properties of a telescope.
 
     Parameters
@@ -72,7 +73,7 @@ class FirstOrder:
 
 
 @dataclass(frozen=True)
-class SeidelSums:
+class SeidelSums(Result):
     """Seidel sums [m] of a telescope, surface by surface.
 
     The wavefront of a sum ``S`` at the rim of the pupil and field is S1/8 (spherical), S2/2 (coma), S3/2
@@ -85,6 +86,8 @@ class SeidelSums:
     contributions : ndarray, shape (n_surface, 5)
         Spherical aberration, coma, astigmatism, Petzval sum, distortion of each [m].
     """
+
+    _table = ("names", "contributions")
 
     names: tuple[str, ...]
     contributions: np.ndarray

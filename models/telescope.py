@@ -96,6 +96,9 @@ class Telescope:
         is that of the ray from the object through the centre of the entrance pupil.
     """
 
+    #: Function that error messages name to whoever gives a name in place of a telescope.
+    LOADER = "pachon.load_telescope"
+
     name: str
     surfaces: tuple[Surface, ...]
     stop_z: float

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
+from ..core.result import Result
 from ..core.units import angle, broadcast_together, metres, radians
 from ..models.telescope import Telescope
 from .kernels import surface as surface_kernels
@@ -72,7 +73,7 @@ def field_angles(slopes: np.ndarray, projection: str = "zemax") -> np.ndarray:
 
 @check_arguments
 @dataclass(frozen=True)
-class Rays:
+class Rays(Result):
     """Rays of one wavelength before the first surface, in the telescope frame.
 
     Attributes
@@ -92,10 +93,15 @@ class Rays:
         If the arrays differ in length, or have other shapes.
     """
 
+    _table = ("position", "direction", "path_length")
+
     position: np.ndarray
     direction: np.ndarray
     path_length: np.ndarray
     wavelength: float
+
+    def _label(self) -> str:
+        return f"{len(self)} rays, {self.wavelength * 1e9:.5g} nm"
 
     def __post_init__(self) -> None:
         # Kernels read as many rays as there are path lengths, whatever the length of the others.

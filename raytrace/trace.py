@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError
 from ..core.launch import launch
+from ..core.plotting import BLUE, axes_at, plain_text, styled
+from ..core.result import Result
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
@@ -19,9 +21,13 @@ from .kernels.trace import trace_rays
 from .pack.surfaces import pack_surfaces, refractive_indices
 from .rays import Rays, RayStatus
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 @dataclass(frozen=True)
-class TraceResult:
+class TraceResult(Result):
     """Rays at one surface, in the telescope frame.
 
     Attributes
@@ -40,12 +46,31 @@ class TraceResult:
         Index of the CCD landed on, -1 in a gap; only after a trace to a focal plane of CCDs.
     """
 
+    _table = ("position", "direction", "path_length", "status")
+
     surface: str
     position: np.ndarray
     direction: np.ndarray
     path_length: np.ndarray
     status: np.ndarray
     ccd: np.ndarray | None = None
+
+    def _label(self) -> str:
+        return f"{len(self.status)} rays at {self.surface}, {int(self.vignetted.sum())} without light"
+
+    def _columns(self) -> dict[str, Any]:
+        return super()._columns() | ({} if self.ccd is None else {"ccd": self.ccd})
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw where the rays meet the surface, in x and y of the telescope."""
+        with styled():
+            figure, axes = axes_at(ax, 4.6, 4.6)
+            lit = ~self.vignetted
+            axes.plot(*self.position[~lit, :2].T * 1e3, ".", color="0.75", markersize=3, label="without light")
+            axes.plot(*self.position[lit, :2].T * 1e3, ".", color=BLUE, markersize=3, label="lit")
+            axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title=plain_text(f"rays at {self.surface}"))
+            axes.legend(loc="upper right")
+            return figure
 
     @property
     def vignetted(self) -> np.ndarray:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
 from ..core.launch import launch, start_warp
+from ..core.result import Result
 from ..core.units import broadcast_together, for_each, pure_numbers, radians
 from ..core.warp_arrays import warp_array
 from .galaxy_kernels import transform_galaxies
@@ -24,7 +25,7 @@ _PER_COMPONENT = ("dx", "dy", "fraction", "component_radius", "e1", "e2", "sersi
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
-class Galaxies:
+class Galaxies(Result):
     """Galaxies made of elliptical Sersic components.
 
     Positions are gnomonic: xi towards east, eta towards north, on the plane that touches the sky at the pointing.
@@ -56,6 +57,8 @@ class Galaxies:
     DomainError
         If arrays differ in length or hold values that no galaxy has.
     """
+
+    _table = ("xi", "eta", "magnitude", "radius")
 
     xi: np.ndarray
     eta: np.ndarray

@@ -16,6 +16,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.launch import launch, start_warp
 from ..core.memory import require_bytes
+from ..core.result import Result
 from ..core.threads import one_blas_thread
 from ..core.units import ARCMIN, ARCSEC, for_each, positive_angle, radians, require_positive
 from ..core.warp_arrays import warp_array
@@ -31,7 +32,7 @@ _MARGIN = 1.3
 
 
 @dataclass(frozen=True, eq=False)
-class GalaxyStamps:
+class GalaxyStamps(Result):
     """Galaxies cut out of a mosaic, as tables of their Fourier transforms.
 
     The PSF and the noise of the mosaic remain in them.
@@ -55,6 +56,8 @@ class GalaxyStamps:
     finest_pixel : float
         Side of the smallest pixels that transforms are made for [rad].
     """
+
+    _table = ("magnitude", "radius", "center")
 
     magnitude: np.ndarray
     radius: np.ndarray

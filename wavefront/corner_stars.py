@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
+from ..core.result import Result
 from ..core.units import length, require_count
 from ..models.camera.corner_rafts import corner_focal_plane
 from ..models.camera.focal_plane import FocalPlane
@@ -19,7 +20,7 @@ _MARGIN = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
-class CornerStars:
+class CornerStars(Result):
     """Stars on the sensors in the corners of the focal plane.
 
     Attributes
@@ -35,6 +36,8 @@ class CornerStars:
     fields : ndarray, shape [n_star, 2]
         Field angles [rad], zemax projection.
     """
+
+    _table = ("sensors", "positions", "fields", "heights")
 
     telescope: Telescope
     focal_plane: FocalPlane

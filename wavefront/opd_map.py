@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..core.arguments import check_arguments
+from ..core.docstrings import Description, described
 from ..core.errors import DomainError
-from ..core.plotting import BLUE, figure_of, new_figure, plain_text, styled
+from ..core.plotting import BLUE, axes_at, figure_at, figure_of, plain_text, styled
+from ..core.result import Result
 from ..models.zernike_polynomials import NOLL_NAMES
 
 if TYPE_CHECKING:
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _PupilMaps:
+class _PupilMaps(Result):
     """Maps over the entrance pupil, of one field point or of many."""
 
     value: np.ndarray
@@ -58,11 +60,25 @@ class OpdMap(_PupilMaps):
         two components of the directions are the exit-pupil coordinates of diffraction integrals.
     """
 
+    _images = ("value", "lit")
+
     lit: np.ndarray
     field: tuple[float, float]
     center: np.ndarray
     exit_direction: np.ndarray
     landing: np.ndarray
+
+    def _label(self) -> str:
+        field = ", ".join(f"{angle:.4g}" for angle in np.rad2deg(self.field))
+        return f"{list(self.value.shape)} points at ({field}) deg, {self.wavelength * 1e9:.5g} nm, rms {self.rms:.3g} m"
+
+    def _columns(self) -> dict[str, Any]:
+        # astropy cannot write a column of the name "value" as ECSV.
+        columns = {"x": self.x, "y": self.y, "opd": self.value, "lit": self.lit}
+        return {name: np.ravel(values) for name, values in columns.items()}
+
+    def _described(self, name: str) -> Description:
+        return described(type(self), "value" if name == "opd" else name)
 
     @property
     def rms(self) -> float:
@@ -84,7 +100,7 @@ class OpdMap(_PupilMaps):
         return self.value - plane @ terms
 
     @check_arguments
-    def plot(self, zernikes: ZernikeFit | None = None, name: str = "") -> Figure:
+    def plot(self, zernikes: ZernikeFit | None = None, name: str = "", *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the map in nanometres and waves, with and without piston and tilt, and Zernike terms as bars.
 
         The title contains the ``name`` of the telescope. A map that is not on a square grid or has no lit point raises
@@ -94,7 +110,7 @@ class OpdMap(_PupilMaps):
             raise DomainError(f"opd of shape {self.value.shape}: expected one on a square grid to draw")
         tx, ty = np.rad2deg(self.field)
         with styled():
-            figure = new_figure(11.0, 5.6 if zernikes is None else 9.0)
+            figure = figure_at(ax, 11.0, 5.6 if zernikes is None else 9.0)
             rows = [["map", "rest"]] if zernikes is None else [["map", "rest"], ["bars", "bars"]]
             panels: dict[str, Axes] = figure.subplot_mosaic(rows, height_ratios=(1.0, 0.55)[: len(rows)])
             _draw_map(panels["map"], self, self.value, "as traced: against the reference ray")
@@ -123,6 +139,9 @@ class OpdMaps(_PupilMaps):
         Centres of the reference spheres, telescope frame [m].
     """
 
+    _table = ("fields", "rms", "centers")
+    _images = ("value",)
+
     fields: np.ndarray
     centers: np.ndarray
 
@@ -141,7 +160,7 @@ class OpdMaps(_PupilMaps):
 
 
 @dataclass(frozen=True)
-class ZernikeFit:
+class ZernikeFit(Result):
     """Annular Zernike coefficients of an OPD map.
 
     Attributes
@@ -152,9 +171,23 @@ class ZernikeFit:
         Inner over outer radius of the annulus, and root mean square of the residuals [m].
     """
 
+    _table = ("noll", "coefficients")
+
     coefficients: np.ndarray
     obscuration: float
     residual_rms: float
+
+    @property
+    def noll(self) -> np.ndarray:
+        """Noll indices, shape [jmax]."""
+        return np.arange(1, len(self.coefficients) + 1)
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the terms from tilt on as bars."""
+        with styled():
+            figure, axes = axes_at(ax, 9.0, 3.6)
+            _draw_bars(axes, self)
+            return figure
 
 
 def _rms(value: np.ndarray, lit: np.ndarray) -> float:

@@ -22,8 +22,10 @@ def fit_zernikes(opd: OpdMap, pupil_radius: float, obscuration: float, jmax: int
     ----------
     opd : OpdMap
         The map.
-    pupil_radius, obscuration : float
-        Outer radius of the pupil [m], and its inner over its outer radius.
+    pupil_radius : float
+        Outer radius of the pupil [m].
+    obscuration : float
+        Inner over outer radius of the pupil.
     jmax : int
         Highest Noll index.
 

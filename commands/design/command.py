@@ -21,7 +21,7 @@ from ...core.errors import PachonError
 from .. import options
 from ..inputs import load_model
 from ..interrupt import interruptible
-from ..tables import Column, Rows, print_json
+from ..tables import Column, Rows, numbers_of, print_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -122,7 +122,7 @@ def design_command(
     """
 
     def rows(result: Study) -> Rows:
-        summary = result.summary()
+        summary = numbers_of(result.summary())
         cells = [column.texts(result, summary) for column in columns]
         text = caption.format_map(summary) if isinstance(caption, str) else caption(summary)
         return Rows([column.heading for column in columns], [*zip(*cells, strict=True)], text, left)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
-from ..tables import FIELD, Column, Rows, number_texts
+from ..tables import FIELD, Column, Rows, number_texts, numbers_of
 from .command import Given, Outcome, Study, design_command
 
 
@@ -119,7 +119,7 @@ def zernikes(
 
 def _rows(result: Any) -> Rows:
     """Return every term at every field."""
-    summary = result.summary()
+    summary = numbers_of(result.summary())
     return _terms(summary, [f"{field}°" for field in number_texts(summary["field_deg"], ".4g")], summary["zernike_nm"])
 
 
@@ -127,7 +127,7 @@ def _map_rows(result: Any) -> Rows:
     """Return statistics of every term over the field."""
     import numpy as np
 
-    nm = result.summary()["zernike_nm"]
+    nm = 1e9 * result.coefficients
     values = [nm.mean(axis=0), np.sqrt((nm**2).mean(axis=0)), nm.min(axis=0), nm.max(axis=0)]
     return _terms(result.summary(), ["mean", "rms", "least", "largest"], values)
 
@@ -150,7 +150,7 @@ def _double_rows(result: Any) -> Rows:
     import numpy as np
 
     summary = result.summary()
-    nm = summary["double_zernike_nm"][:, 3:]
+    nm = 1e9 * result.coefficients[:, 3:]
     order = np.unravel_index(np.argsort(-np.abs(nm), axis=None, kind="stable")[:16], nm.shape)
     rows = [(f"{k + 1}", f"{j + 4}", f"{nm[k, j]:.3f}") for k, j in zip(*order, strict=True)]
     caption = f"The largest from defocus on; rms of all {summary['rms_without_tilt_nm']:.2f} nm over pupil and field."

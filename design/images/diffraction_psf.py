@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import zoom
 
-from ...core.plotting import new_figure, styled
+from ...core.plotting import figure_at, styled
 from ...core.units import arcseconds
 from .. import drawing
 from ..result import FieldResult
@@ -51,6 +51,20 @@ class DiffractionPsf(FieldResult):
     n_pupil : int
         Points across the pupil.
     """
+
+    _table = (
+        "fields",
+        "strehl",
+        "fwhm",
+        "rms_radius",
+        "airy_radius",
+        "inside",
+        "lit_fraction",
+        "centroid",
+        "reference_point",
+        "plate_scale",
+    )
+    _images = ("image",)
 
     method: str
     image: np.ndarray
@@ -95,7 +109,7 @@ class DiffractionPsf(FieldResult):
         above = (finer > 0.5 * finer.max(axis=(1, 2), keepdims=True)).sum(axis=(1, 2))
         return 2.0 * self.pixel / _FINER * np.sqrt(above / np.pi)
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         arcsec = arcseconds(self.plate_scale)
         return {
@@ -118,11 +132,11 @@ class DiffractionPsf(FieldResult):
             "plate_scale_arcsec_per_um": arcsec * 1e-6,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw each image on a logarithmic scale, and cuts through the first ones."""
         rows, columns = drawing.grid_shape(len(self.fields))
         with styled():
-            figure = new_figure(max(2.3 * columns + 0.9, 6.4), 2.95 * rows + 2.9)
+            figure = figure_at(ax, max(2.3 * columns + 0.9, 6.4), 2.95 * rows + 2.9)
             parts: Any = figure.subfigures(2, 1, height_ratios=[2.8 * rows + 0.4, 2.6])
             above, below = parts
             panels = drawing.panels_of(above, len(self.fields), rows, columns)

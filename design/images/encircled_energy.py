@@ -12,7 +12,7 @@ from scipy.ndimage import zoom
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
+from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
@@ -65,7 +65,10 @@ class EncircledEnergy(FieldResult):
         found = np.array([_crossing(row, self.radius, fraction) for row in self.fraction])
         return np.where(self.fraction[:, -1] >= fraction, found, np.nan)
 
-    def summary(self) -> dict[str, Any]:
+    def _columns(self) -> dict[str, Any]:
+        return self._along("radius", "fraction")
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         arcsec = arcseconds(self.plate_scale)
         radii = {f"ee{round(100 * part)}_radius": self.radius_holding(part) for part in (0.5, 0.8, 0.9)}
@@ -81,10 +84,10 @@ class EncircledEnergy(FieldResult):
             "fraction": self.fraction,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the curves, and the radii of 50 and 80 % against the field."""
         with styled():
-            figure = new_figure(10.0, 4.2)
+            figure = figure_at(ax, 10.0, 4.2)
             left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
             _draw_curves(left, self)
             _draw_radii(right, self)

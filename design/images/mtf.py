@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, RED, new_figure, styled
+from ...core.plotting import BLUE, RED, figure_at, styled
 from ...core.units import MOST, arcseconds, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
@@ -90,7 +90,18 @@ class Mtf(FieldResult):
             [[_falls_to(row, self.frequency, contrast) for row in m] for m in (self.tangential, self.sagittal)], axis=-1
         )
 
-    def summary(self) -> dict[str, Any]:
+    def _columns(self) -> dict[str, Any]:
+        return self._along(
+            "frequency",
+            "tangential",
+            "sagittal",
+            "tangential_limit",
+            "sagittal_limit",
+            "geometric_tangential",
+            "geometric_sagittal",
+        )
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; pairs are tangential, sagittal; lists run over the fields."""
         arcsec = arcseconds(self.plate_scale)
         half = self.frequency_at(0.5)
@@ -114,12 +125,12 @@ class Mtf(FieldResult):
             "geometric_sagittal": self.geometric_sagittal,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the contrast against the frequency, with the limit that diffraction sets."""
         count = len(self.fields)
         rows, columns = grid_shape(count, _MOST)
         with styled():
-            figure = new_figure(max(3.5 * columns, 5.5), 2.6 * rows + 1.0)
+            figure = figure_at(ax, max(3.5 * columns, 5.5), 2.6 * rows + 1.0)
             panels = panels_of(figure, count, rows, columns, sharex=True, sharey=True)
             for i, axes in enumerate(panels):
                 _draw_field(axes, self, i)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, new_figure, plain_text, styled
-from ...models.surface import Interaction
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, figure_at, plain_text, styled
+from ...core.result import Result
+from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
 from ..drawing import field_text, legend_below
@@ -32,7 +33,7 @@ _SMALL = 0.4
 
 
 @dataclass(frozen=True)
-class Layout:
+class Layout(Result):
     """Sections and rays of a telescope.
 
     Attributes
@@ -55,6 +56,8 @@ class Layout:
         Arriving rays of each field all around the pupil [m].
     """
 
+    _row_type = Surface
+
     telescope: Telescope
     fields: np.ndarray
     wavelength: float
@@ -71,7 +74,15 @@ class Layout:
         width, height = (float(v) for v in np.ptp(points[:, 1:], axis=0))
         return np.array([width, width, height])
 
-    def summary(self) -> dict[str, Any]:
+    def _label(self) -> str:
+        return f"{self.telescope.name}, {len(self.profiles)} surfaces, {len(self.fields)} fields"
+
+    def _columns(self) -> dict[str, Any]:
+        surfaces = self.telescope.surfaces
+        names = [s.name for s in surfaces]
+        return {"name": names, "vertex": [s.vertex for s in surfaces], "reach": [self.reach[name] for name in names]}
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the surfaces."""
         surfaces = self.telescope.surfaces
         return {
@@ -89,7 +100,7 @@ class Layout:
             "rays_drawn": [len(fan) for fan in self.fans],
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the section of the telescope with its rays and, if they are small, its lenses in another panel."""
         drawing = _Drawing(self)
         surfaces = self.telescope.surfaces
@@ -101,7 +112,7 @@ class Layout:
         zoom = bool(self.lenses) and bool(np.ptp(small, axis=0).max() < _SMALL * np.ptp(whole, axis=0).max())
         with styled():
             if zoom:
-                figure = new_figure(12.4, 5.4 if drawing.lying else 6.4)
+                figure = figure_at(ax, 12.4, 5.4 if drawing.lying else 6.4)
                 left, right = figure.subplots(1, 2)
                 _draw(right, drawing, small, within & set(names), beams=False)
                 outside = [n for n in names if n not in within]
@@ -109,7 +120,7 @@ class Layout:
             else:
                 ratio = np.ptp(whole, axis=0)
                 wide = float(np.clip(5.2 * ratio[0] / max(ratio[1], 1e-12), 6.4, 12.0))
-                figure = new_figure(wide + 1.2, float(np.clip(wide * ratio[1] / ratio[0], 3.0, 7.5)) + 1.6)
+                figure = figure_at(ax, wide + 1.2, float(np.clip(wide * ratio[1] / ratio[0], 3.0, 7.5)) + 1.6)
                 left = figure.subplots()
                 _draw(left, drawing, whole, set(names), beams=True)
             legend_below(figure, left, 8)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.plotting import BLUE, ORANGE, RED, new_figure, styled
+from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
@@ -49,6 +49,8 @@ class Distortion(FieldResult):
         Scale at the axis itself [m/rad].
     """
 
+    _table = ("fields", "position", "predicted", "shift", "percent", "percent_of_axis_scale")
+
     reference: str
     position: np.ndarray
     predicted: np.ndarray
@@ -78,7 +80,7 @@ class Distortion(FieldResult):
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(away, 100.0 * (radial / (scale * length**2) - 1.0), np.nan)
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         shift = np.linalg.norm(self.shift, axis=-1)
         return {
@@ -98,10 +100,10 @@ class Distortion(FieldResult):
             "percent_of_axis_scale": self.percent_of_axis_scale,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the shifts, exaggerated, and the distortion [percent] against the distance from the axis."""
         with styled():
-            figure = new_figure(11.0, 5.2)
+            figure = figure_at(ax, 11.0, 5.2)
             picture, curve = figure.subplots(1, 2)
             _draw_picture(picture, self)
             _draw_percent(curve, self)

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
-from ...core.plotting import BLUE, ORANGE, figure_of, new_figure, styled
+from ...core.plotting import BLUE, ORANGE, figure_at, figure_of, styled
+from ...core.result import Result
 from ...core.units import angle, field_label, require_count
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
@@ -50,6 +51,8 @@ class FieldZernikes(FieldResult):
         Fitted points: the whole annulus, vignetted or not, or only where light passes.
     """
 
+    _table = ("fields", "rms", "residual_rms", "coefficients")
+
     coefficients: np.ndarray
     residual_rms: np.ndarray
     obscuration: float
@@ -60,7 +63,7 @@ class FieldZernikes(FieldResult):
         """Root mean square of the terms without piston and tilt [m], shape [n_field]."""
         return np.sqrt((self.coefficients[:, 3:] ** 2).sum(axis=1))
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; rows are fields, columns Noll indices from 1."""
         return {
             "telescope": self.telescope,
@@ -73,13 +76,13 @@ class FieldZernikes(FieldResult):
             "zernike_nm": self.coefficients * 1e9,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the terms of each field as bars; for many fields their rms over the field, and maps of the largest."""
         j = np.arange(4, self.coefficients.shape[1] + 1)
         values = self.coefficients[:, 3:] * 1e9
         with_maps = spread_in_field(self.fields) and len(j) > 0
         with styled():
-            figure = new_figure(11.0, 8.6 if with_maps else 4.8)
+            figure = figure_at(ax, 11.0, 8.6 if with_maps else 4.8)
             annulus = f"the {self.pupil} pupil, obscuration {self.obscuration:g}"
             self._titled(figure, f"annular Zernikes over {annulus}, {self._nanometres()}")
             if with_maps:
@@ -104,7 +107,7 @@ class FieldZernikes(FieldResult):
 
 
 @dataclass(frozen=True)
-class DoubleZernikes:
+class DoubleZernikes(Result):
     """Double Zernike coefficients: Zernikes of the field times annular Zernikes of the pupil.
 
     Attributes
@@ -119,6 +122,8 @@ class DoubleZernikes:
         Root mean square over the field of each pupil coefficient minus the field terms [m].
     """
 
+    _table = ("coefficients",)
+
     coefficients: np.ndarray
     field_radius: float
     at_nodes: FieldZernikes
@@ -130,7 +135,7 @@ class DoubleZernikes:
         x, y = np.atleast_2d(np.asarray(fields, dtype=np.float64)).T / self.field_radius
         return annular_zernikes(len(self.coefficients), x, y).T @ self.coefficients
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; rows are field terms, columns pupil terms, both from 1."""
         nodes = self.at_nodes
         return {
@@ -144,7 +149,7 @@ class DoubleZernikes:
             "double_zernike_nm": self.coefficients * 1e9,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the matrix of coefficients and the sizes of the pupil terms."""
         from matplotlib.colors import SymLogNorm
 
@@ -152,7 +157,7 @@ class DoubleZernikes:
         j, k = np.arange(4, nm.shape[1] + 4), np.arange(1, nm.shape[0] + 1)
         nodes = self.at_nodes
         with styled():
-            figure = new_figure(11.0, 8.8)
+            figure = figure_at(ax, 11.0, 8.8)
             table, bars = figure.subplots(2, 1, height_ratios=(1.7, 1.0), sharex=True)
             largest = max(float(np.abs(nm).max(initial=0.0)), 1e-6)
             norm = SymLogNorm(largest / 100.0, vmin=-largest, vmax=largest)

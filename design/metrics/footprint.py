@@ -49,6 +49,11 @@ class SurfaceFootprint:
     weights: np.ndarray  #: [n_pupil] fraction of the pupil for each ray; they sum to 1
 
     @property
+    def name(self) -> str:
+        """Name of the surface."""
+        return self.surface.name
+
+    @property
     def blocked_fraction(self) -> np.ndarray:
         """Fraction of the pupil that this surface is the first to block, shape [n_field]."""
         return (self.arriving & ~self.passing) @ self.weights
@@ -77,9 +82,15 @@ class Footprint(FieldResult):
         One for each surface.
     """
 
+    _table = ("name", "largest_radius", "blocked_fraction")
+    _row_type = SurfaceFootprint
+
     surfaces: tuple[SurfaceFootprint, ...]
 
-    def summary(self) -> dict[str, Any]:
+    def _columns(self) -> dict[str, Any]:
+        return {name: np.array([getattr(s, name) for s in self.surfaces]) for name in self._table}
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         return {
             "telescope": self.telescope,
@@ -87,7 +98,7 @@ class Footprint(FieldResult):
             "field_deg": np.rad2deg(self.fields),
             "surfaces": [
                 {
-                    "name": s.surface.name,
+                    "name": s.name,
                     "largest_radius_mm": s.largest_radius * 1e3,
                     "blocked_fraction": s.blocked_fraction,
                     "arriving_fraction": s.arriving @ s.weights,
@@ -96,12 +107,12 @@ class Footprint(FieldResult):
             ],
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw a panel for each surface: outlines of the footprints over the clear aperture."""
         colors = field_colors(len(self.fields))
         with styled():
             large = len(self.surfaces) == 1
-            figure, panels = panel_grid(len(self.surfaces), *((6.0, 5.6) if large else (2.9, 3.0)))
+            figure, panels = panel_grid(ax, len(self.surfaces), *((6.0, 5.6) if large else (2.9, 3.0)))
             for axes, footprint in zip(panels, self.surfaces, strict=True):
                 _draw_surface(axes, footprint, colors, [field_text(f) for f in self.fields])
             panels[0].plot([], [], ".", color=RED, markersize=6.0, label="blocked here first")

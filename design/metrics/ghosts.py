@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description, described
 from ...core.errors import DomainError
-from ...core.plotting import RED, new_figure, plain_text, styled
+from ...core.plotting import RED, figure_at, plain_text, styled
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
@@ -100,6 +101,9 @@ class Ghosts(FieldResult):
         Angle on the sky over length on the detector at the star [rad/m].
     """
 
+    _table = ("first", "second", "flux", "peak", "centroid", "diameter", "focus")
+    _images = ("irradiance",)
+
     detector_reflectivity: float
     ghosts: tuple[Ghost, ...]
     star: np.ndarray
@@ -125,7 +129,13 @@ class Ghosts(FieldResult):
         with np.errstate(divide="ignore"):
             return -2.5 * np.log10(np.array([g.peak for g in self.ghosts]) * square_arcsec)
 
-    def summary(self) -> dict[str, Any]:
+    def _columns(self) -> dict[str, Any]:
+        return {name: np.array([getattr(ghost, name) for ghost in self.ghosts]) for name in self._table}
+
+    def _described(self, name: str) -> Description:
+        return described(type(self) if name in self._images else Ghost, name)
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the ghosts, the brightest first."""
         return {
             "telescope": self.telescope,
@@ -144,10 +154,10 @@ class Ghosts(FieldResult):
             "focus_mm": np.array([g.focus for g in self.ghosts]) * 1e3,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the irradiance of all ghosts on the detector, and the brightest one by one."""
         with styled():
-            figure = new_figure(11.6, 5.3)
+            figure = figure_at(ax, 11.6, 5.3)
             parts: Any = figure.subfigures(1, 2, width_ratios=[1.0, 1.12])
             left, right = parts
             _draw_map(left.subplots(), self)

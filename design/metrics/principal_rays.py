@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, GREY, ORANGE, new_figure, styled
+from ...core.plotting import BLUE, GREY, ORANGE, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
@@ -28,6 +28,7 @@ from ..drawing import finish_axes
 from ..result import FieldResult
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Distance of the rays "near" the chief ray from the centre of the entrance pupil, in units of its radius.
@@ -69,6 +70,17 @@ class PrincipalRays(FieldResult):
         Diameter of the exit pupil [m], tangential and sagittal, by the magnification near the chief ray.
     """
 
+    _table = (
+        "fields",
+        "chief_landing",
+        "chief_angle",
+        "f_number",
+        "plate_scale",
+        "exit_pupil",
+        "exit_pupil_distance",
+        "exit_pupil_diameter",
+    )
+
     chief_position: np.ndarray
     chief_direction: np.ndarray
     chief_landing: np.ndarray
@@ -91,7 +103,7 @@ class PrincipalRays(FieldResult):
         """Geometric mean of both plate scales [rad/m], shape [n_field]."""
         return np.sqrt(self.plate_scale.prod(axis=1))
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields, pairs are tangential, sagittal."""
         return {
             "telescope": self.telescope,
@@ -106,7 +118,7 @@ class PrincipalRays(FieldResult):
             "exit_pupil_diameter_m": self.exit_pupil_diameter,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw focal ratio, plate scale, exit pupil and incidence against the distance from the axis."""
         radius = np.rad2deg(self.off_axis_angle)
         order = np.argsort(radius, kind="stable")
@@ -117,7 +129,7 @@ class PrincipalRays(FieldResult):
             ("diameter of the exit pupil [m]", self.exit_pupil_diameter),
         ]
         with styled():
-            figure = new_figure(11.0, 6.4)
+            figure = figure_at(ax, 11.0, 6.4)
             panels = figure.subplots(2, 3, sharex=True).ravel()
             for axes, (label, values) in zip(panels, pairs, strict=False):
                 axes.plot(radius[order], values[order, 0], ".-", color=BLUE, label="tangential")

@@ -51,6 +51,18 @@ class SpotDiagram(FieldResult):
         parallel light.
     """
 
+    _table = (
+        "fields",
+        "rms_radius",
+        "rms_xy",
+        "geometric_radius",
+        "airy_radius",
+        "lit_fraction",
+        "centroid",
+        "reference_point",
+        "plate_scale",
+    )
+
     displacement: np.ndarray
     weight: np.ndarray
     reference_point: np.ndarray
@@ -102,7 +114,7 @@ class SpotDiagram(FieldResult):
                 found[i] = _weighted_quantile(radius[weight > 0][order], weight[weight > 0][order], fraction)
         return found
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         arcsec = arcseconds(self.plate_scale)
         sizes = {
@@ -125,13 +137,13 @@ class SpotDiagram(FieldResult):
             "lit_fraction": self.lit_fraction,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw a panel for each field, all on one scale, with the Airy disc and a scale bar."""
         radius = self.radius_holding(0.8)
         light = np.nanmax(self.geometric_radius, initial=0.0), _FARTHEST * np.nanmax(radius, initial=0.0)
         half = 1.08e6 * max(float(min(light)), float(np.nanmax(self.airy_radius, initial=1e-9)))
         with styled():
-            figure, panels = drawing.panel_grid(len(self.fields), 2.5, 3.0)
+            figure, panels = drawing.panel_grid(ax, len(self.fields), 2.5, 3.0)
             for i, axes in enumerate(panels):
                 _draw_spot(axes, self, i, half, radius[i])
             bar = drawing.round_length(0.7 * half)

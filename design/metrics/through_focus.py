@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import new_figure, styled
+from ...core.plotting import figure_at, styled
 from ...core.units import field_label, metres
 from ...models.telescope import Telescope
 from ...wavefront.bundles import Bundles
@@ -67,7 +67,10 @@ class ThroughFocus(FieldResult):
     best_common: float
     smallest_radius: np.ndarray
 
-    def summary(self) -> dict[str, Any]:
+    def _columns(self) -> dict[str, Any]:
+        return self._along("defocus", "rms_radius", "rms_wavefront", "strehl")
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; rows are fields, columns heights of the detector."""
         return {
             "telescope": self.telescope,
@@ -83,7 +86,7 @@ class ThroughFocus(FieldResult):
             "strehl": self.strehl,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw rms radius, rms wavefront and Strehl ratio against the height of the detector."""
         wavelength = float(self.wavelengths.mean())
         waves = self.rms_wavefront / wavelength
@@ -93,11 +96,12 @@ class ThroughFocus(FieldResult):
             (self.strehl, "Strehl ratio (tilt taken off)", np.full(len(waves), np.nan)),
         ]
         with styled():
-            figure = new_figure(12.0, 4.4)
-            for axes, (values, label, best) in zip(figure.subplots(1, 3), panels, strict=True):
+            figure = figure_at(ax, 12.0, 4.4)
+            row = figure.subplots(1, 3)
+            for axes, (values, label, best) in zip(row, panels, strict=True):
                 _draw_curves(axes, self, values, best)
                 axes.set(ylabel=label, ylim=(0.0, None))
-            legend_below(figure, figure.axes[0])
+            legend_below(figure, row[0])
             common = f"{self.best_common * 1e6:+.3g} µm"
             return self._titled(figure, f"through focus; the spots of all fields together are smallest at {common}")
 

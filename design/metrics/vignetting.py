@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, figure_of, new_figure, styled
+from ...core.plotting import BLUE, figure_at, figure_of, styled
 from ...core.units import require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
@@ -41,6 +41,8 @@ class Vignetting(FieldResult):
         Lit fraction on the axis.
     """
 
+    _table = ("fields", "off_axis_angle", "lit_fraction", "error", "relative")
+
     lit_fraction: np.ndarray
     error: np.ndarray
     axis_fraction: float
@@ -50,7 +52,7 @@ class Vignetting(FieldResult):
         """Light relative to the axis, shape [n_field]."""
         return self.lit_fraction / self.axis_fraction
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; lists run over the fields."""
         return {
             "telescope": self.telescope,
@@ -65,11 +67,11 @@ class Vignetting(FieldResult):
             "relative": self.relative,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the light relative to the axis against the distance from it and, where fields suffice, as a map."""
         with_map = spread_in_field(self.fields)
         with styled():
-            figure = new_figure(11.0 if with_map else 6.5, 4.6)
+            figure = figure_at(ax, 11.0 if with_map else 6.5, 4.6)
             panels = figure.subplots(1, 2 if with_map else 1, squeeze=False)[0]
             _draw_profile(panels[0], self)
             if with_map:

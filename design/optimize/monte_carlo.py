@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, check_choice
-from ...core.plotting import BLUE, GREY, RED, new_figure, plain_text, styled
+from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
+from ...core.result import Result
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ..parameters.degrees_of_freedom import DegreesOfFreedom
@@ -22,6 +23,7 @@ from .optimize import NO_EFFECT
 from .sensitivity import field_rings
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MERITS: dict[str, Callable[[Telescope, Beams], Merit]] = {"wavefront": WavefrontMerit, "spots": SpotMerit}
@@ -32,7 +34,7 @@ _TITLES = {"wavefront": "rms wavefront", "spots": "rms spot radius"}
 
 
 @dataclass(frozen=True)
-class MonteCarlo:
+class MonteCarlo(Result):
     """The merit of telescopes drawn within tolerances.
 
     Attributes
@@ -61,6 +63,8 @@ class MonteCarlo:
         Rms contribution of each tolerance alone, compensated, in quadrature, to first order [m].
     """
 
+    _table = ("merit", "deviations", "moves")
+
     telescope: str
     merit_name: str
     method: str
@@ -79,7 +83,7 @@ class MonteCarlo:
         """Return the quantile of the merit [m] for a fraction (0 to 1) of the telescopes; lost ones count as worst."""
         return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), fraction, method="higher"))
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit."""
         return {
             "telescope": self.telescope,
@@ -97,14 +101,14 @@ class MonteCarlo:
             "compensator_rms": np.sqrt((self.moves**2).mean(axis=0)),
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the distribution of the merit and the contributions of the tolerances."""
         finite = np.sort(self.merit[np.isfinite(self.merit)])
         highest = float(finite.max(initial=self.nominal))
         unit, scale = ("nm", 1e9) if highest < 1e-6 else ("µm", 1e6)
         shown = np.argsort(self.contribution)[::-1][:_BARS]
         with styled():
-            figure = new_figure(9.0, max(3.4, 1.2 + 0.19 * len(shown)))
+            figure = figure_at(ax, 9.0, max(3.4, 1.2 + 0.19 * len(shown)))
             left, right = figure.subplots(1, 2)
             percent_below = 100.0 * np.arange(1, len(finite) + 1) / len(self.merit)
             left.step(finite * scale, percent_below, where="post", color=BLUE)

@@ -12,7 +12,8 @@ from scipy.optimize import least_squares
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, shown
-from ...core.plotting import BLUE, GREY, new_figure, plain_text, styled
+from ...core.plotting import BLUE, GREY, figure_at, plain_text, styled
+from ...core.result import Result
 from ...core.threads import one_blas_thread
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
@@ -24,6 +25,7 @@ from .targets import FocalLength, Target
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Fraction of the effects of single surfaces on single rays below which the effect of a variable is rounding.
@@ -35,7 +37,7 @@ _COLLINEAR = 1e-6
 
 
 @dataclass(frozen=True)
-class Optimum:
+class Optimum(Result):
     """Result of an optimisation.
 
     Attributes
@@ -62,6 +64,9 @@ class Optimum:
         Why the solver stopped.
     """
 
+    _table = ("start_values", "values", "changes", "uncertainty", "effect")
+    _row_type = Parameter
+
     telescope: Telescope
     variables: tuple[Parameter, ...]
     changes: np.ndarray
@@ -79,7 +84,15 @@ class Optimum:
         """Standard deviation of each variable, in its own unit, shape [n_variable]."""
         return np.sqrt(np.diag(self.covariance))
 
-    def summary(self) -> dict[str, Any]:
+    def _label(self) -> str:
+        start, end = self.history[0], self.history[-1]
+        return f"{self.telescope.name}, {len(self.variables)} variables, rms {start:.4g} -> {end:.4g} m"
+
+    def _columns(self) -> dict[str, Any]:
+        names = {"address": [p.address for p in self.variables], "unit": [p.unit or "1" for p in self.variables]}
+        return names | super()._columns()
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit."""
         return {
             "telescope": self.telescope.name,
@@ -98,13 +111,13 @@ class Optimum:
             "message": self.message,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the merit step by step, and the effect of the change of each variable."""
         from matplotlib.ticker import MaxNLocator
 
         with styled():
             names = [p.address for p in self.variables]
-            figure = new_figure(8.4, max(3.2, 1.4 + 0.24 * len(names)))
+            figure = figure_at(ax, 8.4, max(3.2, 1.4 + 0.24 * len(names)))
             steps, bars = figure.subplots(1, 2)
             steps.semilogy(range(len(self.history)), self.history * 1e6, "o-", color=BLUE, markersize=4)
             steps.xaxis.set_major_locator(MaxNLocator(integer=True))

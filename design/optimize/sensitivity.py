@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.plotting import BLUE, new_figure, plain_text, styled
+from ...core.plotting import BLUE, figure_at, plain_text, styled
 from ...core.threads import one_blas_thread
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
@@ -25,6 +25,7 @@ from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Default points along the radius of the pupil; the fit is exact up to degree 47 of wavefront times term.
@@ -49,10 +50,17 @@ class Sensitivity(FieldResult):
         Coefficients of the unchanged telescope [m].
     """
 
+    _table = ("parameters", "units", "rms", "matrix")
+
     parameters: Variables
     obscuration: float
     matrix: np.ndarray
     zernikes: np.ndarray
+
+    @property
+    def units(self) -> Sequence[str]:
+        """Unit of each parameter."""
+        return self.parameters.units
 
     @property
     def rms(self) -> np.ndarray:
@@ -80,7 +88,11 @@ class Sensitivity(FieldResult):
         _, values, modes = np.linalg.svd(flat / np.where(norm > 0, norm, 1.0), full_matrices=False)
         return values, modes
 
-    def summary(self) -> dict[str, Any]:
+    def _columns(self) -> dict[str, Any]:
+        named = {"parameters": self.parameters.names, "units": self.units}
+        return named | {"rms": self.rms, "matrix": np.moveaxis(self.matrix, -1, 0)}
+
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit; the matrix is [field][zernike][parameter]."""
         values, _ = self.modes()
         return {
@@ -89,14 +101,14 @@ class Sensitivity(FieldResult):
             "obscuration": self.obscuration,
             "field_deg": np.rad2deg(self.fields),
             "parameters": list(self.parameters.names),
-            "units": list(self.parameters.units),
+            "units": list(self.units),
             "wavefront_rms_m_per_unit": self.rms,
             "singular_values": values,
             "zernike_m": self.zernikes,
             "matrix_m_per_unit": self.matrix,
         }
 
-    def plot(self) -> Figure:
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw the matrix, and the singular values of the degrees of freedom."""
         from matplotlib.ticker import MaxNLocator
 
@@ -105,7 +117,7 @@ class Sensitivity(FieldResult):
         largest = size.max(axis=0)
         with styled():
             names = [plain_text(name) for name in self.parameters.names]
-            figure = new_figure(min(14.0, 4.5 + 0.22 * len(names)), 4.6)
+            figure = figure_at(ax, min(14.0, 4.5 + 0.22 * len(names)), 4.6)
             axes, modes = figure.subplots(1, 2, width_ratios=[2.2, 1.0])
             shown = np.log10(np.maximum(size / np.where(largest > 0, largest, 1.0), 1e-4))
             last = self.matrix.shape[1]

@@ -80,7 +80,15 @@ class Camera:
         return tuple(n for n, r in zip(self.ccd_names, self.raft_of, strict=True) if r == raft)
 
     def ccd_at(self, x: ArrayLike, y: ArrayLike, *, margin: float = 0.0) -> np.ndarray:
-        """Return the index of the CCD at points [m], or at most a margin [m] outside its rim; -1 without one."""
+        """Return the index of the CCD at points; -1 without one.
+
+        Parameters
+        ----------
+        x, y : array_like or Quantity
+            Points [m].
+        margin : float
+            Distance from the rim at which points still belong to a CCD [m].
+        """
         px, py = plane_points(x, y)
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)

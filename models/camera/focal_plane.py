@@ -22,6 +22,7 @@ from .camera import Camera, load_camera
 from .ccd_surfaces import CcdSurfaces
 from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
 from .height_fit import fit_heights, table_column
+from .height_map import HeightMap
 
 if TYPE_CHECKING:
     import trimesh
@@ -35,7 +36,7 @@ _MOST_CELLS = 1024
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
-class FocalPlane:
+class FocalPlane(HeightMap):
     """Height of the CCD surfaces over the nominal focal plane.
 
     Made by `from_budget`, `flat`, `as_measured`, `from_file`, `from_heights` or `from_mesh`.

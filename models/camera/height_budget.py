@@ -33,14 +33,30 @@ _POTATO_POINTS = 129
 @check_arguments
 @dataclass(frozen=True)
 class HeightBudget:
-    """Peak-to-valley size of each term of the focal-plane height."""
+    """Peak-to-valley size of each term of the focal-plane height.
 
-    global_height: float  #: surface of the whole focal plane [m]
-    raft_height: float  #: height of rafts [m]
-    ccd_height: float  #: height of CCDs on their raft [m]
-    ccd_tilt: float  #: tilt of CCDs about either axis [rad]
-    potato_chip: float  #: ripple within a CCD [m]
-    potato_chip_cycles: tuple[float, float] = (1.0, 2.0)  #: fewest and most cycles of the ripple along a CCD's side
+    Parameters
+    ----------
+    global_height : float
+        Surface of the whole focal plane [m].
+    raft_height : float
+        Height of rafts [m].
+    ccd_height : float
+        Height of CCDs on their raft [m].
+    ccd_tilt : float
+        Tilt of CCDs about either axis [rad].
+    potato_chip : float
+        Ripple within a CCD [m].
+    potato_chip_cycles : tuple of float
+        Fewest and most cycles of the ripple along a CCD's side.
+    """
+
+    global_height: float
+    raft_height: float
+    ccd_height: float
+    ccd_tilt: float
+    potato_chip: float
+    potato_chip_cycles: tuple[float, float] = (1.0, 2.0)
 
     def __post_init__(self) -> None:
         for key in ("global_height", "raft_height", "ccd_height", "ccd_tilt", "potato_chip"):

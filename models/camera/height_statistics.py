@@ -8,6 +8,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.result import Values
 from .focal_plane import FocalPlane
 
 # Cells along the side of a CCD, at whose centres heights are taken.
@@ -17,19 +18,41 @@ _TAILS = (2.5, 97.5)
 
 
 @dataclass(frozen=True)
-class HeightStatistics:
-    """Heights of a group of CCDs, each point of their measured surface counted alike [m]."""
+class HeightStatistics(Values):
+    """Heights of a group of CCDs, each point of their measured surface counted alike.
 
-    n_ccd: int  #: number of CCDs
-    mean: float  #: mean height
-    rms: float  #: rms about that mean
-    width95: float  #: width of the interval between 2.5 % and 97.5 % of the heights
-    peak_to_valley: float  #: highest less lowest
-    ccd_mean_rms: float  #: rms of the mean heights of the CCDs about their own mean
-    within_rms: float  #: rms about the mean of each CCD
-    within_width95: float  #: the same width of the heights of one CCD, median over the CCDs
-    tilt_rms: float  #: rms of the best plane of each CCD about its mean
-    shape_rms: float  #: rms about the best plane of each CCD
+    Attributes
+    ----------
+    n_ccd : int
+        Number of CCDs.
+    mean, rms : float
+        Mean height, and rms about it [m].
+    width95 : float
+        Width of the interval between 2.5 % and 97.5 % of the heights [m].
+    peak_to_valley : float
+        Highest less lowest [m].
+    ccd_mean_rms : float
+        Rms of the mean heights of the CCDs about their own mean [m].
+    within_rms : float
+        Rms about the mean of each CCD [m].
+    within_width95 : float
+        Width that holds 95 % of the heights of one CCD, median over the CCDs [m].
+    tilt_rms : float
+        Rms of the best plane of each CCD about its mean [m].
+    shape_rms : float
+        Rms about the best plane of each CCD [m].
+    """
+
+    n_ccd: int
+    mean: float
+    rms: float
+    width95: float
+    peak_to_valley: float
+    ccd_mean_rms: float
+    within_rms: float
+    within_width95: float
+    tilt_rms: float
+    shape_rms: float
 
 
 @check_arguments

@@ -120,16 +120,21 @@ def _conic_change(name: str, value: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _TwoRadii(Shape):
-    """Base of shapes with different radii [m] along x and y."""
+    """Base of shapes with different radii along x and y.
+
+    Parameters
+    ----------
+    radius_x, radius_y : float
+        Radii of curvature [m].
+    """
 
     radius_x: float
     radius_y: float
 
     def __post_init__(self) -> None:
-        check_radius(self.radius_x, "radius_x", flat=True)
-        check_radius(self.radius_y, "radius_y", flat=True)
-        for name in ("conic_x", "conic_y"):
-            check_conic(getattr(self, name, 0.0), name)
+        for axis in "xy":
+            check_radius(getattr(self, f"radius_{axis}"), f"radius_{axis}", flat=True)
+            check_conic(getattr(self, f"conic_{axis}", 0.0), f"conic_{axis}")
 
     @property
     def curvature(self) -> float:
@@ -236,11 +241,9 @@ class Biconic(_TwoRadii):
 class Toroid(_TwoRadii):
     """A conic of the y, z plane rotated about an axis parallel to y, `radius_x` [m] from the vertex.
 
-    With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, ``cx = 1 / radius_x``::
+    With g(y) the conic of radius `radius_y` [m] and constant `conic_y`, ``cx = 1 / radius_x`` (0: a cylinder)::
 
         z = g + q x^2 / (1 + sqrt(1 - q^2 x^2)),    q = cx / (1 - cx g)
-
-    An infinite radius is flat in that direction, so a cylinder is a toroid.
     """
 
     conic_y: float = 0.0
@@ -375,10 +378,9 @@ class ZernikeSag(_Polynomial):
         check_coefficients(self.coefficients)
         if not self.coefficients:
             raise PrescriptionError("zernikes = []: expected at least one coefficient")
-        if not 0 <= self.inner_radius < self.outer_radius < np.inf:
-            raise PrescriptionError(
-                f"zernike radii = [{self.inner_radius!r}, {self.outer_radius!r}] m: expected 0 <= inner < outer"
-            )
+        inner, outer = self.inner_radius, self.outer_radius
+        if not 0 <= inner < outer < np.inf:
+            raise PrescriptionError(f"zernike radii = [{inner!r}, {outer!r}] m: expected 0 <= inner < outer")
 
     @cached_property
     def polynomial(self) -> PolarPolynomial:

@@ -275,7 +275,13 @@ class Plane(Rotational):
 @check_arguments
 @dataclass(frozen=True)
 class Sphere(Rotational):
-    """Sphere of a radius of curvature [m], positive where the centre lies on the +z side."""
+    """Sphere.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of curvature [m], positive where the centre lies on the +z side.
+    """
 
     radius: float
 
@@ -283,7 +289,15 @@ class Sphere(Rotational):
 @check_arguments
 @dataclass(frozen=True)
 class Conic(Rotational):
-    """Conic of revolution: radius of curvature at the vertex [m], and conic constant (0 sphere, -1 paraboloid)."""
+    """Conic of revolution.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of curvature at the vertex [m].
+    conic : float
+        Conic constant: 0 is a sphere, -1 a paraboloid.
+    """
 
     radius: float
     conic: float

@@ -8,12 +8,13 @@ from enum import IntFlag
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import QTable, Table
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.products import Columns, described_table
+from ...core.result import Result
 from ...core.units import real_array, require_positive
 from ...core.version import VERSION
 
@@ -41,7 +42,7 @@ class GalaxyFlag(IntFlag):
 
 
 @dataclass(frozen=True, eq=False)
-class GalaxyFits:
+class GalaxyFits(Result):
     """Elliptical Gaussians before the PSF, of n galaxies.
 
     Parameters
@@ -172,6 +173,13 @@ class GalaxyFits:
         """Return the standard error of a function of the moments from its gradient [n, 3]."""
         spread = (self.covariance[:, 3:, 3:] * gradient[:, None, :]).sum(axis=2)
         return np.sqrt((spread * gradient).sum(axis=1))
+
+    def _label(self) -> str:
+        return f"{len(self)} galaxies, {int(self.good.sum())} without a flag"
+
+    def to_table(self) -> QTable:
+        """Return the fits of :meth:`table`."""
+        return QTable(self.table())
 
     def table(self) -> Table:
         """Return the fits as a table with units and descriptions, a row a galaxy."""

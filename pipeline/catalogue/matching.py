@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,13 @@ from scipy.spatial import KDTree
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.plotting import BLUE, ORANGE, axes_at, styled
+from ...core.result import Result
 from ...core.units import real_array, require_positive
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @check_arguments
@@ -61,7 +68,7 @@ def _differ(name: str, pair: tuple[ArrayLike, ArrayLike]) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class DetectionRates:
+class DetectionRates(Result):
     """Completeness and purity of a catalogue in bins of magnitude.
 
     Parameters
@@ -74,11 +81,29 @@ class DetectionRates:
         Detected objects of each bin of measured magnitude, and those of them that have a match, [n_bins].
     """
 
+    _table = ("faintest", "n_true", "n_found", "completeness", "n_detected", "n_real", "purity")
+
     edges: np.ndarray
     n_true: np.ndarray
     n_found: np.ndarray
     n_detected: np.ndarray
     n_real: np.ndarray
+
+    @property
+    def faintest(self) -> np.ndarray:
+        """Faint edge of each bin [mag], shape [n_bins]."""
+        return self.edges[1:]
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw completeness and purity against magnitude."""
+        with styled():
+            figure, axes = axes_at(ax, 5.6, 3.6)
+            middle = 0.5 * (self.edges[1:] + self.edges[:-1])
+            axes.plot(middle, self.completeness, "o-", color=BLUE, label="completeness, by true magnitude")
+            axes.plot(middle, self.purity, "s-", color=ORANGE, label="purity, by measured magnitude")
+            axes.set(xlabel="magnitude", ylabel="fraction", ylim=(0.0, 1.05))
+            axes.legend(loc="lower left")
+            return figure
 
     @property
     def completeness(self) -> np.ndarray:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import QTable, Table
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.products import Columns, described_table
+from ...core.result import Result
 from ...core.version import VERSION
 
 
@@ -29,7 +30,7 @@ class ObjectFlag(IntFlag):
 
 
 @dataclass(frozen=True, eq=False)
-class DetectedObjects:
+class DetectedObjects(Result):
     """Objects of one image.
 
     Parameters
@@ -56,6 +57,8 @@ class DetectedObjects:
     background : array
         Level of the sky that was subtracted, [ny, nx].
     """
+
+    _images = ("segmentation", "background")
 
     x: np.ndarray
     y: np.ndarray
@@ -94,6 +97,14 @@ class DetectedObjects:
     def e2(self) -> np.ndarray:
         """Ellipticity of the isophote along the diagonal x = y."""
         return self.ellipticity * np.sin(2.0 * self.theta)
+
+    def _label(self) -> str:
+        ny, nx = self.segmentation.shape
+        return f"{len(self)} objects of an image of {nx} x {ny} pixels"
+
+    def to_table(self) -> QTable:
+        """Return the catalogue of :meth:`table`, without magnitudes."""
+        return QTable(self.table())
 
     @check_arguments
     def magnitude(self, zero_point: float) -> np.ndarray:

@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.result import Values
 from ...core.units import real_array
 
 
 @dataclass(frozen=True)
-class ShearCalibration:
+class ShearCalibration(Values):
     """Measured shear as a function of the true one, (1 + m) g + c, of both components.
 
     Parameters

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.result import Result
 from ...core.units import real_array, require_count, require_positive
 from ..simulate.stamps import center_stamps
 from .cutouts import cut_out, first_pixel
@@ -44,7 +45,7 @@ class StarCut(IntFlag):
 
 
 @dataclass(frozen=True, eq=False)
-class StarSelection:
+class StarSelection(Result):
     """Stars among n objects.
 
     Parameters
@@ -63,6 +64,9 @@ class StarSelection:
         The selected stars shifted to the centre of a pixel, background subtracted, in the unit of the image, [k, size,
         size].
     """
+
+    _table = ("index", "positions", "snr")
+    _images = ("stamps",)
 
     index: np.ndarray
     cuts: np.ndarray

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description, described
 from ...core.errors import DomainError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
+from ...core.result import Result
 from ...core.units import length, positive_angle
 from ...core.version import CREATOR
 from ...models.camera.camera import Camera
@@ -44,7 +46,7 @@ _CHI2 = (0.7, 1.4)
 
 
 @dataclass(frozen=True, eq=False)
-class FocalPlanePsf:
+class FocalPlanePsf(Result):
     """The PSF of one exposure over the whole focal plane.
 
     Made by :meth:`fit`; shapes of the PSF are e1, e2 and the weighted rms size.
@@ -216,6 +218,17 @@ class FocalPlanePsf:
         )
         return model._with_stamps(given, components, threads, reporter)
 
+    def _label(self) -> str:
+        return f"{int(self.used.sum())} of {len(self.used)} stars"
+
+    def _columns(self) -> dict[str, Any]:
+        left = self.leave_one_out
+        return {"used": self.used, "e1": left.e1, "e2": left.e2, "size": left.size}
+
+    def _described(self, name: str) -> Description:
+        known = described(type(self) if name == "used" else PsfShapes, name)
+        return known if name == "used" else known._replace(text=f"Prediction from all other stars: {known.text}")
+
     @property
     def mosaic(self) -> Mosaic:
         """The CCDs."""
@@ -271,7 +284,7 @@ class FocalPlanePsf:
         """
         places = self.field.mosaic.places(ccd, x, y)
         values, _ = self.field.predict(places, threads=threads)
-        return self._images(places, values, threads)
+        return self._draw_places(places, values, threads)
 
     @check_arguments
     def draw_uncertainty(
@@ -285,7 +298,7 @@ class FocalPlanePsf:
         for shape in range(3):
             step = np.zeros((len(places), 3))
             step[:, shape] = np.sqrt(np.maximum(variance[:, shape], 0.0))
-            ends = [self._images(places, values + sign * step, threads) for sign in (1.0, -1.0)]
+            ends = [self._draw_places(places, values + sign * step, threads) for sign in (1.0, -1.0)]
             total += (0.5 * (ends[0] - ends[1])) ** 2
         return np.sqrt(total)
 
@@ -300,7 +313,7 @@ class FocalPlanePsf:
         """Read a model; ProductError if the file is missing, damaged or of another kind."""
         return cls(**model_fields(read_fits(Path(path)), Path(path)))
 
-    def _images(self, places: Places, values: np.ndarray, threads: int | None) -> np.ndarray:
+    def _draw_places(self, places: Places, values: np.ndarray, threads: int | None) -> np.ndarray:
         """Return images of given shapes e1, e2 and ln size [n, 3]."""
         optics, mean = self.field.optics, self.mean_star
         scale = self.pixel_scale if optics is None else optics.pixel_scale
@@ -335,7 +348,7 @@ class FocalPlanePsf:
         if components < 1:
             return model
         with reporter.stage("residual stamps"):
-            plain = model._images(places, self.field.data.values[finite], threads)
+            plain = model._draw_places(places, self.field.data.values[finite], threads)
             pca = ResidualImages.fit(stamps - plain, places, weight, self.field.mosaic, components, threads)
         return replace(model, pca=pca)
 

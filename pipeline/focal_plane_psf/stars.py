@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.files import parsing, require_file
+from ...core.result import Result
 from ...core.units import ARCSEC
 from ..ccd_product import CcdProduct, ObservedStars, read_product
 from ..measure.shapes import Shapes, measure_shapes
@@ -49,7 +50,7 @@ class CcdStars(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FocalPlaneStars:
+class FocalPlaneStars(Result):
     """Stars of one exposure.
 
     Attributes
@@ -71,6 +72,8 @@ class FocalPlaneStars:
     pixels : bool
         Whether positions are in pixels.
     """
+
+    _table = ("ccd", "x", "y", "values", "noise", "usable")
 
     ccd: tuple[str, ...]
     x: np.ndarray
@@ -126,6 +129,17 @@ class FocalPlaneStars:
     ) -> FocalPlaneStars:
         """Take stars from a table, structured array or mapping.
 
+        Parameters
+        ----------
+        table : table, structured array or mapping
+            Columns as below.
+        stamps : array, optional
+            Images of the stars, [n, ny, nx].
+        pixel_scale, weight_fwhm : float
+            Pixel of the stamps, and weight of the moments [rad].
+
+        Notes
+        -----
         Columns, in any case: ``ccd`` (name), ``x``, ``y`` (lengths [m], other units are honoured; ``pix``: pixels of
         the CCD); ``e1``, ``e2``, ``size`` ([rad] or with a unit), or stamps, in a column ``stamp`` or as `stamps` [n,
         ny, nx] with `pixel_scale` [rad]; ``snr``, or ``e1_noise``, ``e2_noise`` and ``size_noise`` (relative). Stars

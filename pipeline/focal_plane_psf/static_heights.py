@@ -25,6 +25,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
+from ...core.result import Result
 from ...core.threads import one_blas_thread
 from ...models.camera.camera import Camera, load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
@@ -44,7 +45,7 @@ STEPS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class StaticHeights:
+class StaticHeights(Result):
     """Heights learnt from exposures.
 
     Attributes
@@ -57,6 +58,8 @@ class StaticHeights:
         Number of exposures.
     """
 
+    _table = ("names", "sigma")
+
     focal_plane: FocalPlane
     covariance: np.ndarray
     exposures: int
@@ -65,6 +68,11 @@ class StaticHeights:
     def camera(self) -> Camera:
         """The camera."""
         return self.focal_plane.camera
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the CCDs."""
+        return self.focal_plane.names
 
     @property
     def sigma(self) -> np.ndarray:

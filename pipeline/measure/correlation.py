@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import treecorr
@@ -12,7 +12,13 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice, shown
+from ...core.plotting import BLUE, ORANGE, axes_at, styled
+from ...core.result import Result
 from ...core.units import ARCMIN, angle, radians, real_array, require_count
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Ranges of separation over which xi+ is averaged [arcmin]; Jee & Tyson 2011 give a residual below 1e-7 for the long.
 SEPARATION_RANGES = {"short": (0.0, 10.0), "long": (10.0, 180.0)}
@@ -21,7 +27,7 @@ EXACT_LIMIT = 10_000
 
 
 @dataclass(frozen=True)
-class Correlation:
+class Correlation(Result):
     """Ellipticity correlations in logarithmic bins of separation.
 
     Parameters
@@ -46,6 +52,8 @@ class Correlation:
         Pairs without each patch.
     """
 
+    _table = ("r", "xi_plus", "error_plus", "xi_minus", "error_minus", "n_pairs")
+
     r: np.ndarray
     xi_plus: np.ndarray
     xi_minus: np.ndarray
@@ -61,6 +69,18 @@ class Correlation:
     def r_arcmin(self) -> np.ndarray:
         """Separation [arcmin]."""
         return self.r / ARCMIN
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw xi+ and xi- with their errors against separation."""
+        with styled():
+            figure, axes = axes_at(ax, 5.6, 4.0)
+            for name, xi, error, color in (
+                ("ξ+", self.xi_plus, self.error_plus, BLUE),
+                ("ξ-", self.xi_minus, self.error_minus, ORANGE),
+            ):
+                axes.errorbar(self.r_arcmin, xi, error, fmt="o-", color=color, markersize=3, label=name)
+            draw_correlation_axes(axes)
+            return figure
 
     def as_dict(self) -> dict[str, np.ndarray]:
         """Return separations, correlations, errors and pairs by the names of the products."""
@@ -112,6 +132,14 @@ class Correlation:
         counts, values = pairs[..., inside], xi[..., inside]
         with np.errstate(invalid="ignore"):
             return np.asarray((np.where(counts > 0, values, 0.0) * counts).sum(axis=-1) / counts.sum(axis=-1))
+
+
+def draw_correlation_axes(axes: Axes) -> None:
+    """Draw zero, labels and legend of correlations against separation."""
+    axes.axhline(0.0, color="0.5", linewidth=0.7)
+    axes.set(xscale="log", xlabel="separation [arcmin]", ylabel="correlation of ellipticities")
+    axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
+    axes.legend(loc="best")
 
 
 @check_arguments

@@ -20,20 +20,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.units import Quantity
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description
 from ...core.errors import DomainError
+from ...core.plotting import BLUE, GREY, ORANGE, PURPLE, RED, axes_at, styled
+from ...core.result import Result
 from ...core.units import real_array
-from .correlation import Correlation, shear_correlation
+from .correlation import Correlation, draw_correlation_axes, shear_correlation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
-class RhoStatistics:
+class RhoStatistics(Result):
     """The five rho statistics, each as xi+ and xi- of a correlation; the statistic proper is xi+.
 
     Parameters
@@ -42,11 +49,37 @@ class RhoStatistics:
         As in the module docstring, all of the same stars in the same bins.
     """
 
+    _table = ("r_arcmin", "rho1", "rho2", "rho3", "rho4", "rho5")
+
     rho1: Correlation
     rho2: Correlation
     rho3: Correlation
     rho4: Correlation
     rho5: Correlation
+
+    @property
+    def r_arcmin(self) -> np.ndarray:
+        """Separation [arcmin], shape [n_bins]."""
+        return self.rho1.r_arcmin
+
+    def _columns(self) -> dict[str, Any]:
+        pairs = {name: np.stack([rho.xi_plus, rho.error_plus], axis=1) for name, rho in self.items()}
+        return {"r_arcmin": self.r_arcmin, **pairs}
+
+    def _described(self, name: str) -> Description:
+        known = super()._described(name)
+        return known if name == "r_arcmin" else Description("", f"xi+ of {name}, and its standard error")
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the five statistics with their errors against separation."""
+        with styled():
+            figure, axes = axes_at(ax, 6.0, 4.2)
+            for (name, rho), color in zip(self.items(), (GREY, BLUE, RED, ORANGE, PURPLE), strict=True):
+                axes.errorbar(
+                    rho.r_arcmin, rho.xi_plus, rho.error_plus, fmt="o-", color=color, markersize=3, label=name
+                )
+            draw_correlation_axes(axes)
+            return figure
 
     def items(self) -> Iterator[tuple[str, Correlation]]:
         """Return the name of each statistic with its correlation, in order."""

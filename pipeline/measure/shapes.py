@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.result import Result
 from ...core.threads import one_blas_thread
 from ...core.units import positive_angle, pure_numbers, real_numbers, require_positive
 
@@ -38,7 +39,7 @@ class ShapeFlag(IntFlag):
 
 
 @dataclass(frozen=True)
-class Shapes:
+class Shapes(Result):
     """Shapes of n images, one array element each.
 
     Parameters
@@ -55,6 +56,8 @@ class Shapes:
     flags : array of int
         :class:`ShapeFlag` bits.
     """
+
+    _table = ("e1", "e2", "size", "flux", "x", "y", "flags")
 
     e1: np.ndarray
     e2: np.ndarray

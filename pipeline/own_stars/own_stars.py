@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy import units as u
-from astropy.table import Table
+from astropy.table import QTable, Table
 from astropy.units import Quantity
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
+from ...core.products import Columns, described_table
 from ...core.random_streams import stream
+from ...core.result import Result
 from ...core.units import ARCSEC, positive_angle, real_array, require_seed
 from ..measure.rho_statistics import RhoStatistics, rho_statistics
 from ..measure.shapes import Shapes, fwhm, measure_shapes
@@ -36,7 +37,7 @@ _RIM = 2
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
-class OwnStars:
+class OwnStars(Result):
     """Stars of an image, the PSF model made from the good ones, and its prediction of each star held out.
 
     Attributes
@@ -63,6 +64,8 @@ class OwnStars:
         Of the stamps [rad], and of the weight of the moments [rad].
     """
 
+    _images = ("stamps", "predicted")
+
     model: PsfModel
     positions: np.ndarray
     snr: np.ndarray
@@ -79,21 +82,21 @@ class OwnStars:
 
     def table(self) -> Table:
         """Return all stars with their shapes and residuals."""
-        return Table(
-            {
-                "x": self.positions[:, 0],
-                "y": self.positions[:, 1],
-                "snr": self.snr,
-                "flags": self.flags,
-                "used": self.used,
-                "e1": self.shapes.e1,
-                "e2": self.shapes.e2,
-                "size": self.shapes.size / ARCSEC * u.arcsec,
-                "held_out_e1": self.held_out.e1,
-                "held_out_e2": self.held_out.e2,
-                "held_out_size": self.held_out.size / ARCSEC * u.arcsec,
-            }
-        )
+        one, other = self.shapes, self.held_out
+        columns: Columns = {
+            "x": (self.positions[:, 0], "", "place, in the unit of the positions"),
+            "y": (self.positions[:, 1], "", "place, in the unit of the positions"),
+            "snr": (self.snr, "", "signal-to-noise ratio"),
+            "flags": (self.flags, "", "bits of StarFlag"),
+            "used": (self.used, "", "whether the model is made of it"),
+            "e1": (one.e1, "", "ellipticity along x"),
+            "e2": (one.e2, "", "ellipticity along the diagonal x = y"),
+            "size": (one.size / ARCSEC, "arcsec", "weighted rms size"),
+            "held_out_e1": (other.e1, "", "e1 of the model made without the star"),
+            "held_out_e2": (other.e2, "", "e2 of the model made without the star"),
+            "held_out_size": (other.size / ARCSEC, "arcsec", "size of the model made without the star"),
+        }
+        return described_table(columns, {})
 
     def residuals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return e1, e2 and relative size of the used stars less those predicted without them, [n_used] each."""
@@ -104,7 +107,14 @@ class OwnStars:
             (one.size / other.size - 1.0)[used],
         )
 
-    def summary(self) -> dict[str, Any]:
+    def _label(self) -> str:
+        return f"{len(self.used)} stars, {int(self.used.sum())} used, {self.model!r}"
+
+    def to_table(self) -> QTable:
+        """Return the stars of :meth:`table`."""
+        return QTable(self.table())
+
+    def _summary(self) -> dict[str, Any]:
         """Return numbers of stars, FWHM, and rms residuals at stars that were held out, beside their noise."""
         d1, d2, size = self.residuals()
         counts = {str(f.name).lower(): int(((self.flags & f) > 0).sum()) for f in StarFlag if f}

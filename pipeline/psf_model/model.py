@@ -25,6 +25,7 @@ from . import gaussian_process, kriging
 from .basis import elbow_of
 from .file import model_fields, model_hdus
 from .fit import fit_fields, weighted
+from .picture import PicturedModel
 from .polynomial import Extent, design_matrix, mapped
 
 #: Pixels of noisy stars that deviate by more standard deviations are rejected.
@@ -32,7 +33,7 @@ CLIP_SIGMA = 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class PsfModel:
+class PsfModel(PicturedModel):
     """A PSF model of one CCD: PSF = mean + sum over k of a_k(x, y) component_k.
 
     Every stamp is normalised to unit sum, so the components sum to zero and the model to one wherever it is evaluated.
@@ -88,10 +89,6 @@ class PsfModel:
     weights: np.ndarray | None = None
     kernel: np.ndarray | None = None
     alpha: np.ndarray | None = None
-
-    def __repr__(self) -> str:
-        parts = f"{self.n_components} components ({self.basis}), order {self.order}, {self.n_stars} stars"
-        return f"<PsfModel: {parts}, stamps {self.mean.shape[1]} x {self.mean.shape[0]}>"
 
     @classmethod
     @check_arguments
@@ -191,11 +188,6 @@ class PsfModel:
     def n_stars(self) -> int:
         """Number of stars of the fit."""
         return len(self.coefficients)
-
-    @property
-    def n_components(self) -> int:
-        """Number of components kept."""
-        return len(self.components)
 
     @property
     def n_rejected(self) -> int:

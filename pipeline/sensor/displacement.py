@@ -37,12 +37,23 @@ class TreeRings(Displacement):
 
     ``galsim.SiliconSensor`` moves pixel boundaries: its ``treering_func`` is the negative of this displacement, in
     pixels.
+
+    Parameters
+    ----------
+    amplitude : float
+        Largest displacement A [m].
+    period : float
+        Distance of the rings P [m].
+    center : tuple of float
+        Axis of the rings from the centre of the CCD [m].
+    phase : float
+        Phase at the axis [rad].
     """
 
-    amplitude: float  #: largest displacement A [m]
-    period: float  #: distance of the rings P [m]
-    center: tuple[float, float]  #: axis of the rings from the centre of the CCD [m]
-    phase: float = 0.0  #: at the axis [rad]
+    amplitude: float
+    period: float
+    center: tuple[float, float]
+    phase: float = 0.0
 
     def __post_init__(self) -> None:
         numbers = (self.amplitude, self.period, *self.center, self.phase)
@@ -65,11 +76,20 @@ class EdgeRolloff(Displacement):
 
     A positive one stretches images and makes the pixels at the edge collect less of an even light: they roll off. A
     negative one makes them glow.
+
+    Parameters
+    ----------
+    amplitude : float
+        Displacement at the edge [m].
+    length : float
+        Distance over which it falls by e [m].
+    half_size : float
+        Half the side of the CCD [m].
     """
 
-    amplitude: float  #: displacement at the edge [m]
-    length: float  #: distance over which it falls by e [m]
-    half_size: float  #: half the side of the CCD [m]
+    amplitude: float
+    length: float
+    half_size: float
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.amplitude) or not 0.0 < self.length < np.inf or not 0.0 < self.half_size < np.inf:

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, shown
+from ...core.plotting import draw_stamps
 from ...core.random_streams import stream
-from ...core.units import for_each, pure_numbers, radians, require_seed
+from ...core.result import Result
+from ...core.units import ARCSEC, for_each, pure_numbers, radians, require_seed
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.psf.psf import Psfs, make_psfs
 from .photometry import READ_NOISE
 from .stamps import observe_stamps
 from .star_defects import add_defects
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Pixels on a side of a stamp: a donut of 1.2 mm in pixels of 10 um, and room for the seeing.
 STAMP_SIZE = 181
@@ -26,7 +32,7 @@ _MOST_ELECTRONS = 1e15
 
 
 @dataclass(frozen=True, eq=False)
-class Donuts:
+class Donuts(Result):
     """Images of stars far from focus.
 
     Attributes
@@ -43,11 +49,24 @@ class Donuts:
         :class:`~pachon.StarFlag` bits of second stars and cosmic rays.
     """
 
+    _table = ("fields", "electrons", "defects")
+    _images = ("images",)
+
     images: np.ndarray
     sky_variance: float
     psf: Psfs
     electrons: np.ndarray
     defects: np.ndarray
+
+    @property
+    def fields(self) -> np.ndarray:
+        """Field angles [rad], shape [n_star, 2]."""
+        return self.psf.fields
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the first six donuts."""
+        titles = [f"({x:.3g}, {y:.3g})°" for x, y in np.rad2deg(self.fields)]
+        return draw_stamps(ax, self.images, self.psf.pixel_scale / ARCSEC, titles)
 
 
 @check_arguments

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.errors import ConfigError, DomainError
-from ...core.plotting import BLUE, ORANGE, new_figure, plain_text, styled
+from ...core.plotting import BLUE, ORANGE, figure_at, plain_text, styled
+from ...core.result import Result
 from ...design.optimize.jacobian import ParameterColumns
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...design.parameters.parameters import apply
@@ -23,6 +24,7 @@ from .donut_rays import chief_landing, landing_of, spread_of
 from .pupil_cells import PupilCells
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Rms wavefront over the field that each degree of freedom may make where no prior is given [m].
@@ -92,7 +94,7 @@ class FreedomRays:
 
 
 @dataclass(frozen=True)
-class FreedomEstimate:
+class FreedomEstimate(Result):
     """Estimate of degrees of freedom from the donuts of one exposure.
 
     Attributes
@@ -106,6 +108,8 @@ class FreedomEstimate:
     prior : ndarray, shape [n]
         Standard deviations of the Gaussian prior about zero.
     """
+
+    _table = ("names", "units", "values", "errors", "prior")
 
     freedoms: DegreesOfFreedom
     values: np.ndarray
@@ -141,7 +145,7 @@ class FreedomEstimate:
         values, vectors = np.linalg.eigh(self.covariance / np.outer(self.prior, self.prior))
         return np.sqrt(np.maximum(values, 0.0)), vectors.T
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the estimate by name and unit, of plain numbers and lists."""
         ratio, vectors = self.combinations()
         return {
@@ -154,13 +158,13 @@ class FreedomEstimate:
             "combinations": vectors.tolist(),
         }
 
-    def plot(self) -> Figure:
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw the values in units of the priors, how well combinations are known, and the best and worst of these."""
         ratio, vectors = self.combinations()
         names = [plain_text(name) for name in self.names]
         n = len(names)
         with styled():
-            figure = new_figure(min(14.0, 6.0 + 0.16 * n), 8.0)
+            figure = figure_at(ax, min(14.0, 6.0 + 0.16 * n), 8.0)
             grid = figure.add_gridspec(2, 2, width_ratios=(2.2, 1.0), height_ratios=(1.0, 1.2))
             bars, known, table = (figure.add_subplot(grid[k]) for k in ((0, 0), (0, 1), (1, slice(None))))
             place = np.arange(n)

@@ -9,7 +9,8 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 
-from ...core.plotting import new_figure, plain_text, styled
+from ...core.plotting import figure_at, plain_text, styled
+from ...core.result import Result
 from ...core.units import arcseconds
 from ...design.drawing import field_colors
 from ...design.metrics.field_zernikes import name_terms
@@ -17,16 +18,33 @@ from .degrees import FreedomEstimate
 from .flags import DonutFlag
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Donuts of one picture unless others are asked for.
 _SHOWN = 6
 #: Range of the residuals over their standard deviation.
 _RANGE = 5.0
+#: Meaning of the columns of the table.
+_WAVEFRONT = "wavefront beyond that of the telescope, annular Zernike term of this Noll index"
+_MEANINGS = {
+    "field_x": "field angle along x",
+    "field_y": "field angle along y",
+    "flags": "bits of DonutFlag",
+    "reasons": "flags in words",
+    "flux": "light of the star",
+    "x": "place of the chief ray from the centre of the stamp",
+    "y": "place of the chief ray from the centre of the stamp",
+    "background": "uniform level left on the stamp",
+    "fwhm": "full width at half maximum of the long exposure",
+    "chi2": "sum of squares of the residuals over their variance",
+    "n_pixels": "number of the pixels in that sum",
+    "companion_ratio": "flux of the second star of a blend over that of the first",
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class DonutFit:
+class DonutFit(Result):
     """Wavefronts of n donuts, one array element each; NaN where a flag says that there is no result.
 
     Attributes
@@ -130,6 +148,9 @@ class DonutFit:
         """Root of the summed squares of the Zernikes [m], shape [n]."""
         return np.sqrt((self.zernikes**2).sum(axis=1))
 
+    def _label(self) -> str:
+        return f"{len(self)} donuts, {int(self.usable.sum())} with results, Zernikes {self.noll[0]} to {self.noll[-1]}"
+
     def to_table(self) -> QTable:
         """Return one row a donut, with units: field, flags, Zernikes and their errors, and the star's own unknowns."""
         table = QTable()
@@ -144,6 +165,10 @@ class DonutFit:
         table["companion_ratio"] = self.companion[:, 0]
         for k, j in enumerate(self.noll):
             table[f"Z{j}"], table[f"Z{j}_err"] = self.zernikes[:, k] * 1e9 * u.nm, self.errors[:, k] * 1e9 * u.nm
+        for name in table.colnames:
+            table[name].info.description = _MEANINGS.get(name.removesuffix("_err"), _WAVEFRONT)
+            if name.endswith("_err"):
+                table[name].info.description = f"standard error of {name.removesuffix('_err')}"
         table.meta.update(
             telescope=self.telescope,
             wavelength_nm=(self.wavelengths * 1e9).tolist(),
@@ -152,50 +177,43 @@ class DonutFit:
         )
         return table
 
-    def summary(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit, of plain numbers and lists; None in place of NaN."""
         out: dict[str, Any] = {
             "telescope": self.telescope,
-            "wavelength_nm": (self.wavelengths * 1e9).tolist(),
+            "wavelength_nm": self.wavelengths * 1e9,
             "obscuration": self.obscuration,
-            "noll": self.noll.tolist(),
-            "field_deg": np.rad2deg(self.fields).tolist(),
-            "flags": self.flags.tolist(),
+            "noll": self.noll,
+            "field_deg": np.rad2deg(self.fields),
+            "flags": self.flags,
             "reasons": self.reasons,
-            "zernike_nm": _plain(self.zernikes * 1e9),
-            "zernike_error_nm": _plain(self.errors * 1e9),
-            "flux_electrons": _plain(self.flux),
-            "center_pixels": _plain(self.center),
-            "background_electrons": _plain(self.background),
-            "fwhm_arcsec": _plain(arcseconds(self.fwhm)),
-            "chi2": _plain(self.chi2),
-            "n_pixels": self.n_pixels.tolist(),
-            "companion_ratio": _plain(self.companion[:, 0]),
+            "zernike_nm": self.zernikes * 1e9,
+            "zernike_error_nm": self.errors * 1e9,
+            "flux_electrons": self.flux,
+            "center_pixels": self.center,
+            "background_electrons": self.background,
+            "fwhm_arcsec": arcseconds(self.fwhm),
+            "chi2": self.chi2,
+            "n_pixels": self.n_pixels,
+            "companion_ratio": self.companion[:, 0],
         }
         if self.double_zernikes is not None:
-            out["double_zernike_nm"] = _plain(self.double_zernikes * 1e9)
+            out["double_zernike_nm"] = self.double_zernikes * 1e9
         if self.degrees_of_freedom is not None:
             out["degrees_of_freedom"] = self.degrees_of_freedom.summary()
         return out
 
-    def plot(self, donuts: slice | list[int] | None = None) -> Figure:
+    def plot(self, donuts: slice | list[int] | None = None, *, ax: Axes | Figure | None = None) -> Figure:
         """Draw stamps, models and residuals of some donuts, the first six by default, and their Zernikes."""
-        return _draw(self, donuts)
+        return _draw(self, donuts, ax)
 
 
-def _plain(values: np.ndarray) -> Any:
-    """Return an array as lists of numbers, None in place of NaN."""
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return plain.tolist()
-
-
-def _draw(fit: DonutFit, donuts: slice | list[int] | None) -> Figure:
+def _draw(fit: DonutFit, donuts: slice | list[int] | None, ax: Axes | Figure | None) -> Figure:
     """Draw a fit; see :meth:`DonutFit.plot`."""
     chosen = np.arange(len(fit))[slice(_SHOWN) if donuts is None else donuts]
     n = len(chosen)
     with styled():
-        figure = new_figure(max(7.0, 1.9 * n + 0.8), 9.2)
+        figure = figure_at(ax, max(7.0, 1.9 * n + 0.8), 9.2)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.75, 1.0))
         upper, lower = parts
         panels = upper.subplots(3, n, squeeze=False, sharex=True, sharey=True)

@@ -10,6 +10,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.progress import Reporter
 from ...core.random_streams import stream
+from ...core.result import Result
 from ...core.threads import one_blas_thread
 from ...pipeline.wavefront_sensing.result import DonutFit
 from .config import AlignConfig
@@ -23,7 +24,7 @@ _STEADY = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class Alignment(Result):
     """Visits of a loop. States are in units of the tolerances, in the order of the degrees of freedom.
 
     Attributes
@@ -47,6 +48,8 @@ class Alignment:
     first, last : DonutFit
         Donuts of the first and the last visit.
     """
+
+    _table = ("expected", "donuts", "states", "estimates", "errors")
 
     scene: AlignmentScene
     designed: FieldMeans

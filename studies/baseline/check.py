@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...core.arguments import check_arguments
+from ...core.plotting import BLUE, GREY, RED, axes_at, plain_text, styled
+from ...core.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Rows of a table that are shown by default; fewer where all metrics pass.
 _SHOWN, _SHOWN_PASSED = 20, 3
@@ -16,15 +22,31 @@ _COLUMNS = ("metric", "now", "baseline", "tolerance", "unit", "deviation / toler
 
 @dataclass(frozen=True)
 class Deviation:
-    """One metric against its baseline."""
+    """One metric against its baseline.
+
+    Attributes
+    ----------
+    name, unit : str
+        Metric, and the unit of its values.
+    stored : float
+        Value of the baseline.
+    tolerance : float
+        Largest change that passes.
+    found : float or None
+        Present value; None where it cannot be computed.
+    checked_against : str or None
+        Independent source of the stored value.
+    problem : str or None
+        Reason why it cannot be computed.
+    """
 
     name: str
     unit: str
-    stored: float  #: value of the baseline
+    stored: float
     tolerance: float
-    found: float | None  #: present value; None where it cannot be computed
-    checked_against: str | None  #: independent source of the stored value
-    problem: str | None = None  #: reason why it cannot be computed
+    found: float | None
+    checked_against: str | None
+    problem: str | None = None
 
     @property
     def ratio(self) -> float:
@@ -41,7 +63,7 @@ class Deviation:
 
 
 @dataclass(frozen=True)
-class BaselineCheck:
+class BaselineCheck(Result):
     """All metrics of a baseline against their present values.
 
     Attributes
@@ -53,6 +75,8 @@ class BaselineCheck:
     notes : tuple of str
         Other changes since: version, prescription, configuration.
     """
+
+    _row_type = Deviation
 
     path: str
     model: str
@@ -77,7 +101,32 @@ class BaselineCheck:
             return f"{self.path}: all {count} metrics of {self.model} within their tolerances"
         return f"{self.path}: {len(self.out)} of {count} metrics of {self.model} out of tolerance"
 
-    def summary(self) -> dict[str, Any]:
+    def _label(self) -> str:
+        return self.verdict
+
+    def _columns(self) -> dict[str, Any]:
+        rows = self.deviations
+        texts = {
+            name: [getattr(d, name) or "" for d in rows] for name in ("name", "unit", "checked_against", "problem")
+        }
+        found = [np.nan if d.found is None else d.found for d in rows]
+        numbers = {name: [getattr(d, name) for d in rows] for name in ("stored", "tolerance", "ratio")}
+        return {"name": texts["name"], "unit": texts.pop("unit"), "found": found, **numbers, **texts}
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the change of each metric in units of its tolerance, the worst twenty."""
+        worst = [d for d in self.deviations if np.isfinite(d.ratio)][:20]
+        with styled():
+            figure, axes = axes_at(ax, 6.4, 1.2 + 0.22 * len(worst))
+            colors = [BLUE if d.ratio <= 1.0 else RED for d in worst]
+            axes.barh(np.arange(len(worst)), [d.ratio for d in worst], color=colors, height=0.7)
+            axes.axvline(1.0, color=GREY, linewidth=0.8)
+            axes.set_yticks(np.arange(len(worst)), [plain_text(d.name) for d in worst])
+            axes.invert_yaxis()
+            axes.set(xlabel="change over tolerance", title=plain_text(self.model))
+            return figure
+
+    def _summary(self) -> dict[str, Any]:
         """Return the result as plain numbers, deviations worst first."""
         return {
             "baseline": self.path,

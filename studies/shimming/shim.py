@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -17,6 +18,7 @@ import scipy.optimize
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_choice
 from ...core.progress import Reporter
+from ...core.result import Result
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
@@ -37,11 +39,19 @@ _UNIT = 1e-6
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of a part as a rigid body, as :meth:`~pachon.FocalPlane.with_moved` takes it."""
+    """Motion of a part as a rigid body, as :meth:`~pachon.FocalPlane.with_moved` takes it.
 
-    dz: float = 0.0  #: along +z [m]
-    rx: float = 0.0  #: about x [rad]
-    ry: float = 0.0  #: about y [rad]
+    Attributes
+    ----------
+    dz : float
+        Along +z [m].
+    rx, ry : float
+        About x and y [rad].
+    """
+
+    dz: float = 0.0
+    rx: float = 0.0
+    ry: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -53,17 +63,37 @@ class StateMetrics:
 
 
 @dataclass(frozen=True, eq=False)
-class Shims:
-    """Motions of the parts of a focal plane, and what they gain."""
+class Shims(Result):
+    """Motions of the parts of a focal plane, and what they gain.
+
+    Attributes
+    ----------
+    merit, parts : str
+        What was minimised, and what was moved.
+    focus : Motion
+        Of the whole focal plane, about the origin.
+    motions : dict of str to Motion
+        Of each part, beside the focus.
+    fitted, checked : dict of str to StateMetrics
+        By state, from the curves at the nodes of the fit, and from the engine at other places.
+    focused, focal_plane : FocalPlane
+        Focused as a whole, and shimmed.
+    """
+
+    _row_type = Motion
 
     merit: str
     parts: str
-    focus: Motion  #: of the whole focal plane, about the origin
-    motions: dict[str, Motion]  #: of each part, beside the focus
-    fitted: dict[str, StateMetrics]  #: by state, from the curves at the nodes of the fit
-    checked: dict[str, StateMetrics]  #: by state, from the engine at other places
+    focus: Motion
+    motions: dict[str, Motion]
+    fitted: dict[str, StateMetrics]
+    checked: dict[str, StateMetrics]
     focused: FocalPlane
-    focal_plane: FocalPlane  #: shimmed
+    focal_plane: FocalPlane
+
+    def _columns(self) -> dict[str, Any]:
+        moved = self.motions.values()
+        return {"motions": list(self.motions), **{k: [getattr(m, k) for m in moved] for k in ("dz", "rx", "ry")}}
 
 
 @check_arguments

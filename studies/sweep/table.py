@@ -12,8 +12,10 @@ import numpy as np
 from astropy.table import Table
 
 from ...core.arguments import check_arguments
+from ...core.docstrings import Description
 from ...core.errors import ProductError
 from ...core.products import Columns, described_table
+from ...core.result import Result
 from ...core.table_files import write_table
 from ..metrics.stars import STARS
 from .store import SweepStore, readable_rows
@@ -22,7 +24,7 @@ _UNITS = ("um", "nm", "mm", "m", "urad", "rad", "deg", "arcsec", "s")
 
 
 @dataclass(frozen=True)
-class SweepTable:
+class SweepTable(Result):
     """Parameters and metrics of the computed points.
 
     Attributes
@@ -51,6 +53,15 @@ class SweepTable:
 
     def __len__(self) -> int:
         return len(self.number)
+
+    def _label(self) -> str:
+        return f"{self.name}, {len(self)} points, {len(self.parameters)} parameters, {len(self.metrics)} metrics"
+
+    def _columns(self) -> dict[str, Any]:
+        return {name: values for name, (values, _, _) in _columns(self).items()}
+
+    def _described(self, name: str) -> Description:
+        return Description(*_columns(self)[name][1:])
 
 
 @check_arguments
@@ -96,7 +107,7 @@ def export_table(store: SweepStore, path: Path) -> int:
     if not len(table):
         raise ProductError(f"{store.path}: no point has been computed yet")
     meta = {"what": f"sweep {table.name}", "pachon": store.about["pachon"], "digest": store.about["digest"]}
-    write_table(path, _columns(table, meta))
+    write_table(path, described_table(_columns(table), meta))
     return len(table)
 
 
@@ -117,7 +128,7 @@ def salvage(path: Path, out: Path) -> int:
     return len(rows)
 
 
-def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
+def _columns(table: SweepTable) -> Columns:
     columns: Columns = {
         "number": (table.number, "", "number of the point"),
         "seed": (table.seed, "", "seed of its random numbers"),
@@ -126,7 +137,7 @@ def _columns(table: SweepTable, meta: dict[str, Any]) -> Table:
     columns |= {name: (values, STARS.unit(name) or _unit(name), "metric") for name, values in table.metrics.items()}
     columns["problem"] = (table.problem, "", "reason why it could not be computed")
     columns["seconds"] = (table.seconds, "s", "time of the computation")
-    return described_table(columns, meta)
+    return columns
 
 
 def _plain(values: np.ndarray) -> np.ndarray:

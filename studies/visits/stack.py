@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError
 from ...core.products import Stamp, column, image_hdu, read_fits, table_hdu, write_fits
+from ...core.result import Result
 from ...core.units import ARCMIN, ARCSEC
 from ...pipeline.measure.shapes import Shapes, measure_shapes
 from .psf_visit import VisitPsfs
@@ -66,7 +67,7 @@ class PsfSums:
 
 
 @dataclass(frozen=True, eq=False)
-class PsfStack:
+class PsfStack(Result):
     """PSFs of the stack of a number of visits at the points that at least half of them saw.
 
     Attributes
@@ -88,6 +89,9 @@ class PsfStack:
     model_e1, model_e2, model_size : ndarray, shape [n]
         Those of the model.
     """
+
+    _table = ("xi", "eta", "star", "count", "e1", "e2", "size", "model_e1", "model_e2", "model_size")
+    _images = ("true", "model")
 
     visits: int
     xi: np.ndarray
@@ -162,7 +166,7 @@ class PsfStack:
         return len(self.xi)
 
     @check_arguments
-    def write(self, path: Path, stamp: Stamp) -> None:
+    def write_product(self, path: Path, stamp: Stamp) -> None:
         """Write the stack as a FITS table of points and two cubes of images."""
         table = table_hdu(
             "POINTS",

@@ -127,7 +127,7 @@ def stack_visits(
         sums.add(seen)
         if sums.visits in config.kept:
             stack = PsfStack.of(sums, points.sky, points.star, frame.matrix, scale, experiment.weight_fwhm)
-            stack.write(stack_path(folder, sums.visits), stamp)
+            stack.write_product(stack_path(folder, sums.visits), stamp)
         # Written last: visits that it counts have left their stack.
         sums.write(folder / SUMS_NAME, stamp)
     stacks = {n: PsfStack.read(stack_path(folder, n), stamp) for n in config.kept}

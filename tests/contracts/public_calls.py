@@ -133,9 +133,8 @@ class _Made:
         return pachon.load_sweep(ROOT / "studies/sweep/examples/table1_small.yaml")
 
     def make_ccd_image(self):
-        return pachon.CcdImage(
-            "R22_S11", self.image, np.ones_like(self.image), np.zeros(self.image.shape, int), fits.Header()
-        )
+        mask = np.zeros(self.image.shape, int)
+        return pachon.CcdImage("R22_S11", self.image, np.ones_like(self.image), mask, fits.Header({"ZEROPNT": 27.0}))
 
     def make_table(self):
         third = [0.0, 1e-3, 2e-3]

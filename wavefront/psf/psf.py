@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
+from ...core.plotting import draw_stamps
+from ...core.result import Result
 from ...core.units import ARCSEC, angle, length, metres, pure_numbers, radians
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.silicon import Silicon
@@ -21,12 +23,16 @@ from .engine import PsfInputs, Recenter, center_focal_length
 from .engines import ENGINES
 from .image_plane import ImagePlane
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 #: Value of :attr:`Psfs.flags` for a dark star: none of its light reaches the focal plane, and its image is zero.
 DARK = 1
 
 
 @dataclass(frozen=True)
-class Psfs:
+class Psfs(Result):
     """Point spread functions of stars.
 
     Attributes
@@ -52,6 +58,9 @@ class Psfs:
         0, or :data:`DARK`.
     """
 
+    _table = ("fields", "reference_point", "offset", "lit_fraction", "inside", "flags")
+    _images = ("image",)
+
     image: np.ndarray
     pixel_scale: float
     fields: np.ndarray
@@ -62,10 +71,15 @@ class Psfs:
     inside: np.ndarray
     flags: np.ndarray
 
-    def __repr__(self) -> str:
+    def _label(self) -> str:
         waves = [f"{1e9 * w:.6g}" for w in self.wavelengths[:3]] + ["..."] * (len(self.wavelengths) > 3)
         pixel = f"pixels of {self.pixel_scale / ARCSEC:.4g} arcsec"
-        return f"<Psfs: images {list(self.image.shape)}, {pixel}, {', '.join(waves)} nm>"
+        return f"images {list(self.image.shape)}, {pixel}, {', '.join(waves)} nm"
+
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the first six images, each with a square root stretch."""
+        titles = [f"({x:.3g}, {y:.3g})°" for x, y in np.rad2deg(self.fields)]
+        return draw_stamps(ax, self.image, self.pixel_scale / ARCSEC, titles)
 
 
 @check_arguments

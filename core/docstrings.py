@@ -1,0 +1,65 @@
+"""Units and meanings of attributes and arguments, as the docstrings state them."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from typing import Any, NamedTuple
+
+_SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", flags=re.M)
+_ENTRY = re.compile(r"^(\w[\w, ]*) : .*$", flags=re.M)
+_SHAPE = re.compile(r",? (?:of )?(?:same )?(?:shape )?\[(?:n|n[xy]|n_\w+|k|\d+)(?:, [^]]*)?\](?: bool)?")
+_MARKUP = re.compile(r":\w+:`[~.]*([^`]*)`|``?([^`]*)``?")
+#: Names of units in docstrings that astropy spells in another way.
+_SPELLINGS = {"electrons": "electron", "pixels": "pixel", "cycles": "1", " a ": "/", "deg C": "deg_C", "AB ": ""}
+
+
+class Description(NamedTuple):
+    """Meaning of an attribute, from the docstrings of its class."""
+
+    unit: str  #: as astropy parses it; empty for pure numbers
+    text: str  #: its first sentence
+
+
+def described(kind: Any, name: str) -> Description:
+    """Return unit and meaning of an attribute of a class, or of an argument of a class or function."""
+    member = inspect.getattr_static(kind, name, None)
+    text = inspect.getdoc(member) if isinstance(member, (property, functools.cached_property)) else None
+    if text is None:
+        lists = (_listed(base.__doc__) for base in getattr(kind, "__mro__", [kind]) if base.__doc__)
+        text = next((entries[name] for entries in lists if name in entries), "")
+    return Description(_unit_of(text), _first_sentence(text))
+
+
+def _listed(docstring: str) -> dict[str, str]:
+    """Return the entries of the sections Attributes and Parameters of a docstring, by name."""
+    found = {}
+    sections = _SECTION.split(inspect.cleandoc(docstring))
+    for title, body in zip(sections[1::2], sections[2::2], strict=True):
+        if title in ("Attributes", "Parameters"):
+            entries = _ENTRY.split(body)
+            for names, meaning in zip(entries[1::2], entries[2::2], strict=True):
+                found.update(dict.fromkeys(names.split(", "), " ".join(meaning.split())))
+    return found
+
+
+def _first_sentence(text: str) -> str:
+    sentence = re.split(r"(?<=[^.][\w\])])\. |\n\n", text)[0]
+    return _MARKUP.sub(r"\1\2", _SHAPE.sub("", " ".join(sentence.split()))).rstrip(".")
+
+
+@functools.cache
+def _unit_of(text: str) -> str:
+    """Return the first unit in square brackets, as astropy spells it; empty where there is none."""
+    from astropy import units as u
+
+    for found in re.findall(r"\[([^][,]*[A-Za-z][^][,]*)\]", _SHAPE.sub("", text)):
+        for said, spelt in _SPELLINGS.items():
+            found = found.replace(said, spelt)
+        try:
+            # What follows says what they are counted from, as in "pixels from the centre".
+            return str(u.Unit(re.split(" from | of ", found)[0]).to_string())
+        except ValueError:
+            continue
+    return ""
