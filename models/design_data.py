@@ -119,6 +119,8 @@ class DesignData:
             _refuse("fields: expected angles within 90 degrees of the axis")
         if self.telecentric and (self.aiming != "off" or (self.fields and self.field_type == "angle")):
             _refuse("telecentric: expected object or image heights as fields, and no aiming")
+        if self.telecentric and self.aperture in ("entrance_pupil", "f_number"):
+            _refuse(f"telecentric: expected object_na, working_f_number or stop as aperture, not {self.aperture}")
 
     @property
     def unit(self) -> float:

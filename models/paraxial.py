@@ -193,7 +193,9 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
         raise DomainError(f"{telescope.name}: expected an aperture in its design data")
     diameter = image.diameter(data.aperture, data.aperture_value)
     if not 0 < diameter < math.inf:
-        raise DomainError(f"{telescope.name}: {data.aperture} = {data.aperture_value:g}: expected a pupil of finite size")
+        raise DomainError(
+            f"{telescope.name}: {data.aperture} = {data.aperture_value:g}: expected a pupil of finite size"
+        )
     return replace(telescope, stop_z=telescope.surfaces[0].vertex[2] - image.z + 0.0, pupil_diameter=diameter)
 
 

@@ -120,7 +120,7 @@ class Telescope:
     camera: str | None = None
     obstructions: tuple[Obstruction, ...] = ()
     object_distance: float = math.inf
-    design_data: DesignData = DesignData()
+    design_data: DesignData = field(default_factory=DesignData)
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.surfaces]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -178,8 +178,8 @@ def mtf(
     angles = tangential_angle(telescope, principal)
     shape = (2, len(request.fields), len(frequency))
     transfer, perfect, rays = np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, complex)
-    for i, (field, center, angle) in enumerate(zip(request.fields, diagram.reference_point, angles, strict=True)):
-        one = replace(request, fields=field[None])
+    for i, (center, angle) in enumerate(zip(diagram.reference_point, angles, strict=True)):
+        one = request.at_fields(slice(i, i + 1))
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             found = lattice_wavelets(one, float(wavelength), center, float(wavelength) * step, float(angle))
             for total, pupil in ((transfer, found.wavelets.field), (perfect, np.abs(found.wavelets.field))):

@@ -213,7 +213,14 @@ def wavefront_zernikes(
     """
     check_choice("pupil", pupil, PUPILS)
     request = Request.of(
-        telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+        telescope,
+        fields,
+        wavelength,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     points, sample, w = request.fields, request.pupil, request.wavelength
     jmax = require_count(jmax, "jmax", 1, len(sample))
@@ -221,7 +228,15 @@ def wavefront_zernikes(
     terms = annular_zernikes(jmax, x, y, telescope.pupil_obscuration).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
     for part, some in request.parts():
-        optics = trace_pupils(telescope, some.fields, w, sample.points, projection=projection, threads=threads)
+        optics = trace_pupils(
+            telescope,
+            some.fields,
+            w,
+            sample.points,
+            vignetting=some.vignetting,
+            projection=projection,
+            threads=threads,
+        )
         value = -optics.path[:, 0]
         used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
         coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, some.fields, pupil)

@@ -145,7 +145,14 @@ def footprint(
         raise DomainError("surfaces = []: expected the name of a surface at least")
     wanted = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
     request = Request.of(
-        telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+        telescope,
+        fields,
+        wavelength,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     n_field = len(request.fields)
     angle = np.linspace(0.0, 2.0 * np.pi, _RIM)

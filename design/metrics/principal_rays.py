@@ -19,7 +19,8 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, new_figure, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus, field_direction, launch_bundles
+from ...raytrace.launch import launch_bundles
+from ...raytrace.rays import RayStatus, field_direction
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
 from ...wavefront.pupil_sampling import pupil_sampling
@@ -161,7 +162,7 @@ def principal_rays(
     DomainError
         If a field or the wavelength lies outside what the telescope covers, or a chief ray does not reach the detector.
     """
-    request = Request.of(telescope, fields, wavelength, projection=projection, threads=threads)
+    request = Request.of(telescope, fields, wavelength, projection=projection, threads=threads, one_wavelength=True)
     _ = request.wavelength  # one only
     return principal_rays_of(request)
 
@@ -180,7 +181,7 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     # Per field: the direction of the chief ray and four beside it; each through centre, near zone and rim of the pupil.
     near = (slopes[:, None] + steps).reshape(-1, 2)
     rim = 0.5 * telescope.pupil_diameter * np.stack([axes, -axes], axis=2).reshape(n, 4, 2)
-    through = np.repeat(np.concatenate([np.zeros((n, 1, 2)), _NEAR * rim, rim], axis=1), 5, axis=0)
+    through = np.repeat(request.vignetted(np.concatenate([np.zeros((n, 1, 2)), _NEAR * rim, rim], axis=1)), 5, axis=0)
     directions = field_direction(near[:, 0], near[:, 1], "gnomonic")
     end = trace(telescope, launch_bundles(telescope, directions, wavelength, through), threads=request.threads)
     position, direction = end.position.reshape(n, 5, 9, 3), end.direction.reshape(n, 5, 9, 3)

@@ -196,7 +196,7 @@ def spot_diagram(request: Request, reference: str = "centroid") -> SpotDiagram:
     """Return the spot diagram of a request."""
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     principal = principal_rays_of(request)
-    chief = bundles[len(bundles) // 2].chief_landing()
+    chief = bundles[request.middle_index].chief_landing()
     lit = np.stack([b.lit for b in bundles], axis=1)
     diagram = SpotDiagram(
         request=request,

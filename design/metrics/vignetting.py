@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,8 +119,9 @@ def vignetting(
         n_pupil=count,
         projection=projection,
         threads=threads,
+        one_wavelength=True,
     )
-    everywhere = replace(request, fields=np.concatenate([np.zeros((1, 2)), request.fields]))
+    everywhere = request.at_fields(np.concatenate([np.zeros((1, 2)), request.fields]))
     quarters = np.empty((len(everywhere.fields), 4))
     for part, some in everywhere.parts():
         lit = some.bundles(request.wavelength).lit

@@ -24,7 +24,19 @@ from pydantic import AfterValidator
 from ....core.schema import Section, checked, expected
 from ....core.yaml_reader import as_number
 from ...design_data import DesignData
-from .values import Flag, Info, Numbers, OptionalLength, OptionalNumber, OptionalText, Turn, Wave, Wavelengths, to_si, unit_of
+from .values import (
+    Flag,
+    Info,
+    Numbers,
+    OptionalLength,
+    OptionalNumber,
+    OptionalText,
+    Turn,
+    Wave,
+    Wavelengths,
+    to_si,
+    unit_of,
+)
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -126,8 +138,8 @@ class DesignSection(Section):
             found |= {"wavelengths": self.wavelengths.values, "wavelength_weights": self.wavelengths.weights}
         if self.environment is not None:
             found |= {"temperature": self.environment.temperature_k, "pressure": self.environment.pressure_pa}
-        flags = {"telecentric": self.telecentric, "afocal": self.afocal}
-        return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **flags, **found)
+        found |= {"telecentric": self.telecentric, "afocal": self.afocal}
+        return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **found)
 
 
 def _only(section: Section, but: tuple[str, ...] = ()) -> tuple[str, Any]:

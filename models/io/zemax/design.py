@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def read_environment(header: Block) -> tuple[float | None, float | None]:
     return line.number(0) + ZERO_CELSIUS, line.number(1, 1.0) * STANDARD_ATMOSPHERE
 
 
-def stated_fields(fields: Fields, unit: float) -> dict[str, object]:
+def stated_fields(fields: Fields, unit: float) -> dict[str, Any]:
     """Return the arguments of :class:`DesignData` about the fields, in the axes of the telescope."""
     scale = math.radians(1.0) if fields.kind == 0 else unit
     mirrored = fields.points * np.array([-scale, scale]) + 0.0
@@ -126,7 +127,7 @@ def design_lines(data: DesignData, unit: float) -> list[str]:
 
 def stop_lines(data: DesignData, unit: float) -> list[str]:
     """Return the lines of the header with the aperture as stated, and ray aiming at the stop."""
-    assert data.aperture is not None and data.aperture_value is not None
+    assert data.aperture_value is not None
     value = data.aperture_value
     line = {
         "entrance_pupil": f"ENPD {number_text(value / unit)}",
@@ -134,5 +135,5 @@ def stop_lines(data: DesignData, unit: float) -> list[str]:
         "working_f_number": f"FNUM {number_text(value)} 1",
         "object_na": f"OBNA {number_text(value)} 0",
         "stop": "FLOA",
-    }[data.aperture]
+    }[data.aperture or ""]
     return [line, f"RAIM 0 {AIMING.index(data.aiming)} 1 1 0 0 0 0 0 1"]

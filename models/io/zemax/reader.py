@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
-from ...media.dispersion import model_glass
 from ...design_data import DesignData
+from ...media.dispersion import model_glass
 from ...media.medium import Medium, RelativeToAir
 from ...paraxial import ParaxialSurfaces
 from ...shapes.shape import Plane

@@ -85,7 +85,10 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
         axes = HALF_TURN @ surface.matrix @ HALF_TURN
         own = _surface_lines(surface, before, glasses, unit)
         if own_stop and surface.name == data.stop:
-            own += ["STOP", *([f"DIAM {number_text((data.aperture_value or 0.0) / unit)} 1"] * (data.aperture == "stop"))]
+            own += [
+                "STOP",
+                *([f"DIAM {number_text((data.aperture_value or 0.0) / unit)} 1"] * (data.aperture == "stop")),
+            ]
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
         else:
