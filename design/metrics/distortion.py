@@ -91,7 +91,7 @@ class Distortion(FieldResult):
             "largest_percent_of_axis_scale": float(np.nanmax(np.abs(self.percent_of_axis_scale), initial=0.0)),
             "largest_shift_um": float(shift.max()) * 1e6,
             "rms_shift_um": float(np.sqrt((shift**2).mean())) * 1e6,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "position_mm": self.position * 1e3,
             "predicted_mm": self.predicted * 1e3,
             "percent": self.percent,

@@ -18,7 +18,7 @@ from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import FEW, field_colors, field_text, panel_grid
+from ..drawing import FEW, field_colors, panel_grid
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Footprint(FieldResult):
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "surfaces": [
                 {
                     "name": s.surface.name,
@@ -103,7 +103,7 @@ class Footprint(FieldResult):
             large = len(self.surfaces) == 1
             figure, panels = panel_grid(len(self.surfaces), *((6.0, 5.6) if large else (2.9, 3.0)))
             for axes, footprint in zip(panels, self.surfaces, strict=True):
-                _draw_surface(axes, footprint, colors, [field_text(f) for f in self.fields])
+                _draw_surface(axes, footprint, colors, self.field_labels())
             panels[0].plot([], [], ".", color=RED, markersize=6.0, label="blocked here first")
             handles, labels = panels[0].get_legend_handles_labels()
             if len(self.fields) > FEW:

@@ -97,11 +97,11 @@ class PrincipalRays(FieldResult):
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "chief_landing_mm": self.chief_landing * 1e3,
             "chief_incidence_deg": np.rad2deg(self.chief_angle),
             "f_number": self.f_number,
-            "plate_scale_arcsec_per_um": np.rad2deg(self.plate_scale) * 3600e-6,
+            **self.of_sky({"plate_scale_arcsec_per_um": np.rad2deg(self.plate_scale) * 3600e-6}),
             "exit_pupil_m": self.exit_pupil,
             "exit_pupil_distance_m": self.exit_pupil_distance,
             "exit_pupil_diameter_m": self.exit_pupil_diameter,
@@ -109,7 +109,7 @@ class PrincipalRays(FieldResult):
 
     def plot(self) -> Figure:
         """Draw focal ratio, plate scale, exit pupil and incidence against the distance from the axis."""
-        radius = np.rad2deg(self.off_axis_angle)
+        radius, distance = self.axis_distances()
         order = np.argsort(radius, kind="stable")
         pairs = [
             ("working focal ratio", self.f_number),
@@ -132,7 +132,7 @@ class PrincipalRays(FieldResult):
                 finish_axes(axes)
                 axes.ticklabel_format(useOffset=False)
             for axes in panels[2:5]:
-                axes.set_xlabel("distance from the axis [deg]")
+                axes.set_xlabel(distance)
                 axes.tick_params(labelbottom=True)
             return self._titled(figure, f"chief and marginal rays, {self._nanometres()}")
 

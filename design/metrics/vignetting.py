@@ -58,7 +58,7 @@ class Vignetting(FieldResult):
             "axis_fraction": self.axis_fraction,
             "smallest_relative": float(self.relative.min()),
             "largest_error": float(self.error.max()),
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "radius_deg": np.rad2deg(self.off_axis_angle),
             "fraction": self.lit_fraction,
             "error": self.error,
