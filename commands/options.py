@@ -22,6 +22,13 @@ TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
 Lenient = Annotated[bool, Option("--lenient", help="batoid, Zemax or CODE V file: warn about unknown parts and go on.")]
+GlassCatalogues = Annotated[
+    list[Path] | None,
+    Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a Zemax or CODE V file, once for each."),
+]
+Aiming = Annotated[
+    str | None, Option(help="Rays fill the entrance pupil (off), or the stop (paraxial, real); as the file says.")
+]
 WavelengthNm = Annotated[float | None, Option("--wavelength-nm", help="Wavelength [nm]; the model's own by default.")]
 FieldsDeg = Annotated[
     list[str] | None,
@@ -29,7 +36,7 @@ FieldsDeg = Annotated[
         "--field-deg",
         metavar="X,Y | R",
         help="Field angle [deg], or a distance from the axis along +y; once for each field. "
-        "By default five from the axis to the edge.",
+        "By default those of the file, or five from the axis to the edge.",
     ),
 ]
 WavelengthsNm = Annotated[

@@ -14,10 +14,14 @@ from rich.table import Table
 class Column(NamedTuple):
     """A column of numbers or names."""
 
-    heading: str  #: with the unit in brackets
+    heading: str | Callable[[dict[str, Any]], str]  #: with the unit in brackets; or function of the summary
     values: str | Callable[[Any], Any]  #: key of the result's summary, or function from the result to a value per row
     form: str = ""  #: format of the numbers; of pairs that of each
     scale: float = 1.0  #: factor from the value to the unit of the heading
+
+    def title(self, summary: dict[str, Any]) -> str:
+        """Return the heading."""
+        return self.heading(summary) if callable(self.heading) else self.heading
 
     def texts(self, result: Any, summary: dict[str, Any]) -> list[str]:
         """Return the cells of the column."""
@@ -25,8 +29,18 @@ class Column(NamedTuple):
         return number_texts(values if self.scale == 1.0 else self.scale * values, self.form)
 
 
-#: Field angles, the first column of most tables.
-FIELD = Column("field [deg]", "field_deg", ".4g")
+#: Field angles, or heights of an object at a finite distance: the first column of most tables.
+FIELD = Column(
+    lambda summary: "object [mm]" if "object_mm" in summary else "field [deg]",
+    lambda result: list(result.field_items().values())[-1],
+    ".4g",
+)
+
+
+def field_headings(result: Any) -> list[str]:
+    """Return the field points of a result as headings of columns."""
+    (name, values) = list(result.field_items().items())[-1]
+    return [f"{text}°" if name == "field_deg" else f"{text} mm" for text in number_texts(values, ".4g")]
 
 
 @dataclass(frozen=True)

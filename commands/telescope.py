@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from .inputs import load_model
-from .options import Json, Lenient, Model
+from .options import GlassCatalogues, Json, Lenient, Model
 from .tables import Rows, plain_table, print_json, wide_console
 
 app = typer.Typer()
@@ -18,6 +18,7 @@ app = typer.Typer()
 @app.command("info")
 def info_command(
     model: Annotated[str | None, Argument(help="Bundled model, or path of a prescription.")] = None,
+    glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
     as_json: Json = False,
 ) -> None:
@@ -47,7 +48,7 @@ def info_command(
             table.add_row(entry["name"], entry["description"])
         console.print(table)
         return
-    description = describe(load_model(model, lenient))
+    description = describe(load_model(model, lenient, glass_catalogue or ()))
     if as_json:
         print_json(description)
         return
@@ -66,9 +67,7 @@ def convert_command(
     model: Model,
     out: Annotated[Path, Argument(metavar="OUT", help="File to write: .yaml (ours) or .zmx (Zemax).")],
     format: Annotated[str, Option(help="Format: pachon, batoid or zemax; by default that of the name.")] = "",
-    glass_catalogue: Annotated[
-        list[Path] | None, Option(metavar="FILE.agf", help="Glass catalogue, once for each.")
-    ] = None,
+    glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
 ) -> None:
     """Write a telescope in another format: a batoid, Zemax or CODE V file as ours, any model as batoid's or Zemax's.

@@ -9,7 +9,10 @@ import numpy as np
 
 from ..core.plotting import plain_text
 from ..core.result import Result
+from ..core.units import arcseconds
+from ..raytrace.rays import object_points
 from ..wavefront.request import Request
+from .drawing import field_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,6 +63,42 @@ class FieldResult(Result):
     def off_axis_angle(self) -> np.ndarray:
         """Distance of the field points from the axis [rad], shape [n_field]."""
         return np.linalg.norm(self.fields, axis=-1)
+
+    @property
+    def on_sky(self) -> bool:
+        """Whether the object is at infinity, so that field points and sizes are angles."""
+        return bool(np.isinf(self.request.telescope.object_distance))
+
+    def field_items(self) -> dict[str, np.ndarray]:
+        """Return the field angles for a summary; with the heights of an object at a finite distance."""
+        angles = {"field_deg": np.rad2deg(self.fields)}
+        return angles if self.on_sky else angles | {"object_mm": 1e3 * self.object_heights}
+
+    @property
+    def object_heights(self) -> np.ndarray:
+        """Places x, y of the field points on an object at a finite distance [m], shape [n_field, 2]."""
+        return object_points(self.request.telescope, self.request.directions)[:, :2] + 0.0
+
+    def axis_distances(self) -> tuple[np.ndarray, str]:
+        """Return distances of the field points from the axis, in degrees or millimetres of the object, and a label."""
+        if self.on_sky:
+            return np.rad2deg(self.off_axis_angle), "distance from the axis [deg]"
+        return 1e3 * np.linalg.norm(self.object_heights, axis=-1), "distance of the object from the axis [mm]"
+
+    def field_labels(self) -> list[str]:
+        """Return the field points as plots name them: in degrees, or millimetres of the object."""
+        if self.on_sky:
+            return [field_text(field) for field in self.fields]
+        return [f"({x:.4g}, {y:.4g}) mm" if x else f"{y:.4g} mm" for x, y in 1e3 * self.object_heights]
+
+    def of_sky(self, items: dict[str, Any]) -> dict[str, Any]:
+        """Return entries of a summary that are angles on the sky: nothing where there is none."""
+        return items if self.on_sky else {}
+
+    def size_text(self, size: float, plate_scale: Any) -> str:
+        """Return a size on the detector [m] as text: in micrometres and, on the sky, in arc seconds."""
+        text = f"{size * 1e6:.3g} µm"
+        return f'{text} = {size * arcseconds(plate_scale):.3g}"' if self.on_sky else text
 
     def _nanometres(self) -> str:
         """Return the wavelengths as titles of plots give them."""

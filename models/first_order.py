@@ -24,6 +24,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.result import Result, Values
 from ..core.units import ARCSEC, length
+from .paraxial import curvatures_across, require_on_axis
 from .surface import Interaction, Surface
 from .telescope import Telescope
 
@@ -205,12 +206,10 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float, *, section: bool
     if not surfaces:
         raise DomainError(f"telescope {telescope.name}: expected at least one mirror or lens surface")
     for surface in surfaces:
-        axis = surface.matrix[:, 2]
-        if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:
-            raise DomainError(f"surface {surface.name} of {telescope.name}: expected one on the axis, not perturbed")
+        require_on_axis(surface, telescope.name)
     curvature = -np.array([s.shape.curvature for s in surfaces])
     if section:
-        along_x, along_y = -np.array([_curvatures(s) for s in surfaces]).T
+        along_x, along_y = -np.array([curvatures_across(s) for s in surfaces]).T
         curvature = along_y if along_y.any() else along_x
     h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([0.0, slope])
     z, index = telescope.stop_z, float(telescope.medium_before.index(w))
@@ -224,13 +223,3 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float, *, section: bool
         rows.append((index, index_after, h, u, u_after))
         index, u, z = index_after, u_after, surface.vertex[2]
     return _Trace(w, surfaces, curvature, *(np.array(v, dtype=np.float64) for v in zip(*rows, strict=True)))
-
-
-def _curvatures(surface: Surface) -> tuple[float, float]:
-    """Return the curvatures [1/m] of a surface on the axis along x and y of the telescope."""
-    own = surface.shape.curvatures
-    if own[0] == own[1]:
-        return own
-    # Euler's theorem: squares of the cosines between the axes weight the curvatures of the surface.
-    along_x, along_y = surface.matrix[:2, :2] ** 2 @ np.array(own)
-    return float(along_x), float(along_y)

@@ -56,6 +56,8 @@ class Surface:
         Clear region in the surface's own x, y; None for an unbounded one.
     rotation : nested tuple of float, shape (3, 3)
         Rotation matrix; its columns are the surface's axes in the telescope frame.
+    semi_diameter : float, optional
+        Radius [m] that the surface is made or drawn to; it stops no light.
     """
 
     name: str
@@ -65,10 +67,13 @@ class Surface:
     medium_after: Medium
     aperture: Aperture | None = None
     rotation: Matrix = IDENTITY
+    semi_diameter: float | None = None
 
     def __post_init__(self) -> None:
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
+        if self.semi_diameter is not None and not 0 < self.semi_diameter < np.inf:
+            raise PrescriptionError(f"semi_diameter = {self.semi_diameter!r}: expected a positive number")
         axes = np.array(self.rotation, dtype=np.float64)
         # 1e-9 admits what many rotations accumulate in rounding, and no scaling or reflection.
         if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-9) or np.linalg.det(axes) < 0:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, PrescriptionError, unknown_name
 from ..core.units import broadcast_together, metres, radians
+from .design_data import DesignData
 from .media.medium import ConstantIndex, Medium, check_wavelength_range, wavelengths_within
 from .obstruction import Obstruction
 from .shapes.shape import Shape, Sum
@@ -94,6 +95,8 @@ class Telescope:
     object_distance : float
         Height of the plane of the object [m], telescope frame; infinite for the sky. At a finite distance a field angle
         is that of the ray from the object through the centre of the entrance pupil.
+    design_data : DesignData
+        Aperture, fields, wavelengths and stop as the designer stated them, the defaults of calculations.
     """
 
     #: Function that error messages name to whoever gives a name in place of a telescope.
@@ -120,6 +123,7 @@ class Telescope:
     camera: str | None = None
     obstructions: tuple[Obstruction, ...] = ()
     object_distance: float = math.inf
+    design_data: DesignData = field(default_factory=DesignData)
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.surfaces]
@@ -161,6 +165,7 @@ class Telescope:
         for key, values in (("default_wavelength", (self.default_wavelength,)), ("band", self.band or ())):
             if not all(low <= v <= high for v in values):
                 raise PrescriptionError(f"{key} = {getattr(self, key)!r}: expected within the wavelength range")
+        self.design_data.check_within(names, self.wavelength_range, self.default_wavelength, self.object_distance)
         frames = {g: self.group_frames.get(g) or self._surface_frame(m[0]) for g, m in self.groups.items()}
         object.__setattr__(self, "groups", MappingProxyType({g: tuple(m) for g, m in self.groups.items()}))
         object.__setattr__(self, "group_frames", MappingProxyType(frames))
@@ -341,6 +346,16 @@ class Telescope:
             start.
         """
         return replace(self, obstructions=(*self.obstructions, *obstructions))
+
+    def with_design(self, **changes: Any) -> Telescope:
+        """Return the telescope with other :class:`DesignData`, such as ``aiming="real"``.
+
+        Raises
+        ------
+        PrescriptionError
+            If a value is not as expected.
+        """
+        return replace(self, design_data=replace(self.design_data, **changes))
 
     def check_wavelength(self, wavelength: ArrayLike) -> np.ndarray:
         """Return the wavelength [m] as a float64 array.

@@ -82,6 +82,7 @@ from .models.camera.height_statistics import HeightStatistics as HeightStatistic
 from .models.camera.height_statistics import height_statistics as height_statistics
 from .models.camera.sensor_heights import CornerSensor as CornerSensor
 from .models.camera.silicon import Silicon as Silicon
+from .models.design_data import DesignData as DesignData
 from .models.first_order import FirstOrder as FirstOrder
 from .models.first_order import SeidelSums as SeidelSums
 from .models.first_order import first_order as first_order
@@ -101,6 +102,7 @@ from .models.media.medium import RelativeToAir as RelativeToAir
 from .models.media.medium import Sellmeier as Sellmeier
 from .models.media.tabulated import TabulatedIndex as TabulatedIndex
 from .models.obstruction import Obstruction as Obstruction
+from .models.paraxial import with_floating_pupil as with_floating_pupil
 from .models.paul_baker import paul_baker as paul_baker
 from .models.shapes.freeform import Biconic as Biconic
 from .models.shapes.freeform import OddAsphere as OddAsphere
@@ -170,10 +172,10 @@ from .pipeline.wavefront_sensing.degrees import FreedomEstimate as FreedomEstima
 from .pipeline.wavefront_sensing.fit import fit_donuts as fit_donuts
 from .pipeline.wavefront_sensing.flags import DonutFlag as DonutFlag
 from .pipeline.wavefront_sensing.result import DonutFit as DonutFit
+from .raytrace.launch import launch_rays as launch_rays
 from .raytrace.mesh import land_on_mesh as land_on_mesh
 from .raytrace.rays import Rays as Rays
 from .raytrace.rays import RayStatus as RayStatus
-from .raytrace.rays import launch_rays as launch_rays
 from .raytrace.trace import TraceResult as TraceResult
 from .raytrace.trace import trace as trace
 from .sky.catalogue import read_galaxies as read_galaxies

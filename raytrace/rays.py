@@ -1,4 +1,4 @@
-"""Launch of rays: plane waves from points of the field through given points of the entrance pupil."""
+"""Rays before the first surface: directions of field points, plane waves and light from points of an object."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError
 from ..core.result import Result
-from ..core.units import angle, broadcast_together, metres, radians
+from ..core.units import broadcast_together, metres, radians
 from ..models.telescope import Telescope
 from .kernels import surface as surface_kernels
 
@@ -130,52 +130,8 @@ def check_wavelength(wavelength: Any) -> float:
     return float(value)
 
 
-@check_arguments
-def launch_rays(
-    telescope: Telescope,
-    field: tuple[ArrayLike, ArrayLike],
-    wavelength: ArrayLike,
-    pupil: tuple[ArrayLike, ArrayLike],
-    projection: str = "zemax",
-) -> Rays:
-    """Launch a plane wave from one field point through given points of the entrance pupil.
-
-    Parameters
-    ----------
-    telescope : Telescope
-        The telescope.
-    field : (tx, ty)
-        Field angles [rad]; see :func:`field_direction`.
-    wavelength : float or Quantity
-        Vacuum wavelength [m].
-    pupil : (px, py)
-        Entrance-pupil coordinates [m], arrays of one shape (flattened): points of the plane z = ``telescope.stop_z``
-        that the rays pass through.
-    projection : str
-        Meaning of the field angles.
-
-    Returns
-    -------
-    Rays
-        Rays in phase: they start on one plane perpendicular to their direction, before the first surface, or at one
-        point of the object where that is at a finite distance.
-
-    Raises
-    ------
-    DomainError
-        If the field or the wavelength lies outside what the telescope covers.
-    """
-    tx, ty = angle(field[0], "field x"), angle(field[1], "field y")
-    telescope.check_field(tx, ty)
-    wavelength = check_wavelength(wavelength)
-    telescope.check_wavelength(wavelength)
-    px, py = pupil_points(pupil)
-    points = np.stack([px.ravel(), py.ravel()], axis=-1)
-    return launch_bundles(telescope, field_direction(tx, ty, projection)[None], wavelength, points)
-
-
-def launch_bundles(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
-    """Launch the light of several field points, at any distance, through points of the entrance pupil.
+def straight_bundles(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
+    """Launch the light of several field points, at any distance, through points of the plane of the entrance pupil.
 
     ``directions`` [n_direction, 3] are those of the chief rays, as :func:`field_direction` gives them; ``pupil`` [m] is
     [n_pupil, 2], the same for all of them, or [n_direction, n_pupil, 2]. Returned are ``n_direction * n_pupil`` rays,
@@ -209,7 +165,7 @@ def require_distant_object(telescope: Telescope) -> None:
 
 
 def parallel_rays(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
-    """Launch plane waves as :func:`launch_bundles`; an object at a finite distance is a DomainError."""
+    """Launch plane waves as :func:`straight_bundles`; an object at a finite distance is a DomainError."""
     require_distant_object(telescope)
     # Components stay contiguous (structure of arrays), as the kernels read them.
     v = np.ascontiguousarray(directions.T)[:, :, None]

@@ -138,7 +138,7 @@ def trace(
     telescope : Telescope
         The telescope.
     rays : Rays
-        Rays of one wavelength, from :func:`~pachon.raytrace.rays.launch_rays` for example.
+        Rays of one wavelength, from :func:`~pachon.raytrace.launch.launch_rays` for example.
     surfaces : {"last", "all"}
         Result at the last surface, or a list with one result per surface.
     focal_plane : FocalPlane, optional

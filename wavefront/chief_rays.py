@@ -10,7 +10,8 @@ from ..core.errors import DomainError
 from ..core.units import field_label, length, metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..raytrace.rays import RayStatus, field_angles, field_direction, parallel_rays
+from ..raytrace.launch import launch_bundles
+from ..raytrace.rays import RayStatus, field_angles, field_direction, require_distant_object
 from ..raytrace.trace import TraceResult, trace
 from .request import Request
 
@@ -34,7 +35,8 @@ def chief_rays(
 
     It ends on the CCDs of a focal plane, or on the nominal detector without one.
     """
-    rays = parallel_rays(telescope, directions, wavelength, np.zeros((1, 2)))
+    require_distant_object(telescope)
+    rays = launch_bundles(telescope, directions, wavelength, np.zeros((1, 2)))
     return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
 
 

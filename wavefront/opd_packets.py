@@ -43,14 +43,17 @@ def traced_opds(
     indices = warp_array(refractive_indices(telescope, request.wavelength)[None])
     # From the centre outwards, so that a central obscuration or a rim stops whole packets.
     order = np.argsort(np.hypot(x, y), kind="stable")
-    pupil = warp_array(to_packets(np.stack([x[order], y[order]])), lanes)
+    points = request.entrance_points(request.wavelength, np.stack([x, y], axis=-1)[order])
+    pupil = warp_array(to_packets(points.T), lanes) if points.ndim == 2 else None
     place = np.full(packet_count(len(order)) * LANES, -1, dtype=np.int32)
     place[: len(order)] = order
     packed_place = warp_array(place.reshape(-1, LANES), lane_flags)
     value = np.full((len(directions), x.size), np.nan)
-    step = max(1, _RAYS_AT_ONCE // max(1, x.size))
+    # Fields with pupil points of their own are traced one by one.
+    step = 1 if pupil is None else max(1, _RAYS_AT_ONCE // max(1, x.size))
     for first in range(0, len(value), step):
         part = slice(first, min(first + step, len(value)))
+        own = warp_array(to_packets(points[first].T), lanes) if pupil is None else pupil
         lit = np.ones((part.stop - first) * len(packed_place), dtype=np.int32)
         for surfaces in stages:
             work = np.flatnonzero(lit).astype(np.int32)
@@ -63,7 +66,7 @@ def traced_opds(
                     surfaces,
                     indices,
                     warp_array(work, wp.int32),
-                    pupil,
+                    own,
                     packed_place,
                     float(telescope.stop_z),
                     float(telescope.launch_distance),

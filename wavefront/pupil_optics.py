@@ -6,7 +6,7 @@ paths. The kernel returns these few numbers, so that memory does not hold the ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -16,12 +16,13 @@ from ..core.launch import launch
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
-from ..raytrace.kernels.packet import lane_flags, lanes, packet_count, ray_packets, to_packets
+from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
 from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
-from ..raytrace.rays import RayStatus
+from ..raytrace.rays import RayStatus, require_distant_object
+from ..raytrace.trace import trace
 from .aberration import ResidualWavefront
-from .chief_rays import chief_rays, image_jacobians, reference_rays
+from .chief_rays import image_jacobians, reference_rays
 from .pupil_sampling import CHIEF_RAY
 from .reference_sphere import path_to_sphere
 from .request import Request
@@ -64,15 +65,17 @@ def trace_pupils(
     *,
     focal_plane: FocalPlane | None = None,
     aberration: ResidualWavefront | None = None,
+    vignetting: np.ndarray | None = None,
     projection: str = "zemax",
     threads: int | None = None,
 ) -> PupilOptics:
     """Trace the same pupil points for many stars at several wavelengths to the CCD of each star.
 
-    Other arguments than the pupil points [n_pupil, 2] [m] are those of :meth:`pachon.Request.of`. Each CCD is taken as
-    its tangent plane at the reference point: over the blur of a star, some 50 um, a potato chip of two cycles deviates
-    from it by less than 0.2 nm. An aberration is added to the traced wavefront; reference points and zero of the path
-    stay those of the telescope without it.
+    Other arguments than the pupil points [n_pupil, 2] [m] and the vignetting factors of the stars [n_star, 5] are those
+    of :meth:`pachon.Request.of`.
+    Each CCD is taken as its tangent plane at the reference point: over the blur of a star, some 50 um, a potato chip of
+    two cycles deviates from it by less than 0.2 nm. An aberration is added to the traced wavefront; reference points
+    and zero of the path stay those of the telescope without it.
 
     Raises
     ------
@@ -81,6 +84,8 @@ def trace_pupils(
         ray does not reach the image or lands between two CCDs.
     """
     request = Request.of(telescope, fields, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
+    request = replace(request, vignetting=vignetting)
+    require_distant_object(telescope)
     direction, waves = request.directions, request.wavelengths
     pupil = np.asarray(pupil, dtype=np.float64)
     n_star, n_wave, n_pupil = len(direction), len(waves), len(pupil)
@@ -100,41 +105,54 @@ def trace_pupils(
     radius = telescope.reference_sphere_radius
     chief_path = np.empty((n_star, n_wave))
     for w, index in enumerate(indices[:, -2]):
-        end = chief_rays(telescope, direction, float(waves[w]), threads=threads)
+        end = trace(telescope, request.launch(float(waves[w]), np.zeros((1, 2))), threads=threads)
         chief_path[:, w] = path_to_sphere(end.path_length, index, end.position, end.direction, reference_points, radius)
 
-    count, bundles = packet_count(n_pupil), n_star * n_wave
-    kinds = (lanes, lanes, lanes, lane_flags)
-    out_x, out_y, out_path, out_status = (wp.empty((bundles, count), dtype=kind, device="cpu") for kind in kinds)
-    packed = pack_surfaces(telescope)
-    launch(
-        trace_pupils_kernel.suited(packed),
-        bundles * count,
-        [
-            packed,
-            count,
-            warp_array(indices),
-            warp_array(np.tile(np.arange(n_wave), n_star), wp.int32),
-            warp_array(np.repeat(direction, n_wave, axis=0)),
-            warp_array(to_packets(pupil.T), lanes),
-            float(telescope.stop_z),
-            float(telescope.launch_distance),
-            warp_array(np.repeat(np.concatenate([reference_points, normal], axis=1), n_wave, axis=0)),
-            float(radius),
-            ray_packets(),
-            *(out_x, out_y, out_path, out_status),
-        ],
-        threads=threads,
-    )
+    packed, count = pack_surfaces(telescope), packet_count(n_pupil)
+    planes = np.concatenate([reference_points, normal], axis=1)
 
-    def trimmed(values: wp.array) -> np.ndarray:
-        return values.numpy().reshape(n_star, n_wave, -1)[:, :, :n_pupil]
+    def traced(stars: slice, waves: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
+        """Trace the same points [m] for some stars and wavelengths, by index: x, y, path and status."""
+        bundles = len(direction[stars]) * len(waves)
+        kinds = (lanes, lanes, lanes, lane_flags)
+        out = [wp.empty((bundles, count), dtype=kind, device="cpu") for kind in kinds]
+        launch(
+            trace_pupils_kernel.suited(packed),
+            bundles * count,
+            [
+                packed,
+                count,
+                warp_array(indices),
+                warp_array(np.tile(waves, len(direction[stars])), wp.int32),
+                warp_array(np.repeat(direction[stars], len(waves), axis=0)),
+                warp_array(to_packets(points.T), lanes),
+                float(telescope.stop_z),
+                float(telescope.launch_distance),
+                warp_array(np.repeat(planes[stars], len(waves), axis=0)),
+                float(radius),
+                ray_packets(),
+                *out,
+            ],
+            threads=threads,
+        )
+        return [values.numpy().reshape(-1, len(waves), count * LANES)[:, :, :n_pupil] for values in out]
 
-    offset = np.stack([trimmed(out_x), trimmed(out_y)], axis=-1)
+    aimed = [request.entrance_points(float(w), pupil) for w in waves]
+    if aimed[0].ndim == 2:
+        x, y, traced_path, status = traced(slice(None), np.arange(n_wave), pupil)
+    else:
+        # Every star has pupil points of its own.
+        pieces = [
+            [traced(slice(s, s + 1), np.array([w]), points[s]) for w, points in enumerate(aimed)] for s in range(n_star)
+        ]
+        x, y, traced_path, status = (
+            np.concatenate([np.concatenate([found[k] for found in star], axis=1) for star in pieces]) for k in range(4)
+        )
+    offset = np.stack([x, y], axis=-1)
     if not np.array_equal(rotation, np.eye(3)):
         # The detector's own x and y; the third component, along its normal, is the tilt of a CCD times micrometres.
         offset = offset @ rotation[:2, :2]
-    path = trimmed(out_path) - chief_path[:, :, None]
+    path = traced_path - chief_path[:, :, None]
     jacobian = image_jacobians(telescope, direction, request.middle, threads)
     if aberration is not None:
         # The path is minus the OPD; light is displaced by the Jacobian times the gradient of the path, as by a screen.
@@ -148,7 +166,7 @@ def trace_pupils(
         pupil=pupil,
         displacement=offset.astype(np.float32),
         path=path,
-        lit=trimmed(out_status) == RayStatus.OK,
+        lit=status == RayStatus.OK,
         jacobian=jacobian,
         reference_points=reference_points,
         reference_cosines=(chief.direction @ rotation)[:, :2],

@@ -12,11 +12,14 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, shown
 from ..core.units import metres, pure_numbers, radians
+from ..models.design_data import vignetted
 from ..models.telescope import Telescope
+from ..raytrace.aiming import entrance_points, require_aimed
 from ..raytrace.pack.surfaces import refractive_indices
-from ..raytrace.rays import Rays, RayStatus, field_direction, launch_bundles
+from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
 from ..raytrace.trace import trace
 from .bundles import Bundles
+from .design_fields import design_fields
 from .pupil_sampling import PupilSampling, pupil_sampling
 
 #: Rays in one part of a request: 15 float64 numbers each, so some 60 MB.
@@ -43,6 +46,10 @@ class Request:
         Relative amounts of light of the wavelengths; they sum to 1.
     pupil : PupilSampling
         Points of the entrance pupil.
+    primary : float, optional
+        Wavelength that reference points belong to [m], where it is one of `wavelengths`; else the one in their middle.
+    vignetting : ndarray, shape [n_field, 5], optional
+        Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.DesignData`.
     """
 
     telescope: Telescope
@@ -52,6 +59,8 @@ class Request:
     pupil: PupilSampling
     projection: str
     threads: int | None
+    primary: float | None = None
+    vignetting: np.ndarray | None = None
 
     @classmethod
     @check_arguments
@@ -66,6 +75,8 @@ class Request:
         n_pupil: int | None = None,
         projection: str = "zemax",
         threads: int | None = None,
+        aiming: str | None = None,
+        one_wavelength: bool = False,
     ) -> Request:
         """Validate a request and fill in its defaults.
 
@@ -74,12 +85,15 @@ class Request:
         telescope : Telescope
             The telescope.
         fields : array_like or Quantity, shape [n_field, 2] or [2], optional
-            Field angles [rad]: slopes of the light's own travel, in the stated projection. Five points from the axis
-            to the edge of the field along +y by default.
+            Field angles [rad]: slopes of the light's own travel, in the stated projection. By default those that the
+            design data of the telescope state, with their vignetting factors; where they state none, five points from
+            the axis to the edge of the field along +y.
         wavelengths : array_like or Quantity, shape [n_wave] or scalar, optional
-            Vacuum wavelengths [m]; the telescope's own by default.
+            Vacuum wavelengths [m]. By default those that the design data state, with their weights; where they state
+            none, the telescope's default.
         wavelength_weights : array_like, shape [n_wave], optional
-            Relative amounts of light in front of the telescope; equal by default.
+            Relative amounts of light in front of the telescope; equal by default, but for wavelengths of the design
+            data.
         sampling : {"gauss", "rings", "spiral", "square"} or PupilSampling
             Points of the entrance pupil, see :func:`~pachon.pupil_sampling`.
         n_pupil : int, optional
@@ -88,21 +102,43 @@ class Request:
             Meaning of the field angles, see :func:`~pachon.raytrace.rays.field_direction`.
         threads : int, optional
             Number of threads; all processors by default. Results do not depend on it.
+        aiming : {"off", "paraxial", "real"}, optional
+            Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data say by default.
+        one_wavelength : bool
+            Whether no wavelength means the telescope's default alone.
 
         Raises
         ------
         ConfigError
             If the sampling or the projection is unknown.
+        PrescriptionError
+            If the aiming is unknown, or rays are to be aimed and the telescope has no stop.
         DomainError
             If an array has another shape, a field point or wavelength lies outside what the telescope covers, or a
             weight is negative.
         """
-        points, waves = field_points(telescope, fields), wavelength_points(telescope, wavelengths)
+        if aiming is not None:
+            telescope = telescope.with_design(aiming=aiming)
+        data = telescope.design_data
+        points = field_points(telescope, fields, projection)
+        own_waves = wavelengths is None and not one_wavelength and bool(data.wavelengths)
+        waves = wavelength_points(telescope, data.wavelengths if own_waves else wavelengths)
+        if own_waves and wavelength_weights is None:
+            wavelength_weights = data.wavelength_weights or None
         weights = relative_weights(wavelength_weights, len(waves))
         pupil = pupil_sampling(telescope, sampling, n_pupil)
-        request = cls(telescope, points, waves, weights, pupil, projection, threads)
+        primary = telescope.default_wavelength if own_waves else None
+        vignetting = np.array(data.vignetting) if fields is None and data.vignetting else None
+        request = cls(telescope, points, waves, weights, pupil, projection, threads, primary, vignetting)
         _ = request.directions  # an unknown projection is an error of the request, not of its first use
         return request
+
+    def at_fields(self, fields: np.ndarray | slice) -> Request:
+        """Return the request for a part of its fields, or for other field angles [rad], without vignetting factors."""
+        if not isinstance(fields, slice):
+            return replace(self, fields=fields, vignetting=None)
+        factors = None if self.vignetting is None else self.vignetting[fields]
+        return replace(self, fields=self.fields[fields], vignetting=factors)
 
     @cached_property
     def directions(self) -> np.ndarray:
@@ -116,8 +152,14 @@ class Request:
 
     @property
     def middle(self) -> float:
-        """Wavelength in the middle of the list [m], to which reference points belong."""
-        return float(self.wavelengths[len(self.wavelengths) // 2])
+        """Wavelength to which reference points belong [m]: the primary one, or that in the middle of the list."""
+        return float(self.wavelengths[self.middle_index])
+
+    @property
+    def middle_index(self) -> int:
+        """Index of :attr:`middle` among the wavelengths."""
+        primary = np.flatnonzero(self.wavelengths == self.primary)
+        return int(primary[0]) if len(primary) else len(self.wavelengths) // 2
 
     @property
     def wavelength(self) -> float:
@@ -134,8 +176,28 @@ class Request:
     @check_arguments
     def launch(self, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
         """Return the rays of one wavelength [m], field by field, through other pupil points [m] where given."""
-        points = self.pupil.points if pupil is None else pupil
-        return launch_bundles(self.telescope, self.directions, wavelength, points)
+        points = self.entrance_points(wavelength, self.pupil.points if pupil is None else pupil)
+        return straight_bundles(self.telescope, self.directions, wavelength, points)
+
+    def entrance_points(self, wavelength: float, pupil: np.ndarray) -> np.ndarray:
+        """Return where rays of pupil points [n_pupil, 2] [m] cross the plane of the entrance pupil [m].
+
+        Their shape is [n_pupil, 2], or [n_field, n_pupil, 2] where each field has its own. DomainError if the chief ray
+        of a field cannot be aimed.
+        """
+        points = entrance_points(self.telescope, self.directions, wavelength, self.vignetted(pupil))
+        require_aimed(self.telescope, self.directions, points)
+        return points
+
+    def vignetted(self, pupil: np.ndarray) -> np.ndarray:
+        """Return pupil points [m] with the vignetting factors of each field, [n_field, n_pupil, 2].
+
+        They are [n_pupil, 2], or differ by field. Without vignetting factors they are returned as they are.
+        """
+        if self.vignetting is None:
+            return pupil
+        radius = 0.5 * self.telescope.pupil_diameter
+        return radius * vignetted(pupil / radius, self.vignetting)
 
     @check_arguments
     def bundles(self, wavelength: float, pupil: np.ndarray | None = None) -> Bundles:
@@ -165,16 +227,16 @@ class Request:
         step = max(1, RAYS_AT_ONCE // (len(self.pupil) + 1))
         for first in range(0, len(self.fields), step):
             part = slice(first, min(first + step, len(self.fields)))
-            yield part, replace(self, fields=self.fields[part])
+            yield part, self.at_fields(part)
 
 
 @check_arguments
-def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.ndarray:
+def field_points(telescope: Telescope, fields: ArrayLike | None = None, projection: str = "zemax") -> np.ndarray:
     """Return field angles [rad], shape [n, 2], that the telescope covers.
 
     Parameters
     ----------
-    telescope, fields
+    telescope, fields, projection
         As in :meth:`Request.of`.
 
     Raises
@@ -182,7 +244,9 @@ def field_points(telescope: Telescope, fields: ArrayLike | None = None) -> np.nd
     DomainError
         If the shape is another, or a point lies outside what the telescope covers.
     """
-    if fields is None:
+    if fields is None and telescope.design_data.fields:
+        fields = design_fields(telescope, projection)
+    elif fields is None:
         fields = np.stack([np.zeros(len(_RADII)), _RADII * telescope.field_radius], axis=-1)
     points = np.atleast_2d(radians(fields, "fields"))
     if points.ndim != 2 or points.shape[1] != 2 or not len(points):

@@ -64,13 +64,16 @@ class Given:
     wavelength_nm: Any = None
     across_band: int | None = None
     projection: str = "zemax"
+    aiming: str | None = None
+    glass_catalogue: Sequence[Path] | None = None
     lenient: bool = False
     threads: int | None = None
 
     @cached_property
     def telescope(self) -> Telescope:
         """The telescope."""
-        return load_model(self.model, self.lenient)
+        telescope = load_model(self.model, self.lenient, self.glass_catalogue or ())
+        return telescope if self.aiming is None else telescope.with_design(aiming=self.aiming)
 
     @cached_property
     def fields(self) -> np.ndarray | None:
@@ -96,9 +99,11 @@ class Given:
 
     @property
     def images(self) -> int:
-        """The number of images, over fields and wavelengths; five fields by default."""
-        count = 5 if self.fields is None else len(self.fields)
-        return count if self.wavelength is None else count * len(self.wavelength)
+        """The number of images, over fields and wavelengths."""
+        from ...wavefront.request import Request
+
+        request = Request.of(*self.where, projection=self.projection)
+        return len(request.fields) * len(request.wavelengths)
 
     @contextmanager
     def stage(self, title: str, total: int | None) -> Iterator[Callable[[int], None]]:
@@ -123,9 +128,11 @@ def design_command(
 
     def rows(result: Study) -> Rows:
         summary = numbers_of(result.summary())
-        cells = [column.texts(result, summary) for column in columns]
+        # A result has no arc seconds, for example, where there is no sky.
+        shown = [column for column in columns if callable(column.values) or column.values in summary]
+        cells = [column.texts(result, summary) for column in shown]
         text = caption.format_map(summary) if isinstance(caption, str) else caption(summary)
-        return Rows([column.heading for column in columns], [*zip(*cells, strict=True)], text, left)
+        return Rows([column.title(summary) for column in shown], [*zip(*cells, strict=True)], text, left)
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
         name = compute.__name__
@@ -164,6 +171,8 @@ def _parameters(compute: Callable[..., Any], band: bool, picture: Any) -> tuple[
         **(several if band else one),
         **{p.name: (p.annotation, p.default) for p in own},
         "projection": (options.Projection, "zemax"),
+        "aiming": (options.Aiming, None),
+        "glass_catalogue": (options.GlassCatalogues, None),
         "lenient": (options.Lenient, False),
         "picture": (picture, None),
         "threads": (options.Threads, None),

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
-from ..tables import Column, Rows, number_texts
+from ..tables import Column, Rows, field_headings, number_texts
 from .command import Given, Outcome, design_command
 
 #: Number of rays that takes longer than two seconds to trace.
@@ -110,7 +110,7 @@ def _footprint_rows(result: Any) -> Rows:
     for s in result.surfaces:
         blocked = number_texts(100.0 * s.blocked_fraction, ".2f")
         rows.append((s.surface.name, f"{np.nanmax(s.largest_radius, initial=0.0) * 1e3:.2f}", *blocked))
-    fields = [f"{text}°" for text in number_texts(result.summary()["field_deg"], ".4g")]
+    fields = field_headings(result)
     caption = (
         "Reaches to: largest distance from the vertex of light that arrives. Then, field by field, the part of the "
         "pupil [%] that the surface is the first to block."

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
-from ..tables import FIELD, Column, Rows, number_texts, numbers_of
+from ..tables import FIELD, Column, Rows, field_headings, number_texts, numbers_of
 from .command import Given, Outcome, Study, design_command
 
 
@@ -120,7 +120,7 @@ def zernikes(
 def _rows(result: Any) -> Rows:
     """Return every term at every field."""
     summary = numbers_of(result.summary())
-    return _terms(summary, [f"{field}°" for field in number_texts(summary["field_deg"], ".4g")], summary["zernike_nm"])
+    return _terms(summary, field_headings(result), summary["zernike_nm"])
 
 
 def _map_rows(result: Any) -> Rows:

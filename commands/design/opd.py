@@ -80,7 +80,9 @@ class FittedOpd:
 )
 def opd(
     given: Given,
-    field_deg: Annotated[str, Option(metavar="X,Y", help="Field angle [deg].")] = "0,0",
+    field_deg: Annotated[
+        str | None, Option(metavar="X,Y", help="Field angle [deg]; by default the first of the file, or the axis.")
+    ] = None,
     grid: Annotated[int, Option(min=8, max=4096, help="Points across the pupil.")] = 256,
     zernikes: Annotated[int, Option(min=4, max=500, help="Highest Noll index to fit.")] = 28,
 ) -> Outcome:
@@ -97,10 +99,14 @@ def opd(
     import numpy as np
 
     from ...wavefront.opd import wavefront_opd
+    from ...wavefront.request import field_points
     from ...wavefront.zernike import fit_zernikes
 
     telescope = given.telescope
-    x, y = degrees_pair(field_deg, "--field-deg")
+    if field_deg is None:
+        x, y = np.rad2deg(field_points(telescope, projection=given.projection)[0]).tolist()
+    else:
+        x, y = degrees_pair(field_deg, "--field-deg")
     wavelength = telescope.default_wavelength if given.wavelength is None else given.wavelength
     found = wavefront_opd(telescope, tuple(np.deg2rad([x, y])), wavelength, grid=grid, **given.how)
     fit = fit_zernikes(found, 0.5 * telescope.pupil_diameter, telescope.pupil_obscuration, zernikes)

@@ -119,17 +119,17 @@ class DiffractionPsf(FieldResult):
             "pupil_points": self.n_pupil,
             "pixel_um": self.pixel * 1e6,
             "pixels": self.image.shape[-1],
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "reference_mm": self.reference_point * 1e3,
             "strehl": self.strehl,
             "fwhm_um": self.fwhm * 1e6,
-            "fwhm_arcsec": self.fwhm * arcsec,
+            **self.of_sky({"fwhm_arcsec": self.fwhm * arcsec}),
             "centroid_um": self.centroid * 1e6,
             "airy_radius_um": self.airy_radius * 1e6,
-            "airy_radius_arcsec": self.airy_radius * arcsec,
+            **self.of_sky({"airy_radius_arcsec": self.airy_radius * arcsec}),
             "light_inside": self.inside,
             "lit_fraction": self.lit_fraction,
-            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
         }
 
     def plot(self, ax: Axes | Figure | None = None) -> Figure:
@@ -145,7 +145,7 @@ class DiffractionPsf(FieldResult):
                 image = _draw_image(axes, self, i)
             half = 0.5e6 * self.pixel * self.image.shape[-1]
             bar = drawing.round_length(0.6 * half)
-            drawing.draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcseconds(self.plate_scale)[0] * bar * 1e-6:.3g}"')
+            drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
             bar_and_label: Any = (*panels[0].lines, *panels[0].texts)
             for part in bar_and_label:
                 part.set_color("white")
@@ -175,11 +175,11 @@ def _draw_image(axes: Axes, psf: DiffractionPsf, i: int) -> Any:
     )
     drawing.draw_circle(axes, psf.airy_radius[i] * 1e6, color="white", style=(0, (3, 2)))
     axes.set(xticks=[], yticks=[])
-    axes.set_title(drawing.field_text(psf.fields[i]), fontsize=9.5)
+    axes.set_title(psf.field_labels()[i], fontsize=9.5)
     fwhm = psf.fwhm[i]
     lit = "" if psf.lit_fraction[i] > 0.995 else f"lit {100 * psf.lit_fraction[i]:.1f} % of the pupil"
     axes.set_xlabel(
-        f'Strehl {psf.strehl[i]:.3g}\nFWHM {fwhm * 1e6:.3g} µm = {fwhm * arcseconds(psf.plate_scale)[i]:.2g}"\n{lit}',
+        f"Strehl {psf.strehl[i]:.3g}\nFWHM {psf.size_text(fwhm, float(psf.plate_scale[i]))}\n{lit}",
         fontsize=7.5,
     )
     return shown
@@ -192,7 +192,7 @@ def _draw_cuts(panels: Any, psf: DiffractionPsf) -> None:
             density = psf.image[i] / psf.pixel**2 * 1e-12
             row, column = np.unravel_index(int(np.argmax(density)), density.shape)
             cut = density[row] if name == "x" else density[:, column]
-            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=drawing.field_text(psf.fields[i]))
+            axes.plot(psf.axis * 1e6, cut, color=color, linewidth=1.2, label=psf.field_labels()[i])
         label = f"{name} on the detector from the middle of the image [µm]"
         drawing.finish_axes(axes, xlabel=label, xlim=(psf.axis[0] * 1e6, psf.axis[-1] * 1e6), ylim=(0.0, None))
     panels[0].set_ylabel("part of the light per µm²\n(through the brightest pixel)")

@@ -16,7 +16,7 @@ from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
-from ..drawing import FEW, field_colors, field_text, finish_axes, second_scale
+from ..drawing import FEW, field_colors, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, spots
 from ..result import FieldResult
 from .diffraction import DiffractionPsf, fft_psf
@@ -76,10 +76,10 @@ class EncircledEnergy(FieldResult):
             "telescope": self.telescope,
             "kind": self.kind,
             "wavelength_nm": self.wavelengths * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             **{f"{name}_um": value * 1e6 for name, value in radii.items()},
-            **{f"{name}_arcsec": value * arcsec for name, value in radii.items()},
-            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+            **self.of_sky({f"{name}_arcsec": value * arcsec for name, value in radii.items()}),
+            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
             "radius_um": self.radius * 1e6,
             "fraction": self.fraction,
         }
@@ -252,8 +252,8 @@ def _crossing(fraction: np.ndarray, radius: np.ndarray, wanted: float) -> float:
 def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
     few = len(result.fields) <= FEW
     colors = field_colors(len(result.fields))
-    for field, row, color in zip(result.fields, result.fraction, colors, strict=True):
-        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=field_text(field) if few else None)
+    for label, row, color in zip(result.field_labels(), result.fraction, colors, strict=True):
+        axes.plot(result.radius * 1e6, row, color=color, linewidth=1.3, label=label if few else None)
     for part in (0.5, 0.8):
         axes.axhline(part, color="0.6", linewidth=0.7, linestyle=(0, (4, 3)))
         axes.annotate(f"{100 * part:.0f} %", (1.0, part), xycoords=("axes fraction", "data"), xytext=(-3, 2),
@@ -268,17 +268,19 @@ def _draw_curves(axes: Axes, result: EncircledEnergy) -> None:
         xlabel="radius about the centroid of the rays [µm]",
         ylabel="fraction of the light within",
     )
-    second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
+    if result.on_sky:
+        second_scale(axes, float(np.rad2deg(result.plate_scale[0])) * 3600e-6, "arc seconds")
     if few:
         axes.legend(loc="lower right")
 
 
 def _draw_radii(axes: Axes, result: EncircledEnergy) -> None:
-    away = np.rad2deg(result.off_axis_angle)
+    away, distance = result.axis_distances()
+    scale, unit = (arcseconds(result.plate_scale), "arcsec") if result.on_sky else (np.full(len(away), 1e6), "µm")
     order = np.argsort(away, kind="stable")
     for part, color in ((0.9, ORANGE), (0.8, RED), (0.5, BLUE)):
-        radius = (result.radius_holding(part) * arcseconds(result.plate_scale))[order]
+        radius = (result.radius_holding(part) * scale)[order]
         axes.plot(away[order], radius, "o-", color=color, markersize=3.5, linewidth=1.2, label=f"{100 * part:.0f} %")
-    label = "radius that holds the fraction [arcsec]"
-    finish_axes(axes, ylim=(0.0, None), xlabel="distance from the axis [deg]", ylabel=label)
+    label = f"radius that holds the fraction [{unit}]"
+    finish_axes(axes, ylim=(0.0, None), xlabel=distance, ylabel=label)
     axes.legend(loc="best", ncols=3)

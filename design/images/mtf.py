@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from ...core.plotting import BLUE, RED, figure_at, styled
 from ...core.units import MOST, arcseconds, require_count
 from ...models.telescope import Telescope
 from ...wavefront.request import Request
-from ..drawing import field_text, finish_axes, grid_shape, legend_below, panels_of, second_scale
+from ..drawing import finish_axes, grid_shape, legend_below, panels_of, second_scale
 from ..metrics.principal_rays import PrincipalRays, principal_rays_of
 from ..metrics.spots import spot_diagram
 from ..result import FieldResult
@@ -108,14 +108,14 @@ class Mtf(FieldResult):
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "obscuration": self.obscuration,
             "f_number": self.f_number,
             "cutoff_cycles_per_mm": self.cutoff * 1e-3,
-            "cutoff_cycles_per_arcsec": self.cutoff / arcsec,
+            **self.of_sky({"cutoff_cycles_per_arcsec": self.cutoff / arcsec}),
             "half_contrast_cycles_per_mm": half * 1e-3,
-            "half_contrast_cycles_per_arcsec": half / arcsec,
-            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+            **self.of_sky({"half_contrast_cycles_per_arcsec": half / arcsec}),
+            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
             "frequency_cycles_per_mm": self.frequency * 1e-3,
             "tangential": self.tangential,
             "sagittal": self.sagittal,
@@ -189,8 +189,8 @@ def mtf(
     angles = tangential_angle(telescope, principal)
     shape = (2, len(request.fields), len(frequency))
     transfer, perfect, rays = np.zeros(shape, complex), np.zeros(shape, complex), np.zeros(shape, complex)
-    for i, (field, center, angle) in enumerate(zip(request.fields, diagram.reference_point, angles, strict=True)):
-        one = replace(request, fields=field[None])
+    for i, (center, angle) in enumerate(zip(diagram.reference_point, angles, strict=True)):
+        one = request.at_fields(slice(i, i + 1))
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
             found = lattice_wavelets(one, float(wavelength), center, float(wavelength) * step, float(angle))
             for total, pupil in ((transfer, found.wavelets.field), (perfect, np.abs(found.wavelets.field))):
@@ -255,8 +255,8 @@ def _draw_field(axes: Axes, result: Mtf, i: int) -> None:
         axes.plot(frequency, solid[i], color=color, linewidth=1.5, label=name)
     finish_axes(axes, xlim=(0.0, frequency[-1]), ylim=(0.0, 1.0))
     half = result.frequency_at(0.5)[i] * 1e-3
-    text = f"{field_text(result.fields[i])}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)"
+    text = f"{result.field_labels()[i]}\n50 % at {half[0]:.3g} (t), {half[1]:.3g} (s)"
     axes.text(0.97, 0.95, text, transform=axes.transAxes, ha="right", va="top", fontsize=8)
-    if i < _MOST:
+    if i < _MOST and result.on_sky:
         arcsec_per_mm = float(np.rad2deg(result.plate_scale[i].mean())) * 3600e-3
         second_scale(axes, 1.0 / arcsec_per_mm, "cycles per arc second")

@@ -159,11 +159,12 @@ def layout(
     Parameters
     ----------
     telescope, fields, wavelength, projection, threads
-        As in :meth:`pachon.Request.of`; by default fields are the axis and both edges of the field along y.
+        As in :meth:`pachon.Request.of`; where the design data state no fields, they are the axis and both edges of the
+        field along y.
     """
-    edge = telescope.field_radius
-    given = [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None else fields
-    request = Request.of(telescope, given, wavelength, projection=projection, threads=threads)
+    edge, stated = telescope.field_radius, telescope.design_data.fields
+    given = [[0.0, -edge], [0.0, 0.0], [0.0, edge]] if fields is None and not stated else fields
+    request = Request.of(telescope, given, wavelength, projection=projection, threads=threads, one_wavelength=True)
     points, w = request.fields, request.wavelength
     lenses = find_lenses(telescope, w)
     reach = even_edges(telescope, lenses, drawn_radii(telescope, points, w, threads))

@@ -11,8 +11,9 @@ import numpy as np
 from ...models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
+from ...raytrace.launch import launch_rays
 from ...raytrace.pack.surfaces import refractive_indices
-from ...raytrace.rays import RayStatus, launch_rays
+from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 
 #: Points of a surface in section.
@@ -47,7 +48,7 @@ def ray_paths(
     """Return the paths of the rays that arrive [m], telescope frame, shape [n_ray, n_surface + 1, 3].
 
     They start at the height `top` [m] in front of the telescope, and pass the intersections with all surfaces. The
-    other arguments are those of :func:`~pachon.raytrace.rays.launch_rays`.
+    other arguments are those of :func:`~pachon.raytrace.launch.launch_rays`.
     """
     rays = launch_rays(telescope, (field[0], field[1]), wavelength, pupil, projection)
     met = trace(telescope, rays, "all", threads=threads)

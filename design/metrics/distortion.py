@@ -93,7 +93,7 @@ class Distortion(FieldResult):
             "largest_percent_of_axis_scale": float(np.nanmax(np.abs(self.percent_of_axis_scale), initial=0.0)),
             "largest_shift_um": float(shift.max()) * 1e6,
             "rms_shift_um": float(np.sqrt((shift**2).mean())) * 1e6,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "position_mm": self.position * 1e3,
             "predicted_mm": self.predicted * 1e3,
             "percent": self.percent,
@@ -143,7 +143,14 @@ def distortion(
     check_choice("reference", reference, REFERENCES)
     points = field_lattice(telescope, _ACROSS) if fields is None else fields
     request = Request.of(
-        telescope, points, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+        telescope,
+        points,
+        wavelength,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     slopes = request.slopes
     if len(slopes) < 3 or np.linalg.matrix_rank(slopes - slopes.mean(axis=0), tol=1e-9) < 2:
@@ -155,7 +162,7 @@ def distortion(
         raise DomainError(f"{field_label(lost)}: no light reaches the detector")
     scale, rotation, offset = _similarity(slopes, position)
     near = _NEAR_AXIS * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    beside = replace(request, fields=near, projection="gnomonic")
+    beside = replace(request.at_fields(near), projection="gnomonic")
     ends = beside.bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
     jacobian = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * _NEAR_AXIS)
     return Distortion(

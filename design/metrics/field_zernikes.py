@@ -23,7 +23,7 @@ from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
 from ...wavefront.pupil_sampling import PupilSampling, gauss_annulus
 from ...wavefront.request import Request
-from ..drawing import FEW, draw_field_map, field_colors, field_text, panels_of, spread_in_field
+from ..drawing import FEW, draw_field_map, field_colors, panels_of, spread_in_field
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class FieldZernikes(FieldResult):
             "wavelength_nm": self.wavelength * 1e9,
             "obscuration": self.obscuration,
             "pupil": self.pupil,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "rms_without_tilt_nm": self.rms * 1e9,
             "residual_rms_nm": self.residual_rms * 1e9,
             "zernike_nm": self.coefficients * 1e9,
@@ -94,9 +94,9 @@ class FieldZernikes(FieldResult):
             if len(self.fields) <= FEW:
                 width = 0.85 / len(self.fields)
                 colors = field_colors(len(self.fields))
-                for i, (row, field, color) in enumerate(zip(values, self.fields, colors, strict=True)):
+                for i, (row, label, color) in enumerate(zip(values, self.field_labels(), colors, strict=True)):
                     offset = (i - 0.5 * (len(self.fields) - 1)) * width
-                    bars.bar(j + offset, row, width, color=color, label=field_text(field))
+                    bars.bar(j + offset, row, width, color=color, label=label)
                 bars.set_ylabel("coefficient = rms over the annulus [nm]")
                 bars.legend(loc="best", ncols=2)
             else:
@@ -218,7 +218,14 @@ def wavefront_zernikes(
     """
     check_choice("pupil", pupil, PUPILS)
     request = Request.of(
-        telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+        telescope,
+        fields,
+        wavelength,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     points, sample, w = request.fields, request.pupil, request.wavelength
     jmax = require_count(jmax, "jmax", 1, len(sample))
@@ -226,7 +233,15 @@ def wavefront_zernikes(
     terms = annular_zernikes(jmax, x, y, telescope.pupil_obscuration).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
     for part, some in request.parts():
-        optics = trace_pupils(telescope, some.fields, w, sample.points, projection=projection, threads=threads)
+        optics = trace_pupils(
+            telescope,
+            some.fields,
+            w,
+            sample.points,
+            vignetting=some.vignetting,
+            projection=projection,
+            threads=threads,
+        )
         value = -optics.path[:, 0]
         used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
         coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, some.fields, pupil)

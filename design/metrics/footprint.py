@@ -18,7 +18,7 @@ from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import FEW, field_colors, field_text, panel_grid
+from ..drawing import FEW, field_colors, panel_grid
 from ..result import FieldResult
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class Footprint(FieldResult):
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "surfaces": [
                 {
                     "name": s.name,
@@ -114,7 +114,7 @@ class Footprint(FieldResult):
             large = len(self.surfaces) == 1
             figure, panels = panel_grid(ax, len(self.surfaces), *((6.0, 5.6) if large else (2.9, 3.0)))
             for axes, footprint in zip(panels, self.surfaces, strict=True):
-                _draw_surface(axes, footprint, colors, [field_text(f) for f in self.fields])
+                _draw_surface(axes, footprint, colors, self.field_labels())
             panels[0].plot([], [], ".", color=RED, markersize=6.0, label="blocked here first")
             handles, labels = panels[0].get_legend_handles_labels()
             if len(self.fields) > FEW:
@@ -156,7 +156,14 @@ def footprint(
         raise DomainError("surfaces = []: expected the name of a surface at least")
     wanted = [telescope.surface_names.index(telescope.surface(name).name) for name in names]
     request = Request.of(
-        telescope, fields, wavelength, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+        telescope,
+        fields,
+        wavelength,
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     n_field = len(request.fields)
     angle = np.linspace(0.0, 2.0 * np.pi, _RIM)

@@ -7,7 +7,7 @@ Reflectivities are Fresnel's for bare glass at the angle of each ray, mean of bo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -214,7 +214,14 @@ def ghosts(
     n_pupil = require_count(n_pupil, "n_pupil", 400)
     where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
     request = Request.of(
-        telescope, where, wavelength, sampling="spiral", n_pupil=n_pupil, projection=projection, threads=threads
+        telescope,
+        where,
+        wavelength,
+        sampling="spiral",
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+        one_wavelength=True,
     )
     coatings = Coatings(telescope, reflectivity, detector_reflectivity)
     if not ghost_pairs(telescope):
@@ -233,7 +240,7 @@ def ghosts(
         if progress is not None:
             progress(1)
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
-    rim = replace(request, fields=edge).bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
+    rim = request.at_fields(edge).bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
     found = [_measure(landing, direct) for landing in landings if landing.weight.sum() > 0]
     # Where no ray from the edge of the field arrives, the map covers whole ghosts.
     radius = float(np.nanmax(np.linalg.norm(rim, axis=-1), initial=0.0)) or max(

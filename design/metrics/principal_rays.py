@@ -19,7 +19,8 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus, field_direction, launch_bundles
+from ...raytrace.launch import launch_bundles
+from ...raytrace.rays import RayStatus, field_direction
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
 from ...wavefront.pupil_sampling import pupil_sampling
@@ -108,11 +109,11 @@ class PrincipalRays(FieldResult):
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "chief_landing_mm": self.chief_landing * 1e3,
             "chief_incidence_deg": np.rad2deg(self.chief_angle),
             "f_number": self.f_number,
-            "plate_scale_arcsec_per_um": np.rad2deg(self.plate_scale) * 3600e-6,
+            **self.of_sky({"plate_scale_arcsec_per_um": np.rad2deg(self.plate_scale) * 3600e-6}),
             "exit_pupil_m": self.exit_pupil,
             "exit_pupil_distance_m": self.exit_pupil_distance,
             "exit_pupil_diameter_m": self.exit_pupil_diameter,
@@ -120,7 +121,7 @@ class PrincipalRays(FieldResult):
 
     def plot(self, ax: Axes | Figure | None = None) -> Figure:
         """Draw focal ratio, plate scale, exit pupil and incidence against the distance from the axis."""
-        radius = np.rad2deg(self.off_axis_angle)
+        radius, distance = self.axis_distances()
         order = np.argsort(radius, kind="stable")
         pairs = [
             ("working focal ratio", self.f_number),
@@ -143,7 +144,7 @@ class PrincipalRays(FieldResult):
                 finish_axes(axes)
                 axes.ticklabel_format(useOffset=False)
             for axes in panels[2:5]:
-                axes.set_xlabel("distance from the axis [deg]")
+                axes.set_xlabel(distance)
                 axes.tick_params(labelbottom=True)
             return self._titled(figure, f"chief and marginal rays, {self._nanometres()}")
 
@@ -173,7 +174,7 @@ def principal_rays(
     DomainError
         If a field or the wavelength lies outside what the telescope covers, or a chief ray does not reach the detector.
     """
-    request = Request.of(telescope, fields, wavelength, projection=projection, threads=threads)
+    request = Request.of(telescope, fields, wavelength, projection=projection, threads=threads, one_wavelength=True)
     _ = request.wavelength  # one only
     return principal_rays_of(request)
 
@@ -192,7 +193,7 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     # Per field: the direction of the chief ray and four beside it; each through centre, near zone and rim of the pupil.
     near = (slopes[:, None] + steps).reshape(-1, 2)
     rim = 0.5 * telescope.pupil_diameter * np.stack([axes, -axes], axis=2).reshape(n, 4, 2)
-    through = np.repeat(np.concatenate([np.zeros((n, 1, 2)), _NEAR * rim, rim], axis=1), 5, axis=0)
+    through = np.repeat(request.vignetted(np.concatenate([np.zeros((n, 1, 2)), _NEAR * rim, rim], axis=1)), 5, axis=0)
     directions = field_direction(near[:, 0], near[:, 1], "gnomonic")
     end = trace(telescope, launch_bundles(telescope, directions, wavelength, through), threads=request.threads)
     position, direction = end.position.reshape(n, 5, 9, 3), end.direction.reshape(n, 5, 9, 3)

@@ -127,13 +127,13 @@ class SpotDiagram(FieldResult):
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
             "rays_per_field": int(np.prod(self.weight.shape[1:])),
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "reference_mm": self.reference_point * 1e3,
             "centroid_um": self.centroid * 1e6,
             "rms_xy_um": self.rms_xy * 1e6,
             **{f"{name}_um": value * 1e6 for name, value in sizes.items()},
-            **{f"{name}_arcsec": value * arcsec for name, value in sizes.items()},
-            "plate_scale_arcsec_per_um": arcsec * 1e-6,
+            **self.of_sky({f"{name}_arcsec": value * arcsec for name, value in sizes.items()}),
+            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
             "lit_fraction": self.lit_fraction,
         }
 
@@ -147,8 +147,7 @@ class SpotDiagram(FieldResult):
             for i, axes in enumerate(panels):
                 _draw_spot(axes, self, i, half, radius[i])
             bar = drawing.round_length(0.7 * half)
-            arcsec = bar * 1e-6 * float(np.rad2deg(self.plate_scale[0])) * 3600.0
-            drawing.draw_scale_bar(panels[0], bar, f'{bar:g} µm = {arcsec:.3g}"')
+            drawing.draw_scale_bar(panels[0], bar, self.size_text(bar * 1e-6, float(self.plate_scale[0])))
             for handle in filter(None, drawing.legend_below(figure, panels[0], markerscale=3.0).legend_handles):
                 handle.set_alpha(1.0)
             return self._titled(figure, "spots about the centroid")
@@ -208,7 +207,7 @@ def spot_diagram(request: Request, reference: str = "centroid") -> SpotDiagram:
     """Return the spot diagram of a request."""
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     principal = principal_rays_of(request)
-    chief = bundles[len(bundles) // 2].chief_landing()
+    chief = bundles[request.middle_index].chief_landing()
     lit = np.stack([b.lit for b in bundles], axis=1)
     diagram = SpotDiagram(
         request=request,
@@ -251,9 +250,9 @@ def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: floa
     drawing.draw_circle(axes, spots.airy_radius[i] * 1e6, color="black", style="-", label="Airy disc")
     drawing.draw_circle(axes, radius * 1e6, color=RED, style=(0, (4, 2)), label="80 % of the rays")
     drawing.bare_frame(axes, half)
-    scale = float(arcseconds(spots.plate_scale)[i])
+    scale = float(spots.plate_scale[i])
     rms = spots.rms_radius[i]
-    text = f'rms {rms * 1e6:.3g} µm = {rms * scale:.3g}"\n80 % {radius * 1e6:.3g} µm = {radius * scale:.3g}"'
+    text = f"rms {spots.size_text(rms, scale)}\n80 % {spots.size_text(radius, scale)}"
     if not np.isfinite(rms):
         text = "no light arrives"
     elif spots.lit_fraction[i] < 0.995:
@@ -261,5 +260,5 @@ def _draw_spot(axes: Axes, spots: SpotDiagram, i: int, half: float, radius: floa
     beyond = float(spots.weight[i][np.abs(centered).max(axis=-1) > half].sum())
     if beyond > 0:
         text += f"\n{100 * beyond / spots.lit_fraction[i]:.2g} % of the rays beyond the frame"
-    axes.set_title(drawing.field_text(spots.fields[i]), fontsize=9.5)
+    axes.set_title(spots.field_labels()[i], fontsize=9.5)
     axes.set_xlabel(text, fontsize=7.5)

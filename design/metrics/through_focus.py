@@ -21,7 +21,7 @@ from ...models.telescope import Telescope
 from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import FEW, field_colors, field_text, finish_axes, legend_below
+from ..drawing import FEW, field_colors, finish_axes, legend_below
 from ..result import FieldResult
 from .principal_rays import PARALLEL, principal_rays_of
 
@@ -75,7 +75,7 @@ class ThroughFocus(FieldResult):
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelengths * 1e9,
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "best_focus_spot_um": self.best_spot * 1e6,
             "best_focus_wavefront_um": self.best_wavefront * 1e6,
             "best_focus_common_um": self.best_common * 1e6,
@@ -234,8 +234,8 @@ def _draw_curves(axes: Axes, result: ThroughFocus, values: np.ndarray, best: np.
     heights = result.defocus * 1e6
     few = len(result.fields) <= FEW
     colors = field_colors(len(result.fields))
-    for row, field, color, height in zip(values, result.fields, colors, best * 1e6, strict=True):
-        axes.plot(heights, row, color=color, linewidth=1.4, label=field_text(field) if few else None)
+    for row, label, color, height in zip(values, result.field_labels(), colors, best * 1e6, strict=True):
+        axes.plot(heights, row, color=color, linewidth=1.4, label=label if few else None)
         if heights[0] <= height <= heights[-1]:
             axes.plot(height, np.interp(height, heights, row), "o", color=color, markersize=4.0)
     axes.axvline(0.0, color="0.6", linewidth=0.7)

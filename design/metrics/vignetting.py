@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,7 +60,7 @@ class Vignetting(FieldResult):
             "axis_fraction": self.axis_fraction,
             "smallest_relative": float(self.relative.min()),
             "largest_error": float(self.error.max()),
-            "field_deg": np.rad2deg(self.fields),
+            **self.field_items(),
             "radius_deg": np.rad2deg(self.off_axis_angle),
             "fraction": self.lit_fraction,
             "error": self.error,
@@ -121,8 +121,9 @@ def vignetting(
         n_pupil=count,
         projection=projection,
         threads=threads,
+        one_wavelength=True,
     )
-    everywhere = replace(request, fields=np.concatenate([np.zeros((1, 2)), request.fields]))
+    everywhere = request.at_fields(np.concatenate([np.zeros((1, 2)), request.fields]))
     quarters = np.empty((len(everywhere.fields), 4))
     for part, some in everywhere.parts():
         lit = some.bundles(request.wavelength).lit

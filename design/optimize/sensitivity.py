@@ -200,6 +200,7 @@ def sensitivity(
         n_pupil=_RINGS if n_pupil is None and sampling == "gauss" else n_pupil,
         projection=projection,
         threads=threads,
+        one_wavelength=True,
     )
     points, pupil, (x, y) = request.fields, request.pupil, request.unit_pupil.T
     terms = annular_zernikes(n_zernike, x, y, telescope.pupil_obscuration)

@@ -63,6 +63,9 @@ class _Made:
     def make_model(self):
         return pachon.PsfModel.fit(self.stamps, self.places, n_components=2, order=1)
 
+    def make_floating(self):
+        return pachon.load_telescope("paul_baker").with_design(stop="M1", aperture="f_number", aperture_value=4.0)
+
     def make_spots(self):
         return pachon.spots(self.tel, [(0.0, 0.0)], n_pupil=3)
 
@@ -209,6 +212,7 @@ def calls(folder):
         "lsst_camera": (pachon.lsst_camera, {}),
         "height_statistics": (pachon.height_statistics, {"focal_plane": m.plane}),
         "first_order": (pachon.first_order, {"telescope": tel, "wavelength": w}),
+        "with_floating_pupil": (pachon.with_floating_pupil, {"telescope": m.floating}),
         "seidel_sums": (pachon.seidel_sums, {"telescope": tel, "wavelength": w, "field": 0.01}),
         "corner_sensors": (pachon.corner_sensors, {"name": "lsstcam"}),
         "load_telescope": (pachon.load_telescope, {"name_or_path": m.file, "lenient": False, "glass_catalogues": []}),
@@ -400,7 +404,12 @@ def _methods(m, tel, w, x, y):
                  "r0": 0.1, "outer_scale": 30.0, "weather": pachon.Weather(520.0, 10.0, 8.0)}),
         "Surface": (pachon.Surface, {"name": "s", "interaction": pachon.Interaction.REFRACT, "shape": pachon.Conic(5.0),
                     "vertex": (0.0, 0.0, 0.0), "medium_after": pachon.ConstantIndex(1.0),
-                    "aperture": pachon.Circle(1.0)}),
+                    "aperture": pachon.Circle(1.0), "semi_diameter": 1.0}),
+        "DesignData": (pachon.DesignData, {"length_unit": "mm", "aperture": "f_number", "aperture_value": 4.0,
+                       "stop": "M1", "aiming": "real", "field_type": "angle", "fields": ((0.0, 0.1),),
+                       "field_weights": (1.0,), "vignetting": ((0.0, 0.0, 0.1, 0.1, 0.0),), "wavelengths": (w,),
+                       "wavelength_weights": (1.0,), "temperature": 280.0, "pressure": 1e5, "telecentric": False,
+                       "afocal": False}),
         "Surface.to_local": (tel.surfaces[0].to_local, {"points": np.zeros((2, 3))}),
         "Surface.moved": (tel.surfaces[0].moved, {"shift": (0.0, 0.0, 0.0), "about": (0.0, 0.0, 0.0)}),
         "Telescope.perturbed": (tel.perturbed, {"name": "M2", "shift": (0.0, 0.0, 0.0), "tilt": (0.0, 0.0, 0.0),
@@ -450,7 +459,7 @@ def _methods(m, tel, w, x, y):
         "Atmosphere.at_times": (m.air.at_times, {"times": [0.25, 0.75], "exposure": 1.0}),
         "Request.of": (pachon.Request.of, {"telescope": tel, "fields": np.zeros((1, 2)), "wavelengths": [w],
                        "wavelength_weights": [1.0], "sampling": "gauss", "n_pupil": 3, "projection": "zemax",
-                       "threads": 1}),
+                       "threads": 1, "aiming": "off", "one_wavelength": True}),
         "CcdImage.read": (pachon.CcdImage.read, {"path": m.folder / "none.fits"}),
     }  # fmt: skip
     return out

@@ -14,7 +14,7 @@ from pachon.core.errors import PachonError
 from pachon.models.io.prescription import DATA, load_telescope
 from pachon.pipeline.config import load_configuration, to_yaml
 from pachon.pipeline.experiment import Experiment
-from pachon.raytrace.rays import launch_rays
+from pachon.raytrace.launch import launch_rays
 from pachon.raytrace.trace import trace
 from pachon.studies.sweep.design import point_count
 from pachon.studies.sweep.file import load_sweep

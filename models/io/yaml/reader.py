@@ -17,6 +17,7 @@ from ...obstruction import Obstruction
 from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from .apertures import ApertureKeys, ObstructionSection
+from .design import DesignSection
 from .media import AnyMedium
 from .shapes import SURFACE_SHAPES, ShapeSection
 from .values import (
@@ -28,6 +29,7 @@ from .values import (
     Number,
     OptionalAngles,
     OptionalBand,
+    OptionalLength,
     OptionalPlace,
     OptionalText,
     PositiveAngle,
@@ -58,6 +60,7 @@ class SurfaceKeys(ApertureKeys):
     tilt: OptionalAngles = None
     rotation: Rotation = IDENTITY
     medium: OptionalText = None
+    semi_diameter: OptionalLength = None
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -84,6 +87,7 @@ class SurfaceKeys(ApertureKeys):
             medium_after=_chosen("medium", self.medium, media, medium_before),
             aperture=self.clear_aperture(),
             rotation=self.rotation if self.tilt is None else _matrix(rotation_matrix(self.tilt)),
+            semi_diameter=self.semi_diameter,
         )
 
 
@@ -167,6 +171,7 @@ class Prescription(Section):
     reference_sphere_radius: PositiveLength
     field: FieldSection
     wavelengths: WavelengthsSection
+    design: DesignSection = DesignSection()
     camera: OptionalText = None
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
@@ -208,6 +213,7 @@ class Prescription(Section):
             groups={name: group.surfaces for name, group in self.groups.items()},
             group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},
             obstructions=self.obstructions,
+            design_data=self.design.data(),
         )
 
 

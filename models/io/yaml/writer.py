@@ -11,6 +11,7 @@ from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
 from .apertures import aperture_items, obstruction_items
+from .design import design_items
 from .media import medium_items
 from .reader import INTERACTIONS
 from .shapes import shape_items
@@ -45,6 +46,7 @@ def telescope_to_yaml(telescope: Telescope) -> str:
         "medium_before": names[t.medium_before] if t.medium_before != VACUUM else None,
     }
     lists = {
+        "design": [(f"  {key}: ", value) for key, value in design_items(t.design_data).items()],
         "media": [(f"  {name}: ", medium_items(medium)) for medium, name in names.items() if medium != VACUUM],
         "groups": [(f"  {flow(name)}: ", _group_items(t, name)) for name in t.groups],
         "obstructions": [("  - ", obstruction_items(obstruction)) for obstruction in t.obstructions],
@@ -91,6 +93,7 @@ def _surface_items(surface: Surface, names: dict[Medium, str]) -> dict[str, Any]
     items |= {key: value for key, value in (("x", x), ("y", y)) if value != 0}
     items |= {} if surface.rotation == IDENTITY else {"rotation": surface.rotation}
     items |= shape | aperture_items(surface.aperture)
+    items |= {} if surface.semi_diameter is None else {"semi_diameter": surface.semi_diameter}
     return items | ({"medium": Bare(names[surface.medium_after])} if kind == "refract" else {})
 
 

@@ -20,17 +20,20 @@ from pathlib import Path
 import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
+from ...design_data import DesignData
 from ...media.dispersion import model_glass
 from ...media.medium import Medium, RelativeToAir
+from ...paraxial import ParaxialSurfaces
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
 from .apertures import read_aperture
+from .design import Fields, length_unit, read_aiming, read_environment, read_fields, stated_fields
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
 from .shapes import read_shape
-from .system import UNITS, ParaxialSurfaces, read_pupil, read_wavelengths
+from .system import UNITS, Pupil, Wavelengths, read_pupil, read_wavelengths
 
 #: Comment of the plane that the writer puts in front to carry the entrance pupil.
 PUPIL_COMMENT = "pachon entrance pupil"
@@ -80,7 +83,7 @@ class _LensReader:
     def telescope(self) -> Telescope:
         """Return the telescope that the file describes."""
         header, findings = self.file.header, self.findings
-        waves = read_wavelengths(header)
+        waves, fields = read_wavelengths(header), read_fields(header)
         self._check_environment()
         pupil_plane = False
         for number, block in enumerate(self.file.surfaces[1:], start=1):
@@ -94,7 +97,9 @@ class _LensReader:
         if self.stop is None:
             findings.report(header.problem("no surface is the stop (STOP)"), "the first is taken")
             self.paraxial.mark_stop(0.0, first=True)
-        pupil = read_pupil(self.file, self.paraxial, self.unit, waves.primary, self.first_medium, findings)
+        pupil = read_pupil(self.file, self.paraxial, self.unit, waves.primary, fields, findings)
+        stop = None if pupil_plane else self.surfaces[self.paraxial.stop].name
+        data = self._design_data(fields, waves, pupil, stop)
         header.report_rest(IGNORED_HEADER, findings)
         self.file.surfaces[0].used |= {"TYPE", "CURV", "DISZ", "CONI"}
         self.file.surfaces[0].report_rest(IGNORED_SURFACE, findings)
@@ -103,7 +108,7 @@ class _LensReader:
         z0 = _first_power(self.surfaces)
         surfaces = tuple(self._placed(s, z0) for s in self.surfaces)
         low, high = self._wavelength_range(waves.values)
-        reach = max(max(abs(v) for s in surfaces for v in s.vertex), abs(pupil.z + z0), pupil.diameter)
+        reach = max(max(abs(v) for s in surfaces for v in s.vertex), abs(pupil.image.z + z0), pupil.diameter)
         limit = min(max(2 * pupil.field_radius, math.radians(5.0)), math.radians(85.0))
         return Telescope(
             name=self.file.path.stem,
@@ -112,7 +117,7 @@ class _LensReader:
             description=header.text("NAME"),
             surfaces=surfaces,
             # Heights count against the light.
-            stop_z=float(z0 - pupil.z) + 0.0,
+            stop_z=float(z0 - pupil.image.z) + 0.0,
             pupil_diameter=pupil.diameter,
             pupil_obscuration=0.0,
             launch_distance=3.0 * reach / math.cos(limit),
@@ -123,7 +128,27 @@ class _LensReader:
             default_wavelength=waves.primary,
             band=waves.band(low, high),
             medium_before=self.first_medium,
-            object_distance=float(z0 - pupil.object_z),
+            object_distance=float(z0 + pupil.image.object_distance),
+            design_data=data,
+        )
+
+    def _design_data(self, fields: Fields, waves: Wavelengths, pupil: Pupil, stop: str | None) -> DesignData:
+        telecentric = pupil.image.telecentric
+        aiming = read_aiming(self.file.header)
+        temperature, pressure = read_environment(self.file.header)
+        return DesignData(
+            length_unit=length_unit(self.unit),
+            aperture=pupil.aperture[0],
+            aperture_value=pupil.aperture[1],
+            stop=stop,
+            # Zemax aims no rays in a telecentric object space; a file without a stop has nothing to aim at.
+            aiming="off" if telecentric or stop is None else aiming,
+            **stated_fields(fields, self.unit),
+            wavelengths=waves.values,
+            wavelength_weights=waves.weights if len(set(waves.weights)) > 1 else (),
+            temperature=temperature,
+            pressure=pressure,
+            telecentric=telecentric,
         )
 
     def _check_environment(self) -> None:
@@ -197,6 +222,7 @@ class _LensReader:
             interaction, after = Interaction.DETECTOR, self.medium
         else:
             interaction = Interaction.PASS if after == self.medium else Interaction.REFRACT
+        semi_diameter = block.number("DIAM", 0.0) * self.unit
         self.paraxial.add(shape.curvatures, self.medium, after, mirror=mirror)
         self.medium = after
         x, y, z = (float(v) for v in self.origin)
@@ -209,6 +235,7 @@ class _LensReader:
                 medium_after=after,
                 aperture=None if aperture is None else rotated_aperture(aperture),
                 rotation=rotated_axes(self.axes),
+                semi_diameter=semi_diameter if semi_diameter > 0 else None,
             )
         )
 

@@ -1,8 +1,9 @@
 """Write a telescope as a sequential Zemax lens file (.zmx), with a glass catalogue (.agf) beside it where it needs one.
 
-The axes are rotated as by the reader (see `frame`). A plane of its own in front carries the stop, so that the entrance
-pupil is that of the telescope; the reader recognises this plane by its comment. Surfaces off the axis or tilted stand
-between two coordinate breaks, of which the second undoes the first.
+The axes are rotated as by the reader (see `frame`). Where the telescope's stop and stated aperture make its entrance
+pupil, they are written; else a plane of its own in front carries the stop, so that the entrance pupil is that of the
+telescope, and the reader recognises this plane by its comment. Surfaces off the axis or tilted stand between two
+coordinate breaks, of which the second undoes the first.
 """
 
 from __future__ import annotations
@@ -16,19 +17,26 @@ from typing import Any
 
 import numpy as np
 
-from ....core.errors import PrescriptionError
+from ....core.errors import DomainError, PrescriptionError
+from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
+from ...paraxial import with_floating_pupil
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_angles
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
 from .apertures import aperture_lines
+from .design import design_lines, stop_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
 from .reader import PUPIL_COMMENT
 from .shapes import shape_lines
 from .text import number_text
 
 MM = 1e-3
+#: Names of the units of a file [m].
+UNIT_NAMES = {1e-3: "MM", 1e-2: "CM", 0.0254: "IN", 1.0: "METER"}
+#: Difference of two pupils that rounding makes, over their size.
+_ROUNDING = 1e-12
 #: AGF coefficients of a glass of constant index: Schott's formula with its first term alone.
 CONSTANT_FORMULA = 1
 
@@ -44,41 +52,47 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     if t.obstructions:
         raise PrescriptionError(f"{t.name}: obstruction {t.obstructions[0].name}: a Zemax file cannot hold meshes")
     glasses = _glass_names(t)
-    angles = math.degrees(t.field_radius)
-    low, high = t.band or (t.default_wavelength, t.default_wavelength)
-    waves = list(dict.fromkeys([t.default_wavelength, low, high]))
+    data = t.design_data
+    unit = MM if data == DesignData() else data.unit
+    own_stop = _stop_makes_pupil(t)
+    if data.telecentric and not own_stop:
+        raise PrescriptionError(f"{t.name}: a telecentric object space needs its stop and its aperture in a Zemax file")
     lines = [
         "VERS 190513 30 123457 L123457",
         "MODE SEQ",
         f"NAME {' '.join((t.description or t.name).split())}",
-        "UNIT MM X W X CM MR CPMM",
-        f"ENPD {number_text(t.pupil_diameter / MM)}",
-        "ENVD 20 1 0",
-        f"FTYP 0 0 3 {len(waves)} 0 0 0",
-        "XFLN 0 0 0",
-        f"YFLN 0 {number_text(angles / math.sqrt(2))} {number_text(angles)}",
-        *(f"WAVM {i} {_micrometres(w)} 1" for i, w in enumerate(waves, start=1)),
-        "PWAV 1",
+        f"UNIT {UNIT_NAMES[unit]} X W X CM MR CPMM",
+        *(stop_lines(data, unit) if own_stop else [f"ENPD {number_text(t.pupil_diameter / unit)}"]),
+        *_field_lines(t, unit),
+        *_wavelength_lines(t),
     ]
+    first = t.surfaces[0].vertex[2] if own_stop else t.stop_z
     blocks = [["TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]]
-    distance = (t.object_distance - t.stop_z) / MM
+    distance = (t.object_distance - first) / unit
     blocks[0].append(f"DISZ {number_text(distance)}" if math.isfinite(distance) else "DISZ INFINITY")
-    # The plane of the stop, in front of all; z counts along the light, from the origin.
-    blocks.append(
-        [f"COMM {PUPIL_COMMENT}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
-    )
-    place = -t.stop_z
+    if not own_stop:
+        # The plane of the stop, in front of all; z counts along the light, from the origin.
+        blocks.append(
+            [f"COMM {PUPIL_COMMENT}", "STOP", "TYPE STANDARD", "CURV 0.0", *_glass_line(t.medium_before, glasses)]
+        )
+    place = -first
     before = t.medium_before
     for surface in t.surfaces:
         x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex))
-        blocks[-1].append(f"DISZ {number_text((z - place) / MM)}")
+        if len(blocks) > 1:
+            blocks[-1].append(f"DISZ {number_text((z - place) / unit)}")
         place = z
         axes = HALF_TURN @ surface.matrix @ HALF_TURN
-        own = _surface_lines(surface, before, glasses)
+        own = _surface_lines(surface, before, glasses, unit)
+        if own_stop and surface.name == data.stop:
+            own += [
+                "STOP",
+                *([f"DIAM {number_text((data.aperture_value or 0.0) / unit)} 1"] * (data.aperture == "stop")),
+            ]
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
         else:
-            values = [x / MM, y / MM, *np.degrees(rotation_angles(axes))]
+            values = [x / unit, y / unit, *np.degrees(rotation_angles(axes))]
             medium = _glass_line(before, glasses)
             blocks.append([*_break_lines(values, 0), *medium, "DISZ 0"])
             blocks.append([*own, "DISZ 0"])
@@ -90,6 +104,46 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
+
+
+def _stop_makes_pupil(t: Telescope) -> bool:
+    """Return whether stop and aperture are stated, and make the entrance pupil of the telescope."""
+    if t.design_data.stop is None or t.design_data.aperture is None:
+        return False
+    try:
+        made = with_floating_pupil(t)
+    except DomainError:
+        return False
+    close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
+    return math.isclose(made.stop_z, t.stop_z, **close) and math.isclose(made.pupil_diameter, t.pupil_diameter, **close)
+
+
+def _field_lines(t: Telescope, unit: float) -> list[str]:
+    """Return the lines of the fields: those that are stated, or three from the axis to the edge."""
+    data, waves = t.design_data, len(_wavelengths(t))
+    if data.fields:
+        kind, telecentric = FIELD_TYPES.index(data.field_type), int(data.telecentric)
+        head = [f"FTYP {kind} {telecentric} {len(data.fields)} {waves} 0 0 0"]
+    else:
+        edge = math.degrees(t.field_radius)
+        head = [
+            f"FTYP 0 0 3 {waves} 0 0 0",
+            "XFLN 0 0 0",
+            f"YFLN 0 {number_text(edge / math.sqrt(2))} {number_text(edge)}",
+        ]
+    return [*head, *design_lines(data, unit)]
+
+
+def _wavelengths(t: Telescope) -> list[float]:
+    """Return the wavelengths that are stated, or the default and the edges of the band."""
+    return list(t.design_data.wavelengths or dict.fromkeys([t.default_wavelength, *(t.band or ())]))
+
+
+def _wavelength_lines(t: Telescope) -> list[str]:
+    waves = _wavelengths(t)
+    weights = t.design_data.wavelength_weights or [1] * len(waves)
+    lines = [f"WAVM {i} {_micrometres(w)} {a!r}" for i, (w, a) in enumerate(zip(waves, weights, strict=True), start=1)]
+    return [*lines, f"PWAV {waves.index(t.default_wavelength) + 1}"]
 
 
 def _micrometres(wavelength: float) -> str:
@@ -106,18 +160,20 @@ def _break_lines(values: list[float], order: int) -> list[str]:
     ]
 
 
-def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str]) -> list[str]:
+def _surface_lines(surface: Surface, before: Medium, glasses: dict[Medium, str], unit: float) -> list[str]:
     lines = [f"COMM {' '.join(surface.name.split())}"]
     try:
         if surface.interaction == Interaction.PHASE:
             raise PrescriptionError("phase screens cannot be written")
-        lines += shape_lines(rotated_shape(surface.shape), MM)
+        lines += shape_lines(rotated_shape(surface.shape), unit)
         if surface.interaction == Interaction.MIRROR:
             lines.append("GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0")
         elif surface.interaction != Interaction.DETECTOR:
             lines += _glass_line(surface.medium_after, glasses)
         if surface.aperture is not None:
-            lines += aperture_lines(rotated_aperture(surface.aperture), MM)
+            lines += aperture_lines(rotated_aperture(surface.aperture), unit)
+        if surface.semi_diameter is not None:
+            lines.append(f"DIAM {number_text(surface.semi_diameter / unit)} 1")
     except PrescriptionError as error:
         raise PrescriptionError(f"surface {surface.name}: {error}") from None
     return lines

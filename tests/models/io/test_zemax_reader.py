@@ -1,6 +1,8 @@
 """Zemax lens files: what the parts of a file become, the real ones of other projects, and what is refused."""
 
+import math
 import random
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -406,7 +408,6 @@ def test_lenient_warns_of_each_thing_left_out(tmp_path):
 def test_real_files_load_without_leniency_or_warning(path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", ".*FTYP 3 1 3 1 0 0 0: a telecentric object space is not read")
         telescope = load_telescope(path)
     assert telescope.surfaces[-1].interaction == Interaction.DETECTOR
 
@@ -542,17 +543,18 @@ def test_placeholders_behind_an_unknown_glass_are_no_indices(tmp_path, figures):
             load_telescope(path, lenient=lenient)
 
 
-def test_a_telecentric_object_space_is_said(tmp_path):
-    text = MIRROR.replace("FTYP 0 0", "FTYP 1 1").replace("DISZ INFINITY", "DISZ 1600")
-    path = written(tmp_path, text)
-    with pytest.warns(
-        PrescriptionWarning, match=r"FTYP 1 1 .*: a telecentric .* is not read; the stop limits the rays"
-    ):
-        load_telescope(path)
+def test_a_telecentric_object_space_has_its_pupil_by_the_numerical_aperture(tmp_path):
+    finite = MIRROR.replace("DISZ INFINITY", "DISZ 1600").replace("FTYP 0 0", "FTYP 1 1")
+    telescope = load_telescope(written(tmp_path, re.sub("ENPD .*", "OBNA 0.02", finite)))
+    assert telescope.design_data.telecentric
+    # The beam of one point at the first surface, which is 1600 mm from the object.
+    assert telescope.object_distance - telescope.stop_z == pytest.approx(1.6, rel=1e-14)
+    assert telescope.stop_z == telescope.surfaces[0].vertex[2]
+    assert telescope.pupil_diameter == pytest.approx(3.2 * math.tan(math.asin(0.02)), rel=1e-14)
     # Of an object at infinity it means nothing.
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert load_telescope(written(tmp_path, MIRROR.replace("FTYP 0 0", "FTYP 0 1")))
+    assert not load_telescope(written(tmp_path, MIRROR.replace("FTYP 0 0", "FTYP 0 1"))).design_data.telecentric
+    with pytest.raises(PrescriptionError, match="telecentric: expected object or image heights as fields"):
+        load_telescope(written(tmp_path, finite.replace("FTYP 1 1", "FTYP 0 1")))
 
 
 def test_the_f_number_of_a_cylinder_is_that_of_its_curved_section(tmp_path):

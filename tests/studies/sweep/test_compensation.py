@@ -4,7 +4,7 @@ import pytest
 from pachon.core.errors import PachonError
 from pachon.pipeline.config import configuration_of, with_options
 from pachon.pipeline.experiment import Experiment
-from pachon.raytrace.rays import launch_rays
+from pachon.raytrace.launch import launch_rays
 from pachon.raytrace.trace import trace
 from pachon.studies.sweep.compensation import compensated
 from pachon.wavefront.chief_rays import fields_at

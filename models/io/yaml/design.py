@@ -1,0 +1,172 @@
+"""The section ``design`` of prescription files: design data as the designer stated them.
+
+::
+
+    design:
+      length: mm                                    # unit of tables: m, cm, mm or in
+      aperture: {f_number: 8.0}                     # or entrance_pupil, working_f_number, object_na, stop
+      stop: S6
+      aiming: paraxial                              # off, paraxial, real
+      fields: {angle: [[0, 0], [0, 14]], weights: [1, 1], vignetting: [[0, 0, 0, 0, 0], [0, 0, 0.1, 0.2, 0]]}
+      wavelengths: {values: [0.486, 0.588], weights: [1, 2]}
+      environment: {temperature_k: 293.15, pressure_pa: 101325}
+      telecentric: false
+      afocal: false
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator
+
+from ....core.schema import Section, checked, expected
+from ....core.yaml_reader import as_number
+from ...design_data import DesignData
+from .values import (
+    Flag,
+    Info,
+    Numbers,
+    OptionalLength,
+    OptionalNumber,
+    OptionalText,
+    Turn,
+    Wave,
+    Wavelengths,
+    to_si,
+    unit_of,
+)
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+def _rows(size: int) -> Callable[[Any], Rows | None]:
+    def convert(value: Any) -> Rows | None:
+        if not isinstance(value, list):
+            return None
+        rows = [tuple(map(as_number, row)) if isinstance(row, list) else () for row in value]
+        return None if any(len(row) != size or None in row for row in rows) else tuple(rows)  # type: ignore[arg-type]
+
+    return convert
+
+
+def _in_si(quantity: str, first: int = 0) -> AfterValidator:
+    """Return the conversion of the numbers of each row from the one of index `first` on."""
+
+    def convert(rows: Rows, info: Info) -> Rows:
+        unit = unit_of(quantity, info)
+        return tuple((*row[:first], *(to_si(v, unit) for v in row[first:])) for row in rows)
+
+    return AfterValidator(convert)
+
+
+_POINTS = checked(_rows(2), "a list of pairs of numbers")
+Angles = Annotated[Rows, _POINTS, _in_si("angle")]
+Heights = Annotated[Rows, _POINTS, _in_si("length")]
+Vignetting = Annotated[Rows, checked(_rows(5), "a list of rows of five numbers"), _in_si("angle", 4)]
+
+
+class ApertureSection(Section):
+    """One aperture."""
+
+    entrance_pupil: OptionalLength = None
+    f_number: OptionalNumber = None
+    working_f_number: OptionalNumber = None
+    object_na: OptionalNumber = None
+    stop: OptionalLength = None
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        if len(content) != 1:
+            raise expected(f"one of {', '.join(cls.keys())}")
+
+
+class FieldsSection(Section):
+    """Field points of one type, their weights and vignetting factors."""
+
+    angle: Angles = ()
+    object_height: Heights = ()
+    paraxial_image_height: Heights = ()
+    real_image_height: Heights = ()
+    weights: Numbers = ()
+    vignetting: Vignetting = ()
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        kinds = cls.keys()[:4]
+        if sum(key in content for key in kinds) != 1:
+            raise expected(f"one of {', '.join(kinds)}")
+
+
+class WavelengthsSection(Section):
+    """Wavelengths and their weights."""
+
+    values: Wavelengths
+    weights: Numbers = ()
+
+
+class EnvironmentSection(Section):
+    """Temperature and pressure."""
+
+    temperature_k: OptionalNumber = None
+    pressure_pa: OptionalNumber = None
+
+
+class DesignSection(Section):
+    """Design data."""
+
+    length: Literal["m", "cm", "mm", "in"] = "m"
+    aperture: ApertureSection | None = None
+    stop: OptionalText = None
+    aiming: Literal["off", "paraxial", "real"] = "off"
+    fields: FieldsSection | None = None
+    wavelengths: WavelengthsSection | None = None
+    environment: EnvironmentSection | None = None
+    telecentric: Flag = False
+    afocal: Flag = False
+
+    def data(self) -> DesignData:
+        """Return the design data."""
+        found: dict[str, Any] = {}
+        if self.aperture is not None:
+            found["aperture"], found["aperture_value"] = _only(self.aperture)
+        if self.fields is not None:
+            found |= {"field_weights": self.fields.weights, "vignetting": self.fields.vignetting}
+            found["field_type"], found["fields"] = _only(self.fields, but=("weights", "vignetting"))
+        if self.wavelengths is not None:
+            found |= {"wavelengths": self.wavelengths.values, "wavelength_weights": self.wavelengths.weights}
+        if self.environment is not None:
+            found |= {"temperature": self.environment.temperature_k, "pressure": self.environment.pressure_pa}
+        found |= {"telecentric": self.telecentric, "afocal": self.afocal}
+        return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **found)
+
+
+def _only(section: Section, but: tuple[str, ...] = ()) -> tuple[str, Any]:
+    """Return the one key of a section that its file has, but for some, and its value."""
+    (key,) = section.model_fields_set - set(but)
+    return key, getattr(section, key)
+
+
+def design_items(data: DesignData) -> dict[str, Any]:
+    """Return the section of design data, in metres; what has its default is left out."""
+    default = DesignData()
+    found: dict[str, Any] = {}
+    if data.length_unit != default.length_unit:
+        found["length"] = data.length_unit
+    if data.aperture is not None:
+        found["aperture"] = {data.aperture: data.aperture_value}
+    found |= {key: getattr(data, key) for key in ("stop", "aiming") if getattr(data, key) != getattr(default, key)}
+    if data.fields:
+        turn = Turn if data.field_type == "angle" else float
+        fields: dict[str, Any] = {data.field_type: [[turn(v) for v in row] for row in data.fields]}
+        fields |= {"weights": data.field_weights} if data.field_weights else {}
+        rows = [[*row[:4], Turn(row[4])] for row in data.vignetting]
+        found["fields"] = fields | ({"vignetting": rows} if rows else {})
+    if data.wavelengths:
+        found["wavelengths"] = {"values": [Wave(w) for w in data.wavelengths]}
+        found["wavelengths"] |= {"weights": data.wavelength_weights} if data.wavelength_weights else {}
+    environment = {"temperature_k": data.temperature, "pressure_pa": data.pressure}
+    if stated := {key: value for key, value in environment.items() if value is not None}:
+        found["environment"] = stated
+    return found | {key: True for key in ("telecentric", "afocal") if getattr(data, key)}

@@ -1,0 +1,216 @@
+"""Paraxial rays along an axis: the entrance pupil that a stop makes, and its size by the aperture that is stated.
+
+Heights are traced along the light, ``s = -z``, from the first surface. At a surface of curvature ``c`` along s::
+
+    n' u' = n u - h c (n' - n)        h_next = h + u t
+
+with the index n negative behind an odd number of mirrors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError
+from .media.medium import Medium
+from .surface import Interaction, Surface
+from .telescope import Telescope
+
+#: Height at the stop, over that of a ray from its middle, below which the entrance pupil is at infinity.
+_NO_IMAGE = 1e-9
+
+
+@dataclass
+class ParaxialSurfaces:
+    """Surfaces of a paraxial trace: curvatures [1/m], media, mirrors and the distance to the next [m].
+
+    Like Zemax it traces in the plane x = 0; where no surface is curved there, in the plane y = 0.
+    """
+
+    rows: list[tuple[tuple[float, float], Medium, Medium, bool]] = field(default_factory=list)
+    distances: list[float] = field(default_factory=list)
+    stop: int = 0
+    stop_radius: float = 0.0
+    _ahead: float = 0.0
+
+    @classmethod
+    def of(cls, telescope: Telescope, stop: str) -> ParaxialSurfaces:
+        """Return the surfaces of a telescope, with one of them as the stop; DomainError if one is off the axis."""
+        found, medium = cls(), telescope.medium_before
+        z = telescope.surfaces[0].vertex[2]
+        for surface in telescope.surfaces:
+            require_on_axis(surface, telescope.name)
+            found.advance(z - surface.vertex[2])
+            z = surface.vertex[2]
+            if surface.name == stop:
+                found.mark_stop(0.0)
+            x, y = curvatures_across(surface)
+            found.add((-x, -y), medium, surface.medium_after, mirror=surface.interaction == Interaction.MIRROR)
+            medium = surface.medium_after
+        return found
+
+    def add(self, curvatures: tuple[float, float], before: Medium, after: Medium, *, mirror: bool) -> None:
+        """Add a surface of given curvatures along x and y."""
+        self.rows.append((curvatures, before, after, mirror))
+        self.distances.append(self._ahead)
+        self._ahead = 0.0
+
+    def advance(self, thickness: float) -> None:
+        """Go on along the axis [m]; coordinate breaks do it too."""
+        self._ahead += thickness
+
+    def mark_stop(self, radius: float, *, first: bool = False) -> None:
+        """Take the next surface (or the first) for the stop, with its semi-diameter [m]."""
+        self.stop, self.stop_radius = (0 if first else len(self.rows)), radius
+
+    def trace(self, height: float, slope: float, wavelength: float) -> tuple[np.ndarray, float]:
+        """Return the heights [m] at the surfaces, and the last slope, of a ray by its first height [m] and slope."""
+        heights = []
+        n = float(self.rows[0][1].index(wavelength))
+        axis = 1 if any(curvatures[1] for curvatures, *_ in self.rows) else 0
+        for (curvatures, _, after, mirror), distance in zip(self.rows, self.distances, strict=True):
+            height += slope * distance
+            heights.append(height)
+            glass = float(after.index(wavelength))
+            n_after = -n if mirror else math.copysign(glass, n)
+            slope = (n * slope - height * curvatures[axis] * (n_after - n)) / n_after
+            n = n_after
+        return np.array(heights), slope
+
+
+@dataclass(frozen=True)
+class StopImage:
+    """Paraxial image of the stop by the surfaces in front of it: the entrance pupil.
+
+    Attributes
+    ----------
+    surfaces : ParaxialSurfaces
+        The surfaces.
+    wavelength : float
+        Vacuum wavelength [m].
+    object_distance : float
+        From the object to the first surface [m].
+    z : float
+        From the first surface to the entrance pupil, along the light [m]. In a telecentric object space, whose chief
+        rays are parallel to the axis, that is the first surface.
+    telecentric : bool
+        Whether the object space is telecentric.
+    stop_scale : float
+        Height at the stop for each unit of height in the entrance pupil.
+    image_scale, image_slope : float
+        Height [m] and slope of the chief ray at the last surface for each unit of the tangent of the field angle.
+    focal_length : float
+        Effective focal length [m]; infinite of an afocal system.
+    """
+
+    surfaces: ParaxialSurfaces
+    wavelength: float
+    object_distance: float
+    z: float
+    telecentric: bool
+    stop_scale: float
+    image_scale: float
+    image_slope: float
+    focal_length: float
+
+    @classmethod
+    def of(
+        cls, surfaces: ParaxialSurfaces, wavelength: float, object_distance: float, *, telecentric: bool
+    ) -> StopImage | None:
+        """Return the image of the stop; None where it is at infinity, and so is the object or it has no distance."""
+        heights, end_slope = surfaces.trace(1.0, 0.0, wavelength)
+        across, across_slope = surfaces.trace(0.0, 1.0, wavelength)
+        scale, offset = float(heights[surfaces.stop]), float(across[surfaces.stop])
+        at_infinity = abs(scale) < _NO_IMAGE * max(1.0, abs(offset))
+        telecentric = telecentric or at_infinity
+        if telecentric and (not math.isfinite(object_distance) or object_distance == 0):
+            return None
+        if telecentric:
+            # The chief ray of the field angle t starts at the height -t object_distance.
+            z = 0.0
+            image, slope = -object_distance * float(heights[-1]), -object_distance * end_slope
+            # At unit height in the plane of the first surface its slope is 1 / object_distance.
+            scale += offset / object_distance
+        else:
+            z = offset / scale
+            image, slope = float(across[-1] - z * heights[-1]), across_slope - z * end_slope
+        focal_length = -1.0 / end_slope if end_slope else math.inf
+        return cls(surfaces, wavelength, object_distance, z, telecentric, scale, image, slope, focal_length)
+
+    def diameter(self, aperture: str, value: float) -> float:
+        """Return the diameter of the entrance pupil [m] of an aperture of DesignData; 0 or infinite if it has none."""
+        distance = abs(self.object_distance + self.z)
+        if aperture == "entrance_pupil":
+            return value
+        if aperture == "stop":
+            return 2.0 * value / abs(self.stop_scale) if self.stop_scale else math.inf
+        if not value > 0:
+            return 0.0
+        if aperture == "object_na":
+            sine = value / float(self.surfaces.rows[0][1].index(self.wavelength))
+            return 2.0 * distance * math.tan(math.asin(sine)) if sine < 1 else math.inf
+        if aperture == "f_number" or math.isinf(self.object_distance):
+            return abs(self.focal_length) / value
+        # The paraxial working f-number, 1 / (2 n u): of the cone of light from the object to the image.
+        _, slope = self.surfaces.trace(self.object_distance, 1.0, self.wavelength)
+        cone = abs(slope * float(self.surfaces.rows[-1][2].index(self.wavelength)))
+        return distance / (value * cone) if cone else math.inf
+
+
+def stop_image(telescope: Telescope) -> StopImage:
+    """Return the paraxial image of a telescope's stop at its default wavelength.
+
+    DomainError if its design data name no stop, a surface is off the axis, or the image is at infinity.
+    """
+    data = telescope.design_data
+    if data.stop is None:
+        raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
+    surfaces = ParaxialSurfaces.of(telescope, data.stop)
+    distance = telescope.object_distance - telescope.surfaces[0].vertex[2]
+    found = StopImage.of(surfaces, telescope.default_wavelength, distance, telecentric=data.telecentric)
+    if found is None:
+        raise DomainError(f"{telescope.name}: the stop {data.stop!r} makes an entrance pupil at infinity (telecentric)")
+    return found
+
+
+@check_arguments
+def with_floating_pupil(telescope: Telescope) -> Telescope:
+    """Return the telescope with the entrance pupil that its stop and the aperture that it states make now.
+
+    Surfaces that were changed move the image of the stop and, at a stated focal ratio, its diameter.
+
+    Raises
+    ------
+    DomainError
+        If the design data have no stop or no aperture, a surface is off the axis, or the pupil has no finite size.
+    """
+    image, data = stop_image(telescope), telescope.design_data
+    if data.aperture is None or data.aperture_value is None:
+        raise DomainError(f"{telescope.name}: expected an aperture in its design data")
+    diameter = image.diameter(data.aperture, data.aperture_value)
+    if not 0 < diameter < math.inf:
+        raise DomainError(
+            f"{telescope.name}: {data.aperture} = {data.aperture_value:g}: expected a pupil of finite size"
+        )
+    return replace(telescope, stop_z=telescope.surfaces[0].vertex[2] - image.z + 0.0, pupil_diameter=diameter)
+
+
+def require_on_axis(surface: Surface, name: str) -> None:
+    """Raise a DomainError for a surface off the axis of its telescope."""
+    axis = surface.matrix[:, 2]
+    if surface.vertex[0] or surface.vertex[1] or axis[0] or axis[1] or axis[2] < 0:
+        raise DomainError(f"surface {surface.name} of {name}: expected one on the axis, not perturbed")
+
+
+def curvatures_across(surface: Surface) -> tuple[float, float]:
+    """Return the curvatures [1/m] of a surface on the axis along x and y of the telescope."""
+    own = surface.shape.curvatures
+    if own[0] == own[1]:
+        return own
+    # Euler's theorem: squares of the cosines between the axes weight the curvatures of the surface.
+    along_x, along_y = surface.matrix[:2, :2] ** 2 @ np.array(own)
+    return float(along_x), float(along_y)

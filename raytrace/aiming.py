@@ -1,0 +1,186 @@
+"""Ray aiming: points of the entrance pupil through which rays reach given points of the stop.
+
+The pupil that the front of a lens makes of its stop moves and deforms with the field. A ray of the pupil coordinates p,
+in units of the radius of the entrance pupil, is aimed where it meets the stop at p times the radius of the stop. The
+two coordinates in the plane of the entrance pupil are found for all rays together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import DomainError
+from ..core.units import field_label
+from ..models.design_data import DesignData
+from ..models.surface import Interaction
+from ..models.telescope import Telescope
+from .landing import Landing, derivatives, determinants, find_points, solved
+from .rays import field_angles, field_direction, object_points, straight_bundles
+from .trace import trace
+
+#: Step of the differences that the first derivatives come from, in units of the radius of the entrance pupil.
+_DIFFERENCE = 1e-6
+#: Steps in the field angle [rad] by which chief rays are followed from the axis; the second where the first fail.
+_FIELD_STEPS = np.deg2rad((10.0, 1.0))
+#: Steps by which rays that are not found at once are followed from the chief ray outwards.
+_PUPIL_STEPS = 12
+
+
+def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> np.ndarray:
+    """Return where rays of pupil points [m] cross the plane of the entrance pupil, [n_pupil, 2] or by direction.
+
+    The arguments are those of :func:`~pachon.raytrace.rays.straight_bundles`. Without aiming the points are returned as
+    they are; else their shape is [n_direction, n_pupil, 2], NaN where no ray reaches the point of the stop, and where
+    none does so through its middle.
+    """
+    data = telescope.design_data
+    if data.telecentric:
+        return object_points(telescope, directions)[:, None, :2] + pupil
+    if data.aiming == "off":
+        return pupil
+    stop = stop_of(telescope)
+    n = len(directions)
+    chief = _chief_points(telescope, stop, directions, wavelength)
+    relative = np.broadcast_to(pupil / (0.5 * telescope.pupil_diameter), (n, *pupil.shape[-2:]))
+    target = (stop.radius * relative @ stop.axes.T).reshape(-1, 2)
+    rays = np.repeat(directions, relative.shape[1], axis=0)
+    landing = stop.landing(telescope, rays, wavelength)
+    start = np.repeat(chief, relative.shape[1], axis=0)
+    # All rays of a field begin with the derivatives at its chief ray.
+    slopes = derivatives(stop.landing(telescope, directions, wavelength), chief, _difference(telescope))
+    first = start + solved(np.repeat(slopes, relative.shape[1], axis=0), target)
+    found = find_points(landing, first, target, stop.radius, _difference(telescope))
+    lost = np.flatnonzero(np.isnan(found).any(axis=1))
+    if len(lost):
+
+        def of_lost(points: np.ndarray, which: np.ndarray) -> np.ndarray:
+            return landing(points, lost[which])
+
+        points = start[lost]
+        for k in range(1, _PUPIL_STEPS + 1):
+            points = find_points(
+                of_lost, points, target[lost] * (k / _PUPIL_STEPS), stop.radius, _difference(telescope)
+            )
+        found[lost] = points
+    return found.reshape(n, -1, 2)
+
+
+def require_aimed(telescope: Telescope, directions: np.ndarray, points: np.ndarray) -> None:
+    """Raise a DomainError that names the first of the fields, by their directions, of which no ray was aimed."""
+    lost = np.isnan(points).all(axis=(-2, -1)) if points.ndim == 3 else np.zeros(len(directions), dtype=bool)
+    if lost.any():
+        first = directions[lost][:1]
+        label = field_label(field_angles(first[:, :2] / -first[:, 2:])[0])
+        name = telescope.design_data.stop
+        raise DomainError(f"{label}: no ray from this field passes the middle of the stop {name!r} of {telescope.name}")
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """The stop of a telescope, with the surfaces in front of it.
+
+    Attributes
+    ----------
+    front : Telescope
+        The surfaces up to the stop, none of which stops light.
+    radius : float
+        Radius of the stop that pupil coordinates of 1 belong to [m].
+    axes : ndarray, shape [2, 2]
+        Axes x and y of the entrance pupil, in those of the stop, as columns.
+    """
+
+    front: Telescope
+    radius: float
+    axes: np.ndarray
+
+    def landing(self, telescope: Telescope, directions: np.ndarray, wavelength: float) -> Landing:
+        """Return the function from points of the entrance pupil to the stop for rays of given chief directions."""
+
+        def land(points: np.ndarray, which: np.ndarray) -> np.ndarray:
+            rays = straight_bundles(telescope, directions[which], wavelength, points[:, None])
+            return self.front.surfaces[-1].to_local(trace(self.front, rays).position)[:, :2]
+
+        return land
+
+
+@lru_cache(maxsize=64)
+def stop_of(telescope: Telescope) -> Stop:
+    """Return the stop of a telescope whose design data name one; DomainError if no light on the axis reaches it.
+
+    Its radius is that of the paraxial or of the real marginal ray at the default wavelength, as `aiming` says; or that
+    which the design data state.
+    """
+    data = telescope.design_data
+    if data.stop is None:
+        raise DomainError(f"{telescope.name}: expected a surface that is the stop (design data: stop)")
+    front = _front(telescope, data.stop)
+    axis, light = field_direction(0.0, 0.0)[None], telescope.default_wavelength
+    unscaled = Stop(front, 1.0, np.eye(2))
+    landing = unscaled.landing(telescope, axis, light)
+    rim = 0.5 * telescope.pupil_diameter
+    chief = find_points(landing, np.zeros((1, 2)), np.zeros((1, 2)), rim, _difference(telescope))
+    # The error of central differences is one of third order, which two steps remove.
+    near, far = (_central(landing, chief, step * rim) for step in (1e-3, 2e-3))
+    scale = (4.0 * near - far) / 3.0
+    if not np.isfinite(scale).all() or determinants(scale[None])[0] == 0.0:
+        raise DomainError(f"{telescope.name}: no ray on the axis passes the middle of the stop {data.stop!r}")
+    u, _, v = np.linalg.svd(scale)
+    marginal = np.array([[0.0, rim]])
+    if data.aperture == "stop" and data.aperture_value is not None:
+        radius = data.aperture_value
+    elif data.aiming == "real":
+        radius = float(np.linalg.norm(landing(chief + marginal, np.zeros(1, dtype=int))))
+    else:
+        radius = float(np.linalg.norm(scale @ marginal[0]))
+    if not np.isfinite(radius):
+        raise DomainError(f"{telescope.name}: the marginal ray on the axis does not reach the stop {data.stop!r}")
+    return Stop(front, radius, u @ v)
+
+
+def _front(telescope: Telescope, stop: str) -> Telescope:
+    """Return the surfaces of a telescope up to its stop, which rays cross as they are, without apertures."""
+    surfaces = telescope.surfaces[: telescope.surface_names.index(stop) + 1]
+    before = surfaces[-2].medium_after if len(surfaces) > 1 else telescope.medium_before
+    last = replace(surfaces[-1], interaction=Interaction.PASS, medium_after=before)
+    clear = tuple(replace(s, aperture=None) for s in (*surfaces[:-1], last))
+    bare: dict[str, Any] = {"groups": {}, "group_frames": {}, "obstructions": (), "design_data": DesignData()}
+    return replace(telescope, surfaces=clear, **bare)
+
+
+def _difference(telescope: Telescope) -> float:
+    return _DIFFERENCE * 0.5 * telescope.pupil_diameter
+
+
+def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wavelength: float) -> np.ndarray:
+    """Return the points of the entrance pupil [n, 2] of rays through the middle of the stop, from the axis outwards."""
+    slopes = directions[:, :2] / -directions[:, 2:]
+    size = np.hypot(*slopes.T)
+    angle, along = np.arctan(size), slopes / np.where(size > 0, size, 1.0)[:, None]
+    found = np.full_like(slopes, np.nan)
+    for step in _FIELD_STEPS:
+        left = np.flatnonzero(np.isnan(found).any(axis=1))
+        points = before = np.zeros((len(left), 2))
+        for k in range(int(np.ceil(angle[left].max(initial=0.0) / step)) + 1):
+            at = np.minimum(k * step, angle[left])
+            going = (k - 1) * step < angle[left]
+            tx, ty = (np.tan(at)[:, None] * along[left])[going].T
+            light = field_direction(tx, ty, "gnomonic")
+            landing = stop.landing(telescope, light, wavelength)
+            # The pupil moves steadily with the field: go on as in the step before.
+            guess = (2.0 * points - before)[going] if k > 1 else points[going]
+            moved = points.copy()
+            moved[going] = find_points(landing, guess, np.zeros_like(guess), stop.radius, _difference(telescope))
+            points, before = moved, np.where(going[:, None], points, moved)
+        found[left] = points
+    return found
+
+
+def _central(landing: Landing, point: np.ndarray, step: float) -> np.ndarray:
+    """Return the derivatives [2, 2] at one point by central differences."""
+    one = np.zeros(1, dtype=int)
+    sides = [landing(point + step * axis, one) - landing(point - step * axis, one) for axis in np.eye(2)]
+    return np.concatenate(sides).T / (2.0 * step)

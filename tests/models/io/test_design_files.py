@@ -1,0 +1,193 @@
+"""Design data in files: read from Zemax, CODE V and YAML, and written back."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import PrescriptionError
+from pachon.models.design_data import DesignData
+from pachon.models.io.prescription import load_telescope, save_telescope
+
+DATA = Path(__file__).parents[2] / "data" / "zmx"
+FILES = sorted(DATA.glob("*.zmx"))
+#: Files whose stop is off the axis, which is not written.
+FOLDED = ("HoO-V2C18Ex46", "simple_fold_mirror_up", "zmax_37992")
+
+LENS = """MODE SEQ
+UNIT CM X W X CM MR CPMM
+{aperture}
+ENVD 15 0.5 0
+RAIM 0 2 1 1 0 0 0 0 0 1
+FTYP {kind} 0 2 3 0 0 0
+XFLN 0 3 7 7
+YFLN 0 4 7 7
+FWGN 1 2 9 9
+VDXN 0 0.1
+VDYN 0 0.2
+VCXN 0 0.3
+VCYN 0 0.4
+VANN 0 30
+WAVM 1 0.4861 1
+WAVM 2 0.5876 2
+WAVM 3 0.6563 0.5
+PWAV 2
+SURF 0
+  TYPE STANDARD
+  CURV 0.0
+  DISZ {distance}
+SURF 1
+  COMM front
+  TYPE STANDARD
+  CURV 0.1
+  DISZ 1
+  GLAS N-BK7
+  DIAM 3 0
+SURF 2
+  COMM back
+  TYPE STANDARD
+  CURV -0.1
+  DISZ 2
+SURF 3
+  COMM iris
+  STOP
+  TYPE STANDARD
+  CURV 0
+  DISZ 7
+  DIAM 1 1
+SURF 4
+  TYPE STANDARD
+  CURV 0
+  DISZ 0
+"""
+
+
+def lens(tmp_path, kind=0, aperture="ENPD 2", distance="INFINITY"):
+    path = tmp_path / "lens.zmx"
+    path.write_text(LENS.format(kind=kind, aperture=aperture, distance=distance))
+    return load_telescope(path)
+
+
+def test_a_zemax_file_keeps_what_its_designer_stated(tmp_path):
+    telescope = lens(tmp_path)
+    data = telescope.design_data
+    assert (data.length_unit, data.aperture, data.aperture_value) == ("cm", "entrance_pupil", 0.02)
+    assert (data.stop, data.aiming, data.field_type) == ("iris", "real", "angle")
+    # Half a turn about y: x changes its sign, and so do decentres along x and angles.
+    assert np.rad2deg(data.fields) == pytest.approx(np.array([[0, 0], [-3, 4]]), abs=1e-12)
+    assert data.field_weights == (1.0, 2.0)
+    assert data.vignetting[1] == pytest.approx((-0.1, 0.2, 0.3, 0.4, -np.pi / 6), rel=1e-14)
+    assert data.wavelengths == (0.4861e-6, 0.5876e-6, 0.6563e-6)
+    assert data.wavelength_weights == (1.0, 2.0, 0.5)
+    assert telescope.default_wavelength == 0.5876e-6
+    assert (data.temperature, data.pressure) == (288.15, 50662.5)
+    assert [s.semi_diameter for s in telescope.surfaces] == [0.03, None, 0.01, None]
+    assert all(s.aperture is None for s in telescope.surfaces)
+
+
+@pytest.mark.parametrize(
+    ("line", "aperture", "value"),
+    [
+        ("ENPD 2", "entrance_pupil", 0.02),
+        ("FNUM 4 0", "f_number", 4.0),
+        ("FNUM 4 1", "working_f_number", 4.0),
+        ("OBNA 0.05", "object_na", 0.05),
+        ("FLOA", "stop", 0.01),
+    ],
+)
+@pytest.mark.parametrize("kind", ["object_height", "paraxial_image_height", "real_image_height"])
+@pytest.mark.parametrize("ending", ["zmx", "yaml"])
+def test_what_is_stated_is_written_back(tmp_path, line, aperture, value, kind, ending):
+    number = ("angle", "object_height", "paraxial_image_height", "real_image_height").index(kind)
+    telescope = lens(tmp_path, number, line, "50")
+    assert telescope.design_data.aperture == aperture
+    assert telescope.design_data.aperture_value == pytest.approx(value, rel=1e-15)
+    assert telescope.design_data.fields[1] == pytest.approx((-0.03, 0.04), rel=1e-15)
+    save_telescope(telescope, tmp_path / f"again.{ending}")
+    again = load_telescope(tmp_path / f"again.{ending}")
+    if ending == "yaml":
+        assert again == telescope
+    # A file in centimetres divides and multiplies by its unit.
+    assert again.pupil_diameter == pytest.approx(telescope.pupil_diameter, rel=1e-15)
+    assert again.design_data.fields[1] == pytest.approx(telescope.design_data.fields[1], rel=1e-15)
+    same = ("length_unit", "aperture", "stop", "aiming", "field_type", "field_weights", "wavelengths", "temperature")
+    assert all(getattr(again.design_data, key) == getattr(telescope.design_data, key) for key in same)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+def test_real_files_keep_their_design_data(tmp_path, path):
+    telescope = load_telescope(path)
+    save_telescope(telescope, tmp_path / "again.yaml")
+    assert load_telescope(tmp_path / "again.yaml") == telescope
+    save_telescope(telescope, tmp_path / "again.zmx")
+    expected = telescope.design_data
+    if path.stem in FOLDED:
+        expected = telescope.with_design(stop=None, aiming="off").design_data
+    found = load_telescope(tmp_path / "again.zmx").design_data
+    # Zemax's own temperature and pressure where a file states none.
+    for key in (key for key in DesignData.__dataclass_fields__ if key not in ("temperature", "pressure")):
+        assert getattr(found, key) == getattr(expected, key), key
+
+
+def test_a_pupil_of_another_origin_is_written_as_a_plane(tmp_path):
+    """A stop that does not make the telescope's entrance pupil is not written: the pupil is what counts."""
+    from dataclasses import replace
+
+    telescope = lens(tmp_path)
+    other = replace(telescope, stop_z=telescope.stop_z + 0.01)
+    save_telescope(other, tmp_path / "again.zmx")
+    again = load_telescope(tmp_path / "again.zmx")
+    assert again.stop_z == pytest.approx(other.stop_z, abs=1e-16)
+    assert (again.design_data.stop, again.design_data.aiming) == (None, "off")
+    assert again.design_data.fields == other.design_data.fields
+
+
+def test_codev_files_keep_fields_and_wavelengths(tmp_path):
+    path = tmp_path / "lens.seq"
+    path.write_text(
+        "RDM\nDIM M\nEPD 10\nWL 656.3 587.6 486.1\nREF 2\nXAN 0 0\nYAN 0 7\n"
+        "SO 0 1e20\nS 50 5 NBK7_SCHOTT\nS -50 20\nS 0 30\nSTO\nSI 0 0\n"
+    )
+    data = load_telescope(path).design_data
+    assert (data.length_unit, data.aperture, data.aperture_value, data.stop) == ("mm", "entrance_pupil", 0.01, "S3")
+    assert np.rad2deg(data.fields) == pytest.approx(np.array([[0, 0], [0, 7]]), abs=1e-12)
+    assert data.wavelengths == pytest.approx((656.3e-9, 587.6e-9, 486.1e-9), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("environment: {", "environment: [1]  # {", r"design.environment = \[1\]: expected a mapping"),
+        ("{entrance_pupil: 0.02}", "{entrance_pupil: 0.02, f_number: 4}", "design.aperture = .*: expected one of"),
+        ("angle: [", "angel: [", "unknown key design.fields.angel"),
+        ("aiming: real", "aiming: yes", "design.aiming = True: expected one of off, paraxial, real"),
+        ("stop: iris", "stop: irish", "stop = 'irish': expected the name of a surface, such as 'front'"),
+        ("length: cm", "length: ell", "design.length = 'ell': expected one of m, cm, mm, in"),
+        ("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0.0, 0.0]", "design.fields.vignetting = .*: expected a list of rows of five"),
+        ("semi_diameter: 0.03", "semi_diameter: -1", "semi_diameter = -1.0: expected a positive number"),
+    ],
+)
+def test_wrong_design_sections_are_refused(tmp_path, old, new, expected):
+    save_telescope(lens(tmp_path), tmp_path / "lens.yaml")
+    text = (tmp_path / "lens.yaml").read_text()
+    assert old in text
+    (tmp_path / "wrong.yaml").write_text(text.replace(old, new, 1))
+    with pytest.raises(PrescriptionError, match=expected):
+        load_telescope(tmp_path / "wrong.yaml")
+
+
+def test_yaml_is_in_the_units_of_its_file(tmp_path):
+    """Millimetres and degrees become metres and radians, in the section design too."""
+    save_telescope(pachon.load_telescope("paul_baker"), tmp_path / "t.yaml")
+    text = (tmp_path / "t.yaml").read_text()
+    section = (
+        "design:\n  aperture: {entrance_pupil: 8.4}\n  stop: M1\n"
+        "  fields: {angle: [[0, 0], [0.1, 0.2]], vignetting: [[0, 0, 0, 0, 0], [0, 0, 0, 0, 90]]}\n"
+        "  wavelengths: {values: [0.5, 0.6]}\n  environment: {temperature_k: 280}\n"
+    )
+    (tmp_path / "t.yaml").write_text(text.replace("surfaces:", section + "surfaces:"))
+    data = load_telescope(tmp_path / "t.yaml").design_data
+    assert data.fields[1] == pytest.approx(np.deg2rad((0.1, 0.2)), rel=1e-15)
+    assert data.vignetting[1][4] == pytest.approx(np.pi / 2, rel=1e-15)
+    assert (data.aperture_value, data.wavelengths, data.temperature) == (8.4, (5e-7, 6e-7), 280.0)

@@ -1,0 +1,136 @@
+"""Ray aiming: rays reach the stop where they should, in Zemax's sense, against a root finder ray by ray."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import root
+
+import pachon
+from pachon.core.errors import DomainError, PrescriptionError
+from pachon.models.design_data import DesignData
+from pachon.models.io.prescription import load_telescope
+from pachon.raytrace.aiming import stop_of
+from pachon.raytrace.rays import Rays
+
+DATA = Path(__file__).parents[1] / "data" / "zmx"
+WIDE = DATA / "circular_aperture_example_with_aperture.zmx"
+PUPIL = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [0.8, 0.0], [-0.5, 0.6]])
+
+
+@pytest.fixture(scope="module")
+def wide():
+    return load_telescope(WIDE)
+
+
+def at_stop(telescope, rays):
+    """Where rays meet the stop, x and y in its own frame [m]."""
+    index = telescope.surface_names.index(telescope.design_data.stop)
+    met = pachon.trace(telescope, rays, "all", threads=1)[index]
+    return telescope.surfaces[index].to_local(met.position)[:, :2]
+
+
+def launched(telescope, field, points):
+    radius = 0.5 * telescope.pupil_diameter
+    return pachon.launch_rays(telescope, field, telescope.default_wavelength, tuple(radius * points.T))
+
+
+@pytest.mark.parametrize("aiming", ["paraxial", "real"])
+@pytest.mark.parametrize("degrees", [(0.0, 0.0), (0.0, 35.0), (0.0, 50.0), (-20.0, 30.0)])
+def test_rays_of_a_wide_angle_lens_fill_the_stop(wide, degrees, aiming):
+    telescope = wide.with_design(aiming=aiming)
+    rays = launched(telescope, np.deg2rad(degrees), PUPIL)
+    # Broyden's method ends at 1e-12 of the radius of the stop, some 10 mm.
+    assert at_stop(telescope, rays) == pytest.approx(stop_of(telescope).radius * PUPIL, abs=2e-14)
+    # The light of a star is parallel whatever is aimed at.
+    slopes = np.tan(np.deg2rad(degrees))
+    assert rays.direction[:, :2] / -rays.direction[:, 2:] == pytest.approx(np.tile(slopes, (5, 1)), abs=1e-14)
+
+
+def test_the_radius_of_the_stop_is_that_of_the_paraxial_or_the_real_marginal_ray(wide):
+    off = wide.with_design(aiming="off")
+    rim = at_stop(off, launched(off, (0.0, 0.0), np.array([[0.0, 1.0]])))[0, 1]
+    assert stop_of(wide.with_design(aiming="real")).radius == pytest.approx(rim, rel=1e-12)
+    # Near the axis real rays are paraxial: the error falls as the square of the height.
+    small = 1e-4
+    near = at_stop(off, launched(off, (0.0, 0.0), np.array([[0.0, small]])))[0, 1] / small
+    assert stop_of(wide).radius == pytest.approx(near, rel=1e-8)
+    assert abs(rim / near - 1.0) > 1e-3
+    stated = wide.with_design(aperture="stop", aperture_value=4e-3, aiming="real")
+    assert stop_of(stated).radius == 4e-3
+
+
+@pytest.mark.long
+def test_aimed_rays_are_those_of_a_root_finder(wide):
+    """Brute force: scipy's root per ray, on the plane of the entrance pupil, of the un-aimed lens."""
+    field = np.deg2rad((10.0, 33.0))
+    aimed = launched(wide, field, PUPIL)
+    plain = wide.with_design(aiming="off")
+    for point, position in zip(PUPIL, aimed.position, strict=True):
+
+        def miss(q, point=point):
+            rays = launched(plain, field, np.array([q]))
+            return (at_stop(plain, rays)[0] - stop_of(wide).radius * point) * 1e3
+
+        found = root(miss, [0.3, 0.8] + 0.9 * point, tol=1e-11)
+        assert np.abs(found.fun).max() < 1e-10
+        # Rays are parallel: the difference across the beam counts.
+        start = launched(plain, field, found.x[None])
+        assert position == pytest.approx(start.position[0], abs=1e-12)
+
+
+def test_a_batch_may_be_split(wide):
+    field = np.deg2rad((0.0, 47.0))
+    together = launched(wide, field, PUPIL)
+    one = [launched(wide, field, PUPIL[i : i + 1]) for i in range(len(PUPIL))]
+    assert np.array_equal(together.position, np.concatenate([rays.position for rays in one]))
+
+
+def test_without_aiming_nothing_changes(wide):
+    """Points of the plane of the entrance pupil, to the last bit, for a telescope without design data too."""
+    bare = replace(wide, design_data=DesignData())
+    for telescope in (bare, wide.with_design(aiming="off")):
+        rays = launched(telescope, (0.0, 0.2), PUPIL)
+        assert isinstance(rays, Rays)
+        down = rays.position + rays.direction * ((telescope.stop_z - rays.position[:, 2:]) / rays.direction[:, 2:])
+        assert down[:, :2] == pytest.approx(0.5 * telescope.pupil_diameter * PUPIL, abs=1e-15)
+    assert np.array_equal(launched(bare, (0.0, 0.2), PUPIL).position, rays.position)
+
+
+def test_the_stop_behind_a_lens_of_a_finite_object():
+    """One thin-ish lens, the object 300 mm in front: rays start at the object and fill the stop behind the lens."""
+    telescope = replace(load_telescope(DATA / "lens1.zmx"), object_distance=0.3).with_design(aiming="real")
+    for ty in (0.0, 0.1, 0.2):
+        rays = launched(telescope, (0.0, ty), PUPIL)
+        assert np.ptp(rays.position, axis=0).max() == 0
+        assert rays.position[0, 1] == pytest.approx(-np.tan(ty) * (0.3 - telescope.stop_z), abs=1e-15)
+        assert at_stop(telescope, rays) == pytest.approx(stop_of(telescope).radius * PUPIL, abs=1e-14)
+
+
+def test_a_mirror_in_front_of_the_stop_keeps_the_sense_of_the_pupil():
+    """Aimed rays go to the rays without aiming as the pupil becomes small: none is turned round."""
+    telescope = load_telescope(DATA / "lens1.zmx")
+    assert telescope.design_data.stop is not None
+    aimed = launched(telescope.with_design(aiming="paraxial"), (0.0, 0.0), 1e-3 * PUPIL)
+    plain = launched(telescope, (0.0, 0.0), 1e-3 * PUPIL)
+    assert aimed.position == pytest.approx(plain.position, abs=1e-10)
+
+
+def test_a_field_that_no_ray_can_reach_is_said(wide):
+    beyond = replace(wide, field_limit=np.deg2rad(84.0))
+    with pytest.raises(
+        DomainError, match=r"field = \(0, 80\) deg: no ray from this field passes the middle of the stop"
+    ):
+        launched(beyond, np.deg2rad((0.0, 80.0)), PUPIL)
+
+
+def test_a_stop_that_cannot_be_found_is_said(wide):
+    with pytest.raises(PrescriptionError, match=r"stop = 'S99': expected the name of a surface, such as 'S1'"):
+        wide.with_design(stop="S99")
+    with pytest.raises(PrescriptionError, match="aiming = 'real': expected a surface that is the stop"):
+        wide.with_design(stop=None, aiming="real")
+    with pytest.raises(PrescriptionError, match="aiming = 'true': expected one of off, paraxial, real"):
+        wide.with_design(aiming="true")
+    with pytest.raises(PrescriptionError, match="aiming = 'paraxial': expected a surface that is the stop"):
+        pachon.Request.of(pachon.load_telescope("auxtel"), aiming="paraxial")
