@@ -17,7 +17,6 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PrescriptionError
 from ...core.units import metres
 
-
 #: Fraunhofer lines d, F, C and g [um], at which glass makers state the index.
 LINE_D, LINE_F, LINE_C, LINE_G = 0.5875618, 0.4861327, 0.6562725, 0.4358343
 
@@ -182,8 +181,8 @@ class RelativeToAir(Medium):
 class ChangedIndex(Medium):
     """Medium with the index of another plus a constant at every wavelength, and more or less dispersion.
 
-    With a factor f, ``n(w) = n_d + change + f (n_0(w) - n_d)``, ``n_d`` the index of the other medium at the d line: the
-    Abbe number of the other medium is divided by f, its relative partial dispersions stay.
+    With a factor f, ``n(w) = n_d + change + f (n_0(w) - n_d)``, where ``n_d`` is the index of the other medium at the d
+    line. The Abbe number of the other medium is divided by f, its relative partial dispersions stay.
 
     Parameters
     ----------

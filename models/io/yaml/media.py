@@ -11,7 +11,7 @@
 =================================================================== ==================================================
 
 ``range`` and ``wavelengths`` are in the wavelength unit of the file. Indices relative to air carry that air,
-``in_air: {air: ciddor, ...}``; ``shift: 1e-5`` adds to the index of any kind, and ``dispersion: 1.02`` is a factor of its
+``in_air: {air: ciddor, ...}``; ``shift: 1e-5`` adds to the index of any kind, ``dispersion: 1.02`` is a factor of its
 change with wavelength, about the d line.
 """
 
