@@ -28,7 +28,7 @@ def draw_before_after(
     middle = float(wavelengths[len(wavelengths) // 2])
     for axes, telescope, name in zip(sections.subplots(1, 2), telescopes, ("before", "after"), strict=True):
         draw_section(axes, layout(telescope, shown, middle))
-        axes.set_title(name)
+        axes.text(0.02, 0.03, name, transform=axes.transAxes)
     requests = [Request.of(t, shown, wavelengths, sampling="rings", n_pupil=_RINGS) for t in telescopes]
     diagrams = [spot_diagram(r) for r in requests]
     panels = spots.subplots(2, len(shown), squeeze=False)

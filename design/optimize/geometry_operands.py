@@ -47,8 +47,8 @@ class EdgeThickness(GoalOperand):
     surface : str
         Name of the surface in front, or of a group of two surfaces.
     radius : float, optional
-        Distance from the axis [m]; by default the larger clear radius of the two surfaces, which is that of the aperture
-        or, without one, of the paraxial light of the whole field.
+        Distance from the axis [m]; by default the larger clear radius of the two surfaces, which is that of the
+        aperture or, without one, of the paraxial light of the whole field.
     value, minimum, maximum, weight : float
         As in :class:`~.operand.GoalOperand` [m].
     """

@@ -72,8 +72,9 @@ class Operand:
     @property
     def label(self) -> str:
         """Name in messages and tables, such as "edge_thickness(L1)"."""
-        given = (v for _, v in self.quantity if v is not None and not callable(v))
-        return f"{self.kind}({', '.join(_shown(v) for v in given)})".replace("()", "")
+        given = [(name, v) for name, v in self.quantity if v is not None and not callable(v)]
+        texts = [_degrees(v) if name == "field" else _shown(v) for name, v in given]
+        return f"{self.kind}({', '.join(texts)})" if texts else self.kind
 
     @property
     def exact(self) -> bool:
@@ -168,6 +169,10 @@ def angles_of(field: ArrayLike) -> tuple[float, float]:
 def wavelength_of(wavelength: float | None, telescope: Telescope) -> float:
     """Return a wavelength [m]; the telescope's own where none is given."""
     return telescope.default_wavelength if wavelength is None else wavelength
+
+
+def _degrees(field: tuple[float, float]) -> str:
+    return " ".join(f"{np.rad2deg(v):.4g}" for v in field) + " deg"
 
 
 def _shown(value: Any) -> str:

@@ -115,6 +115,11 @@ class Optimum:
         """Standard deviation of each variable, in its own unit, shape [n_variable]."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def step_effects(self) -> np.ndarray:
+        """Effect of the change of each variable at the solution, rms [m], shape [n_variable]."""
+        return np.abs(self.changes) * self.effect
+
     def summary(self) -> dict[str, Any]:
         """Return the results by name and unit."""
         return {
@@ -173,7 +178,7 @@ class Optimum:
         name = f"rms of {self.merit_name}" + (" and operands" if self.operands else "")
         steps.set(xlabel="step", ylabel=f"{name} [µm]", title=plain_text(self.telescope.name))
         places = np.arange(len(self.addresses))
-        bars.barh(places, np.abs(self.changes) * self.effect * 1e6, color=GREY, height=0.7)
+        bars.barh(places, self.step_effects * 1e6, color=GREY, height=0.7)
         bars.set_yticks(places, [plain_text(name) for name in self.addresses])
         bars.invert_yaxis()
         bars.set_xlabel("change of each times its effect, rms [µm]")

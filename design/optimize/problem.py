@@ -66,11 +66,13 @@ class DesignProblem:
             values, slopes = state.merit.derivatives(columns)
             parts = [(np.sqrt(state.weight) * values, np.sqrt(state.weight) * slopes)]
             effect = np.linalg.norm(slopes, axis=0)
+            near: dict[tuple[int, float], Telescope] = {}
             for operand in state.operands:
                 if operand.exact:
                     parts.append(operand.derivatives(columns))
                 else:
-                    parts.append(self._differences(operand, i, columns.telescope, changes, places, effect))
+                    steps = np.divide(operand.step, effect, out=np.full_like(effect, operand.step), where=effect > 0)
+                    parts.append(self._differences(operand, i, columns.telescope, changes, places, steps, near))
             self.sizes.append((len(values), len(state.operands)))
             for value, rate in parts:
                 full = np.zeros((len(value), len(self.variables)))
@@ -104,15 +106,20 @@ class DesignProblem:
         telescope: Telescope,
         changes: np.ndarray,
         places: Sequence[int],
-        effect: np.ndarray,
+        steps: np.ndarray,
+        near: dict[tuple[int, float], Telescope],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual and derivatives of an operand by central differences."""
+        """Return residual and derivatives of an operand by central differences; telescopes `near` are kept."""
         residual, slope = operand.residual(operand.measure(telescope))
         rates = np.zeros((1, len(places)))
         if slope:
-            for k, (place, size) in enumerate(zip(places, effect, strict=True)):
-                step = np.zeros(len(changes))
-                step[place] = operand.step / size if size > 0 else operand.step
-                there, here = (operand.measure(self._telescope(i, changes + sign * step)) for sign in (1.0, -1.0))
-                rates[0, k] = slope * (there - here) / (2.0 * step[place])
+            for k, (place, step) in enumerate(zip(places, steps, strict=True)):
+                ends = []
+                for size in (step, -step):
+                    if (place, size) not in near:
+                        moved = changes.copy()
+                        moved[place] += size
+                        near[place, size] = self._telescope(i, moved)
+                    ends.append(operand.measure(near[place, size]))
+                rates[0, k] = slope * (ends[0] - ends[1]) / (2.0 * step)
         return np.array([residual]), rates

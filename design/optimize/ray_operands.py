@@ -90,10 +90,10 @@ class _RmsOperand(GoalOperand):
     _merits: ClassVar[type[SpotMerit] | type[WavefrontMerit]]
 
     @property
-    def exact(self) -> bool:  # noqa: D102
+    def exact(self) -> bool:
         return True
 
-    def bound(self, telescope: Telescope) -> Self:  # noqa: D102
+    def bound(self, telescope: Telescope) -> Self:
         waves = None if self.wavelengths is None else list(self.wavelengths)
         rays = Beams.of(telescope, angles_of(self.field), waves, n_pupil=self.n_pupil)
         return replace(self, merit=type(self)._merits(telescope, rays))
@@ -103,10 +103,10 @@ class _RmsOperand(GoalOperand):
         assert found is not None
         return found
 
-    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+    def measure(self, telescope: Telescope) -> float:
         return float(np.linalg.norm(self._merit(telescope).residuals(telescope)))
 
-    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:
         values, slopes = self._merit(columns.telescope).derivatives(columns)
         number = float(np.linalg.norm(values))
         return number, values @ slopes / max(number, np.finfo(float).tiny)
@@ -149,9 +149,9 @@ class WavefrontMtf(GoalOperand):
     r"""Modulation transfer at one frequency, estimated from differences of the wavefront.
 
     The transfer function is the mean of ``exp(i k dW)`` over the overlap of the pupil with itself, shifted by the
-    wavelength times the frequency, ``dW`` the difference of the wavefront between both. Here it is ``exp(-k^2 var(dW)/2)``
-    times the overlap, which falls steadily with the aberration where the true one oscillates: exact for a perfect
-    wavefront, and to second order in it.
+    wavelength times the frequency, ``dW`` the difference of the wavefront between both. Here it is the overlap times
+    ``exp(-k^2 var(dW) / 2)``, equal to second order in the wavefront. It falls steadily with the aberration, where the
+    true one oscillates.
 
     Parameters
     ----------

@@ -45,10 +45,10 @@ class _ExactOperand(GoalOperand):
     """Operand whose number and derivatives are computed together."""
 
     @property
-    def exact(self) -> bool:  # noqa: D102
+    def exact(self) -> bool:
         return True
 
-    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+    def measure(self, telescope: Telescope) -> float:
         return self.gradient(ParameterColumns.at(telescope, ()))[0]
 
 

@@ -109,9 +109,7 @@ def _of_address(telescopes: Sequence[Telescope], names: list[str], text: str | P
         start = parameter.value(telescopes[first])
         inside = solver[first]
         assert inside is not None
-        result.append(
-            Variable(prefix + parameter.address, solver, parameter, start, inside.value(telescopes[first]))
-        )
+        result.append(Variable(prefix + parameter.address, solver, parameter, start, inside.value(telescopes[first])))
     return result
 
 
@@ -177,7 +175,12 @@ def _usual(telescopes: Sequence[Telescope], variable: Variable) -> tuple[float, 
 
 
 def random_starts(
-    variables: Sequence[Variable], bounded: Iterable[str], box: tuple[np.ndarray, np.ndarray], spread: float, seed: int, n: int
+    variables: Sequence[Variable],
+    bounded: Iterable[str],
+    box: tuple[np.ndarray, np.ndarray],
+    spread: float,
+    seed: int,
+    n: int,
 ) -> np.ndarray:
     """Return changes to start from, shape [n, n_variable].
 

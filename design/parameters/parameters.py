@@ -31,12 +31,12 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique, error_context, unknown_name
-from ...models.media.medium import abbe_number, with_index_change
+from ...models.media.medium import Medium, abbe_number, with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
 from ...models.telescope import Telescope, rotation_matrix
 from .shape_terms import shape_with_term, term_unit
-from .thickness import front_surface, light_axis, shifted_behind, thickness
+from .thickness import front_surface, light_axis, thickness, with_thicknesses
 
 _OF_MEDIA = ("n", "abbe")
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
@@ -247,13 +247,15 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
             raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
     start = telescope
     telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
+    shapes: dict[str, Shape] = {}
+    media: dict[int, Medium] = {}
     for parameter, change in zip(parameters, changes, strict=True):
         if not change:
             continue
         if parameter.kind == "shape":
-            shape = telescope.surface(parameter.target).shape
+            shape = shapes.get(parameter.target) or telescope.surface(parameter.target).shape
             value = shape.parameters[parameter.name] + change
-            telescope = telescope.with_shape(parameter.target, shape.with_parameter(parameter.name, value))
+            shapes[parameter.target] = shape.with_parameter(parameter.name, value)
         elif parameter.kind in ("index", "abbe"):
             addition, factor = change, 1.0
             if parameter.kind == "abbe":
@@ -261,19 +263,25 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
                 if not number + change > 0:
                     raise DomainError(f"{parameter.address} = {number + change:.6g}: expected a positive Abbe number")
                 addition, factor = 0.0, number / (number + change)
-            surfaces = list(telescope.surfaces)
             for i in index_surfaces(telescope, parameter.target):
-                medium = with_index_change(surfaces[i].medium_after, addition, factor)
-                surfaces[i] = replace(surfaces[i], medium_after=medium)
-            telescope = replace(telescope, surfaces=tuple(surfaces))
+                media[i] = with_index_change(media.get(i, telescope.surfaces[i].medium_after), addition, factor)
+    if shapes or media:
+        changed = tuple(
+            replace(s, shape=shapes.get(s.name, s.shape), medium_after=media.get(i, s.medium_after))
+            if s.name in shapes or i in media
+            else s
+            for i, s in enumerate(telescope.surfaces)
+        )
+        telescope = replace(telescope, surfaces=changed)
     for body, motion in _body_motions(telescope, parameters, changes):
         if motion.any():
             telescope = telescope.perturbed(body, shift=motion[:3], tilt=motion[3:])
-    for parameter, change in zip(parameters, changes, strict=True):
-        if parameter.kind == "thickness" and change:
-            first = front_surface(start, parameter.target)
-            telescope = shifted_behind(telescope, first, change * light_axis(start, first))
-    return telescope
+    thicknesses = [
+        (front_surface(start, p.target), v)
+        for p, v in zip(parameters, changes, strict=True)
+        if p.kind == "thickness" and v
+    ]
+    return with_thicknesses(telescope, start, thicknesses) if thicknesses else telescope
 
 
 def _media(telescope: Telescope) -> set[str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from ...core.errors import DomainError
-from ...models.surface import Interaction
+from ...models.surface import Interaction, Vector
 from ...models.telescope import Telescope
 
 
@@ -49,14 +50,27 @@ def thickness(telescope: Telescope, index: int) -> float:
     return float(light_axis(telescope, index) @ (behind - here))
 
 
-def shifted_behind(telescope: Telescope, index: int, shift: np.ndarray) -> Telescope:
-    """Return the telescope with all surfaces behind one shifted [m], and with them the groups that hold no other."""
-    surfaces = tuple(s.moved(shift=shift) if i > index else s for i, s in enumerate(telescope.surfaces))
-    behind = {s.name for s in surfaces[index + 1 :]}
-    frames = dict(telescope.group_frames)
+def with_thicknesses(telescope: Telescope, start: Telescope, changes: Iterable[tuple[int, float]]) -> Telescope:
+    """Return the telescope with thicknesses behind some surfaces, by their indices, changed by lengths [m].
+
+    The surfaces behind each are shifted along its axis in the telescope `start`, before other changes. The pivot of a
+    group goes with the first of its surfaces.
+    """
+    shifts = np.zeros((len(telescope.surfaces), 3))
+    for index, change in changes:
+        shifts[index + 1 :] += change * light_axis(start, index)
+    surfaces = tuple(
+        replace(s, vertex=_shifted(s.vertex, shift)) if shift.any() else s
+        for s, shift in zip(telescope.surfaces, shifts, strict=True)
+    )
+    frames, names = dict(telescope.group_frames), telescope.surface_names
     for group, members in telescope.groups.items():
-        if behind.issuperset(members):
-            vertex, axes = frames[group]
-            x, y, z = (float(v) for v in np.array(vertex) + shift)
-            frames[group] = (x, y, z), axes
+        first = min(names.index(member) for member in members)
+        vertex, axes = frames[group]
+        frames[group] = _shifted(vertex, shifts[first]), axes
     return replace(telescope, surfaces=surfaces, group_frames=frames)
+
+
+def _shifted(vertex: Vector, shift: np.ndarray) -> Vector:
+    x, y, z = (float(v) for v in np.array(vertex) + shift)
+    return x, y, z
