@@ -15,8 +15,8 @@ D, F, C = 587.5618e-9, 486.1327e-9, 656.2725e-9
 def lens():
     """``lens(rows, ...)``: rows of radius [mm], thickness [mm] and glass.
 
-    Radii are as in lens tables, positive with the centre behind the surface. An empty name is air; the last thickness leads to the flat detector. The entrance pupil is ``stop`` mm behind the
-    first vertex.
+    Radii are as in lens tables, positive with the centre behind the surface. An empty name is air; the last thickness
+    leads to the flat detector. The entrance pupil is ``stop`` mm behind the first vertex.
     """
 
     def build(rows, *, pupil, field_deg, stop=0.0, name="lens"):
