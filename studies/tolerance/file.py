@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -126,11 +126,25 @@ def load_tolerances(path: str | os.PathLike[str], telescope: str | None = None) 
         changed = {"telescope": _beside(path, found) if telescope is None else found}
         if file.degrees_of_freedom is not None:
             changed["degrees_of_freedom"] = _beside(path, file.degrees_of_freedom)
-        if (file.merit == "mtf") != (file.frequency_per_mm is not None):
-            raise ConfigError(f"frequency_per_mm = {file.frequency_per_mm}: expected with merit mtf, and only there")
-        if file.method != "traced" and file.merit not in ("spots", "wavefront"):
-            raise ConfigError(f"method = {file.method!r}: expected 'traced' for the merit {file.merit}")
-    return file.model_copy(update=changed)
+        changed_file = file.model_copy(update=changed)
+        _check(changed_file)
+    return changed_file
+
+
+def with_settings(file: ToleranceFile, **settings: Any) -> ToleranceFile:
+    """Return a file with other values of some keys, those that are not None."""
+    changed = {key: value for key, value in settings.items() if value is not None}
+    found = validated(ToleranceFile, {**file.model_dump(mode="json", exclude_unset=True), **changed}, "tolerances")
+    _check(found)
+    return found
+
+
+def _check(file: ToleranceFile) -> None:
+    """Check values that depend on each other."""
+    if (file.merit == "mtf") != (file.frequency_per_mm is not None):
+        raise ConfigError(f"frequency_per_mm = {file.frequency_per_mm}: expected with merit mtf, and only there")
+    if file.method != "traced" and file.merit not in ("spots", "wavefront"):
+        raise ConfigError(f"method = {file.method!r}: expected 'traced' for the merit {file.merit}")
 
 
 def _beside(path: Path, name: str) -> str:
