@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,8 @@ def draw_before_after(
 ) -> None:
     """Draw the sections of two telescopes side by side, and below them their spots at some field points."""
     shown = fields[np.unique(np.linspace(0, len(fields) - 1, _SPOTS).astype(int))]
-    sections, spots = figure.subfigures(2, 1, height_ratios=[1.0, 1.0])
+    parts: Any = figure.subfigures(2, 1)
+    sections, spots = parts
     middle = float(wavelengths[len(wavelengths) // 2])
     for axes, telescope, name in zip(sections.subplots(1, 2), telescopes, ("before", "after"), strict=True):
         draw_section(axes, layout(telescope, shown, middle))

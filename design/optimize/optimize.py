@@ -241,7 +241,7 @@ def _states(
         raise ConfigError(f"{len(found)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
     total, states, beams = sum(one.weight for one in found), [], []
     for one in found:
-        weights = dict(field_weights=one.field_weights, wavelength_weights=one.wavelength_weights)
+        weights: dict[str, Any] = dict(field_weights=one.field_weights, wavelength_weights=one.wavelength_weights)
         rays = Beams.of(one.telescope, one.fields, one.wavelengths, **weights, **options)
         wanted = merit if not isinstance(merit, str) else _merit(merit, one.telescope, rays, reference, goal)
         operands = (*targets, *one.operands)
@@ -292,7 +292,7 @@ def _covariance(
     for mode in modes[flat]:
         # In natural units, the largest part 1.
         parts = mode / norm * rate
-        main = np.flatnonzero(np.abs(mode) > 0.05)
+        main = np.flatnonzero(np.abs(mode) > 0.05).tolist()
         parts = parts / parts[main[np.argmax(np.abs(mode[main]))]]
         combinations.append(" ".join(f"{parts[i]:+.4g} {variables[i].address}" for i in main))
     return noise * spread @ spread.T, tuple(combinations)

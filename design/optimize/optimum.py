@@ -158,7 +158,8 @@ class Optimum:
         with styled():
             above = max(3.2, 1.4 + 0.24 * len(self.addresses))
             figure = new_figure(10.4, above + 6.4)
-            course, designs = figure.subfigures(2, 1, height_ratios=[above, 6.4])
+            parts: Any = figure.subfigures(2, 1, height_ratios=[above, 6.4])
+            course, designs = parts
             steps, bars = course.subplots(1, 2)
             self._draw_course(steps, bars)
             draw_before_after(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -85,7 +86,7 @@ class _RmsOperand(GoalOperand):
     field: tuple[float, float]
     wavelengths: tuple[float, ...] | None = None
     n_pupil: int = 6
-    merit: Merit | None = field(default=None, repr=False, compare=False, kw_only=True)
+    merit: Merit | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
 
     _merits: ClassVar[type[SpotMerit] | type[WavefrontMerit]]
 
@@ -171,7 +172,7 @@ class WavefrontMtf(GoalOperand):
     frequency: float
     angle: float = 0.5 * math.pi
     wavelength: float | None = None
-    shear: tuple[float, float] | None = field(default=None, repr=False, compare=False, kw_only=True)
+    shear: tuple[float, float] | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
 
     def bound(self, telescope: Telescope) -> Self:  # noqa: D102
         wavelength = wavelength_of(self.wavelength, telescope)

@@ -371,9 +371,9 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
     for row, parameter in enumerate(parameters):
         if parameter.kind == "thickness":
             first = front_surface(telescope, parameter.target)
-            along = light_axis(start, first)
+            shift = light_axis(start, first)
             behind = result[:, first + 1 :]
             # Points about which bodies rotate are shifted along.
-            behind[..., :3] -= np.cross(behind[..., 3:], values[row] * along)
-            result[row, first + 1 :, :3] += along
+            behind[..., :3] -= np.cross(behind[..., 3:], values[row] * shift)
+            result[row, first + 1 :, :3] += shift
     return result

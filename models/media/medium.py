@@ -218,7 +218,8 @@ class ChangedIndex(Medium):
 def with_index_change(medium: Medium, change: float, dispersion: float = 1.0) -> Medium:
     """Return a medium with its index changed by a constant and its dispersion by a factor; changes accumulate."""
     if isinstance(medium, ChangedIndex):
-        medium, change, dispersion = medium.medium, medium.change + change, medium.dispersion * dispersion
+        change, dispersion = medium.change + change, medium.dispersion * dispersion
+        medium = medium.medium
     return ChangedIndex(medium, change, medium.name, dispersion) if change or dispersion != 1.0 else medium
 
 

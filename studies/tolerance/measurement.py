@@ -80,7 +80,7 @@ class ToleranceMeasurement:
         def excess(power: float) -> float:
             ends = np.zeros((2, n))
             ends[:, index] = start * 2.0**power * np.array([-1.0, 1.0])
-            losses = [self.merit.loss(self.at(v), nominal) for v in self.values_of(ends)]
+            losses = self.merit.loss(np.array([self.at(v) for v in self.values_of(ends)]), nominal)
             # A telescope that loses its light costs more than any that does not.
             return float(np.max(np.where(np.isnan(losses), _FARTHEST * allowed, losses))) - allowed
 

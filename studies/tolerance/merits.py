@@ -57,8 +57,8 @@ class ToleranceMerit:
         except PachonError:
             return np.nan
 
-    def loss(self, value: float, nominal: float) -> float:
-        """Return by how much a number is worse than the nominal one."""
+    def loss(self, value: np.ndarray, nominal: float) -> np.ndarray:
+        """Return by how much numbers are worse than the nominal one."""
         return nominal - value if self.larger else value - nominal
 
 

@@ -85,7 +85,7 @@ class ToleranceStudy:
     @property
     def cost(self) -> np.ndarray:
         """Loss of the merit at the worse end of each tolerance, shape [n_tolerance]; infinite where light is lost."""
-        ends = np.stack([self.merit.loss(v, self.nominal) for v in (self.lower, self.upper)])  # type: ignore[arg-type]
+        ends = self.merit.loss(np.stack([self.lower, self.upper]), self.nominal)
         return np.max(np.where(np.isnan(ends), np.inf, ends), axis=0)
 
     @property
