@@ -36,6 +36,7 @@ from . import (
     study,
     sweep,
     telescope,
+    tolerance,
     visits,
 )
 from .interrupt import InterruptedRunError
@@ -115,6 +116,7 @@ for _group in (
     sweep,
     baseline,
     design,
+    tolerance,
     camera,
     shim,
     align,

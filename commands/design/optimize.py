@@ -83,48 +83,105 @@ def sensitivity(
     Column("end", "values", ".9g"),
     Column("change", "changes", ".4g"),
     Column("uncertainty", "uncertainty", ".2g"),
-    Column("effect of the change [µm]", lambda result: abs(result.changes) * result.effect, ".4g", 1e6),
+    Column("effect of the change [µm]", lambda result: _optimum(result).step_effects, ".4g", 1e6),
     left=2,
     band=True,
 )
 def optimize(
     given: Given,
-    variables: Annotated[str, Option(help=f"{_ADDRESSES}.")],
-    merit: Annotated[str, Option(help="Merit function to minimise: spots or wavefront.")] = "spots",
+    variables: Annotated[str | None, Option(help=f"{_ADDRESSES}, L1.thickness, silica.abbe.")] = None,
+    merit: Annotated[str | None, Option(help="Merit function to minimise: spots (by default) or wavefront.")] = None,
     focal_length: Annotated[float | None, Option(help="Focal length to be held [m].")] = None,
     bounds: Annotated[
         list[str] | None,
         Option(metavar="ADDRESS=LOW:HIGH", help="Limits of a variable; of a motion those of its change."),
     ] = None,
+    config: Annotated[
+        Path | None,
+        Option(metavar="FILE.yaml", help="In place of these: variables, operands, configurations, glasses."),
+    ] = None,
     out: Annotated[Path | None, Option(help="Prescription to write; by default named after the model.")] = None,
 ) -> Outcome:
     """Optimise a telescope over chosen variables, compensators among them, with exact derivatives.
+
+    A file has operands (focal length, distortion, edges, angles...), several configurations, bounds with units, glasses
+    to choose from the catalogue and random restarts; see docs/optimisation.md.
 
     **Examples**
 
     - `pachon optimize lsst_v3.3_r --variables Camera.dz,M2.dz`
     - `pachon optimize paul_baker --variables M1.conic,M2.conic --merit wavefront --bounds M1.conic=-1.1:-0.9`
+    - `pachon optimize triplet.zmx --config opt.yaml --out better.yaml`
     """
-    from ...design.optimize.optimize import optimize as compute
     from ...design.optimize.targets import FocalLength
     from ...models.io.prescription import save_telescope
 
-    telescope, *where = given.where
-    result = compute(
-        telescope,
-        name_list(variables, "--variables"),
-        merit,
-        *where,
-        bounds=dict(_bounds(text) for text in bounds or ()),
-        targets=() if focal_length is None else (FocalLength(focal_length),),
-        **given.how,
-    )
-    path = out or Path(f"optimized_{telescope.name}.yaml")
-    save_telescope(result.telescope, path)
+    if (config is None) == (variables is None):
+        raise ConfigError("pachon optimize: expected either --variables or --config")
+    if config is not None:
+        for name, value in (("merit", merit), ("focal-length", focal_length), ("bounds", bounds)):
+            if value is not None:
+                raise ConfigError(f"--{name} is given beside --config: expected it in the file")
+        result = _from_file(given, config)
+    else:
+        from ...design.optimize.optimize import optimize as compute
+
+        telescope, *where = given.where
+        result = compute(
+            telescope,
+            name_list(variables or "", "--variables"),
+            merit or "spots",
+            *where,
+            bounds=dict(_bounds(text) for text in bounds or ()),
+            targets=() if focal_length is None else (FocalLength(focal_length),),
+            **given.how,
+        )
+    found = _optimum(result)
+    several = len(found.telescopes) > 1
+    if several and out is not None:
+        raise ConfigError(f"--out {out}: expected none with several configurations, each is named after its telescope")
+    paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in found.telescopes]
+    for telescope, path in zip(found.telescopes, paths, strict=True):
+        save_telescope(telescope, path)
+    return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
+
+
+def _from_file(given: Given, path: Path) -> Any:
+    """Return the optimum of a file, or the choice of glasses that it asks for."""
+    from ...design.optimize.glass_choice import choose_glasses
+    from ...design.optimize.optimize import optimize as compute
+    from ...design.optimize.optimize_file import load_optimization, optimization_arguments
+
+    if given.fields is not None or given.wavelength is not None:
+        raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
+    file = load_optimization(path)
+    arguments = optimization_arguments(file, given.telescope, path)
+    if not file.glasses:
+        return compute(**arguments, **given.how)
+    if file.configurations:
+        raise ConfigError("glasses: expected a file without configurations", file=path)
+    return choose_glasses(**arguments, glasses=file.glasses, nearest=file.nearest_glasses, **given.how)
+
+
+def _optimum(result: Any) -> Any:
+    """Return the optimum of a result, which may be a choice of glasses."""
+    return getattr(result, "optimum", result)
+
+
+def _notes(result: Any) -> list[str]:
+    """Return merit and operands before and after, glasses and collinear combinations as lines."""
     s = result.summary()
-    rms = f"{s['rms_start_m'] * 1e6:.6g} -> {s['rms_end_m'] * 1e6:.6g} µm, {s['steps']} steps"
-    collinear = [f"collinear: {combination}" for combination in s["collinear"]]
-    return Outcome(result, notes=[f"rms of {s['merit']}: {rms}", *collinear, f"prescription: {path.resolve()}"])
+    lines = [f"rms of {s['merit']}: {s['rms_start_m'] * 1e6:.6g} -> {s['rms_end_m'] * 1e6:.6g} µm, {s['steps']} steps"]
+    if s["operands"]:
+        both = s["rms_start_with_operands_m"] * 1e6, s["rms_end_with_operands_m"] * 1e6
+        lines.append(f"with operands: {both[0]:.6g} -> {both[1]:.6g} µm")
+    several = len(s["configurations"]) > 1
+    for one in s["operands"]:
+        unit = "" if one["unit"] == "1" else f" {one['unit']}"
+        owner = f" of {one['configuration']}" if several else ""
+        lines.append(f"{one['operand']}{owner}: {one['start']:.6g} -> {one['end']:.6g}{unit} ({one['goal']})")
+    lines += [f"glass: {old} -> {new}" for old, new in s.get("glasses", {}).items()]
+    return lines + [f"collinear: {combination}" for combination in s["collinear"]]
 
 
 def _bounds(text: str) -> tuple[str, tuple[float, float]]:

@@ -194,6 +194,13 @@ def layout(
     )
 
 
+def draw_section(axes: Axes, layout: Layout) -> None:
+    """Draw the section of a whole telescope with its rays, without legend and title."""
+    drawing = _Drawing(layout)
+    names = [n for n, profile in layout.profiles.items() if np.isfinite(profile).all(axis=1).any()]
+    _draw(axes, drawing, drawing.box(names), set(names), beams=True)
+
+
 class _Drawing:
     """Coordinates of a drawing: (y, z) upright, or (-z, y) for a long telescope."""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...models.media.medium import LINE_D
 from ...models.shapes.polar_polynomial import PolarPolynomial
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.adjoint_matrix import AdjointMatrix, column_table, polynomial_terms
@@ -15,6 +16,9 @@ from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS
 from ...wavefront.reference_sphere import sphere_distance_derivatives
 from ..parameters.parameters import Parameter, apply, index_surfaces, shapes_with_terms, twists
 from ..parameters.shape_terms import term_polynomial
+
+#: Kinds of parameters that change the index of a medium.
+_MEDIA = ("index", "abbe")
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,9 @@ class ParameterColumns:
     polynomials: tuple[tuple[int, float, int, np.ndarray], ...]
     other_terms: tuple[tuple[int, str], ...]
     intermediate: int
-    weights: np.ndarray  #: [n_column, n_parameter] derivatives of the columns with respect to the parameters
+    #: [n_column, n_parameter] derivatives of the columns with respect to the parameters; see :meth:`weights_at`.
+    weights: np.ndarray
+    abbe_numbers: dict[int, float]  #: Abbe numbers by the places of their parameters
 
     @classmethod
     def at(
@@ -52,7 +58,7 @@ class ParameterColumns:
         # The effect of motions is that of the difference between the bodies on both sides of a gap.
         ends = np.zeros((len(parameters), 1, 6))
         motion = -np.diff(twists(telescope, parameters, values), axis=1, prepend=ends, append=ends)
-        runs = {p: index_surfaces(telescope, one.target) for p, one in enumerate(parameters) if one.kind == "index"}
+        runs = {p: index_surfaces(telescope, one.target) for p, one in enumerate(parameters) if one.kind in _MEDIA}
         behind = {(s, "index") for run in runs.values() for s in run}
         before = {(s + 1, "index") for run in runs.values() for s in run if s + 1 < len(names)}
         gaps = {(int(g), "gap") for g in np.flatnonzero(motion.any(axis=(0, 2)))}
@@ -93,8 +99,21 @@ class ParameterColumns:
         for i, (p, _, _) in enumerate(others):
             total[used + i, p] = 1.0
         listed = tuple(block[:4] for block in blocks)
+        numbers = {p: one.value(telescope) + values[p] for p, one in enumerate(parameters) if one.kind == "abbe"}
         other_terms = tuple((s, name) for _, s, name in others)
-        return cls(moved, parameters, table, listed, other_terms, count, total[first:])
+        return cls(moved, parameters, table, listed, other_terms, count, total[first:], numbers)
+
+    def weights_at(self, wavelength: float) -> np.ndarray:
+        """Return the weights of the columns at a wavelength [m]; dispersion changes indices by amounts of its own."""
+        if not self.abbe_numbers:
+            return self.weights
+        factors = np.ones(len(self.parameters))
+        for p, number in self.abbe_numbers.items():
+            place = index_surfaces(self.telescope, self.parameters[p].target)[0]
+            medium = self.telescope.surfaces[place].medium_after
+            # n = n_d + V_0 / V (n_0 - n_d).
+            factors[p] = -float(medium.index(wavelength) - medium.index(LINE_D * 1e-6)) / number
+        return self.weights * factors
 
     def adjoints(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return the weighted columns of the adjoint matrix of a forward pass, shape [n_output, n_column, n]."""
@@ -128,12 +147,14 @@ class ParameterColumns:
 
         A derivative far below it is rounding, as the terms cancel.
         """
-        terms = np.abs(self.adjoints(forward, gradient, threads=threads)).transpose(0, 2, 1) @ np.abs(self.weights)
+        terms = np.abs(self.adjoints(forward, gradient, threads=threads)).transpose(0, 2, 1)
+        terms = terms @ np.abs(self.weights_at(forward.wavelength))
         return np.sqrt(np.mean(terms**2, axis=(0, 1)))
 
     def derivatives(self, forward: ForwardPass, gradient: OutputGradient, *, threads: int | None = None) -> np.ndarray:
         """Return the derivatives of every output and ray with respect to each parameter, [n_output, n, n_parameter]."""
-        return np.matmul(self.adjoints(forward, gradient, threads=threads).transpose(0, 2, 1), self.weights)
+        weights = self.weights_at(forward.wavelength)
+        return np.matmul(self.adjoints(forward, gradient, threads=threads).transpose(0, 2, 1), weights)
 
 
 def _polynomial_weights(found: dict[int, PolarPolynomial], n: int, scale: float) -> tuple[int, np.ndarray]:

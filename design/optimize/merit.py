@@ -196,13 +196,14 @@ class WavefrontMerit:
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         beams, parts = self._beams, []
         for i, wavelength in enumerate(beams.request.wavelengths):
+            weights = columns.weights_at(float(wavelength))
 
-            def reduced(block: WavefrontBlock, i: int = i) -> np.ndarray:
+            def reduced(block: WavefrontBlock, i: int = i, weights: np.ndarray = weights) -> np.ndarray:
                 roots, basis = self._roots[i, block.fields], self._basis[i, block.fields]
                 value = block.value - self._goal[i, block.fields]
                 # NaN for a lost ray makes the solver take a shorter step.
                 value = np.where((block.status > RayStatus.VIGNETTED) & (roots > 0), np.nan, value)
-                change = block.by_center @ block.moved - block.columns @ columns.weights
+                change = block.by_center @ block.moved - block.columns @ weights
                 both = roots[..., None] * np.concatenate([value[..., None], change], axis=2)
                 return (both - basis @ (basis.transpose(0, 2, 1) @ both)).reshape(-1, both.shape[-1])
 
@@ -211,10 +212,12 @@ class WavefrontMerit:
         return whole[:, 0], whole[:, 1:]
 
     def size_of_terms(self, columns: ParameterColumns) -> np.ndarray:  # noqa: D102
+        request = self._beams.request
+        weights = np.abs(columns.weights_at(float(request.wavelengths[0])))
+
         def squares(block: WavefrontBlock) -> np.ndarray:
-            size = np.abs(block.by_center) @ np.abs(block.moved) + np.abs(block.columns) @ np.abs(columns.weights)
+            size = np.abs(block.by_center) @ np.abs(block.moved) + np.abs(block.columns) @ weights
             return (size**2).sum(axis=(0, 1))
 
-        request = self._beams.request
         total = sum(FieldWavefronts(columns, request, float(request.wavelengths[0])).map(squares))
         return np.sqrt(total / (len(request.fields) * len(request.pupil)))

@@ -10,23 +10,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, PachonError, check_choice
+from ...core.errors import ConfigError, check_choice
 from ...core.plotting import BLUE, GREY, RED, figure_at, plain_text, styled
 from ...core.result import Result
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import PupilSampling
 from ..parameters.degrees_of_freedom import DegreesOfFreedom
 from ..parameters.tolerances import Tolerance, draw
-from .jacobian import ParameterColumns
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
-from .optimize import NO_EFFECT
 from .sensitivity import field_rings
+from .toleranced_merit import TolerancedMerit
+from .yields import Yield
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MERITS: dict[str, Callable[[Telescope, Beams], Merit]] = {"wavefront": WavefrontMerit, "spots": SpotMerit}
+METHODS = ("linear", "quadratic", "traced")
 _PERCENTILES = (50, 80, 90, 95)
 #: Largest contributions in the plot.
 _BARS = 20
@@ -44,7 +45,7 @@ class MonteCarlo(Result):
     merit_name : str
         "wavefront" (rms without piston and tilt) or "spots" (rms radius), over all fields and wavelengths.
     method : str
-        "linear" or "traced".
+        "linear", "quadratic" or "traced".
     tolerances : tuple of Tolerance
         The tolerances.
     compensators : tuple of str
@@ -82,6 +83,11 @@ class MonteCarlo(Result):
     def at_most(self, fraction: float) -> float:
         """Return the quantile of the merit [m] for a fraction (0 to 1) of the telescopes; lost ones count as worst."""
         return float(np.quantile(np.where(np.isnan(self.merit), np.inf, self.merit), fraction, method="higher"))
+
+    @check_arguments
+    def yield_at(self, requirement: float) -> Yield:
+        """Return the fraction of the telescopes whose merit [m] is at most a requirement, with its binomial error."""
+        return Yield.of(self.merit, requirement)
 
     def _summary(self) -> dict[str, Any]:
         """Return the results by name and unit."""
@@ -159,8 +165,10 @@ def monte_carlo(
     """Return the merits of telescopes drawn within tolerances.
 
     In the linear method the residuals of the merit are linear in the deviations, with their exact derivatives: a
-    thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. The
-    traced method traces each telescope. Compensators follow from linear least squares in both.
+    thousand draws cost little more than one. The merit itself, the root of a sum of squares, is not linearised. In the
+    quadratic method the sum of squares has its exact second derivatives, from differences of exact gradients. The
+    traced method traces each telescope. Compensators follow from linear least squares, in the quadratic method from the
+    quadratic itself.
 
     Parameters
     ----------
@@ -176,7 +184,7 @@ def monte_carlo(
         Degrees of freedom of the names.
     compensators : iterable of str
         Names of degrees of freedom that are optimised for each draw, such as the focus of the camera.
-    method : {"linear", "traced"}
+    method : {"linear", "quadratic", "traced"}
         Method, see above.
     fields : array_like or Quantity, shape [n_field, 2], optional
         Field angles [rad]; by default 31 over the field of view, see :func:`~.field_rings`.
@@ -192,8 +200,7 @@ def monte_carlo(
     """
     chosen, free = tuple(tolerances), tuple(compensators)
     check_choice("merit", merit, MERITS)
-    if method not in ("linear", "traced"):
-        raise ConfigError(f"method = {method!r}: expected 'linear' or 'traced'")
+    check_choice("method", method, METHODS)
     deviations = draw(chosen, seed, n)
     names = [t.name for t in chosen] + list(free)
     for name in names:
@@ -204,34 +211,18 @@ def monte_carlo(
     rays = Beams.of(
         telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
     )
-    judge: Merit = MERITS[merit](telescope, rays)
-    prepared, parameters, matrix = dof.parameter_matrix(telescope)
-    columns = ParameterColumns.at(prepared, parameters)
-    residuals, slopes = judge.derivatives(columns)
-    slopes = slopes @ matrix
-    by_draw, by_free = slopes[:, : len(chosen)], slopes[:, len(chosen) :]
-    # Rounding errors of the effects, a fraction of the terms that cancel.
-    least = NO_EFFECT * (judge.size_of_terms(columns) @ np.abs(matrix))[len(chosen) :] if free else np.zeros(0)
-    setting = _settings(by_free, free, least)
-    # Residuals and their slopes after compensation.
-    fixed = residuals - by_free @ (setting @ residuals)
-    left = by_draw - by_free @ (setting @ by_draw)
-    moves = -(deviations @ (setting @ by_draw).T + setting @ residuals)
-    contribution = np.linalg.norm(left, axis=0) * np.array([t.spread for t in chosen])
-    if method == "linear":
-        # |r + J v|^2 through the small matrices J^T J and J^T r.
-        square = fixed @ fixed + 2.0 * deviations @ (left.T @ fixed)
-        square = square + np.einsum("ni,ij,nj->n", deviations, left.T @ left, deviations)
-        found = np.sqrt(np.maximum(square, 0.0))
-        nominal = float(np.linalg.norm(fixed))
-    else:
+    built = TolerancedMerit.of(telescope, chosen, free, dof, MERITS[merit](telescope, rays))
+    moves = built.moves(deviations)
+    if method == "traced":
         found = np.empty(len(deviations))
         for i, values in enumerate(np.concatenate([deviations, moves], axis=1)):
-            found[i] = _merit(judge, dof.apply(telescope, values))
+            found[i] = built.measure(built.telescope_at(values))
             if progress is not None:
                 progress(1)
-        still = np.concatenate([np.zeros(len(chosen)), -(setting @ residuals)])
-        nominal = _merit(judge, dof.apply(telescope, still))
+        nominal = built.measure(built.nominal_telescope)
+    else:
+        found = built.linear(deviations) if method == "linear" else built.quadratic(deviations)
+        nominal = built.nominal
     return MonteCarlo(
         telescope=telescope.name,
         merit_name=merit,
@@ -244,22 +235,5 @@ def monte_carlo(
         moves=moves,
         merit=found,
         nominal=nominal,
-        contribution=contribution,
+        contribution=built.contribution,
     )
-
-
-def _merit(judge: Merit, telescope: Telescope) -> float:
-    """Return the merit of a telescope [m]; NaN where its light is lost."""
-    try:
-        return float(np.linalg.norm(judge.residuals(telescope)))
-    except PachonError:
-        return np.nan
-
-
-def _settings(slopes: np.ndarray, names: tuple[str, ...], least: np.ndarray) -> np.ndarray:
-    """Return the matrix from residuals to minus the best setting of compensators, shape [n_free, n]."""
-    size = np.linalg.norm(slopes, axis=0)
-    for name, value, rounding in zip(names, size, least, strict=True):
-        if not value > rounding:
-            raise DomainError(f"compensator {name!r} has no effect on the merit: expected one that has")
-    return np.linalg.pinv(slopes / size, rcond=1e-9) / size[:, None] if names else np.zeros((0, len(slopes)))

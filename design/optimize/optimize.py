@@ -3,30 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, shown
-from ...core.plotting import BLUE, GREY, figure_at, plain_text, styled
-from ...core.result import Result
 from ...core.threads import one_blas_thread
+from ...core.units import require_count
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
-from ..parameters.parameters import Parameter, apply, parse_parameters
+from ..parameters.parameters import Parameter
+from .configuration import DesignConfiguration, configurations
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
-from .targets import FocalLength, Target
+from .operand import Operand, check_operands
+from .optimum import OperandChange, Optimum
+from .problem import DesignProblem, DesignState
+from .variables import Variable, free_variables, limits, random_starts
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Fraction of the effects of single surfaces on single rays below which the effect of a variable is rounding.
 NO_EFFECT = 1e-11
@@ -36,112 +34,17 @@ _FIRST_STEP = 100.0
 _COLLINEAR = 1e-6
 
 
-@dataclass(frozen=True)
-class Optimum(Result):
-    """Result of an optimisation.
-
-    Attributes
-    ----------
-    telescope : Telescope
-        The optimised telescope.
-    variables : tuple of Parameter
-        Free parameters.
-    changes : ndarray, shape [n_variable]
-        Change of each, in its own unit.
-    start_values, values : ndarray, shape [n_variable]
-        Values before and after; those of motions are relative to the start.
-    merit_name : str
-        "spots" or "wavefront".
-    history : ndarray, shape [n_step + 1]
-        Rms of merit and targets [m] before the first step and after each.
-    effect : ndarray, shape [n_variable]
-        Rms change of the merit's residuals per unit of each variable [m], at the solution.
-    covariance : ndarray, shape [n_variable, n_variable]
-        Covariance of the variables, with the final residuals as noise, without combinations of no effect.
-    collinear : tuple of str
-        Combinations of variables without effect on the merit, such as "M1.radius - 0.998 M1.curvature".
-    message : str
-        Why the solver stopped.
-    """
-
-    _table = ("start_values", "values", "changes", "uncertainty", "effect")
-    _row_type = Parameter
-
-    telescope: Telescope
-    variables: tuple[Parameter, ...]
-    changes: np.ndarray
-    start_values: np.ndarray
-    values: np.ndarray
-    merit_name: str
-    history: np.ndarray
-    effect: np.ndarray
-    covariance: np.ndarray
-    collinear: tuple[str, ...]
-    message: str
-
-    @property
-    def uncertainty(self) -> np.ndarray:
-        """Standard deviation of each variable, in its own unit, shape [n_variable]."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def _label(self) -> str:
-        start, end = self.history[0], self.history[-1]
-        return f"{self.telescope.name}, {len(self.variables)} variables, rms {start:.4g} -> {end:.4g} m"
-
-    def _columns(self) -> dict[str, Any]:
-        names = {"address": [p.address for p in self.variables], "unit": [p.unit or "1" for p in self.variables]}
-        return names | super()._columns()
-
-    def _summary(self) -> dict[str, Any]:
-        """Return the results by name and unit."""
-        return {
-            "telescope": self.telescope.name,
-            "merit": self.merit_name,
-            "rms_start_m": self.history[0],
-            "rms_end_m": self.history[-1],
-            "steps": len(self.history) - 1,
-            "variables": [p.address for p in self.variables],
-            "units": [p.unit or "1" for p in self.variables],
-            "start_values": self.start_values,
-            "values": self.values,
-            "changes": self.changes,
-            "uncertainty": self.uncertainty,
-            "effect_m_per_unit": self.effect,
-            "collinear": list(self.collinear),
-            "message": self.message,
-        }
-
-    def plot(self, ax: Axes | Figure | None = None) -> Figure:
-        """Draw the merit step by step, and the effect of the change of each variable."""
-        from matplotlib.ticker import MaxNLocator
-
-        with styled():
-            names = [p.address for p in self.variables]
-            figure = figure_at(ax, 8.4, max(3.2, 1.4 + 0.24 * len(names)))
-            steps, bars = figure.subplots(1, 2)
-            steps.semilogy(range(len(self.history)), self.history * 1e6, "o-", color=BLUE, markersize=4)
-            steps.xaxis.set_major_locator(MaxNLocator(integer=True))
-            steps.grid(True, which="major", linewidth=0.3)
-            steps.set(xlabel="step", ylabel=f"rms of {self.merit_name} [µm]", title=plain_text(self.telescope.name))
-            places = np.arange(len(names))
-            bars.barh(places, np.abs(self.changes) * self.effect * 1e6, color=GREY, height=0.7)
-            bars.set_yticks(places, [plain_text(name) for name in names])
-            bars.invert_yaxis()
-            bars.set_xlabel("change of each times its effect, rms [µm]")
-            return figure
-
-
 @check_arguments
 @one_blas_thread()
 def optimize(
-    telescope: Telescope,
+    telescope: Telescope | Sequence[Telescope | DesignConfiguration],
     variables: Iterable[str | Parameter],
     merit: str | Merit = "spots",
     fields: ArrayLike | None = None,
     wavelengths: ArrayLike | None = None,
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    targets: Sequence[FocalLength | Target] = (),
+    targets: Sequence[Operand] = (),
     field_weights: ArrayLike | None = None,
     wavelength_weights: ArrayLike | None = None,
     reference: str = "centroid",
@@ -151,26 +54,33 @@ def optimize(
     projection: str = "zemax",
     tolerance: float = 1e-10,
     max_steps: int = 200,
+    restarts: int = 0,
+    spread: float = 0.3,
+    seed: int = 0,
     threads: int | None = None,
 ) -> Optimum:
     """Minimise spots or wavefronts over chosen variables.
 
     A trust-region least-squares solver with exact derivatives of every ray. Variables are scaled by their effects, so
-    that a conic constant and a coefficient of r^8 are comparable. Compensators (focus, tilt of the camera) are
-    variables like all others.
+    that a conic constant and a coefficient of r^8 are comparable; radii are solved for as curvatures. Compensators
+    (focus, tilt of the camera) are variables like all others.
 
     Parameters
     ----------
-    telescope, fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
+    telescope : Telescope or sequence of Telescope and DesignConfiguration
+        The telescope, or configurations that are optimised together: bands, zoom positions. Each has a name of its own.
+    fields, wavelengths, wavelength_weights, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`, but for 6 rings of pupil points by default.
     variables : iterable of str or Parameter
-        Free parameters, see :mod:`~pachon.design.parameters.parameters`.
+        Free parameters, see :mod:`~pachon.design.parameters.parameters`. Configurations that have an address share
+        it; after the name of a telescope and a colon it is that of one of them: ``zoom_2:L2.thickness``.
     merit : {"spots", "wavefront"} or Merit
-        Merit function: rms spot radius, or rms wavefront without piston and tilt.
+        Merit function: rms spot radius, or rms wavefront without piston and tilt; an object for one telescope.
     bounds : mapping of str to (low, high), optional
-        Limits of variables: of the value itself for a shape or index, of the change for a motion.
-    targets : sequence of FocalLength and Target
-        Further numbers to be reached.
+        Limits of variables: of the change for a motion, else of the value itself. By default curvatures are limited by
+        the clear radii of their surfaces, thicknesses to positive values, indices and Abbe numbers to those of glasses.
+    targets : sequence of Operand
+        Further numbers to be reached or held within limits, of each configuration.
     field_weights : array_like, shape [n_field], optional
         Weights in the mean square; equal by default.
     reference : {"centroid", "chief"}
@@ -180,81 +90,124 @@ def optimize(
     tolerance : float
         Relative change of the sum of squares, or of the variables, at which the solver stops.
     max_steps : int
-        Largest number of evaluations of the merit.
+        Largest number of evaluations of the merit, from each start.
+    restarts : int
+        Number of random starts beside the telescope as it is; the best end is returned.
+    spread : float
+        Width of the random starts, relative to the values of the variables; those with two bounds are drawn evenly
+        between them.
+    seed : int
+        Seed of the random starts.
 
     Raises
     ------
     DomainError
         If a variable has no effect, a bound excludes the start, or no ray reaches the image.
     ConfigError, UnknownNameError
-        If a merit or variable does not exist.
+        If a merit or variable does not exist, or an operand is given twice.
     """
-    chosen = parse_parameters(variables, telescope)
-    rays = Beams.of(
-        telescope,
-        fields,
-        wavelengths,
-        field_weights=field_weights,
-        wavelength_weights=wavelength_weights,
-        sampling=sampling,
-        n_pupil=n_pupil,
-        projection=projection,
-        threads=threads,
+    require_count(restarts, "restarts", 0)
+    states, beams = _states(
+        configurations(
+            telescope,
+            fields=fields,
+            wavelengths=wavelengths,
+            field_weights=field_weights,
+            wavelength_weights=wavelength_weights,
+        ),
+        merit,
+        tuple(targets),
+        reference,
+        goal,
+        dict(sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads),
     )
-    if not isinstance(merit, str) and not hasattr(merit, "derivatives"):
-        raise ConfigError(f"merit = {shown(merit)}: expected 'spots', 'wavefront' or a Merit")
-    wanted = merit if not isinstance(merit, str) else _merit(merit, telescope, rays, reference, goal)
-    problem = _Problem(telescope, chosen, wanted, tuple(targets))
-    low, high = _bounds(telescope, chosen, bounds or {})
-    start, slopes = problem.linear(np.zeros(len(chosen)))
+    telescopes = [state.telescope for state in states]
+    chosen = free_variables(telescopes, variables)
+    problem = DesignProblem(states, chosen)
+    box = limits(telescopes, chosen, bounds or {})
+    still = np.zeros(len(chosen))
+    start, slopes = problem.linear(still)
     effect = np.linalg.norm(slopes, axis=0)
-    rounding = NO_EFFECT * wanted.size_of_terms(ParameterColumns.at(telescope, chosen))
-    idle = [p.address for p, value, least in zip(chosen, effect, rounding, strict=True) if not value > least]
+    scale = np.divide(1.0, effect, out=np.ones_like(effect), where=effect > 0)
+    rounding = NO_EFFECT * problem.rounding()
+    idle = [v.address for v, value, least in zip(chosen, effect, rounding, strict=True) if not value > least]
     if idle:
         raise DomainError(f"variable {idle[0]} has no effect on the merit: leave it out")
-    scale = 1.0 / effect
-    history = [float(np.linalg.norm(start))]
+    begun = problem.merit_part(start)
+    done, history = _solve(problem, box, still, start, scale, tolerance, max_steps)
+    for other in random_starts(chosen, bounds or {}, box, spread, seed, restarts):
+        residuals = problem.residuals(other)
+        if np.isfinite(residuals).all():
+            found, course = _solve(problem, box, other, residuals, scale, tolerance, max_steps)
+            if found.cost < done.cost:
+                done, history = found, course
+    solved = done.x * scale
+    values, slopes = problem.linear(solved)
+    end = float(np.linalg.norm(values))
+    if end != history[-1]:
+        history.append(end)
+    rate = np.array([v.rate(x) for v, x in zip(chosen, solved, strict=True)])
+    covariance, collinear = _covariance(values, slopes, chosen, rate)
+    changes = np.array([v.change(x) for v, x in zip(chosen, solved, strict=True)])
+    start_values = np.array([v.start for v in chosen])
+    ended = problem.telescopes(solved)
+    return Optimum(
+        telescopes=tuple(ended),
+        start_telescopes=tuple(telescopes),
+        fields=tuple(b.request.fields for b in beams),
+        wavelengths=tuple(b.request.wavelengths for b in beams),
+        variables=tuple(v.parameter for v in chosen),
+        addresses=tuple(v.address for v in chosen),
+        changes=changes,
+        start_values=start_values,
+        values=start_values + changes,
+        merit_name=merit if isinstance(merit, str) else type(merit).__name__,
+        merits=np.array([np.linalg.norm(begun), np.linalg.norm(problem.merit_part(values))]),
+        history=np.array(history),
+        operands=tuple(
+            OperandChange(operand, state.telescope.name, operand.measure(state.telescope), operand.measure(after))
+            for state, after in zip(states, ended, strict=True)
+            for operand in state.operands
+        ),
+        effect=np.linalg.norm(slopes, axis=0) / np.abs(rate),
+        covariance=covariance,
+        collinear=collinear,
+        message=str(done.message),
+    )
+
+
+def _solve(
+    problem: DesignProblem,
+    box: tuple[np.ndarray, np.ndarray],
+    start: np.ndarray,
+    residuals: np.ndarray,
+    scale: np.ndarray,
+    tolerance: float,
+    max_steps: int,
+) -> tuple[OptimizeResult, list[float]]:
+    """Return the solution in variables over their scale, and the rms of all residuals before and after each step."""
+    history: list[float] = []
 
     def jacobian(scaled: np.ndarray) -> np.ndarray:
         # Called at the start and after each step.
         values, change = problem.linear(scaled * scale)
-        if scaled.any():
-            history.append(float(np.linalg.norm(values)))
+        history.append(float(np.linalg.norm(values)))
         return change * scale
 
     done = least_squares(
         lambda scaled: problem.residuals(scaled * scale),
-        np.zeros(len(chosen)),
+        start / scale,
         jac=jacobian,
-        bounds=(low / scale, high / scale),
+        bounds=(box[0] / scale, box[1] / scale),
         method="trf",
         # Generous first steps: variables that compensate each other move far for little effect.
-        x_scale=float(max(_FIRST_STEP * history[0], np.finfo(float).tiny)),
+        x_scale=float(max(_FIRST_STEP * float(np.linalg.norm(residuals)), np.finfo(float).tiny)),
         ftol=tolerance,
         xtol=tolerance,
         gtol=1e-15,
         max_nfev=max_steps,
     )
-    changes = done.x * scale
-    values, slopes = problem.linear(changes)
-    end = float(np.linalg.norm(values))
-    if end != history[-1]:
-        history.append(end)
-    covariance, collinear = _covariance(values, slopes, chosen)
-    begun = np.array([p.value(telescope) for p in chosen])
-    return Optimum(
-        telescope=apply(telescope, dict(zip(chosen, changes, strict=True))),
-        variables=chosen,
-        changes=changes,
-        start_values=begun,
-        values=begun + changes,
-        merit_name=merit if isinstance(merit, str) else type(merit).__name__,
-        history=np.array(history),
-        effect=np.linalg.norm(slopes, axis=0),
-        covariance=covariance,
-        collinear=collinear,
-        message=str(done.message),
-    )
+    return done, history
 
 
 def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
@@ -273,54 +226,43 @@ def wavefronts(telescope: Telescope, rays: Beams) -> np.ndarray:
     )
 
 
-@dataclass
-class _Problem:
-    """Merit and targets as functions of the changes of all variables."""
+def _states(
+    found: tuple[DesignConfiguration, ...],
+    merit: str | Merit,
+    targets: tuple[Operand, ...],
+    reference: str,
+    goal: Any,
+    options: dict[str, Any],
+) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
+    """Return merit and operands of each configuration, and their rays."""
+    if not isinstance(merit, str) and not hasattr(merit, "derivatives"):
+        raise ConfigError(f"merit = {shown(merit)}: expected 'spots', 'wavefront' or a Merit")
+    if len(found) > 1 and (goal is not None or not isinstance(merit, str)):
+        raise ConfigError(f"{len(found)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
+    total, states, beams = sum(one.weight for one in found), [], []
+    for one in found:
+        weights: dict[str, Any] = dict(field_weights=one.field_weights, wavelength_weights=one.wavelength_weights)
+        rays = Beams.of(one.telescope, one.fields, one.wavelengths, **weights, **options)
+        wanted = merit if not isinstance(merit, str) else _merit(merit, one.telescope, rays, reference, goal)
+        operands = (*targets, *one.operands)
+        check_operands(operands)
+        bound = []
+        for operand in operands:
+            # An operand that the telescope does not have is an error of the input, not a step that goes too far.
+            bound.append(operand.bound(one.telescope))
+            _check_start(bound[-1], one.telescope)
+        states.append(DesignState(one.telescope, wanted, tuple(bound), one.weight / total))
+        beams.append(rays)
+    return tuple(states), tuple(beams)
 
-    telescope: Telescope
-    variables: tuple[Parameter, ...]
-    merit: Merit
-    targets: tuple[FocalLength | Target, ...]
-    size: int = 0  #: number of residuals, once they are known
 
-    def _at(self, changes: np.ndarray) -> Telescope:
-        return apply(self.telescope, dict(zip(self.variables, changes, strict=True)))
-
-    def residuals(self, changes: np.ndarray) -> np.ndarray:
-        """Return all residuals [m]; NaN, for a shorter step, where the telescope is not valid."""
-        try:
-            telescope = self._at(changes)
-            return np.concatenate([self.merit.residuals(telescope), *(t.residuals(telescope) for t in self.targets)])
-        except PachonError:
-            if not self.size:
-                raise
-            return np.full(self.size, np.nan)
-
-    def linear(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return all residuals [m] and their derivatives, shape [n, n_variable]."""
-        columns = ParameterColumns.at(self.telescope, self.variables, changes)
-        values, slopes = self.merit.derivatives(columns)
-        found, rates = [values], [slopes]
-        for target in self.targets:
-            if isinstance(target, Target):
-                found.append(target.residuals(columns.telescope))
-                rates.append(self._differences(target, changes, np.linalg.norm(slopes, axis=0)))
-            else:
-                value, rate = target.derivatives(columns)
-                found.append(value)
-                rates.append(rate)
-        whole = np.concatenate(found)
-        self.size = len(whole)
-        return whole, np.concatenate(rates)
-
-    def _differences(self, target: Target, changes: np.ndarray, effect: np.ndarray) -> np.ndarray:
-        rates = np.zeros((1, len(changes)))
-        for i, size in enumerate(effect):
-            step = np.zeros(len(changes))
-            step[i] = target.step / size if size > 0 else target.step
-            there, here = (target.residuals(self._at(changes + sign * step)) for sign in (1.0, -1.0))
-            rates[:, i] = (there - here) / (2.0 * step[i])
-        return rates
+def _check_start(operand: Operand, telescope: Telescope) -> None:
+    try:
+        number = operand.measure(telescope)
+    except PachonError as error:
+        raise error.within(subject=f"operand {operand.label} of {telescope.name}") from None
+    if not np.isfinite(number):
+        raise DomainError(f"operand {operand.label} of {telescope.name} = {number!r}: expected a finite number")
 
 
 def _merit(name: str, telescope: Telescope, rays: Beams, reference: str, goal: Any) -> Merit:
@@ -335,26 +277,8 @@ def _merit(name: str, telescope: Telescope, rays: Beams, reference: str, goal: A
     return SpotMerit(telescope, rays, reference)
 
 
-def _bounds(
-    telescope: Telescope, variables: tuple[Parameter, ...], bounds: Mapping[str, tuple[float, float]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits of the changes."""
-    limits = np.array([[-np.inf, np.inf]] * len(variables))
-    addresses = [p.address for p in variables]
-    for address, pair in bounds.items():
-        if address not in addresses:
-            raise ConfigError(f"bounds of {address!r}: expected one of the variables, {', '.join(addresses)}")
-        i = addresses.index(address)
-        now = variables[i].value(telescope)
-        low, high = (float(v) for v in pair)
-        if not low < high or not low <= now <= high:
-            raise DomainError(f"bounds of {address} = ({low:g}, {high:g}): expected rising ones about its {now:.6g}")
-        limits[i] = low - now, high - now
-    return limits[:, 0], limits[:, 1]
-
-
 def _covariance(
-    values: np.ndarray, slopes: np.ndarray, variables: tuple[Parameter, ...]
+    values: np.ndarray, slopes: np.ndarray, variables: Sequence[Variable], rate: np.ndarray
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the covariance of the variables, and the combinations without effect."""
     norm = np.linalg.norm(slopes, axis=0)
@@ -362,13 +286,13 @@ def _covariance(
     _, sizes, modes = np.linalg.svd(slopes / norm, full_matrices=False)
     flat = sizes < _COLLINEAR * sizes[0]
     inverse = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, sizes))
-    spread = (modes.T * inverse) / norm[:, None]
+    spread = (modes.T * inverse) / norm[:, None] * rate[:, None]
     noise = float(values @ values) / max(1, len(values) - len(variables))
     combinations = []
     for mode in modes[flat]:
         # In natural units, the largest part 1.
-        parts = mode / norm
-        main = np.flatnonzero(np.abs(mode) > 0.05)
+        parts = mode / norm * rate
+        main = np.flatnonzero(np.abs(mode) > 0.05).tolist()
         parts = parts / parts[main[np.argmax(np.abs(mode[main]))]]
         combinations.append(" ".join(f"{parts[i]:+.4g} {variables[i].address}" for i in main))
     return noise * spread @ spread.T, tuple(combinations)

@@ -205,6 +205,7 @@ def sensitivity(
     points, pupil, (x, y) = request.fields, request.pupil, request.unit_pupil.T
     terms = annular_zernikes(n_zernike, x, y, telescope.pupil_obscuration)
     columns = ParameterColumns.at(telescope, chosen)
+    weights = columns.weights_at(request.wavelength)
     zernikes = np.empty((len(points), n_zernike))
     matrix = np.empty((len(points), n_zernike, len(chosen)))
     weighted, by_ray = pupil.weights * terms, np.ascontiguousarray(terms.T)
@@ -224,7 +225,7 @@ def sensitivity(
             )
         # Normal equations of the fit of each field: those of the whole pupil, less the few rays that are not lit.
         normal = whole - np.stack([products(dark) for dark in ~lit])
-        value, change = block.project(weighted, columns.weights)
+        value, change = block.project(weighted, weights)
         solved = np.linalg.solve(normal, np.concatenate([change, value[..., None]], axis=2))
         matrix[part], zernikes[part] = solved[..., :-1], solved[..., -1]
         matrix[part, 0] += block.piston
@@ -234,7 +235,7 @@ def sensitivity(
     with one_blas_thread():
         whole = products(np.arange(len(pupil)))
         wavefronts = FieldWavefronts(columns, request, request.wavelength, lit_only=True)
-        terms_size = np.max(wavefronts.map(fit), axis=0) @ np.abs(columns.weights)
+        terms_size = np.max(wavefronts.map(fit), axis=0) @ np.abs(weights)
     # Rotation about the axis has no effect; its rounding errors become zero.
     matrix[:, :, np.abs(matrix).max(axis=(0, 1)) < _ROUNDING * terms_size] = 0.0
     return Sensitivity(request, ParameterVector(chosen), telescope.pupil_obscuration, matrix, zernikes)

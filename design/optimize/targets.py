@@ -1,26 +1,61 @@
-"""Targets: numbers that an optimisation holds at a value, in addition to its merit."""
+"""Operands with exact derivatives from chief rays, and any function of a telescope."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError, check_choice
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.rays import field_direction, parallel_rays
 from .jacobian import ParameterColumns
+from .operand import GoalOperand, Operand, direction_of, operand_kind, wavelength_of
 
 #: Angle [rad] between the two chief rays of the focal length; distortion enters as its square.
 _SMALL_FIELD = 1e-4
 
 
+def _landing(columns: ParameterColumns, light: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return landing points of chief rays of some directions [m], shape [2, n], and derivatives [2, n, n_parameter]."""
+    forward = forward_pass(columns.telescope, parallel_rays(columns.telescope, light, wavelength, np.zeros((1, 2))))
+    return forward.landing[:2], columns.derivatives(forward, landing_gradient(forward))
+
+
+def _near_axis() -> np.ndarray:
+    """Return the directions of two chief rays near the axis, shape [2, 3]."""
+    return field_direction(np.array([-0.5, 0.5]) * _SMALL_FIELD, np.zeros(2))
+
+
+def _scale(landing: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the distance of two landing points over the tangent of their angle, and its derivatives."""
+    apart = np.diff(landing, axis=1)[:, 0]
+    length = float(np.hypot(*apart))
+    per_angle = 1.0 / (2.0 * np.tan(0.5 * _SMALL_FIELD))
+    return per_angle * length, per_angle / length * apart @ np.diff(change, axis=1)[:, 0]
+
+
+@dataclass(frozen=True)
+class _ExactOperand(GoalOperand):
+    """Operand whose number and derivatives are computed together."""
+
+    @property
+    def exact(self) -> bool:
+        return True
+
+    def measure(self, telescope: Telescope) -> float:
+        return self.gradient(ParameterColumns.at(telescope, ()))[0]
+
+
+@operand_kind("focal_length", "m")
 @check_arguments
 @dataclass(frozen=True)
-class FocalLength:
+class FocalLength(_ExactOperand):
     """Focal length: distance on the detector of two chief rays near the axis over the tangent of their angle.
 
     This is the scale on the detector. It differs from the paraxial focal length if the detector is not in the paraxial
@@ -28,58 +63,133 @@ class FocalLength:
 
     Parameters
     ----------
-    value : float
+    value : float, optional
         Wanted focal length [m].
     weight : float
         An error of 1 mm counts as `weight` times 1 mm of rms spot or wavefront.
     wavelength : float, optional
         Vacuum wavelength [m]; the telescope's own by default.
+    minimum, maximum : float, optional
+        Limits [m], in place of a value.
     """
 
-    value: float
+    value: float | None = None
     weight: float = 1.0
     wavelength: float | None = None
 
-    def residuals(self, telescope: Telescope) -> np.ndarray:
-        """Return the residual [m], shape [1]."""
-        return self.derivatives(ParameterColumns.at(telescope, ()))[0]
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+        wavelength = wavelength_of(self.wavelength, columns.telescope)
+        return _scale(*_landing(columns, _near_axis(), wavelength))
 
-    def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residual [m] and its derivatives, shape [1, n_parameter]."""
-        telescope = columns.telescope
-        angles = np.array([-0.5, 0.5]) * _SMALL_FIELD
-        light = field_direction(angles, np.zeros(2))
-        w = telescope.default_wavelength if self.wavelength is None else self.wavelength
-        forward = forward_pass(telescope, parallel_rays(telescope, light, w, np.zeros((1, 2))))
-        change = np.diff(columns.derivatives(forward, landing_gradient(forward)), axis=1)[:, 0]
-        apart = np.diff(forward.landing[:2], axis=1)[:, 0]
-        length = float(np.hypot(*apart))
-        rate = self.weight / (2.0 * np.tan(0.5 * _SMALL_FIELD))
-        return np.array([rate * length - self.weight * self.value]), (rate / length * apart @ change)[None]
+
+@operand_kind("f_number", "1")
+@check_arguments
+@dataclass(frozen=True)
+class FNumber(FocalLength):
+    """Focal ratio: :class:`FocalLength` over the diameter of the entrance pupil."""
+
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+        length, change = super().gradient(columns)
+        return length / columns.telescope.pupil_diameter, change / columns.telescope.pupil_diameter
+
+
+@operand_kind("chief_ray", "m")
+@check_arguments
+@dataclass(frozen=True)
+class ChiefRay(_ExactOperand):
+    """Landing point of a chief ray on the detector, along one axis.
+
+    Parameters
+    ----------
+    field : tuple of float, shape (2,)
+        Field angles [rad].
+    axis : {"x", "y"}
+        Axis of the detector.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.Operand` [m].
+    """
+
+    field: tuple[float, float]
+    axis: str = "y"
+    wavelength: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("axis", self.axis, ("x", "y"))
+
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+        light = direction_of(self.field, columns.telescope)
+        landing, change = _landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
+        row = "xy".index(self.axis)
+        return float(landing[row, 0]), change[row, 0]
+
+
+@operand_kind("distortion", "1")
+@check_arguments
+@dataclass(frozen=True)
+class RelativeDistortion(_ExactOperand):
+    """Distance of a chief ray's landing point from that of the axis over ``f tan(theta)``, minus 1.
+
+    Parameters
+    ----------
+    field : tuple of float, shape (2,)
+        Field angles [rad], not those of the axis.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.Operand`; pure numbers, 0.01 is one per cent.
+    """
+
+    field: tuple[float, float]
+    wavelength: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not any(self.field):
+            raise DomainError(f"operand {self.label}: expected a field off the axis")
+
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
+        light = np.concatenate([_near_axis(), direction_of(self.field, columns.telescope)])
+        landing, change = _landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
+        focal, by_focal = _scale(landing[:, :2], change[:, :2])
+        away = landing[:, 2] - landing[:, :2].mean(axis=1)
+        by_away = change[:, 2] - change[:, :2].mean(axis=1)
+        distance = float(np.hypot(*away))
+        perfect = float(np.hypot(*light[2, :2]) / -light[2, 2])
+        ratio = distance / (focal * perfect)
+        return ratio - 1.0, ratio * (away / distance**2 @ by_away - by_focal / focal)
 
 
 @check_arguments
 @dataclass(frozen=True)
-class Target:
-    """Any property of a telescope, with derivatives from central differences.
+class Target(Operand):
+    """Any function of a telescope, with derivatives from central differences.
 
     Parameters
     ----------
     function : callable
         Function of a telescope that returns the number.
-    value : float
+    value : float, optional
         Wanted value.
     weight : float
         Factor from the number to an rms spot or wavefront [m].
     step : float
         Effect on wavefront or spots [m] of the step of a variable for the differences.
+    minimum, maximum : float, optional
+        Limits, in place of a value.
     """
 
+    kind: ClassVar[str] = "function"
+    unit: ClassVar[str] = "1"
+
     function: Callable[[Telescope], float]
-    value: float
+    value: float | None = None
     weight: float = 1.0
     step: float = 1e-5
+    minimum: float | None = field(default=None, kw_only=True)
+    maximum: float | None = field(default=None, kw_only=True)
 
-    def residuals(self, telescope: Telescope) -> np.ndarray:
-        """Return the residual, shape [1]."""
-        return np.array([self.weight * (float(self.function(telescope)) - self.value)])
+    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+        return float(self.function(telescope))

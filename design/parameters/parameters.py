@@ -9,10 +9,14 @@ address                    meaning                                      unit
 ``M1.a6`` ``M1.Z5``        a power or Zernike term, added if absent     m^-5, m
 ``silica.n``               refractive index of a medium, wherever it is
 ``L1_entrance.n``          refractive index behind one surface
+``silica.abbe``            Abbe number, the index at the d line stays
+``L1_entrance.thickness``  distance to the next surface, along the light m
+``L1.thickness``           the same of an element, a group of two         m
 ========================== ============================================ ======
 
 Shift and tilt are those of :meth:`Telescope.perturbed`, of a surface or a group. *Values are changes*: zero leaves the
-telescope as it is. Where several bodies move, groups go before their members.
+telescope as it is. Where several bodies move, groups go before their members. A thickness moves all surfaces behind it
+along the axis of the surface in front of it (:mod:`.thickness`); that comes last. The entrance pupil stays.
 """
 
 from __future__ import annotations
@@ -26,13 +30,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, check_unique, unknown_name
-from ...models.media.medium import with_index_change
+from ...core.errors import ConfigError, DomainError, check_unique, error_context, unknown_name
+from ...models.media.medium import Medium, abbe_number, with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
 from ...models.telescope import Telescope, rotation_matrix
 from .shape_terms import shape_with_term, term_unit
+from .thickness import front_surface, light_axis, thickness, with_thicknesses
 
+_OF_MEDIA = ("n", "abbe")
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 
@@ -46,8 +52,8 @@ class Parameter:
     address, target : str
         Address, and the surface, group or medium in it.
     name : str
-        A motion, a term of the shape, or "n".
-    kind : {"motion", "shape", "index"}
+        A motion, a term of the shape, "n", "abbe" or "thickness".
+    kind : {"motion", "shape", "index", "abbe", "thickness"}
         Kind of the parameter.
     unit : str
         Unit of its values; empty for a pure number.
@@ -56,7 +62,7 @@ class Parameter:
     address: str
     target: str
     name: str
-    kind: Literal["motion", "shape", "index"]
+    kind: Literal["motion", "shape", "index", "abbe", "thickness"]
     unit: str
 
     @classmethod
@@ -84,27 +90,44 @@ class Parameter:
         target = max(targets, key=len)
         name = text[len(target) + 1 :]
         if target in media and target not in telescope.surface_names and target not in telescope.groups:
-            if name != "n":
-                raise unknown_name(f"parameter of medium {target}", name, ("n",))
-            return cls(text, target, name, "index", "")
+            if name not in _OF_MEDIA:
+                raise unknown_name(f"parameter of medium {target}", name, _OF_MEDIA)
+            return cls._of_medium(text, target, name, telescope)
+        if name == "thickness":
+            front_surface(telescope, target)
+            return cls(text, target, name, "thickness", "m")
         if name in MOTIONS:
             return cls(text, target, name, "motion", "m" if name[0] == "d" else "rad")
         if target in telescope.groups:
-            raise unknown_name(f"motion of group {target}", name, MOTIONS)
+            raise unknown_name(f"motion of group {target}", name, (*MOTIONS, "thickness"))
         surface = telescope.surface(target)
-        if name == "n":
+        if name in _OF_MEDIA:
             if surface.interaction != Interaction.REFRACT:
                 raise DomainError(f"parameter {text!r}: expected a refracting surface")
-            return cls(text, target, name, "index", "")
+            return cls._of_medium(text, target, name, telescope)
         return cls(text, target, name, "shape", term_unit(shape_with_term(surface, name), name))
 
+    @classmethod
+    def _of_medium(cls, text: str, target: str, name: str, telescope: Telescope) -> Parameter:
+        found = cls(text, target, name, "index" if name == "n" else "abbe", "")
+        if name == "abbe":
+            with error_context(subject=f"parameter {text!r}"):
+                if not np.isfinite(found.value(telescope)):
+                    raise DomainError("expected a medium with dispersion")
+        return found
+
     def value(self, telescope: Telescope) -> float:
-        """Return the present value: of a term, or of the index at the default wavelength; 0 for a motion."""
+        """Return the present value: of a term, thickness or Abbe number, or the index at the default wavelength.
+
+        It is 0 for a motion.
+        """
         if self.kind == "motion":
             return 0.0
-        if self.kind == "index":
-            first = telescope.surfaces[index_surfaces(telescope, self.target)[0]]
-            return float(first.medium_after.index(telescope.default_wavelength))
+        if self.kind == "thickness":
+            return thickness(telescope, front_surface(telescope, self.target))
+        if self.kind in ("index", "abbe"):
+            medium = telescope.surfaces[index_surfaces(telescope, self.target)[0]].medium_after
+            return abbe_number(medium) if self.kind == "abbe" else float(medium.index(telescope.default_wavelength))
         return float(telescope.surface(self.target).shape.parameters.get(self.name, 0.0))
 
 
@@ -222,23 +245,43 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
     for parameter, change in zip(parameters, changes, strict=True):
         if not np.isfinite(change):
             raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
+    start = telescope
     telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
+    shapes: dict[str, Shape] = {}
+    media: dict[int, Medium] = {}
     for parameter, change in zip(parameters, changes, strict=True):
         if not change:
             continue
         if parameter.kind == "shape":
-            shape = telescope.surface(parameter.target).shape
+            shape = shapes.get(parameter.target) or telescope.surface(parameter.target).shape
             value = shape.parameters[parameter.name] + change
-            telescope = telescope.with_shape(parameter.target, shape.with_parameter(parameter.name, value))
-        elif parameter.kind == "index":
-            surfaces = list(telescope.surfaces)
+            shapes[parameter.target] = shape.with_parameter(parameter.name, value)
+        elif parameter.kind in ("index", "abbe"):
+            addition, factor = change, 1.0
+            if parameter.kind == "abbe":
+                number = parameter.value(start)
+                if not number + change > 0:
+                    raise DomainError(f"{parameter.address} = {number + change:.6g}: expected a positive Abbe number")
+                addition, factor = 0.0, number / (number + change)
             for i in index_surfaces(telescope, parameter.target):
-                surfaces[i] = replace(surfaces[i], medium_after=with_index_change(surfaces[i].medium_after, change))
-            telescope = replace(telescope, surfaces=tuple(surfaces))
+                media[i] = with_index_change(media.get(i, telescope.surfaces[i].medium_after), addition, factor)
+    if shapes or media:
+        changed = tuple(
+            replace(s, shape=shapes.get(s.name, s.shape), medium_after=media.get(i, s.medium_after))
+            if s.name in shapes or i in media
+            else s
+            for i, s in enumerate(telescope.surfaces)
+        )
+        telescope = replace(telescope, surfaces=changed)
     for body, motion in _body_motions(telescope, parameters, changes):
         if motion.any():
             telescope = telescope.perturbed(body, shift=motion[:3], tilt=motion[3:])
-    return telescope
+    thicknesses = [
+        (front_surface(start, p.target), v)
+        for p, v in zip(parameters, changes, strict=True)
+        if p.kind == "thickness" and v
+    ]
+    return with_thicknesses(telescope, start, thicknesses) if thicknesses else telescope
 
 
 def _media(telescope: Telescope) -> set[str]:
@@ -287,7 +330,7 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
     the changes `values` of all parameters.
     """
     result = np.zeros((len(parameters), len(telescope.surfaces), 6))
-    names = telescope.surface_names
+    start, names = telescope, telescope.surface_names
     for body, motion in _body_motions(telescope, parameters, values):
         shift, tilt = motion[:3], motion[3:]
         members = _members(telescope, body)
@@ -325,4 +368,12 @@ def twists(telescope: Telescope, parameters: tuple[Parameter, ...], values: np.n
             result[row, places, 3:] = w
         if motion.any():
             telescope = telescope.perturbed(body, shift=shift, tilt=tilt)
+    for row, parameter in enumerate(parameters):
+        if parameter.kind == "thickness":
+            first = front_surface(telescope, parameter.target)
+            shift = light_axis(start, first)
+            behind = result[:, first + 1 :]
+            # Points about which bodies rotate are shifted along.
+            behind[..., :3] -= np.cross(behind[..., 3:], values[row] * shift)
+            result[row, first + 1 :, :3] += shift
     return result

@@ -14,7 +14,7 @@ from ...core.errors import ConfigError, DomainError, check_unique
 from ...core.random_streams import stream
 from ...core.units import require_count, require_seed
 
-DISTRIBUTIONS = ("uniform", "normal", "truncated")
+DISTRIBUTIONS = ("uniform", "normal", "truncated", "end_point")
 
 
 @check_arguments
@@ -27,10 +27,10 @@ class Tolerance:
     name : str
         Name of the degree of freedom, or address of the parameter.
     size : float
-        Largest deviation to either side ("uniform"), or standard deviation of the normal distribution before
-        truncation. In the unit of the degree of freedom.
-    distribution : {"uniform", "normal", "truncated"}
-        Distribution of the deviations.
+        Largest deviation to either side ("uniform", "end_point"), or standard deviation of the normal distribution
+        before truncation. In the unit of the degree of freedom.
+    distribution : {"uniform", "normal", "truncated", "end_point"}
+        Distribution of the deviations; "end_point" is either limit, with equal probability.
     limit : float, optional
         Largest deviation of a truncated distribution, in the same unit.
 
@@ -44,7 +44,7 @@ class Tolerance:
 
     name: str
     size: float
-    distribution: Literal["uniform", "normal", "truncated"] = "uniform"
+    distribution: Literal["uniform", "normal", "truncated", "end_point"] = "uniform"
     limit: float | None = None
 
     def __post_init__(self) -> None:
@@ -75,6 +75,8 @@ class Tolerance:
         uniform = stream(require_seed(seed), "tolerance", self.name).uniform(size=require_count(n, "n", 1))
         if self.distribution == "uniform":
             return self.size * (2.0 * uniform - 1.0)
+        if self.distribution == "end_point":
+            return np.where(uniform < 0.5, -self.size, self.size)
         low = 0.0 if self.limit is None else ndtr(-self.limit / self.size)
         # The generator may return 0, where the normal quantile is infinite.
         return self.size * ndtri(np.maximum(low + (1.0 - 2.0 * low) * uniform, np.finfo(float).tiny))

@@ -30,7 +30,17 @@ from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError
-from .medium import ConstantIndex, Medium, check_wavelength_range, real_index, wavelengths_within
+from .medium import (
+    LINE_C,
+    LINE_D,
+    LINE_F,
+    LINE_G,
+    ConstantIndex,
+    Medium,
+    check_wavelength_range,
+    real_index,
+    wavelengths_within,
+)
 
 
 @dataclass(frozen=True)
@@ -109,10 +119,6 @@ class Dispersion(Medium):
         with np.errstate(all="ignore"):
             value = np.asarray(formula.value((w * 1e6) ** 2, padded))
             return real_index(value, w, squared=formula.square)
-
-
-#: Fraunhofer lines d, F, C and g [um], at which glass makers state the index.
-LINE_D, LINE_F, LINE_C, LINE_G = 0.5875618, 0.4861327, 0.6562725, 0.4358343
 
 
 #: Coefficient of w^2 [um^-2] in Schott's formula, about the mean of common glasses: their infrared absorption.

@@ -17,6 +17,9 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, PrescriptionError
 from ...core.units import metres
 
+#: Fraunhofer lines d, F, C and g [um], at which glass makers state the index.
+LINE_D, LINE_F, LINE_C, LINE_G = 0.5875618, 0.4861327, 0.6562725, 0.4358343
+
 
 def check_wavelength_range(wavelength_range: tuple[float, float]) -> None:
     """Raise PrescriptionError unless a range of wavelengths [m] is two finite numbers, rising from above zero."""
@@ -176,7 +179,10 @@ class RelativeToAir(Medium):
 @check_arguments
 @dataclass(frozen=True)
 class ChangedIndex(Medium):
-    """Medium with the index of another plus a constant at every wavelength.
+    """Medium with the index of another plus a constant at every wavelength, and more or less dispersion.
+
+    With a factor f, ``n(w) = n_d + change + f (n_0(w) - n_d)``, where ``n_d`` is the index of the other medium at the d
+    line. The Abbe number of the other medium is divided by f, its relative partial dispersions stay.
 
     Parameters
     ----------
@@ -186,21 +192,41 @@ class ChangedIndex(Medium):
         Addition to its index.
     name : str
         Name for messages and files; not part of equality.
+    dispersion : float
+        Factor of its dispersion, positive.
     """
 
     medium: Medium
     change: float
     name: str = field(default="", compare=False)
+    dispersion: float = 1.0
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.change):
             raise PrescriptionError(f"change = {self.change!r}: expected a finite change of the refractive index")
+        if not (np.isfinite(self.dispersion) and self.dispersion > 0):
+            raise PrescriptionError(f"dispersion = {self.dispersion!r}: expected a positive factor of the dispersion")
 
     def index(self, wavelength: ArrayLike) -> np.ndarray:  # noqa: D102
-        return self.medium.index(wavelength) + self.change
+        index = self.medium.index(wavelength)
+        if self.dispersion != 1.0:
+            at_d = self.medium.index(LINE_D * 1e-6)
+            index = at_d + self.dispersion * (index - at_d)
+        return index + self.change
 
 
-def with_index_change(medium: Medium, change: float) -> Medium:
-    """Return a medium with its index changed by a constant; successive changes add up."""
-    base, before = (medium.medium, medium.change) if isinstance(medium, ChangedIndex) else (medium, 0.0)
-    return ChangedIndex(base, before + change, medium.name) if before + change else base
+def with_index_change(medium: Medium, change: float, dispersion: float = 1.0) -> Medium:
+    """Return a medium with its index changed by a constant and its dispersion by a factor; changes accumulate."""
+    if isinstance(medium, ChangedIndex):
+        change, dispersion = medium.change + change, medium.dispersion * dispersion
+        medium = medium.medium
+    return ChangedIndex(medium, change, medium.name, dispersion) if change or dispersion != 1.0 else medium
+
+
+def abbe_number(medium: Medium) -> float:
+    """Return the Abbe number ``(n_d - 1) / (n_F - n_C)`` of a medium; infinite without dispersion.
+
+    A DomainError where the medium does not cover the lines d, F and C.
+    """
+    d, blue, red = (float(medium.index(line * 1e-6)) for line in (LINE_D, LINE_F, LINE_C))
+    return (d - 1.0) / (blue - red) if blue != red else np.inf

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from ...core.errors import ConfigError, ProductError, cut_short
 from ...core.files import make_folder, partial_path, publish_new
@@ -59,6 +59,17 @@ class PointResult:
     problem: str | None  #: reason why it could not be computed, in one line
     seconds: float  #: time of the computation
     worker: str  #: machine and process of the computation
+
+
+class StoredStudy(Protocol):
+    """File of a study as a store keeps it: a section with a digest of its content and of the files that it names."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the content."""
+
+    def model_dump(self, *, mode: str) -> dict[str, Any]:
+        """Return the content as plain mappings."""
 
 
 class DamagedStoreError(ProductError):
@@ -144,7 +155,7 @@ class SweepStore:
             raise _damaged(self.path, error) from None
 
 
-def create_store(path: Path, sweep: SweepFile, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
+def create_store(path: Path, sweep: StoredStudy, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
     """Create the file of a sweep with all its points and no results, whole or not at all."""
     partial = partial_path(path)
     make_folder(path.parent)
@@ -209,7 +220,7 @@ def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:
     connection.close()
 
 
-def check_same_sweep(store: SweepStore, sweep: SweepFile) -> None:
+def check_same_sweep(store: SweepStore, sweep: StoredStudy) -> None:
     """Refuse another sweep than that of the store, in one line with the differences."""
     if store.about.get("digest") == sweep.digest:
         return

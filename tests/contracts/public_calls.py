@@ -30,6 +30,19 @@ class _Made:
         pachon.save_telescope(self.tel, path)
         return path
 
+    def make_lens(self):
+        return pachon.load_telescope(ROOT / "tests" / "data" / "zmx" / "lens1.zmx")
+
+    def make_optimization(self):
+        path = self.folder / "opt.yaml"
+        path.write_text("variables: [M2.dz]\n")
+        return path
+
+    def make_tolerances(self):
+        path = self.folder / "tol.yaml"
+        path.write_text("tolerances: [{name: M2.dz_um, size: 10}]\ndraws: 2\nrings: 2\n")
+        return path
+
     def make_lsst(self):
         return pachon.load_telescope("lsst_v3.3_r")
 
@@ -201,6 +214,12 @@ def calls(folder):
         "optimize": (pachon.optimize, waves | {"variables": ["M2.dz"], "merit": "spots", "n_pupil": 3,
                      "bounds": {"M2.dz": (-1e-3, 1e-3)}, "targets": [], "field_weights": [1.0],
                      "reference": "centroid", "sampling": "gauss"}),
+        "choose_glasses": (pachon.choose_glasses, {"telescope": m.lens, "variables": ["Image.dz"], "glasses": ["N-SF2"],
+                           "merit": "spots", "nearest": 1}),
+        "load_optimization": (pachon.load_optimization, {"path": m.optimization}),
+        "load_tolerances": (pachon.load_tolerances, {"path": m.tolerances, "telescope": "paul_baker"}),
+        "run_tolerances": (pachon.run_tolerances, {"telescope": tel, "threads": 1,
+                           "file": pachon.load_tolerances(m.tolerances, "paul_baker")}),
         "sensitivity": (pachon.sensitivity, mono | {"parameters": ["M2.dz"], "n_zernike": 6,
                         "sampling": "gauss", "n_pupil": 6}),
         "apply_changes": (pachon.apply_changes, {"telescope": m.lsst, "changes": {"M2.dz_um": 1.0}}),
@@ -328,6 +347,22 @@ def _methods(m, tel, w, x, y):
     xy = {"x": x, "y": y}
     out = {
         "FocalLength": (pachon.FocalLength, {"value": 10.0, "weight": 1.0, "wavelength": w}),
+        "FNumber": (pachon.FNumber, {"value": 4.0, "weight": 1.0, "wavelength": w}),
+        "ChiefRay": (pachon.ChiefRay, {"field": (0.0, 0.001), "axis": "y", "wavelength": w, "value": 0.03}),
+        "RelativeDistortion": (pachon.RelativeDistortion, {"field": (0.0, 0.001), "wavelength": w, "maximum": 0.01}),
+        "BackFocus": (pachon.BackFocus, {"wavelength": w, "minimum": 0.1}),
+        "CenterThickness": (pachon.CenterThickness, {"surface": "M1", "minimum": 0.1, "maximum": 0.2, "weight": 1.0}),
+        "EdgeThickness": (pachon.EdgeThickness, {"surface": "M1", "radius": 1.0, "minimum": 0.1}),
+        "SagAt": (pachon.SagAt, {"surface": "M1", "radius": 1.0, "value": 0.1}),
+        "TotalLength": (pachon.TotalLength, {"first": "M1", "last": "M2", "maximum": 20.0}),
+        "IncidenceAngle": (pachon.IncidenceAngle, {"surface": "M1", "field": (0.0, 0.001), "pupil": (0.0, 1.0),
+                           "wavelength": w, "maximum": 0.5}),
+        "ExitAngle": (pachon.ExitAngle, {"surface": "M1", "field": (0.0, 0.001), "maximum": 0.5}),
+        "RmsSpot": (pachon.RmsSpot, {"field": (0.0, 0.001), "wavelengths": (w,), "n_pupil": 3, "maximum": 1e-5}),
+        "RmsWavefront": (pachon.RmsWavefront, {"field": (0.0, 0.001), "n_pupil": 3, "maximum": 1e-7}),
+        "WavefrontMtf": (pachon.WavefrontMtf, {"field": (0.0, 0.001), "frequency": 1e4, "angle": 0.0, "wavelength": w,
+                         "minimum": 0.5}),
+        "DesignConfiguration": (pachon.DesignConfiguration, {"telescope": tel, "weight": 1.0, "operands": ()}),
         "Tolerance": (pachon.Tolerance, {"name": "M2.dz", "size": 1e-5, "distribution": "uniform"}),
         "Tolerance.draw": (pachon.Tolerance("a", 1.0).draw, {"seed": 1, "n": 3}),
         "Parameter.parse": (pachon.Parameter.parse, {"text": "M2.dz", "telescope": tel}),

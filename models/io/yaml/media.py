@@ -11,7 +11,8 @@
 =================================================================== ==================================================
 
 ``range`` and ``wavelengths`` are in the wavelength unit of the file. Indices relative to air carry that air,
-``in_air: {air: ciddor, ...}``; ``shift: 1e-5`` adds to the index of any kind.
+``in_air: {air: ciddor, ...}``; ``shift: 1e-5`` adds to the index of any kind, ``dispersion: 1.02`` is a factor of its
+change with wavelength, about the d line.
 """
 
 from __future__ import annotations
@@ -27,17 +28,18 @@ from ...media.dispersion import Dispersion
 from ...media.medium import ChangedIndex, ConstantIndex, Medium, RelativeToAir, Sellmeier, with_index_change
 from ...media.tabulated import TabulatedIndex
 from ..glass_catalogue import GlassCatalogue
-from .values import Band, Number, Numbers, OptionalFile, Text, Wavelengths
+from .values import Band, Number, Numbers, OptionalFile, PositiveNumber, Text, Wavelengths
 
 
 class MediumSection(Parameters):
-    """A medium of any kind; `shift` adds to its index."""
+    """A medium of any kind; `shift` adds to its index, `dispersion` is a factor of its change with wavelength."""
 
     shift: Number = 0.0
+    dispersion: PositiveNumber = 1.0
 
     def medium(self, name: str) -> Medium:
         """Return the medium under a name."""
-        return with_index_change(replace(self.build(), name=name), self.shift)
+        return with_index_change(replace(self.build(), name=name), self.shift, self.dispersion)
 
 
 AIR = MediumSection.of(
@@ -58,7 +60,8 @@ class GlassSection(MediumSection):
     def medium(self, name: str) -> Medium:
         """Return the medium under a name."""
         medium = replace(self.build(), name=name)
-        return with_index_change(RelativeToAir(medium, self.in_air, name) if self.in_air else medium, self.shift)
+        medium = RelativeToAir(medium, self.in_air, name) if self.in_air else medium
+        return with_index_change(medium, self.shift, self.dispersion)
 
 
 def _glass(name: str, file: Path | None) -> Medium:
@@ -84,7 +87,7 @@ MEDIA: dict[str, type[MediumSection]] = {
 
 
 def _kind(content: dict[str, Any]) -> str:
-    known = [*MEDIA, "C", "range", "in_air", "shift"]
+    known = [*MEDIA, "C", "range", "in_air", "shift", "dispersion"]
     for key in content:
         if key not in known and not MEDIA.keys() & content.keys():
             raise unknown_key(key, known)
@@ -99,7 +102,8 @@ def medium_items(medium: Medium) -> dict[str, Any]:
     if isinstance(medium, RelativeToAir):
         return medium_items(medium.relative) | {"in_air": medium_items(medium.air)}
     if isinstance(medium, ChangedIndex):
-        return medium_items(medium.medium) | {"shift": medium.change}
+        factor = {"dispersion": medium.dispersion} if medium.dispersion != 1.0 else {}
+        return medium_items(medium.medium) | {"shift": medium.change} | factor
     if (found := written(MEDIA, medium)) is None:
         raise PrescriptionError(f"medium {type(medium).__name__}: expected one that prescription files can hold")
     kind, items = found

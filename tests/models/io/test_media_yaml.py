@@ -28,6 +28,9 @@ MEDIA = {
     "{glass: n-bk7}": GlassCatalogue.bundled()["N-BK7"],
     "{glass: N-BK7, in_air: {air: ciddor, temperature_k: 293.15}}": GlassCatalogue.bundled().in_vacuum("N-BK7"),
     "{n: 1.5, shift: 1.0e-5}": ChangedIndex(ConstantIndex(1.5), 1e-5),
+    "{B: [1.0], C: [0.01], range: [0.3, 2.5], shift: 1.0e-5, dispersion: 1.02}": ChangedIndex(
+        Sellmeier((1.0,), (0.01,), (0.3e-6, 2.5e-6)), 1e-5, dispersion=1.02
+    ),
     "{glass: F2, in_air: {air: ciddor}, shift: -2.0e-5}": ChangedIndex(
         RelativeToAir(GlassCatalogue.bundled()["F2"], Air()), -2e-5
     ),

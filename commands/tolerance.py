@@ -1,0 +1,106 @@
+"""The command ``pachon tolerance``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from .inputs import load_model
+from .interrupt import interruptible
+from .options import Json, Lenient, Model, Quiet, Threads
+from .tables import Rows, number_texts, print_json
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
+
+app = typer.Typer()
+#: Tolerances in the table, the costliest.
+_SHOWN = 12
+
+
+@app.command("tolerance")
+def tolerance_command(
+    model: Model,
+    tolerances: Annotated[Path, Argument(metavar="TOL.yaml", help="Tolerances, compensators, merit, requirement.")],
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder to write to; by default tolerance_ and the model.")
+    ] = None,
+    method: Annotated[str | None, Option(help="Monte Carlo: linear, quadratic or traced, as in the file.")] = None,
+    draws: Annotated[int | None, Option("--draws", "-n", min=1, help="Telescopes to draw, as in the file.")] = None,
+    seed: Annotated[int | None, Option(help="Seed of the draws, as in the file.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Compute only what is missing in the folder.")] = False,
+    lenient: Lenient = False,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Find what tolerances cost, how tight they must be, and how many telescopes meet a requirement.
+
+    Every tolerance is traced at both of its ends (sensitivity), the size that costs a stated loss is found (inverse
+    sensitivity), and telescopes are drawn with all of them at once; compensators follow. Tables (ECSV), plots and
+    summary.json go into one folder, with the store of what was computed.
+
+    **Examples**
+
+    - `pachon tolerance triplet.zmx tol.yaml`
+    - `pachon tolerance triplet.zmx tol.yaml --method linear -n 100000 -o many`
+    - `pachon tolerance lsst_v3.3_r tol.yaml --processes 4`, and after an interruption `--resume`
+    """
+    from ..core.files import make_folder
+    from ..models.io.prescription import bundled_names
+    from ..studies.tolerance.file import load_tolerances, with_settings
+    from ..studies.tolerance.product import tolerance_summary, write_tolerances
+    from ..studies.tolerance.study import run_tolerances
+
+    telescope = load_model(model, lenient)
+    source = model if model in bundled_names() else str(Path(model).resolve())
+    file = with_settings(load_tolerances(tolerances, source), method=method, draws=draws, seed=seed)
+    folder = out or Path(f"tolerance_{telescope.name}")
+    make_folder(folder)
+    resumed = f"go on with: pachon tolerance {model} {tolerances} -o {folder} --resume"
+    with (
+        interruptible(quiet, resumed) as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
+        study = run_tolerances(
+            telescope,
+            file,
+            folder / "points.tolerance",
+            resume=resume,
+            workers=maker,
+            threads=threads,
+            reporter=reporter,
+        )
+    write_tolerances(study, file, folder)
+    summary = tolerance_summary(study)
+    if as_json:
+        print_json({**summary, "folder": str(folder)})
+        return
+    if not quiet:
+        _show(summary)
+    print(f"tolerances: {folder.resolve()}")
+
+
+def _show(summary: dict[str, Any]) -> None:
+    """Print the costliest tolerances, and the Monte Carlo below."""
+    unit = f" [{summary['unit']}]" if summary["unit"] else ""
+    plain = f" {summary['unit']}" if summary["unit"] else ""
+    rows = []
+    for one in summary["worst_offenders"][:_SHOWN]:
+        size_unit = "" if one["unit"] == "1" else f" {one['unit']}"
+        ends = number_texts([one["lower_end"], one["upper_end"]], ".5g")
+        rows.append((one["name"], f"{one['size']:.4g}{size_unit}", *ends, f"{one['size_for_the_loss']:.4g}{size_unit}"))
+    headings = ("tolerance", "size", f"lower end{unit}", f"upper end{unit}", f"{summary['loss_percent']:g} % loss at")
+    caption = f"The costliest of {summary['tolerances']}; as designed {summary['nominal']:.5g}{plain}."
+    Rows(headings, rows, caption).show()
+    reached = ", ".join(f"{p} % {summary[f'reached_by_{p}_percent']:.5g}" for p in (50, 80, 95))
+    lost = f"; {summary['lost']} without light" if summary["lost"] else ""
+    print(f"{summary['draws']} telescopes, {summary['method']}: reached by {reached}{plain}{lost}")
+    if "yield" in summary:
+        found = summary["yield"]
+        interval = f"{100 * found['low']:.1f} to {100 * found['high']:.1f} %"
+        print(f"requirement {summary['requirement']:g}{plain}: met by {100 * found['fraction']:.1f} % ({interval})")

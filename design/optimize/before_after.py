@@ -1,0 +1,46 @@
+"""Picture of a telescope before and after an optimisation: sections and spots, each pair on one scale."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...models.telescope import Telescope
+from ...wavefront.request import Request
+from ..drawing import bare_frame, field_text, wavelength_colors
+from ..layout.layout import draw_section, layout
+from ..metrics.spots import spot_diagram
+
+if TYPE_CHECKING:
+    from matplotlib.figure import SubFigure
+
+#: Field points whose spots are drawn, and rings of rays of a spot.
+_SPOTS, _RINGS = 5, 8
+
+
+def draw_before_after(
+    figure: SubFigure, telescopes: tuple[Telescope, Telescope], fields: np.ndarray, wavelengths: np.ndarray
+) -> None:
+    """Draw the sections of two telescopes side by side, and below them their spots at some field points."""
+    shown = fields[np.unique(np.linspace(0, len(fields) - 1, _SPOTS).astype(int))]
+    parts: Any = figure.subfigures(2, 1)
+    sections, spots = parts
+    middle = float(wavelengths[len(wavelengths) // 2])
+    for axes, telescope, name in zip(sections.subplots(1, 2), telescopes, ("before", "after"), strict=True):
+        draw_section(axes, layout(telescope, shown, middle))
+        axes.text(0.02, 0.03, name, transform=axes.transAxes)
+    requests = [Request.of(t, shown, wavelengths, sampling="rings", n_pupil=_RINGS) for t in telescopes]
+    diagrams = [spot_diagram(r) for r in requests]
+    panels = spots.subplots(2, len(shown), squeeze=False)
+    for row, diagram, name in zip(panels, diagrams, ("before", "after"), strict=True):
+        half = 1.1e6 * float(np.nanmax(diagram.geometric_radius, initial=1e-9))
+        colors = wavelength_colors(len(wavelengths))
+        for i, axes in enumerate(row):
+            centered = (diagram.displacement[i] - diagram.centroid[i]) * 1e6
+            for xy, weight, color in zip(centered, diagram.weight[i], colors, strict=True):
+                axes.plot(*xy[weight > 0].T, ".", markersize=1.6, markeredgewidth=0.0, color=color)
+            bare_frame(axes, half)
+            axes.set_title(field_text(shown[i]), fontsize=8)
+            axes.set_xlabel(f"rms {diagram.rms_radius[i] * 1e6:.3g} µm", fontsize=7.5)
+        row[0].set_ylabel(f"{name}, ±{half:.3g} µm", fontsize=7.5)

@@ -1,0 +1,187 @@
+"""Choice of glasses: index and Abbe number as variables first, then glasses of a catalogue in their place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, PachonError, check_unique, unknown_name
+from ...core.units import require_count
+from ...models.io.glass_catalogue import GlassCatalogue
+from ...models.media.medium import LINE_D, Medium, abbe_number
+from ...models.telescope import VACUUM, Telescope
+from ..parameters.parameters import Parameter
+from .optimize import optimize
+from .optimum import Optimum
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: End of the name of a glass while its index and Abbe number are variables.
+_MODEL = " (model)"
+
+
+@dataclass(frozen=True)
+class GlassTrial:
+    """A glass of the catalogue that was tried.
+
+    Attributes
+    ----------
+    glass : str
+        Glass of the telescope in whose place it was.
+    name : str
+        Glass of the catalogue.
+    rms : float
+        Rms of merit and operands with it [m]; infinite where no light arrives.
+    """
+
+    glass: str
+    name: str
+    rms: float
+
+
+@dataclass(frozen=True)
+class GlassChoice:
+    """Telescope with glasses from a catalogue.
+
+    Attributes
+    ----------
+    optimum : Optimum
+        The optimum with the chosen glasses, from the telescope as it was.
+    model : Optimum
+        The optimum over indices and Abbe numbers, a limit for the glasses.
+    glasses : dict of str to str
+        Chosen glass of the catalogue for each glass.
+    trials : tuple of GlassTrial
+        All glasses that were tried.
+    """
+
+    optimum: Optimum
+    model: Optimum
+    glasses: dict[str, str]
+    trials: tuple[GlassTrial, ...]
+
+    def plot(self) -> Figure:
+        """Draw the optimum; see :meth:`Optimum.plot`."""
+        return self.optimum.plot()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the results by name and unit."""
+        trials = [{"glass": t.glass, "name": t.name, "rms_m": t.rms} for t in self.trials]
+        model = {"rms_of_model_glasses_m": self.model.history[-1]}
+        return {**self.optimum.summary(), "glasses": self.glasses, **model, "glass_trials": trials}
+
+
+@check_arguments
+def choose_glasses(
+    telescope: Telescope,
+    variables: Iterable[str | Parameter],
+    glasses: Iterable[str],
+    merit: str = "spots",
+    *,
+    catalogue: GlassCatalogue | None = None,
+    nearest: int = 4,
+    **options: Any,
+) -> GlassChoice:
+    """Optimise a telescope together with its glasses.
+
+    Index and Abbe number of each glass are variables first. Then, glass by glass, the nearest of the catalogue take its
+    place, all variables are optimised again with each, and the best one stays. Near means a small change of the power
+    ``n - 1`` and of the dispersion ``1 / V``, both relative.
+
+    Parameters
+    ----------
+    telescope, merit, options
+        As in :func:`~.optimize.optimize`, for one telescope.
+    variables : iterable of str or Parameter
+        Free parameters beside the glasses.
+    glasses : iterable of str
+        Names of the media to choose.
+    catalogue : GlassCatalogue, optional
+        Glasses to choose from; the bundled ones by default. In a telescope whose space has index 1, indices are those
+        relative to air; else those against vacuum.
+    nearest : int
+        Number of glasses that are tried for each.
+
+    Raises
+    ------
+    UnknownNameError
+        If the telescope has no medium of a name.
+    ConfigError
+        If no glass is named, or one twice.
+    PachonError
+        As :func:`~.optimize.optimize`.
+    """
+    names, fixed = list(glasses), list(variables)
+    source = GlassCatalogue.bundled() if catalogue is None else catalogue
+    require_count(nearest, "nearest", 1)
+    check_unique("glass", names)
+    if not names:
+        raise ConfigError("glasses = []: expected at least one medium of the telescope")
+    known = {s.medium_after.name for s in telescope.surfaces if s.medium_after.name}
+    for name in names:
+        if name not in known:
+            raise unknown_name(f"medium of {telescope.name}", name, sorted(known))
+    free = telescope
+    for name in names:
+        free = _with_medium(free, name, _medium_of(free, name), name + _MODEL)
+
+    def optimum(start: Telescope, left: list[str]) -> Optimum:
+        of_glasses = [f"{name}{_MODEL}.{what}" for name in left for what in ("n", "abbe")]
+        return optimize(start, [*fixed, *of_glasses], merit, **options)
+
+    model = best = optimum(free, names)
+    changes, trials, chosen = best.changes[: -2 * len(names)], [], {}
+    for i, name in enumerate(names):
+        found: list[tuple[float, str, Optimum]] = []
+        for glass in _nearest(source, _medium_of(best.telescope, name + _MODEL), nearest):
+            medium = source[glass] if telescope.medium_before == VACUUM else source.in_vacuum(glass)
+            try:
+                end = optimum(_with_medium(best.telescope, name + _MODEL, medium, glass), names[i + 1 :])
+            except PachonError:
+                trials.append(GlassTrial(name, glass, np.inf))
+                continue
+            trials.append(GlassTrial(name, glass, float(end.history[-1])))
+            found.append((float(end.history[-1]), glass, end))
+        if not found:
+            raise ConfigError(f"glass {name!r}: no glass of {source.source} near it lets light through")
+        _, chosen[name], best = min(found, key=lambda one: one[:2])
+        changes = changes + best.changes[: len(changes)]
+    final = replace(
+        best,
+        start_telescopes=(telescope,),
+        start_values=best.values - changes,
+        changes=changes,
+        merits=np.array([model.merits[0], best.merits[1]]),
+        history=np.concatenate([model.history, best.history[1:]]),
+    )
+    return GlassChoice(final, model, chosen, tuple(trials))
+
+
+def _medium_of(telescope: Telescope, name: str) -> Medium:
+    return next(s.medium_after for s in telescope.surfaces if s.medium_after.name == name)
+
+
+def _with_medium(telescope: Telescope, old: str, medium: Medium, name: str) -> Telescope:
+    """Return the telescope with another medium, under a name, in place of one."""
+    named: Medium = replace(medium, name=name)  # type: ignore[type-var]
+    surfaces = tuple(replace(s, medium_after=named) if s.medium_after.name == old else s for s in telescope.surfaces)
+    return replace(telescope, surfaces=surfaces)
+
+
+def _nearest(catalogue: GlassCatalogue, medium: Medium, count: int) -> list[str]:
+    """Return the names of the glasses nearest to a medium, the nearest first."""
+    power, number = float(medium.index(LINE_D * 1e-6)) - 1.0, abbe_number(medium)
+    found = []
+    for name in catalogue:
+        glass = catalogue[name]
+        try:
+            change = float(glass.index(LINE_D * 1e-6)) - 1.0 - power, number / abbe_number(glass) - 1.0
+        except PachonError:
+            continue
+        found.append((float(np.hypot(change[0] / power, change[1])), name))
+    return [name for _, name in sorted(found)[:count]]

@@ -1,0 +1,228 @@
+"""Files of optimisations, YAML.
+
+::
+
+    variables: [S1.radius, S2.radius, S2.thickness, zoom_2:S4.thickness]
+    bounds: {S2.thickness_mm: [0.5, 6]}
+    merit: spots
+    fields_deg: [[0, 0], [0, 8.5], [0, 12]]
+    wavelengths_nm: [486.1, 587.6, 656.3]
+    operands:
+      - {kind: focal_length_mm, target: 25}
+      - {kind: edge_thickness_mm, surface: S1, min: 0.5}
+      - {kind: distortion_percent, field_deg: [0, 12], min: -1, max: 1}
+    configurations:
+      - {telescope: zoom_2.yaml, weight: 2}
+    glasses: [N-SK16, N-SF2]
+    restarts: 10
+
+An operand has one of the kinds of :data:`~.operand.OPERANDS`, with the unit of its numbers at the end of the name.
+Bounds have the unit at the end of the address. The telescope of the command is the first configuration;
+`configurations` are further ones, which share the variables.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, error_context, unknown_name
+from ...core.schema import Count, Positive, Real, Section, Whole, validated
+from ...core.yaml_reader import read_mapping
+from ...models.io.prescription import load_telescope
+from ...models.telescope import Telescope
+from ..parameters.changes import ANGLES, LENGTHS, parse_change
+from . import geometry_operands, ray_operands, targets
+from .configuration import DesignConfiguration
+from .operand import OPERANDS, Operand
+
+_DEGREE = ANGLES["deg"]
+#: Keys of files for the fields of operands, and their units in SI; other fields have their own names.
+_KEYS = {
+    "field": ("field_deg", _DEGREE),
+    "wavelength": ("wavelength_nm", 1e-9),
+    "wavelengths": ("wavelengths_nm", 1e-9),
+    "radius": ("radius_mm", 1e-3),
+    "frequency": ("frequency_per_mm", 1e3),
+    "angle": ("angle_deg", _DEGREE),
+}
+#: Units at the end of kinds, by the unit of the number.
+_UNITS = {"m": LENGTHS, "rad": ANGLES, "1": {"": 1.0, "percent": 0.01}}
+#: Modules whose operands files can name; importing them registers the kinds.
+_MODULES = (targets, geometry_operands, ray_operands)
+
+Pair = tuple[Real, Real]
+Pairs = Annotated[tuple[Pair, ...], Field(min_length=1)]
+Waves = Annotated[tuple[Positive, ...], Field(min_length=1)]
+
+
+class OperandSection(Section):
+    """An operand: kind with unit, target or limits, weight, and the fields of its kind."""
+
+    kind: str
+    target: Real | None = None
+    min: Real | None = None
+    max: Real | None = None
+    weight: Positive = 1.0
+    surface: str | None = None
+    first: str | None = None
+    last: str | None = None
+    axis: Literal["x", "y"] | None = None
+    pupil: Pair | None = None
+    n_pupil: Count | None = None
+    field_deg: Pair | None = None
+    wavelength_nm: Positive | None = None
+    wavelengths_nm: Waves | None = None
+    radius_mm: Positive | None = None
+    frequency_per_mm: Positive | None = None
+    angle_deg: Real | None = None
+
+    def operand(self) -> Operand:
+        """Return the operand; ConfigError or DomainError where its numbers do not fit together."""
+        cls, size = _kind(self.kind)
+        names = [f.name for f in dataclasses.fields(cls) if f.repr]  # type: ignore[arg-type]
+        own = {n: _KEYS.get(n, (n, None)) for n in names if n not in ("value", "minimum", "maximum", "weight")}
+        keys = [key for key, _ in own.values()]
+        for key in self.model_fields_set - {"kind", "target", "min", "max", "weight"}:
+            if key not in keys:
+                raise unknown_name(f"key of operand {self.kind}", key, keys)
+        values: dict[str, Any] = {"weight": self.weight}
+        for name, (key, unit) in own.items():
+            if (value := getattr(self, key)) is not None:
+                values[name] = value if unit is None else _scaled(value, unit)
+        for name, number in (("value", self.target), ("minimum", self.min), ("maximum", self.max)):
+            if number is not None:
+                values[name] = number * size
+        needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING]  # type: ignore[arg-type]
+        for one in needed:
+            if one.name not in values:
+                raise ConfigError(f"operand {self.kind}: {own[one.name][0]} is missing")
+        return cls(**values)
+
+
+def _kind(text: str) -> tuple[type[Operand], float]:
+    """Return the class of a kind with its unit, and the size of the unit in SI."""
+    for kind, cls in OPERANDS.items():
+        units = _UNITS[cls.unit]
+        if text == kind or text.startswith(f"{kind}_"):
+            unit = text[len(kind) + 1 :]
+            if unit in units:
+                return cls, units[unit]
+            raise ConfigError(f"operand {text!r}: expected its unit at the end, one of {', '.join(units)}")
+    known = [
+        kind if cls.unit == "1" else f"{kind}_{'mm' if cls.unit == 'm' else 'deg'}" for kind, cls in OPERANDS.items()
+    ]
+    raise unknown_name("operand", text, known)
+
+
+def _scaled(value: Any, unit: float) -> Any:
+    return tuple(unit * v for v in value) if isinstance(value, tuple) else unit * value
+
+
+class StateSection(Section):
+    """Fields, wavelengths and operands of a configuration."""
+
+    fields_deg: Pairs | None = None
+    field_weights: tuple[Real, ...] | None = None
+    wavelengths_nm: Waves | None = None
+    wavelength_weights: tuple[Real, ...] | None = None
+    operands: tuple[OperandSection, ...] = ()
+
+    def rays(self) -> dict[str, Any]:
+        """Return fields, wavelengths and their weights as arguments."""
+        return {
+            "fields": None if self.fields_deg is None else [_scaled(pair, _DEGREE) for pair in self.fields_deg],
+            "wavelengths": None if self.wavelengths_nm is None else list(_scaled(self.wavelengths_nm, 1e-9)),
+            "field_weights": None if self.field_weights is None else list(self.field_weights),
+            "wavelength_weights": None if self.wavelength_weights is None else list(self.wavelength_weights),
+        }
+
+    def operand_list(self) -> list[Operand]:
+        """Return the operands; an error names the place."""
+        found = []
+        for i, section in enumerate(self.operands):
+            with error_context(key=f"operands.{i}"):
+                found.append(section.operand())
+        return found
+
+
+class ConfigurationSection(StateSection):
+    """A further telescope that shares the variables."""
+
+    telescope: str
+    weight: Positive = 1.0
+
+
+class OptimizeFile(StateSection):
+    """Content of a file of an optimisation."""
+
+    variables: Annotated[tuple[str, ...], Field(min_length=1)]
+    bounds: dict[str, Pair] = Field(default_factory=dict)
+    merit: Literal["spots", "wavefront"] = "spots"
+    reference: Literal["centroid", "chief"] = "centroid"
+    configurations: tuple[ConfigurationSection, ...] = ()
+    glasses: tuple[str, ...] = ()
+    nearest_glasses: Count = 4
+    n_pupil: Count | None = None
+    max_steps: Count = 200
+    restarts: Whole = 0
+    spread: Positive = 0.3
+    seed: Whole = 0
+
+
+@check_arguments
+def load_optimization(path: str | os.PathLike[str]) -> OptimizeFile:
+    """Read the file of an optimisation.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, or is malformed: one line with file, key, value and what was expected.
+    """
+    path = Path(path)
+    return validated(OptimizeFile, read_mapping(path, ConfigError), str(path))
+
+
+def optimization_arguments(file: OptimizeFile, telescope: Telescope, path: Path) -> dict[str, Any]:
+    """Return the arguments of :func:`~.optimize.optimize` for a file and the telescope of its command.
+
+    Paths in the file start from its folder. Errors name the file and the key.
+    """
+    common: dict[str, Any] = file.rays()
+    with error_context(file=path):
+        operands = file.operand_list()
+        states = [DesignConfiguration(telescope, **common, operands=operands)]
+        for i, section in enumerate(file.configurations):
+            with error_context(key=f"configurations.{i}"):
+                beside = path.parent / section.telescope
+                other = load_telescope(beside if beside.is_file() else section.telescope)
+                rays = {k: common[k] if v is None else v for k, v in section.rays().items()}
+                states.append(
+                    DesignConfiguration(other, **rays, weight=section.weight, operands=section.operand_list())
+                )
+        bounds = {}
+        for text, pair in file.bounds.items():
+            owner, colon, name = text.rpartition(":")
+            known = {s.telescope.name: s.telescope for s in states}
+            if colon and owner not in known:
+                raise unknown_name("configuration of bounds", owner, known)
+            parameter, size = parse_change(known[owner] if colon else telescope, name, "bounds")
+            bounds[owner + colon + parameter.address] = (size * pair[0], size * pair[1])
+    start = {"telescope": states} if file.configurations else {"telescope": telescope, **common, "targets": operands}
+    return {
+        **start,
+        "variables": file.variables,
+        "merit": file.merit,
+        "bounds": bounds,
+        "reference": file.reference,
+        "n_pupil": file.n_pupil,
+        "max_steps": file.max_steps,
+        "restarts": file.restarts,
+        "spread": file.spread,
+        "seed": file.seed,
+    }

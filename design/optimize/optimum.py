@@ -1,0 +1,197 @@
+"""Result of an optimisation: telescopes, variables and operands before and after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...core.plotting import BLUE, GREY, figure_at, plain_text, styled
+from ...core.result import Result, Values
+from ...models.telescope import Telescope
+from ..parameters.parameters import Parameter
+from .before_after import draw_before_after
+from .operand import Operand
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class OperandChange(Values):
+    """An operand before and after an optimisation.
+
+    Attributes
+    ----------
+    operand : Operand
+        The operand.
+    configuration : str
+        Name of the telescope.
+    start, end : float
+        Number before and after, in SI.
+    """
+
+    operand: Operand
+    configuration: str
+    start: float
+    end: float
+
+    @property
+    def goal(self) -> str:
+        """Wanted value or limits as text."""
+        one = self.operand
+        if one.value is not None:
+            return f"= {one.value:.6g}"
+        parts = [f">= {one.minimum:.6g}"] if one.minimum is not None else []
+        return ", ".join([*parts, f"<= {one.maximum:.6g}"] if one.maximum is not None else parts)
+
+
+@dataclass(frozen=True)
+class Optimum(Result):
+    """Result of an optimisation.
+
+    Attributes
+    ----------
+    telescopes : tuple of Telescope
+        The optimised telescope of each configuration.
+    start_telescopes : tuple of Telescope
+        The telescopes before.
+    fields : tuple of ndarray, shape [n_field, 2]
+        Field angles [rad] of each configuration.
+    wavelengths : tuple of ndarray, shape [n_wave]
+        Vacuum wavelengths [m] of each configuration.
+    variables : tuple of Parameter
+        Free parameters.
+    addresses : tuple of str
+        Their addresses; those of one configuration alone with its name and a colon in front.
+    changes : ndarray, shape [n_variable]
+        Change of each, in its own unit.
+    start_values, values : ndarray, shape [n_variable]
+        Values before and after; those of motions are relative to the start.
+    merit_name : str
+        "spots" or "wavefront".
+    merits : ndarray, shape [2]
+        Rms of the merit alone [m], without operands, before and after.
+    history : ndarray, shape [n_step + 1]
+        Rms of merit and operands [m] before the first step and after each.
+    operands : tuple of OperandChange
+        Operands before and after.
+    effect : ndarray, shape [n_variable]
+        Rms change of the residuals per unit of each variable [m], at the solution.
+    covariance : ndarray, shape [n_variable, n_variable]
+        Covariance of the variables, with the final residuals as noise, without combinations of no effect.
+    collinear : tuple of str
+        Combinations of variables without effect, such as "M1.radius - 0.998 M1.curvature".
+    message : str
+        Why the solver stopped.
+    """
+
+    _table = ("start_values", "values", "changes", "uncertainty", "effect")
+    _row_type = Parameter
+
+    telescopes: tuple[Telescope, ...]
+    start_telescopes: tuple[Telescope, ...]
+    fields: tuple[np.ndarray, ...]
+    wavelengths: tuple[np.ndarray, ...]
+    variables: tuple[Parameter, ...]
+    addresses: tuple[str, ...]
+    changes: np.ndarray
+    start_values: np.ndarray
+    values: np.ndarray
+    merit_name: str
+    merits: np.ndarray
+    history: np.ndarray
+    operands: tuple[OperandChange, ...]
+    effect: np.ndarray
+    covariance: np.ndarray
+    collinear: tuple[str, ...]
+    message: str
+
+    @property
+    def telescope(self) -> Telescope:
+        """The optimised telescope, of several configurations the first."""
+        return self.telescopes[0]
+
+    @property
+    def uncertainty(self) -> np.ndarray:
+        """Standard deviation of each variable, in its own unit, shape [n_variable]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def step_effects(self) -> np.ndarray:
+        """Effect of the change of each variable at the solution, rms [m], shape [n_variable]."""
+        return np.abs(self.changes) * self.effect
+
+    def _label(self) -> str:
+        start, end = self.history[0], self.history[-1]
+        return f"{self.telescope.name}, {len(self.variables)} variables, rms {start:.4g} -> {end:.4g} m"
+
+    def _columns(self) -> dict[str, Any]:
+        names = {"address": list(self.addresses), "unit": [p.unit or "1" for p in self.variables]}
+        return names | super()._columns()
+
+    def _summary(self) -> dict[str, Any]:
+        """Return the results by name and unit."""
+        return {
+            "telescope": self.telescope.name,
+            "configurations": [t.name for t in self.telescopes],
+            "merit": self.merit_name,
+            "rms_start_m": self.merits[0],
+            "rms_end_m": self.merits[1],
+            "rms_start_with_operands_m": self.history[0],
+            "rms_end_with_operands_m": self.history[-1],
+            "steps": len(self.history) - 1,
+            "variables": list(self.addresses),
+            "units": [p.unit or "1" for p in self.variables],
+            "start_values": self.start_values,
+            "values": self.values,
+            "changes": self.changes,
+            "uncertainty": self.uncertainty,
+            "effect_m_per_unit": self.effect,
+            "operands": [
+                {
+                    "operand": one.operand.label,
+                    "configuration": one.configuration,
+                    "unit": one.operand.unit,
+                    "goal": one.goal,
+                    "start": one.start,
+                    "end": one.end,
+                }
+                for one in self.operands
+            ],
+            "collinear": list(self.collinear),
+            "message": self.message,
+        }
+
+    def plot(self, ax: Axes | Figure | None = None) -> Figure:
+        """Draw merit and effects of the variables, and the telescope with its spots before and after."""
+        with styled():
+            above = max(3.2, 1.4 + 0.24 * len(self.addresses))
+            figure = figure_at(ax, 10.4, above + 6.4)
+            parts: Any = figure.subfigures(2, 1, height_ratios=[above, 6.4])
+            course, designs = parts
+            steps, bars = course.subplots(1, 2)
+            self._draw_course(steps, bars)
+            draw_before_after(
+                designs,
+                (self.start_telescopes[0], self.telescope),
+                self.fields[0],
+                self.wavelengths[0],
+            )
+            return figure
+
+    def _draw_course(self, steps: Axes, bars: Axes) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        steps.semilogy(range(len(self.history)), self.history * 1e6, "o-", color=BLUE, markersize=4)
+        steps.xaxis.set_major_locator(MaxNLocator(integer=True))
+        steps.grid(True, which="major", linewidth=0.3)
+        name = f"rms of {self.merit_name}" + (" and operands" if self.operands else "")
+        steps.set(xlabel="step", ylabel=f"{name} [µm]", title=plain_text(self.telescope.name))
+        places = np.arange(len(self.addresses))
+        bars.barh(places, self.step_effects * 1e6, color=GREY, height=0.7)
+        bars.set_yticks(places, [plain_text(name) for name in self.addresses])
+        bars.invert_yaxis()
+        bars.set_xlabel("change of each times its effect, rms [µm]")

@@ -1,0 +1,218 @@
+"""Operands of rays: angles at surfaces, rms spot and wavefront of a field point, modulation transfer."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError
+from ...core.units import field_label
+from ...models.telescope import Telescope
+from ...raytrace.rays import RayStatus, parallel_rays
+from ...raytrace.trace import trace
+from ...wavefront.chief_rays import image_jacobians
+from ...wavefront.opd import wavefront_opd
+from .jacobian import ParameterColumns
+from .merit import Beams, Merit, SpotMerit, WavefrontMerit
+from .operand import GoalOperand, angles_of, direction_of, operand_kind, wavelength_of
+
+#: Points across the pupil for the modulation transfer.
+_ACROSS = 32
+
+
+@operand_kind("incidence_angle", "rad")
+@check_arguments
+@dataclass(frozen=True)
+class IncidenceAngle(GoalOperand):
+    """Angle [rad] between a ray and the normal of a surface, in front of the surface.
+
+    Parameters
+    ----------
+    surface : str
+        Name of the surface.
+    field : tuple of float, shape (2,)
+        Field angles [rad].
+    pupil : tuple of float, shape (2,)
+        Point of the entrance pupil, in units of its radius; the chief ray by default.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.GoalOperand` [rad].
+    """
+
+    behind: ClassVar[bool] = False
+
+    surface: str
+    field: tuple[float, float]
+    pupil: tuple[float, float] = (0.0, 0.0)
+    wavelength: float | None = None
+
+    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+        surface = telescope.surface(self.surface)
+        point = 0.5 * telescope.pupil_diameter * np.array([self.pupil], dtype=np.float64)
+        light = direction_of(self.field, telescope)
+        rays = parallel_rays(telescope, light, wavelength_of(self.wavelength, telescope), point)
+        results = trace(telescope, rays, surfaces="all", threads=1)
+        i = telescope.surface_names.index(surface.name)
+        here = results[i]
+        if here.status[0] > RayStatus.VIGNETTED:
+            raise DomainError(f"operand {self.label}: the ray does not reach the surface")
+        ray = here.direction[0] if self.behind else (results[i - 1].direction[0] if i else rays.direction[0])
+        x, y, _ = surface.to_local(here.position[0])
+        slope_x, slope_y = surface.shape.gradient(x, y)
+        normal = surface.matrix @ np.array([-float(slope_x), -float(slope_y), 1.0])
+        # The arc tangent stays exact for small angles.
+        return math.atan2(float(np.linalg.norm(np.cross(ray, normal))), abs(float(ray @ normal)))
+
+
+@operand_kind("exit_angle", "rad")
+@check_arguments
+@dataclass(frozen=True)
+class ExitAngle(IncidenceAngle):
+    """Angle [rad] between a ray and the normal of a surface, behind the surface; see :class:`IncidenceAngle`."""
+
+    behind: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class _RmsOperand(GoalOperand):
+    """Root mean square over the rays of one field point, with exact derivatives."""
+
+    field: tuple[float, float]
+    wavelengths: tuple[float, ...] | None = None
+    n_pupil: int = 6
+    merit: Merit | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
+
+    _merits: ClassVar[type[SpotMerit] | type[WavefrontMerit]]
+
+    @property
+    def exact(self) -> bool:
+        return True
+
+    def bound(self, telescope: Telescope) -> Self:
+        waves = None if self.wavelengths is None else list(self.wavelengths)
+        rays = Beams.of(telescope, angles_of(self.field), waves, n_pupil=self.n_pupil)
+        return replace(self, merit=type(self)._merits(telescope, rays))
+
+    def _merit(self, telescope: Telescope) -> Merit:
+        found = self.merit or self.bound(telescope).merit
+        assert found is not None
+        return found
+
+    def measure(self, telescope: Telescope) -> float:
+        return float(np.linalg.norm(self._merit(telescope).residuals(telescope)))
+
+    def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:
+        values, slopes = self._merit(columns.telescope).derivatives(columns)
+        number = float(np.linalg.norm(values))
+        return number, values @ slopes / max(number, np.finfo(float).tiny)
+
+
+@operand_kind("rms_spot", "m")
+@check_arguments
+@dataclass(frozen=True)
+class RmsSpot(_RmsOperand):
+    """Rms radius [m] of the spot of one field point about its centroid, all wavelengths together.
+
+    Parameters
+    ----------
+    field : tuple of float, shape (2,)
+        Field angles [rad].
+    wavelengths : tuple of float, optional
+        Vacuum wavelengths [m]; the telescope's own by default.
+    n_pupil : int
+        Rings of pupil points.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.GoalOperand` [m].
+    """
+
+    _merits: ClassVar[type[SpotMerit] | type[WavefrontMerit]] = SpotMerit
+
+
+@operand_kind("rms_wavefront", "m")
+@check_arguments
+@dataclass(frozen=True)
+class RmsWavefront(_RmsOperand):
+    """Rms wavefront [m] of one field point without piston and tilt; arguments as those of :class:`RmsSpot`."""
+
+    _merits: ClassVar[type[SpotMerit] | type[WavefrontMerit]] = WavefrontMerit
+
+
+@operand_kind("mtf", "1")
+@check_arguments
+@dataclass(frozen=True)
+class WavefrontMtf(GoalOperand):
+    r"""Modulation transfer at one frequency, estimated from differences of the wavefront.
+
+    The transfer function is the mean of ``exp(i k dW)`` over the overlap of the pupil with itself, shifted by the
+    wavelength times the frequency, ``dW`` the difference of the wavefront between both. Here it is the overlap times
+    ``exp(-k^2 var(dW) / 2)``, equal to second order in the wavefront. It falls steadily with the aberration, where the
+    true one oscillates.
+
+    Parameters
+    ----------
+    field : tuple of float, shape (2,)
+        Field angles [rad].
+    frequency : float
+        Spatial frequency on the detector [cycles/m].
+    angle : float
+        Direction of the modulation on the detector [rad], from +x towards +y.
+    wavelength : float, optional
+        Vacuum wavelength [m]; the telescope's own by default.
+    value, minimum, maximum, weight : float
+        As in :class:`~.operand.GoalOperand`.
+    """
+
+    field: tuple[float, float]
+    frequency: float
+    angle: float = 0.5 * math.pi
+    wavelength: float | None = None
+    shear: tuple[float, float] | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
+
+    def bound(self, telescope: Telescope) -> Self:  # noqa: D102
+        wavelength = wavelength_of(self.wavelength, telescope)
+        jacobian = image_jacobians(telescope, direction_of(self.field, telescope), wavelength)[0]
+        # Exit direction cosines of pupil point p are those of the chief ray minus J^-T p.
+        along = self.frequency * wavelength * np.array([math.cos(self.angle), math.sin(self.angle)])
+        x, y = (float(v) for v in jacobian.T @ along)
+        return replace(self, shear=(x, y))
+
+    def measure(self, telescope: Telescope) -> float:  # noqa: D102
+        shear = np.array(self.shear or self.bound(telescope).shear)
+        outer = 0.5 * telescope.pupil_diameter
+        inner, distance = outer * telescope.pupil_obscuration, float(np.hypot(*shear))
+        limit = _overlap(outer, outer, distance) - 2.0 * _overlap(outer, inner, distance)
+        limit = (limit + _overlap(inner, inner, distance)) / (math.pi * (outer**2 - inner**2))
+        if limit <= 0.0:
+            raise DomainError(f"operand {self.label}: expected a frequency below the cut-off of diffraction")
+        across = outer * (2.0 * (np.arange(_ACROSS) + 0.5) / _ACROSS - 1.0)
+        points = np.stack([v.ravel() for v in np.meshgrid(across, across)])
+        both = [points + sign * 0.5 * shear[:, None] for sign in (1.0, -1.0)]
+        inside = np.all([(inner <= np.hypot(*p)) & (np.hypot(*p) <= outer) for p in both], axis=0)
+        wavelength = wavelength_of(self.wavelength, telescope)
+        pupil = np.concatenate([p[:, inside] for p in both], axis=1)
+        opd = wavefront_opd(telescope, self.field, wavelength, (pupil[0], pupil[1]), threads=1).value
+        change = np.subtract(*opd.reshape(2, -1))
+        change = change[np.isfinite(change)]
+        if not len(change):
+            raise DomainError(f"operand {self.label}, {field_label(np.array(self.field))}: no light passes")
+        return limit * math.exp(-0.5 * (2.0 * math.pi / wavelength) ** 2 * float(change.var()))
+
+
+def _overlap(first: float, second: float, distance: float) -> float:
+    """Return the common area of two circles of given radii whose centres are apart by a distance."""
+    if distance >= first + second:
+        return 0.0
+    if distance <= abs(first - second):
+        return math.pi * min(first, second) ** 2
+    cosines = [
+        (distance**2 + sign * (first**2 - second**2)) / (2.0 * distance * r)
+        for sign, r in ((1.0, first), (-1.0, second))
+    ]
+    angles = [math.acos(min(1.0, max(-1.0, c))) for c in cosines]
+    return sum(r**2 * (a - 0.5 * math.sin(2.0 * a)) for r, a in zip((first, second), angles, strict=True))

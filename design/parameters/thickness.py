@@ -1,0 +1,76 @@
+"""Thicknesses: distances between surfaces along the light, and their changes, which move all that is behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...models.surface import Interaction, Vector
+from ...models.telescope import Telescope
+
+
+def front_surface(telescope: Telescope, target: str) -> int:
+    """Return the index of the surface in front of the thickness of a surface, or of an element of two.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such surface or group.
+    DomainError
+        If nothing is behind the surface, or the group is not two surfaces, one behind the other.
+    """
+    names = telescope.surface_names
+    if target in telescope.groups:
+        first, *others = (names.index(member) for member in telescope.groups[target])
+        if others != [first + 1]:
+            raise DomainError(f"parameter '{target}.thickness': expected a group of two surfaces, front and back")
+        return first
+    index = names.index(telescope.surface(target).name)
+    if index + 1 == len(names):
+        raise DomainError(f"parameter '{target}.thickness': expected a surface with another one behind it")
+    return index
+
+
+def light_axis(telescope: Telescope, index: int) -> np.ndarray:
+    """Return the unit vector along the axis of a surface in the direction of the light behind it, shape [3].
+
+    Light comes along -z of the first surface, and each mirror turns it back.
+    """
+    mirrors = sum(s.interaction == Interaction.MIRROR for s in telescope.surfaces[: index + 1])
+    axis: np.ndarray = telescope.surfaces[index].matrix[:, 2]
+    return axis if mirrors % 2 else -axis
+
+
+def thickness(telescope: Telescope, index: int) -> float:
+    """Return the distance [m] from the vertex of a surface to the next one, along the light."""
+    here, behind = (np.array(s.vertex) for s in telescope.surfaces[index : index + 2])
+    return float(light_axis(telescope, index) @ (behind - here))
+
+
+def with_thicknesses(telescope: Telescope, start: Telescope, changes: Iterable[tuple[int, float]]) -> Telescope:
+    """Return the telescope with thicknesses behind some surfaces, by their indices, changed by lengths [m].
+
+    The surfaces behind each are shifted along its axis in the telescope `start`, before other changes. The pivot of a
+    group goes with the first of its surfaces.
+    """
+    shifts = np.zeros((len(telescope.surfaces), 3))
+    for index, change in changes:
+        shifts[index + 1 :] += change * light_axis(start, index)
+    surfaces = tuple(
+        replace(s, vertex=_shifted(s.vertex, shift)) if shift.any() else s
+        for s, shift in zip(telescope.surfaces, shifts, strict=True)
+    )
+    frames, names = dict(telescope.group_frames), telescope.surface_names
+    for group, members in telescope.groups.items():
+        first = min(names.index(member) for member in members)
+        vertex, axes = frames[group]
+        frames[group] = _shifted(vertex, shifts[first]), axes
+    return replace(telescope, surfaces=surfaces, group_frames=frames)
+
+
+def _shifted(vertex: Vector, shift: np.ndarray) -> Vector:
+    x, y, z = (float(v) for v in np.array(vertex) + shift)
+    return x, y, z

@@ -1,0 +1,1 @@
+"""Tolerances of a telescope: sensitivity, inverse sensitivity, Monte Carlo, yield."""

@@ -1,0 +1,91 @@
+"""Files of a tolerance study: tables of sensitivity and draws, summary, plots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.files import write_bytes, write_json
+from ...core.products import Columns, write_ecsv
+from ...core.version import VERSION
+from .file import ToleranceFile
+from .plots import sensitivity_plot, yield_plot
+from .study import ToleranceStudy
+
+_PERCENT = (50, 80, 90, 95, 98)
+#: Worst offenders in the summary.
+_WORST = 20
+
+
+def tolerance_summary(study: ToleranceStudy) -> dict[str, Any]:
+    """Return the figures of a study as plain numbers, merits in the unit of the study."""
+    scale, draws = study.merit.scale, study.draws
+    finite = draws[np.isfinite(draws)]
+    summary: dict[str, Any] = {
+        "telescope": study.telescope,
+        "merit": study.merit.name,
+        "unit": study.merit.unit,
+        "method": study.method,
+        "tolerances": len(study.tolerances),
+        "compensators": list(study.compensators),
+        "compensator_units": list(study.compensator_units),
+        "compensator_rms": np.sqrt((study.moves**2).mean(axis=0)),
+        "draws": len(draws),
+        "lost": len(draws) - len(finite),
+        "nominal": scale * study.nominal,
+        "mean": scale * float(finite.mean()) if len(finite) else None,
+        "spread": scale * float(finite.std()) if len(finite) else None,
+        **{f"reached_by_{percent}_percent": scale * study.at_most(percent / 100.0) for percent in _PERCENT},
+        "worst_offenders": [
+            {
+                "name": study.tolerances[i].name,
+                "size": study.tolerances[i].size,
+                "unit": study.units[i],
+                "lower_end": scale * study.lower[i],
+                "upper_end": scale * study.upper[i],
+                "size_for_the_loss": study.inverse[i],
+            }
+            for i in study.offenders[:_WORST]
+        ],
+        "loss_percent": 100.0 * study.loss,
+    }
+    if study.requirement is not None:
+        found = study.yield_at(study.requirement)
+        summary["requirement"] = scale * study.requirement
+        summary["yield"] = {"fraction": found.fraction, "low": found.low, "high": found.high}
+    return summary
+
+
+def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -> tuple[str, ...]:
+    """Write the files of a study into an existing folder, and return their names."""
+    unit, scale = study.merit.unit, study.merit.scale
+    meta = {"pachon": VERSION, "telescope": study.telescope, "merit": study.merit.title, "seed": file.seed}
+    about = "merit, compensated"
+    sensitivity: Columns = {
+        "name": (np.array([t.name for t in study.tolerances]), "", "tolerance"),
+        "size": (np.array([t.size for t in study.tolerances]), "", "largest or standard deviation, in its unit"),
+        "unit": (np.array(study.units), "", "unit of the deviation"),
+        "distribution": (np.array([t.distribution for t in study.tolerances]), "", ""),
+        "lower_end": (scale * study.lower, unit, f"{about}, at minus the size"),
+        "upper_end": (scale * study.upper, unit, f"{about}, at plus the size"),
+        "cost": (scale * study.cost, unit, "loss at the worse end"),
+        "size_for_the_loss": (study.inverse, "", f"size that costs {100 * study.loss:g} per cent of the merit"),
+    }
+    draws: Columns = {"merit": (scale * study.draws, unit, about)}
+    for i, name in enumerate(study.compensators):
+        draws[f"{name} (compensator)"] = (study.moves[:, i], _fits(study.compensator_units[i]), "")
+    for i, tolerance in enumerate(study.tolerances):
+        draws[tolerance.name] = (study.deviations[:, i], _fits(study.units[i]), "")
+    write_ecsv(folder / "sensitivity.ecsv", sensitivity, {"what": "sensitivity to tolerances", **meta})
+    write_ecsv(folder / "draws.ecsv", draws, {"what": f"telescopes within tolerances, {study.method}", **meta})
+    pictures = {"sensitivity.png": sensitivity_plot(study), "yield.png": yield_plot(study)}
+    for name, png in pictures.items():
+        write_bytes(folder / name, png)
+    write_json(folder / "summary.json", {**tolerance_summary(study), "pachon": VERSION, "digest": file.digest})
+    return "sensitivity.ecsv", "draws.ecsv", "summary.json", *pictures
+
+
+def _fits(unit: str) -> str:
+    return "" if unit == "1" else unit

@@ -1,0 +1,256 @@
+"""Tolerance study of a telescope: sensitivity, inverse sensitivity and Monte Carlo, resumable, on any workers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError
+from ...core.progress import Reporter
+from ...core.threads import one_blas_thread
+from ...core.workers import MakeWorkers, serial_worker
+from ...design.optimize.toleranced_merit import TolerancedMerit
+from ...design.optimize.yields import Yield
+from ...design.parameters.tolerances import Tolerance, draw
+from ...models.telescope import Telescope
+from ..sweep.store import PointResult, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
+from .file import ToleranceFile
+from .measurement import DRAW, INVERSE, LOWER, NOMINAL, UPPER, Batch, ToleranceMeasurement
+from .merits import ToleranceMerit, tolerance_merit
+from .plan import tolerance_plan
+
+#: Points that a worker computes at once.
+_BATCH = 25
+
+
+@dataclass(frozen=True)
+class ToleranceStudy:
+    """Results of a tolerance study.
+
+    Attributes
+    ----------
+    telescope : str
+        Name of the telescope.
+    merit : ToleranceMerit
+        The merit; numbers below are in SI.
+    method : str
+        "linear", "quadratic" or "traced".
+    tolerances : tuple of Tolerance
+        The tolerances.
+    compensators : tuple of str
+        Degrees of freedom that follow each deviation.
+    units, compensator_units : tuple of str
+        Units of deviations and compensators.
+    nominal : float
+        Merit of the telescope as designed, compensated.
+    lower, upper : ndarray, shape [n_tolerance]
+        Merit at minus and plus the size of each tolerance, compensated, traced.
+    inverse : ndarray, shape [n_tolerance]
+        Size of each tolerance whose worse end costs the loss; NaN where none within a factor of 1e4 does.
+    loss : float
+        Relative loss of the merit of these.
+    deviations : ndarray, shape [n, n_tolerance]
+        Drawn deviations.
+    moves : ndarray, shape [n, n_compensator]
+        Compensators of each draw.
+    draws : ndarray, shape [n]
+        Merit of each draw; NaN where its light is lost.
+    requirement : float, optional
+        Requirement on the merit.
+    """
+
+    telescope: str
+    merit: ToleranceMerit
+    method: str
+    tolerances: tuple[Tolerance, ...]
+    compensators: tuple[str, ...]
+    units: tuple[str, ...]
+    compensator_units: tuple[str, ...]
+    nominal: float
+    lower: np.ndarray
+    upper: np.ndarray
+    inverse: np.ndarray
+    loss: float
+    deviations: np.ndarray
+    moves: np.ndarray
+    draws: np.ndarray
+    requirement: float | None = field(default=None)
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Loss of the merit at the worse end of each tolerance, shape [n_tolerance]; infinite where light is lost."""
+        ends = self.merit.loss(np.stack([self.lower, self.upper]), self.nominal)
+        return np.max(np.where(np.isnan(ends), np.inf, ends), axis=0)
+
+    @property
+    def offenders(self) -> np.ndarray:
+        """Indices of the tolerances, the costliest first."""
+        return np.argsort(-self.cost, kind="stable")
+
+    @check_arguments
+    def at_most(self, fraction: float) -> float:
+        """Return the merit that a fraction (0 to 1) of the telescopes reaches; lost ones are worst."""
+        worst = -np.inf if self.merit.larger else np.inf
+        merits = np.where(np.isnan(self.draws), worst, self.draws)
+        part = 1.0 - fraction if self.merit.larger else fraction
+        return float(np.quantile(merits, part, method="lower" if self.merit.larger else "higher"))
+
+    @check_arguments
+    def yield_at(self, requirement: float) -> Yield:
+        """Return the fraction of the telescopes that meet a requirement on the merit, with its binomial error."""
+        return Yield.of(self.draws, requirement, larger=self.merit.larger)
+
+
+@check_arguments
+@one_blas_thread()
+def run_tolerances(
+    telescope: Telescope,
+    file: ToleranceFile,
+    store: str | os.PathLike[str] | None = None,
+    *,
+    merit: Callable[[Telescope], float] | None = None,
+    resume: bool = False,
+    workers: MakeWorkers | None = None,
+    threads: int | None = None,
+    reporter: Reporter | None = None,
+) -> ToleranceStudy:
+    """Compute sensitivity, inverse sensitivity and Monte Carlo of tolerances.
+
+    The results depend on telescope and file alone, not on workers, order or interruptions.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope as designed.
+    file : ToleranceFile
+        Tolerances, compensators, merit and Monte Carlo; see :mod:`~.file`.
+    store : str or path, optional
+        SQLite file that keeps what was computed.
+    merit : callable, optional
+        Function of a telescope that returns a number to be kept small, in place of the merit of the file. For several
+        processes it must be one of a module. Compensators minimise the spots.
+    resume : bool
+        Go on with an existing store.
+    workers : callable, optional
+        Function that makes workers of the function that computes points; by default this process.
+    threads : int, optional
+        Number of threads of this process.
+    reporter : Reporter, optional
+        Progress display; silent by default.
+
+    Raises
+    ------
+    UnknownNameError, ConfigError, DomainError
+        If a name does not exist, a compensator has no effect, or the store is that of another study or in the way.
+    """
+    if merit is not None and file.method != "traced":
+        raise ConfigError(f"method = {file.method!r}: expected 'traced' for a merit of one's own")
+    plan = tolerance_plan(file, telescope)
+    judged = tolerance_merit(file, plan.telescope, merit, threads)
+    built = TolerancedMerit.of(
+        plan.telescope, plan.tolerances, plan.compensators, plan.degrees_of_freedom, judged.judge
+    )
+    measured = ToleranceMeasurement(built, judged, file.loss_percent / 100.0)
+    n = len(plan.tolerances)
+    deviations = draw(plan.tolerances, file.seed, file.draws)
+    points, values = _points(measured, deviations if file.method == "traced" else deviations[:0])
+    results = dict(_results(measured, points, values, file, store, resume, workers, reporter))
+    numbers = np.array([results[i] for i in range(len(points))])
+    ends = numbers[1 : 1 + 2 * n].reshape(n, 2)
+    if file.method == "traced":
+        drawn = numbers[1 + 3 * n :]
+    else:
+        drawn = built.linear(deviations) if file.method == "linear" else built.quadratic(deviations)
+    units = plan.degrees_of_freedom.units
+    return ToleranceStudy(
+        telescope=telescope.name,
+        merit=judged,
+        method=file.method,
+        tolerances=plan.tolerances,
+        compensators=plan.compensators,
+        units=units[:n],
+        compensator_units=units[n:],
+        nominal=float(numbers[0]),
+        lower=ends[:, 0],
+        upper=ends[:, 1],
+        inverse=numbers[1 + 2 * n : 1 + 3 * n],
+        loss=measured.loss,
+        deviations=deviations,
+        moves=built.moves(deviations),
+        draws=drawn,
+        requirement=None if file.requirement is None else file.requirement / judged.scale,
+    )
+
+
+def _points(measured: ToleranceMeasurement, deviations: np.ndarray) -> tuple[list[SweepPoint], np.ndarray]:
+    """Return all points, and deviations and compensators of each, shape [n_point, n_degree_of_freedom].
+
+    The telescope as designed comes first, then the ends of each tolerance, the inverse sensitivities, and the draws.
+    """
+    sizes = np.array([t.size for t in measured.built.tolerances])
+    n = len(sizes)
+    ends = np.stack([-np.diag(sizes), np.diag(sizes)], axis=1).reshape(2 * n, n)
+    rows = np.concatenate([np.zeros((1, n)), ends, np.zeros((n, n)), deviations])
+    about: list[dict[str, Any]] = [{"kind": NOMINAL}]
+    about += [{"kind": kind, "tolerance": i} for i in range(n) for kind in (LOWER, UPPER)]
+    about += [{"kind": INVERSE, "tolerance": i} for i in range(n)]
+    about += [{"kind": DRAW, "draw": i} for i in range(len(deviations))]
+    return [SweepPoint(i, one, 0) for i, one in enumerate(about)], measured.values_of(rows)
+
+
+def _results(
+    measured: ToleranceMeasurement,
+    points: list[SweepPoint],
+    values: np.ndarray,
+    file: ToleranceFile,
+    store: str | os.PathLike[str] | None,
+    resume: bool,
+    workers: MakeWorkers | None,
+    reporter: Reporter | None,
+) -> Iterator[tuple[int, float]]:
+    """Yield number and result of every point, those in the store first; new ones are written to it."""
+    reporter = Reporter(quiet=True) if reporter is None else reporter
+    opened = None if store is None else _open(Path(store), file, points, resume)
+    try:
+        done: list[PointResult] = [] if opened is None else opened.results()
+        yield from map(_number, done)
+        finished = {result.number for result in done}
+        missing = [p for p in points if p.number not in finished]
+        batches = [_batch(missing[i : i + _BATCH], values) for i in range(0, len(missing), _BATCH)]
+        chosen = (workers or serial_worker)(measured)
+        title = f"tolerances: {len(missing)} telescopes, {chosen.description}"
+        with reporter.stage(title, len(missing)) as stage:
+            for found in chosen.results(batches) if batches else ():
+                for result in found:
+                    if opened is not None:
+                        opened.write(result)
+                    yield _number(result)
+                stage.advance(len(found))
+    finally:
+        if opened is not None:
+            opened.close()
+
+
+def _open(path: Path, file: ToleranceFile, points: Sequence[SweepPoint], resume: bool) -> SweepStore:
+    if path.exists() and not resume:
+        raise store_exists(path)
+    if not path.exists():
+        create_store(path, file, points, {})
+    store = SweepStore(path)
+    check_same_sweep(store, file)
+    return store
+
+
+def _batch(points: Sequence[SweepPoint], values: np.ndarray) -> Batch:
+    return Batch(tuple(points), values[[p.number for p in points]])
+
+
+def _number(result: PointResult) -> tuple[int, float]:
+    (value,) = (result.metrics or {"merit": np.nan}).values()
+    return result.number, value
