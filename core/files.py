@@ -206,16 +206,17 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 def json_text(content: Any) -> str:
     """Return indented JSON with sorted keys; numbers that are not finite become null."""
-    return json.dumps(_plain(content), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return json.dumps(plain_values(content), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
 
 
-def _plain(value: Any) -> Any:
+def plain_values(value: Any) -> Any:
+    """Return nested arrays and numbers as JSON has them, to nine digits; numbers that are not finite become None."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain_values(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain_values(v) for v in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain_values(value.tolist())
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
