@@ -1,7 +1,7 @@
 """Zernike polynomials in Fringe order, those of interferometers: 37 terms of amplitude one at the rim of a full disc.
 
-Fringe index j of radial degree n and azimuthal order m (m < 0: sine) is ``(1 + (n + |m|)/2)^2 - 2 |m| + (m < 0)``, up to
-36; term 37 is the spherical aberration of degree 12 (Loomis 1978, FRINGE User's Manual; Wyant & Creath 1992, Applied
+Fringe index j of radial degree n and azimuthal order m (m < 0: sine) is ``(1 + (n + |m|)/2)^2 - 2 |m| + (m < 0)`` up
+to 36; term 37 is the spherical aberration of degree 12 (Loomis 1978, FRINGE User's Manual; Wyant & Creath 1992, Applied
 Optics and Optical Engineering XI, table III). A term is Noll's over its norm, sqrt(n + 1) or sqrt(2 (n + 1)).
 """
 
@@ -105,7 +105,7 @@ def fringe_from_noll(coefficients: ArrayLike) -> np.ndarray:
     noll = np.atleast_1d(metres(coefficients, "coefficients"))
     count = noll.shape[-1]
     other = np.setdiff1d(np.arange(count), _INDEX - 1)
-    lost = other[(noll[..., other] != 0).reshape(-1, len(other)).any(axis=0)]
+    lost = other[(noll.reshape(-1, count)[:, other] != 0).any(axis=0)]
     if len(lost):
         raise DomainError(f"coefficients: Noll term {lost[0] + 1} is not among the {FRINGE_TERMS} Fringe terms")
     padded = np.concatenate([noll, np.zeros((*noll.shape[:-1], max(0, int(_INDEX.max()) - count)))], axis=-1)

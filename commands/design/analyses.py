@@ -182,5 +182,6 @@ def spot_matrix(
     from ...design.analyses.spot_matrix import spot_matrix as compute
 
     defocus = None if range_um is None else np.linspace(*range_um, steps) * 1e-6
-    how: dict[str, Any] = {"against": against, "defocus": defocus, "n_pupil": rays}
-    return compute(*given.where, **how, **given.how)
+    telescope, fields, wavelengths = given.where
+    how: dict[str, Any] = {"against": against, "defocus": defocus, "n_pupil": rays, **given.how}
+    return compute(telescope, fields, wavelengths, **how)

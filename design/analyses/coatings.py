@@ -136,7 +136,7 @@ class _TableSection(Section):
     file: OptionalText = None
 
     @classmethod
-    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+    def check(cls, content: dict[str, Any]) -> None:
         either(content, "file", ("wavelength_nm", "efficiency"))
 
     def coating(self, name: str, folder: Path) -> Coating:

@@ -1,9 +1,11 @@
-"""Relative illumination: light on the detector against the field, by the projected solid angle of the exit pupil.
+"""Relative illumination: light on the detector against the field, by the projected solid angle of its light.
 
-An extended source of one radiance L makes the irradiance ``L n^2 A`` on the detector, where A is the area that its rays
-fill in direction cosines along the detector: the solid angle of the exit pupil, projected (Rimmer 1986, Proc. SPIE 655,
-99). A is the integral of the Jacobian of the direction cosines over the lit entrance pupil. With a small pupil, a flat
-image and no aberration of the pupil it goes as the fourth power of the cosine of the chief ray's angle.
+An extended source of one radiance L makes the irradiance ``L A`` on the detector, where A is the area that the rays
+which meet at a point of it fill in direction cosines along the detector, times the square of the index there: the solid
+angle of the exit pupil, projected (Rimmer 1986, Proc. SPIE 655, 99). Since étendue is conserved, each element of the
+entrance pupil contributes its area times ``|det d(l, m)/d(X, Y)|``, with direction cosines l, m of the incoming ray
+along the pupil and landing points X, Y, at the same point of the pupil. With a small pupil and an image free of
+distortion that goes as the fourth power of the cosine of the field angle.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from .analysis import Analysis, Columns, field_line
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Distance of the rays of the Jacobian from theirs, in units of the radius of the pupil.
+#: Change of the slopes of the light on either side for the Jacobian.
 _STEP = 1e-4
 
 
@@ -141,20 +143,26 @@ def relative_illumination(
 
 def _projected(request: Request) -> tuple[float, float]:
     """Return projected solid angle [sr] and lit fraction of one field."""
-    telescope, sample = request.telescope, request.pupil
-    radius = 0.5 * telescope.pupil_diameter
-    lit = request.bundles(request.wavelength).lit[0]
-    steps = _STEP * radius * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    around = (sample.points[lit, None] + steps).reshape(-1, 2)
-    if not len(around):
+    telescope, sample, wavelength = request.telescope, request.pupil, request.wavelength
+    lit = request.bundles(wavelength).lit[0]
+    if not lit.any():
         return 0.0, 0.0
-    bundles = request.bundles(request.wavelength, around)
-    cosines = bundles.direction[0, :, :2].reshape(-1, 4, 2) * bundles.index
-    along_x, along_y = ((cosines[:, 2 * k] - cosines[:, 2 * k + 1]) / (2.0 * _STEP * radius) for k in range(2))
-    jacobian = np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0])
-    area = np.pi * radius**2 * (1.0 - telescope.pupil_obscuration**2)
-    # A ray of the Jacobian beyond the rim of a steep surface has no direction: its neighbour stands in.
-    known = np.isfinite(jacobian)
+    points = sample.points[lit]
+    steps = _STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    beside = replace(request, fields=request.slopes + steps, projection="gnomonic")
+    landing = beside.bundles(wavelength, points).landing()
+    cosines = beside.launch(wavelength, points).direction.reshape(4, -1, 3)[..., :2]
+    # Both over the same change of the field: their ratio is per metre of the detector.
+    ratio = _determinant(cosines) / _determinant(landing)
+    known = np.isfinite(ratio)
+    index = float(telescope.medium_before.index(wavelength))
+    area = np.pi * (0.5 * telescope.pupil_diameter * index) ** 2 * (1.0 - telescope.pupil_obscuration**2)
     fraction = float(sample.weights[lit].sum())
-    mean = np.average(jacobian[known], weights=sample.weights[lit][known]) if known.any() else 0.0
-    return area * fraction * float(mean), fraction
+    mean = float(np.average(ratio[known], weights=sample.weights[lit][known])) if known.any() else 0.0
+    return area * fraction * mean, fraction
+
+
+def _determinant(values: np.ndarray) -> np.ndarray:
+    """Return the size of the Jacobian [n] of values [4, n, 2] at fields on either side in x, and in y."""
+    (a, b), (c, d) = (values[0] - values[1]).T, (values[2] - values[3]).T
+    return np.abs(a * d - b * c)

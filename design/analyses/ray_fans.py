@@ -138,7 +138,7 @@ class OpdFans(Fans):
         Path of the chief ray minus path of the ray [m], to a sphere about where the chief ray of the same wavelength
         meets the detector; NaN where a ray does not arrive.
     radius : float
-        Radius of the reference sphere [m].
+        Radius of the reference sphere [m], negative where it lies in front of the detector.
     """
 
     value: np.ndarray
@@ -228,15 +228,17 @@ def opd_fans(
     n_points : int
         Rays along each diameter of the pupil, at least 3.
     sphere_radius : float or Quantity, optional
-        Radius of the reference sphere [m]; the telescope's own by default.
+        Radius of the reference sphere [m], which lies beyond the detector or, if negative, in front of it; the
+        telescope's own by default. For the sphere through the exit pupil, as in Zemax, the distance from the detector
+        to the exit pupil.
 
     Raises
     ------
     DomainError
-        If there are too few rays, or the radius is not positive.
+        If there are too few rays, or the radius is zero or not finite.
     """
-    given = telescope.reference_sphere_radius if sphere_radius is None else length(sphere_radius, "sphere_radius")
-    radius = require_positive(given, "sphere_radius", "metres")
+    radius = telescope.reference_sphere_radius if sphere_radius is None else length(sphere_radius, "sphere_radius")
+    require_positive(abs(radius), "sphere_radius", "metres")
     request, pupil, _, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)
     return OpdFans(request, pupil, _lit(bundles), value, radius)

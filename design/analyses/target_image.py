@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.plotting import figure_of
-from ...core.units import arcseconds, length, pure_numbers, require_count, require_positive
 from ...core.units import angle as one_angle
+from ...core.units import arcseconds, length, pure_numbers, require_count, require_positive
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus, field_direction, launch_bundles
 from ...raytrace.trace import trace

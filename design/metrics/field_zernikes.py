@@ -43,8 +43,8 @@ class FieldZernikes(FieldResult):
     Attributes
     ----------
     coefficients : ndarray, shape [n_field, jmax]
-        From j = 1 [m], in entrance-pupil coordinates. Noll's terms are orthonormal over the annulus, so each coefficient
-        is its own rms; Fringe terms have amplitude one at the rim.
+        From j = 1 [m], in entrance-pupil coordinates. Noll's terms are orthonormal over the annulus, so that each
+        coefficient is its own rms; Fringe terms have amplitude one at the rim.
     residual_rms : ndarray, shape [n_field]
         Root mean square of the wavefront minus the terms, over the fitted points [m].
     obscuration : float
