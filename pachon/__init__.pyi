@@ -79,6 +79,7 @@ from .design.parameters.degrees_of_freedom_file import load_degrees_of_freedom a
 from .design.parameters.parameters import Parameter as Parameter
 from .design.parameters.thermal import thermal as thermal
 from .design.parameters.tolerances import Tolerance as Tolerance
+from .design.report.report import design_report as design_report
 from .imaging.config import ImagesConfig as ImagesConfig
 from .imaging.config import load_images_configuration as load_images_configuration
 from .imaging.draw import Window as Window
