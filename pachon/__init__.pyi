@@ -151,6 +151,13 @@ from .models.shapes.shape import Sphere as Sphere
 from .models.shapes.shape import Sum as Sum
 from .models.site import Site as Site
 from .models.site import Weather as Weather
+from .models.starting_designs.lenses import doublet as doublet
+from .models.starting_designs.lenses import singlet as singlet
+from .models.starting_designs.lenses import triplet as triplet
+from .models.starting_designs.new import new_telescope as new_telescope
+from .models.starting_designs.schmidt import schmidt as schmidt
+from .models.starting_designs.two_mirror import newtonian as newtonian
+from .models.starting_designs.two_mirror import two_mirror as two_mirror
 from .models.surface import Interaction as Interaction
 from .models.surface import Surface as Surface
 from .models.telescope import Telescope as Telescope
@@ -231,6 +238,9 @@ from .studies.sweep.file import load_sweep as load_sweep
 from .studies.sweep.sweep import run_sweep as run_sweep
 from .studies.sweep.table import SweepTable as SweepTable
 from .studies.sweep.table import load_sweep_table as load_sweep_table
+from .studies.validation import Validation as Validation
+from .studies.validation import file_schema as file_schema
+from .studies.validation import validate_file as validate_file
 from .studies.visits.config import VisitsConfig as VisitsConfig
 from .studies.visits.config import load_visits_configuration as load_visits_configuration
 from .studies.visits.null_test import null_test as null_test
