@@ -26,6 +26,7 @@ from . import (
     design,
     diagnostics,
     donuts,
+    files,
     images,
     measure,
     model,
@@ -121,6 +122,7 @@ for _group in (
     shim,
     align,
     telescope,
+    files,
 ):
     app.add_typer(_group.app)
 

@@ -100,6 +100,29 @@ def validated(
             del first["input"][first["ctx"]["key"]]
 
 
+def problems_of(
+    model: type[BaseModel], content: Any, source: str, error: type[PachonError] = ConfigError, context: Any = None
+) -> list[PachonError]:
+    """Return the errors of all problems that :func:`validated` would find one after the other; unknown keys first.
+
+    Unknown keys are taken out of the content.
+    """
+    found: list[PachonError] = []
+    while True:
+        try:
+            # Validators write into the context.
+            model.model_validate(content, context=None if context is None else dict(context))
+        except ValidationError as problems:
+            errors = problems.errors(include_url=False)
+            unknown = [p for p in errors if p["type"] == "unknown_key"]
+            found += [_in_one_line(p, content, source, error) for p in unknown or errors]
+            for one in unknown:
+                del one["input"][one["ctx"]["key"]]
+            if unknown:
+                continue
+        return found
+
+
 def unknown_key(key: str, known: list[str]) -> PydanticCustomError:
     """Return the error of a validator of a section with an unknown key."""
     return PydanticCustomError("unknown_key", "unknown key", {"key": key, "known": known})
@@ -129,12 +152,14 @@ class Tagged:
     """Discriminated union of sections by kind, as an annotation.
 
     `kind` is a function from a mapping to its kind, one of the keys of `classes`; it raises :func:`expected`. The value
-    is the object that a section builds or, where `built` is False, the section itself.
+    is the object that a section builds or, where `built` is False, the section itself. `key`, for JSON schemas, is that
+    under which the kind stands.
     """
 
     classes: Mapping[str, type[Section]]
     kind: Callable[[dict[str, Any]], str]
     built: bool = True
+    key: str = ""
 
     @classmethod
     def by_value(cls, key: str, classes: Mapping[str, type[Section]]) -> Tagged:
@@ -146,12 +171,14 @@ class Tagged:
                 raise expected(one_of(classes, value), key)
             return value
 
-        return cls(classes, kind)
+        return cls(classes, kind, key=key)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         # Tags stand in the locations of errors; the brackets tell them from keys.
         choices: Any = {f"<{kind}>": handler.generate_schema(section) for kind, section in self.classes.items()}
-        union: Any = core_schema.tagged_union_schema(choices, discriminator=lambda content: f"<{self.kind(content)}>")
+        union: Any = core_schema.tagged_union_schema(
+            choices, discriminator=lambda content: f"<{self.kind(content)}>", metadata={"tag_key": self.key}
+        )
         if self.built:
             union = core_schema.no_info_after_validator_function(_build, union)
         return core_schema.no_info_before_validator_function(self._check, union)

@@ -8,6 +8,7 @@ be merged into others (``<<: *anchor``); they count as the aliases that they are
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,39 @@ def read_mapping(
     if not isinstance(content, dict):
         raise error(f"expected a mapping of keys to values, not {cut_short(repr(content))}", file=path)
     return content
+
+
+def line_of(path: Path, key: str) -> int | None:
+    """Return the line of a YAML file, from 1, at which a key stands, such as ``surfaces[M1].radius``.
+
+    Brackets hold the place in a list, or the value of some key of the entry. Where the rest of a path is not in the
+    file, it is the line of what is. None if nothing of it is there, or the file is not YAML.
+    """
+    try:
+        node: Any = yaml.compose(path.read_text("utf-8"), Loader=yaml.SafeLoader)
+    except (OSError, ValueError, yaml.YAMLError):
+        return None
+    line = None
+    for part in re.findall(r"[^.\[\]]+|\[[^\]]*\]", key):
+        found = _child(node, part)
+        if found is None:
+            break
+        node, line = found[1], found[0].start_mark.line + 1
+    return line
+
+
+def _child(node: Any, part: str) -> tuple[Any, Any] | None:
+    """Return the node of a key or entry, for its place, and that of its value; None where there is none."""
+    if part.startswith("[") and isinstance(node, yaml.SequenceNode):
+        label = part[1:-1]
+        if label.isdigit() and int(label) < len(node.value):
+            return (node.value[int(label)],) * 2
+        for entry in node.value:
+            if isinstance(entry, yaml.MappingNode) and any(value.value == label for _, value in entry.value):
+                return entry, entry
+    if isinstance(node, yaml.MappingNode):
+        return next((pair for pair in node.value if pair[0].value == part), None)
+    return None
 
 
 def as_number(value: Any) -> float | None:

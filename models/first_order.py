@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
 from ..core.result import Result, Values
-from ..core.units import ARCSEC, length
+from ..core.units import ARCSEC, length, metres
 from .paraxial import curvatures_across, require_on_axis
 from .surface import Interaction, Surface
 from .telescope import Telescope
@@ -96,6 +96,30 @@ class SeidelSums(Result):
     @property
     def total(self) -> np.ndarray:
         """Sums over the surfaces [m], shape (5,)."""
+        return self.contributions.sum(axis=0)
+
+
+@dataclass(frozen=True)
+class ChromaticSums:
+    """Chromatic sums [m] of a telescope between two wavelengths, surface by surface.
+
+    At the rims of pupil and field the wavefront of the shorter wavelength differs from that of the longer one by C_L/2
+    (axial colour, a defocus) and C_T (lateral colour, a tilt).
+
+    Parameters
+    ----------
+    names : tuple of str
+        Mirrors and lens surfaces.
+    contributions : ndarray, shape (n_surface, 2)
+        Axial and lateral colour of each [m].
+    """
+
+    names: tuple[str, ...]
+    contributions: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """Sums over the surfaces [m], shape (2,)."""
         return self.contributions.sum(axis=0)
 
 
@@ -193,6 +217,41 @@ def seidel_sums(telescope: Telescope, wavelength: ArrayLike | None = None, field
     from_aspheric = np.stack([h**4, h**3 * hb, h**2 * hb**2, np.zeros_like(h), h * hb**3]) * aspheric
     contributions = np.stack([s1, s2, s3, s4, s5]) + from_aspheric
     return SeidelSums(tuple(s.name for s in trace.surfaces), contributions.T)
+
+
+@check_arguments
+def chromatic_sums(
+    telescope: Telescope, wavelengths: ArrayLike | None = None, field: float | None = None
+) -> ChromaticSums:
+    """Return the chromatic sums of a centred telescope: Welford's C_L and C_T (chapter 10).
+
+    Parameters
+    ----------
+    telescope, field
+        As for :func:`seidel_sums`.
+    wavelengths : array_like or Quantity, shape [2], optional
+        Shortest and longest vacuum wavelength [m]; the edges of the band where not given. Rays are those of the
+        telescope's default wavelength.
+
+    Raises
+    ------
+    DomainError
+        If no surface acts, one is decentred or tilted, or there are not two wavelengths that the telescope covers.
+    """
+    ends = metres(telescope.band if wavelengths is None else wavelengths, "wavelengths")
+    if ends.shape != (2,):
+        raise DomainError(f"wavelengths of shape {ends.shape}: expected the shortest and the longest")
+    telescope.check_wavelength(ends)
+    angle = telescope.field_radius if field is None else field
+    trace = _trace(telescope, None, np.tan(angle))
+    media = (telescope.medium_before, *(s.medium_after for s in trace.surfaces))
+    # Dispersion over index is the same for light that goes back.
+    relative = np.array([float(m.index(ends[0]) - m.index(ends[1])) for m in media]) / np.abs(
+        [*trace.n[:1], *trace.n_after]
+    )
+    a, b = (trace.n[:, None] * (trace.h * trace.curvature[:, None] + trace.u)).T
+    change = trace.h[:, 0] * np.diff(relative)
+    return ChromaticSums(tuple(s.name for s in trace.surfaces), np.stack([a * change, b * change], axis=-1))
 
 
 def _trace(telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False) -> _Trace:

@@ -15,10 +15,11 @@ def path_to_sphere(
     """Return the optical path [m] of rays to the reference sphere, shape [...].
 
     ``path`` [...] leads up to the positions [..., 3] [m], in front of an image in a medium of refractive index
-    ``index``. ``direction`` holds unit vectors; ``center`` [m] has shape [3] or [..., 3], in the frame of the rays.
+    ``index``. ``direction`` holds unit vectors; ``center`` [m] has shape [3] or [..., 3], in the frame of the rays. The
+    sphere lies beyond the image or, with a negative radius, in front of it.
     """
     root, along = _root_and_projection(position - center, direction, radius)
-    return path + index * (root - along)
+    return path + index * (np.copysign(root, radius) - along)
 
 
 def sphere_distance_derivatives(

@@ -175,7 +175,10 @@ class Request:
 
     @check_arguments
     def launch(self, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
-        """Return the rays of one wavelength [m], field by field, through other pupil points [m] where given."""
+        """Return the rays of one wavelength [m], field by field, through other pupil points [m] where given.
+
+        Pupil points are [n_pupil, 2], the same for all fields, or [n_field, n_pupil, 2].
+        """
         points = self.entrance_points(wavelength, self.pupil.points if pupil is None else pupil)
         return straight_bundles(self.telescope, self.directions, wavelength, points)
 
@@ -204,7 +207,7 @@ class Request:
         """Trace the rays of :meth:`launch` to the detector."""
         points = self.pupil.points if pupil is None else pupil
         # The chief ray is traced as one more point of the pupil.
-        rays = self.launch(wavelength, np.concatenate([points, np.zeros((1, 2))]))
+        rays = self.launch(wavelength, np.concatenate([points, np.zeros((*points.shape[:-2], 1, 2))], axis=-2))
         end = trace(self.telescope, rays, threads=self.threads)
         n, detector = len(self.fields), self.telescope.surfaces[-1]
         position = detector.to_local(end.position).reshape(n, -1, 3)

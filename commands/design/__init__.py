@@ -1,6 +1,6 @@
 """The commands on the design of a telescope, each with a table, a picture and metrics as JSON."""
 
-from . import metrics, field, images, opd, optimize  # noqa: I001  (the order of the help)
+from . import metrics, analyses, light, field, images, opd, optimize, report  # noqa: I001  (the order of the help)
 from .command import app
 
-__all__ = ["app", "field", "images", "metrics", "opd", "optimize"]
+__all__ = ["analyses", "app", "field", "images", "light", "metrics", "opd", "optimize", "report"]

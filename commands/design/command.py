@@ -135,7 +135,7 @@ def design_command(
         return Rows([column.title(summary) for column in shown], [*zip(*cells, strict=True)], text, left)
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
-        name = compute.__name__
+        name = compute.__name__.replace("_", "-")
         parameters, own = _parameters(compute, band, picture)
 
         def command(picture: Path | None, as_json: bool, **values: Any) -> None:

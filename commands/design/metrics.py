@@ -88,12 +88,13 @@ def focus(
 @design_command()
 def zernikes(
     given: Given,
-    jmax: Annotated[int, Option(min=4, max=500, help="Highest Noll index in the pupil.")] = 28,
+    jmax: Annotated[int, Option(min=4, max=500, help="Highest index in the pupil.")] = 28,
     pupil: Annotated[str, Option(help="full: the whole annulus, orthogonal; lit: where light passes.")] = "full",
     over_field: Annotated[bool, Option("--map", help="Maps over the field of view.")] = False,
     double: Annotated[
         int | None, Option(min=1, max=200, metavar="KMAX", help="Double Zernikes, terms in the field.")
     ] = None,
+    fringe: Annotated[bool, Option("--fringe", help="Fringe order, up to 37 terms of amplitude one.")] = False,
 ) -> Outcome:
     """Fit annular Zernikes (Noll, in nm) to the wavefronts of field points, or over the whole field of view.
 
@@ -102,6 +103,7 @@ def zernikes(
     - `pachon zernikes lsst_v3.3_r`: five fields from the axis to the edge
     - `pachon zernikes lsst_v3.3_r --map`: each term over the field
     - `pachon zernikes lsst_v3.3_r --double 22 --json`: Zernikes of the field times those of the pupil
+    - `pachon zernikes my_lens.zmx --fringe --jmax 37`: as interferometers order and scale them
     """
     from ...design.metrics.field_zernikes import double_zernikes, wavefront_zernikes
     from ...design.metrics.vignetting import field_disc
@@ -110,11 +112,15 @@ def zernikes(
         raise ConfigError("--field-deg, --map and --double: expected one of them")
     telescope = given.telescope
     how = dict(jmax=jmax, pupil=pupil, **given.how)
+    if fringe and double is not None:
+        raise ConfigError("--fringe and --double: expected one of them")
     if double is not None:
         terms = double_zernikes(telescope, given.wavelength, kmax=double, **how)
         return Outcome(terms, _double_rows, stem=f"double_zernikes_{telescope.name}")
     fields = field_disc(telescope) if over_field else given.fields
-    return Outcome(wavefront_zernikes(telescope, fields, given.wavelength, **how), _map_rows if over_field else _rows)
+    ordering = "fringe" if fringe else "noll"
+    found = wavefront_zernikes(telescope, fields, given.wavelength, ordering=ordering, **how)
+    return Outcome(found, _map_rows if over_field else _rows)
 
 
 def _rows(result: Any) -> Rows:
@@ -132,17 +138,18 @@ def _map_rows(result: Any) -> Rows:
     return _terms(result.summary(), ["mean", "rms", "least", "largest"], values)
 
 
-def noll_labels(count: int) -> list[str]:
-    """Return the indices of the first Noll terms, with their names where they have one."""
-    from ...models.zernike_polynomials import NOLL_NAMES
+def term_labels(count: int, ordering: str = "noll") -> list[str]:
+    """Return the indices of the first terms, with their names where they have one."""
+    from ...design.metrics.field_zernikes import term_label
 
-    return [f"{j} {NOLL_NAMES.get(j, '')}".strip() for j in range(1, count + 1)]
+    return [term_label(j, ordering) for j in range(1, count + 1)]
 
 
 def _terms(summary: dict[str, Any], headings: list[str], columns: Any) -> Rows:
     cells = [number_texts(values, ".2f") for values in columns]
     caption = "{telescope}, {wavelength_nm:g} nm; {pupil} pupil, obscuration {obscuration:g}; nm".format_map(summary)
-    return Rows(["term", *headings], [*zip(noll_labels(len(cells[0])), *cells, strict=True)], caption)
+    labels = term_labels(len(cells[0]), summary["ordering"])
+    return Rows(["term", *headings], [*zip(labels, *cells, strict=True)], caption)
 
 
 def _double_rows(result: Any) -> Rows:

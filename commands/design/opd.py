@@ -11,7 +11,7 @@ from typer import Option
 from ..options import degrees_pair
 from ..tables import Column
 from .command import Given, Outcome, design_command
-from .metrics import noll_labels
+from .metrics import term_labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,7 +68,7 @@ class FittedOpd:
 
 
 @design_command(
-    Column("Noll term", lambda result: noll_labels(len(result.fit.coefficients))),
+    Column("Noll term", lambda result: term_labels(len(result.fit.coefficients))),
     Column("[nm]", "zernike_nm", ".3f"),
     Column("[waves]", lambda result: result.fit.coefficients / result.opd.wavelength, ".5f"),
     caption=lambda s: (

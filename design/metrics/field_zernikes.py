@@ -18,6 +18,7 @@ from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, figure_at, figure_of, styled
 from ...core.result import Result
 from ...core.units import angle, field_label, require_count
+from ...models.fringe_zernikes import FRINGE_NAMES, FRINGE_TERMS, fringe_zernikes
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import NOLL_NAMES, annular_zernikes
 from ...wavefront.pupil_optics import trace_pupils
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PUPILS = ("full", "lit")
+ORDERINGS = ("noll", "fringe")
 #: Maps of single terms in one plot.
 _MAPS = 8
 
@@ -42,13 +44,16 @@ class FieldZernikes(FieldResult):
     Attributes
     ----------
     coefficients : ndarray, shape [n_field, jmax]
-        Noll order from j = 1 [m]; orthonormal terms in entrance-pupil coordinates, so each is its own rms.
+        From j = 1 [m], in entrance-pupil coordinates. Noll's terms are orthonormal over the annulus, so that each
+        coefficient is its own rms; Fringe terms have amplitude one at the rim.
     residual_rms : ndarray, shape [n_field]
         Root mean square of the wavefront minus the terms, over the fitted points [m].
     obscuration : float
         Inner over outer radius of the annulus.
     pupil : {"full", "lit"}
         Fitted points: the whole annulus, vignetted or not, or only where light passes.
+    ordering : {"noll", "fringe"}
+        Terms: annular ones in Noll's order, or those of the full disc in Fringe order.
     """
 
     _table = ("fields", "rms", "residual_rms", "coefficients")
@@ -57,19 +62,26 @@ class FieldZernikes(FieldResult):
     residual_rms: np.ndarray
     obscuration: float
     pupil: str
+    ordering: str = "noll"
 
     @property
     def rms(self) -> np.ndarray:
-        """Root mean square of the terms without piston and tilt [m], shape [n_field]."""
-        return np.sqrt((self.coefficients[:, 3:] ** 2).sum(axis=1))
+        """Root mean square over the annulus of the terms without piston and tilt [m], shape [n_field]."""
+        if self.ordering == "noll":
+            return np.sqrt((self.coefficients[:, 3:] ** 2).sum(axis=1))
+        sample = gauss_annulus(1.0, self.obscuration, 16, 64)
+        terms = fringe_zernikes(max(self.coefficients.shape[1], 4), *sample.points.T)[3:]
+        value = self.coefficients[:, 3:] @ terms[: self.coefficients.shape[1] - 3]
+        return np.sqrt(value**2 @ sample.weights - (value @ sample.weights) ** 2)
 
     def _summary(self) -> dict[str, Any]:
-        """Return the results by name and unit; rows are fields, columns Noll indices from 1."""
+        """Return the results by name and unit; rows are fields, columns indices of the terms from 1."""
         return {
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
             "obscuration": self.obscuration,
             "pupil": self.pupil,
+            "ordering": self.ordering,
             **self.field_items(),
             "rms_without_tilt_nm": self.rms * 1e9,
             "residual_rms_nm": self.residual_rms * 1e9,
@@ -84,7 +96,8 @@ class FieldZernikes(FieldResult):
         with styled():
             figure = figure_at(ax, 11.0, 8.6 if with_maps else 4.8)
             annulus = f"the {self.pupil} pupil, obscuration {self.obscuration:g}"
-            self._titled(figure, f"annular Zernikes over {annulus}, {self._nanometres()}")
+            kind = "annular" if self.ordering == "noll" else "Fringe"
+            self._titled(figure, f"{kind} Zernikes over {annulus}, {self._nanometres()}")
             if with_maps:
                 parts: Any = figure.subfigures(2, 1, height_ratios=(1.0, 1.35))
                 bars = parts[0].subplots()
@@ -97,12 +110,13 @@ class FieldZernikes(FieldResult):
                 for i, (row, label, color) in enumerate(zip(values, self.field_labels(), colors, strict=True)):
                     offset = (i - 0.5 * (len(self.fields) - 1)) * width
                     bars.bar(j + offset, row, width, color=color, label=label)
-                bars.set_ylabel("coefficient = rms over the annulus [nm]")
+                measure = "rms over the annulus" if self.ordering == "noll" else "amplitude at the rim"
+                bars.set_ylabel(f"coefficient = {measure} [nm]")
                 bars.legend(loc="best", ncols=2)
             else:
                 bars.bar(j, np.sqrt((values**2).mean(axis=0)), 0.75, color=BLUE)
                 bars.set_ylabel("rms over the fields [nm]")
-            name_terms(bars, j)
+            name_terms(bars, j, self.ordering)
             return figure
 
 
@@ -189,6 +203,7 @@ def wavefront_zernikes(
     *,
     jmax: int = 28,
     pupil: str = "full",
+    ordering: str = "noll",
     sampling: str | PupilSampling = "gauss",
     n_pupil: int | None = None,
     projection: str = "zemax",
@@ -203,20 +218,24 @@ def wavefront_zernikes(
     telescope, fields, wavelength, sampling, n_pupil, projection, threads
         As in :meth:`pachon.Request.of`.
     jmax : int
-        Highest Noll index.
+        Highest index; at most 37 in Fringe order.
     pupil : {"full", "lit"}
         "full": project on the whole annulus, clear apertures ignored. The terms stay orthogonal, so a coefficient does
         not depend on `jmax`, and it varies smoothly over the field. "lit": fit where light passes, as for a measured
         wavefront.
+    ordering : {"noll", "fringe"}
+        Noll's order of annular terms of rms one, or the Fringe order of terms of the full disc of amplitude one. Fringe
+        terms are not orthogonal over an annulus: there they are fitted by least squares, as in Zemax.
 
     Raises
     ------
     ConfigError
-        If pupil is unknown.
+        If pupil or ordering is unknown.
     DomainError
         If there are fewer points than terms, or rays of the full annulus do not reach the detector.
     """
     check_choice("pupil", pupil, PUPILS)
+    check_choice("ordering", ordering, ORDERINGS)
     request = Request.of(
         telescope,
         fields,
@@ -228,9 +247,11 @@ def wavefront_zernikes(
         one_wavelength=True,
     )
     points, sample, w = request.fields, request.pupil, request.wavelength
-    jmax = require_count(jmax, "jmax", 1, len(sample))
+    most = len(sample) if ordering == "noll" else min(len(sample), FRINGE_TERMS)
+    jmax = require_count(jmax, "jmax", 1, most)
     x, y = request.unit_pupil.T
-    terms = annular_zernikes(jmax, x, y, telescope.pupil_obscuration).T
+    noll = ordering == "noll"
+    terms = (annular_zernikes(jmax, x, y, telescope.pupil_obscuration) if noll else fringe_zernikes(jmax, x, y)).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
     for part, some in request.parts():
         optics = trace_pupils(
@@ -245,7 +266,7 @@ def wavefront_zernikes(
         value = -optics.path[:, 0]
         used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
         coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, some.fields, pupil)
-    return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil)
+    return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil, ordering)
 
 
 #: Most rings of field points.
@@ -338,17 +359,19 @@ def _fit(
     return coefficients, np.sqrt((rest**2 @ weights) / (used @ weights))
 
 
-def term_label(j: int) -> str:
-    """Return Noll index and name of a term."""
-    return f"{j} {NOLL_NAMES.get(j, '')}".strip()
+def term_label(j: int, ordering: str = "noll") -> str:
+    """Return index and name of a term."""
+    names = NOLL_NAMES if ordering == "noll" else FRINGE_NAMES
+    return f"{j} {names.get(j, '')}".strip()
 
 
-def name_terms(axes: Axes, j: np.ndarray) -> None:
-    """Label an axis of Noll indices."""
+def name_terms(axes: Axes, j: np.ndarray, ordering: str = "noll") -> None:
+    """Label an axis of indices of terms."""
     axes.axhline(0.0, color="0.3", linewidth=0.7)
     if len(j) <= 45:
-        axes.set_xticks(j, [term_label(int(n)) for n in j], rotation=60, ha="right", rotation_mode="anchor")
-    axes.set_xlabel("Noll index")
+        labels = [term_label(int(n), ordering) for n in j]
+        axes.set_xticks(j, labels, rotation=60, ha="right", rotation_mode="anchor")
+    axes.set_xlabel(f"{ordering.capitalize()} index")
     axes.grid(True, axis="y", color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
 
@@ -362,6 +385,6 @@ def _draw_maps(figure: Any, result: FieldZernikes, j: np.ndarray) -> None:
         edge = max(float(np.abs(nm).max()), 1e-6)
         image = draw_field_map(axes, result.fields, nm, cmap="RdBu_r", vmin=-edge, vmax=edge)
         figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
-        axes.set_title(f"{term_label(int(n))} [nm]", fontsize=9)
+        axes.set_title(f"{term_label(int(n), result.ordering)} [nm]", fontsize=9)
     figure.supxlabel("field x [deg]", fontsize=9)
     figure.supylabel("field y [deg]", fontsize=9)

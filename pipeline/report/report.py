@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...core.page import Picture, render
 from ..ccd_product import CcdProduct
 from ..config import ReconstructionConfig, to_yaml
 from ..defaults import noise_free_components
@@ -14,7 +16,6 @@ from ..experiment import Experiment
 from ..measure.correlation import Correlation
 from ..measure.summary import CORRELATED, of_focal_plane
 from .focal_plane_plots import close_up_plot, heights_plot, whiskers_plot
-from .page import Picture, render
 from .psf_plots import eigen_psf_plot, spectrum_plot, stamps_plot
 from .statistics_plots import correlation_plot, models_plot, scatter_plot
 from .tables import (
@@ -29,12 +30,15 @@ from .tables import (
 
 #: More CCDs than this are shown by their closest to the axis, their middle and their farthest one.
 _CLOSE_UPS = 3
+#: Templates of the reports of runs and sweeps.
+TEMPLATES = Path(__file__).parent / "templates"
 OBSERVED_COMPONENTS = "Eigen-PSFs of the observed stars"
 
 
 def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequence[Picture]) -> str:
     """Return the report of a run as HTML that refers to no other file."""
     return render(
+        TEMPLATES,
         "report.html",
         config=experiment.config,
         telescope=experiment.telescope,

@@ -10,7 +10,8 @@ import numpy as np
 
 from ...core.errors import ProductError
 from ...core.files import make_folder, write_bytes, write_json
-from ...pipeline.report.page import Picture, render
+from ...core.page import Picture, render
+from ...pipeline.report.report import TEMPLATES
 from . import plots
 from .analysis import Budget, Curve, allowances, budget, curves, rank_correlations, summary
 from .file import SweepFile
@@ -32,9 +33,10 @@ def write_report(store: SweepStore, folder: Path) -> Path:
     metrics = summary(table, sweep)
     pictures = sweep_pictures(table, sweep)
     for name, picture in pictures:
-        write_bytes(folder / f"{name}.png", picture.png)
+        write_bytes(folder / f"{name}.png", picture.data)
     write_json(folder / "summary.json", {**metrics, "pachon": store.about["pachon"], "digest": store.about["digest"]})
     page = render(
+        TEMPLATES,
         "sweep.html",
         sweep=sweep,
         summary=metrics,

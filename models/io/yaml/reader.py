@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, create_model
 
-from ....core.errors import PrescriptionError, error_context
+from ....core.errors import PachonError, PrescriptionError, error_context
 from ....core.schema import Section, Tagged, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
 from ...media.medium import Medium
@@ -152,7 +152,7 @@ def _no_vacuum(media: Any) -> Any:
     return media
 
 
-_SURFACE = Tagged(_SURFACES, _surface_kind, built=False)
+_SURFACE = Tagged(_SURFACES, _surface_kind, built=False, key="shape")
 _OBSTRUCTION = Tagged({"mesh": ObstructionSection}, lambda content: "mesh")
 
 
@@ -178,6 +178,23 @@ class Prescription(Section):
     groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
     obstructions: Annotated[tuple[Annotated[Obstruction, _OBSTRUCTION], ...], ROWS] = ()
     surfaces: Annotated[tuple[Annotated[SurfaceKeys, _SURFACE], ...], ROWS]
+
+    def problems(self) -> list[PachonError]:
+        """Return the errors of media and surfaces that cannot be made, each by itself."""
+        found: list[PachonError] = []
+        media: dict[str, Medium] = {"vacuum": VACUUM}
+        for name, medium in self.media.items():
+            try:
+                media[name] = medium.medium(name)
+            except PachonError as error:
+                found.append(error.within(key=f"media.{name}"))
+                media[name] = VACUUM
+        for section in self.surfaces:
+            try:
+                section.surface(media, VACUUM)
+            except PachonError as error:
+                found.append(error.within(key=f"surfaces[{section.name}]"))
+        return found
 
     def telescope(self) -> Telescope:
         """Return the telescope."""

@@ -15,20 +15,25 @@ class Picture:
     """One picture of a report."""
 
     title: str
-    png: bytes
+    data: bytes
     shows: str  #: caption
     paper: str = ""  #: corresponding figure of Jee & Tyson 2011; empty where there is none
+    kind: str = "png"  #: format of the data: png or svg
 
     @property
     def source(self) -> str:
         """The picture as a data URI."""
-        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
+        mime = "svg+xml" if self.kind == "svg" else self.kind
+        return f"data:image/{mime};base64," + base64.b64encode(self.data).decode("ascii")
 
 
-def render(template: str, **content: Any) -> str:
-    """Return a page made from one of the templates; a missing name is an error."""
+def render(folder: Path, template: str, **content: Any) -> str:
+    """Return a page made from a template of a folder; a missing name is an error.
+
+    Templates include the common styles of this layer, ``style.css`` and ``print.css``.
+    """
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=FileSystemLoader([folder, Path(__file__).parent / "templates"]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -1,0 +1,145 @@
+"""Commands on light and images of targets: ``illumination``, ``throughput``, ``strehl`` and ``target``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Option
+
+from ...core.errors import ConfigError
+from ..options import degrees_pair
+from ..tables import FIELD, Column, Rows
+from .command import Given, Outcome, Study, design_command
+
+
+@design_command(
+    FIELD,
+    Column("relative illumination [%]", lambda result: 100 * result.relative, ".3f"),
+    Column("lit part of the pupil [%]", lambda result: 100 * result.lit_fraction, ".3f"),
+    caption="By the projected solid angle of the exit pupil; a uniform source.",
+)
+def illumination(
+    given: Given, rays: Annotated[int, Option(min=16, max=10**6, help="Rays of each field.")] = 2000
+) -> Study:
+    """Draw the relative illumination of the detector against the field, vignetting included.
+
+    **Examples**
+
+    - `pachon illumination my_lens.zmx`
+    - `pachon illumination lsst_v3.3_r --field-deg 0 --field-deg 1.75 --rays 20000`
+    """
+    from ...design.analyses.illumination import relative_illumination
+
+    return relative_illumination(*given.where, n_pupil=rays, **given.how)
+
+
+@design_command(band=True)
+def throughput(
+    given: Given,
+    coatings: Annotated[
+        Path | None, Option(metavar="FILE.yaml", help="Coatings of surfaces and absorption of glasses.")
+    ] = None,
+) -> Outcome:
+    """Draw the throughput against the wavelength: bare or coated surfaces, absorption, vignetting.
+
+    Lens surfaces without a coating reflect after Fresnel; mirrors without one are perfect.
+
+    **Examples**
+
+    - `pachon throughput my_lens.zmx`
+    - `pachon throughput lsst_v3.3_r --coatings coatings.yaml --field-deg 0`
+    """
+    from ...design.analyses.throughput import throughput as compute
+
+    return Outcome(compute(*given.where, coatings=coatings, **given.how), _throughput_rows)
+
+
+def _throughput_rows(result: Any) -> Rows:
+    from ...design.drawing import field_text
+
+    headings = ("wavelength [nm]", *(field_text(f) for f in result.fields))
+    rows = [
+        (f"{w * 1e9:.6g}", *(f"{100 * v:.3f}" for v in column))
+        for w, column in zip(result.wavelengths, result.value.T, strict=True)
+    ]
+    return Rows(
+        headings, rows, f"{result.telescope}: light on the detector over light on the annular pupil [%].", left=0
+    )
+
+
+@design_command(
+    FIELD,
+    Column("rms wavefront [nm]", "rms_wavefront_nm", ".3f"),
+    Column("of the rms", "strehl_of_rms", ".4f"),
+    Column("of the wavefront", "strehl_of_wavefront", ".4f"),
+    Column("of the PSF", lambda result: result.psf, ".4f"),
+    caption="Piston and tilt removed; a number for each wavelength.",
+    band=True,
+)
+def strehl(
+    given: Given, psf: Annotated[bool, Option("--psf/--no-psf", help="Diffraction images too.")] = True
+) -> Study:
+    """Compute Strehl ratios from the rms wavefront, from the wavefront, and from the diffraction image.
+
+    **Examples**
+
+    - `pachon strehl my_lens.zmx`
+    - `pachon strehl lsst_v3.3_r --across-band 3 --no-psf`
+    """
+    from ...design.analyses.strehl import strehl as compute
+
+    return compute(*given.where, from_psf=psf, **given.how)
+
+
+@design_command(band=True)
+def target(
+    given: Given,
+    field_deg: Annotated[str, Option(metavar="X,Y", help="Field angle of the middle of the target [deg].")] = "0,0",
+    image: Annotated[
+        Path | None, Option(metavar="PICTURE", help="Picture to image, .png, in place of bars; its grey values.")
+    ] = None,
+    width_arcsec: Annotated[
+        float | None, Option(min=0.0, help="Width of the target; 60 Airy radii by default.")
+    ] = None,
+    bars: Annotated[int, Option(min=1, max=12, help="Bars of each kind.")] = 3,
+    rays: Annotated[int, Option(min=1, max=100_000, help="Rays of each pixel of the target.")] = 400,
+) -> Outcome:
+    """Draw the geometric image of a bar target, or of a small picture.
+
+    **Examples**
+
+    - `pachon target my_lens.zmx`
+    - `pachon target lsst_v3.3_r --field-deg 0,1.7 --width-arcsec 20 --bars 5`
+    """
+    import numpy as np
+
+    from ...core.units import ARCSEC
+    from ...design.analyses.target_image import bar_target, target_image
+
+    picture = bar_target(bars=bars) if image is None else _grey(image)
+    middle = np.deg2rad(degrees_pair(field_deg, "--field-deg"))
+    width = None if width_arcsec is None else width_arcsec * ARCSEC
+    how: dict[str, Any] = {"width": width, "field": middle, "wavelengths": given.wavelength, "n_rays": rays}
+    return Outcome(target_image(given.telescope, picture, **how, **given.how), _target_rows)
+
+
+def _grey(path: Path) -> Any:
+    """Return a picture as brightness, rows upwards."""
+    from matplotlib.image import imread
+
+    try:
+        values = imread(path)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise ConfigError(f"--image: expected a picture, .png ({error})", file=path) from None
+    return (values if values.ndim == 2 else values[..., :3].mean(axis=-1))[::-1].astype(float)
+
+
+def _target_rows(result: Any) -> Rows:
+    s = result.summary()
+    rows = [
+        ("pixel of the target", f"{s['target_pixel_arcsec']:.5g} arcsec"),
+        ("pixel of the image", f"{s['pixel_um']:.5g} µm"),
+        ("light on the image", f"{100 * s['light_inside']:.3f} %"),
+    ]
+    return Rows(("metric", "value"), rows, f"{s['telescope']}: diffraction is left out.")

@@ -1,0 +1,154 @@
+"""Base of the analyses of a design: pictures in given axes, tables with units, JSON-safe summaries."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.files import plain_values
+from ...core.plotting import figure_of, new_figure, styled
+from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import CHIEF_RAY
+from ...wavefront.request import Request
+from ..result import FieldResult
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Columns of a table by name: values and their unit, empty for names and pure numbers.
+Columns = dict[str, tuple[Any, str]]
+#: Points of curves along the field, and wavelengths across the band, where none are given.
+_ALONG_FIELD, _ACROSS_BAND = 33, 5
+
+
+@dataclass(frozen=True)
+class Analysis(FieldResult):
+    """Base of analyses: a summary, a table and a picture of one or more panels."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the results by name and unit, as JSON has them; NaN is None."""
+        common = {
+            "telescope": self.telescope,
+            "wavelength_nm": self.wavelengths * 1e9,
+            "field_deg": np.rad2deg(self.fields),
+        }
+        return plain_values(common | self._values())
+
+    def to_table(self) -> QTable:
+        """Return the results as a table with units, a row for each value of the longest column."""
+        from astropy.table import QTable
+
+        return QTable(_table_columns(self._columns()), meta={"telescope": self.telescope})
+
+    @check_arguments
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Draw the result.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Axes to draw in; several panels take their place. A figure of its own with a title without them.
+        """
+        rows, columns = self._grid
+        with styled():
+            if ax is None:
+                figure: Any = new_figure(*self._size)
+                self._titled(figure, self._title)
+            elif rows * columns == 1:
+                self._draw([ax])
+                return figure_of(ax)
+            else:
+                place = ax.get_subplotspec()
+                assert place is not None
+                ax.set_axis_off()
+                figure = figure_of(ax).add_subfigure(place)
+            panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+            self._draw(panels)
+            return figure_of(panels[0])
+
+    @property
+    def _grid(self) -> tuple[int, int]:
+        """Rows and columns of panels."""
+        return 1, 1
+
+    @property
+    def _size(self) -> tuple[float, float]:
+        """Width and height of the picture [inches]."""
+        return 6.5, 4.6
+
+    @property
+    @abstractmethod
+    def _title(self) -> str:
+        """Title behind the name of the telescope."""
+
+    @abstractmethod
+    def _draw(self, panels: Sequence[Axes]) -> None:
+        """Draw into panels."""
+
+    @abstractmethod
+    def _columns(self) -> Columns:
+        """Return the columns of the table; their arrays have shapes that broadcast together."""
+
+    @abstractmethod
+    def _values(self) -> dict[str, Any]:
+        """Return the entries of the summary behind telescope, wavelengths and fields."""
+
+    def _field_columns(self, extra: int = 0) -> Columns:
+        """Return the columns of the field angles, with so many axes of length 1 behind that of the fields."""
+        x, y = (v.reshape(-1, *(1,) * extra) for v in np.rad2deg(self.fields).T)
+        return {"field_x": (x, "deg"), "field_y": (y, "deg")}
+
+
+def _table_columns(columns: Columns) -> dict[str, Any]:
+    from astropy import units as u
+
+    arrays = np.broadcast_arrays(*(np.asarray(values) for values, _ in columns.values()))
+    flat = dict(zip(columns, (np.array(a).ravel() for a in arrays), strict=True))
+    return {
+        name: flat[name] if values.dtype.kind in "Ub" else u.Quantity(flat[name], unit)
+        for name, (values, unit) in ((n, (np.asarray(v), unit)) for n, (v, unit) in columns.items())
+    }
+
+
+def field_line(telescope: Telescope) -> np.ndarray:
+    """Return field points [rad] from the axis along +y to the edge of the field of view, shape [n, 2]."""
+    y = np.linspace(0.0, telescope.field_radius, _ALONG_FIELD)
+    return np.stack([np.zeros_like(y), y], axis=-1)
+
+
+def line_request(
+    telescope: Telescope,
+    fields: ArrayLike | None,
+    wavelengths: ArrayLike | None,
+    projection: str,
+    threads: int | None,
+) -> Request:
+    """Return the request of curves along the field, with chief rays as pupil points."""
+    line = field_line(telescope) if fields is None else fields
+    return Request.of(telescope, line, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
+
+
+def band_wavelengths(telescope: Telescope, wavelengths: ArrayLike | None, count: int = _ACROSS_BAND) -> Any:
+    """Return wavelengths [m] to study colour at: as given, those of the telescope's file, or some across its band."""
+    if wavelengths is None and len(Request.of(telescope, sampling=CHIEF_RAY).wavelengths) == 1:
+        return np.linspace(*(telescope.band or telescope.wavelength_range), count)
+    return wavelengths
+
+
+def tangential_axes(request: Request) -> np.ndarray:
+    """Return unit vectors along the field (y on the axis) and across it for each field, shape [n_field, 2, 2].
+
+    The first axis after the fields is tangential, sagittal; the last x, y of pupil and detector.
+    """
+    slopes = request.slopes
+    radius = np.hypot(*slopes.T)[:, None]
+    tangential = np.where(radius > 0, slopes / np.where(radius > 0, radius, 1.0), [0.0, 1.0])
+    return np.stack([tangential, np.stack([tangential[:, 1], -tangential[:, 0]], axis=-1)], axis=1)

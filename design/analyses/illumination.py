@@ -1,0 +1,168 @@
+"""Relative illumination: light on the detector against the field, by the projected solid angle of its light.
+
+An extended source of one radiance L makes the irradiance ``L A`` on the detector, where A is the area that the rays
+which meet at a point of it fill in direction cosines along the detector, times the square of the index there: the solid
+angle of the exit pupil, projected (Rimmer 1986, Proc. SPIE 655, 99). Since étendue is conserved, each element of the
+entrance pupil contributes its area times ``|det d(l, m)/d(X, Y)|``, with direction cosines l, m of the incoming ray
+along the pupil and landing points X, Y, at the same point of the pupil. With a small pupil and an image free of
+distortion that goes as the fourth power of the cosine of the field angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError
+from ...core.plotting import BLUE, GREY, ORANGE
+from ...core.units import require_count
+from ...models.telescope import Telescope
+from ...wavefront.request import Request
+from ..drawing import finish_axes
+from .analysis import Analysis, Columns, field_line
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Change of the slopes of the light on either side for the Jacobian.
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class RelativeIllumination(Analysis):
+    """Irradiance of the detector by a uniform source, field by field.
+
+    Attributes
+    ----------
+    solid_angle : ndarray, shape [n_field]
+        Solid angle of the light on the detector, projected on it [sr], vignetting included.
+    axis_solid_angle : float
+        The same on the axis [sr].
+    lit_fraction : ndarray, shape [n_field]
+        Fraction of the area of the entrance pupil that is lit.
+    chief_cosine : ndarray, shape [n_field]
+        Cosine of the field angle.
+    """
+
+    solid_angle: np.ndarray
+    axis_solid_angle: float
+    lit_fraction: np.ndarray
+    chief_cosine: np.ndarray
+
+    @property
+    def relative(self) -> np.ndarray:
+        """Irradiance relative to the axis, shape [n_field]."""
+        return self.solid_angle / self.axis_solid_angle
+
+    @property
+    def f_number(self) -> float:
+        """Focal ratio in air of an unobscured cone of the solid angle on the axis."""
+        return float(0.5 * np.sqrt(np.pi / self.axis_solid_angle))
+
+    @property
+    def _title(self) -> str:
+        return f"relative illumination at {self._nanometres()}"
+
+    def _columns(self) -> Columns:
+        return self._field_columns() | {
+            "relative_illumination": (self.relative, ""),
+            "projected_solid_angle": (self.solid_angle, "sr"),
+            "lit_fraction": (self.lit_fraction, ""),
+        }
+
+    def _values(self) -> dict[str, Any]:
+        return {
+            "relative_illumination": self.relative,
+            "projected_solid_angle_sr": self.solid_angle,
+            "lit_fraction": self.lit_fraction,
+            "smallest_relative": float(self.relative.min()),
+            "f_number_of_axis_cone": self.f_number,
+        }
+
+    def _draw(self, panels: Sequence[Axes]) -> None:
+        (axes,) = panels
+        angle = np.rad2deg(self.off_axis_angle)
+        order = np.argsort(angle, kind="stable")
+        axes.plot(angle[order], 100 * self.relative[order], color=BLUE, linewidth=1.6, label="relative illumination")
+        lit = 100 * self.lit_fraction[order]
+        axes.plot(angle[order], lit, "--", color=ORANGE, linewidth=1.0, label="lit part of the entrance pupil")
+        fourth = 100 * self.chief_cosine[order] ** 4
+        axes.plot(angle[order], fourth, ":", color=GREY, linewidth=1.0, label="cos⁴ of the field angle")
+        top = max(102.0, 1.02 * float(100 * self.relative.max()))
+        finish_axes(axes, xlim=(0, None), ylim=(0, top), xlabel="field [deg]", ylabel="[%]")
+        axes.legend(loc="lower left")
+
+
+@check_arguments
+def relative_illumination(
+    telescope: Telescope,
+    fields: ArrayLike | None = None,
+    wavelength: ArrayLike | None = None,
+    *,
+    n_pupil: int = 2000,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> RelativeIllumination:
+    """Trace the relative illumination of the detector.
+
+    Parameters
+    ----------
+    telescope, wavelength, projection, threads
+        As in :meth:`pachon.Request.of`.
+    fields : array_like or Quantity, shape [n_field, 2], optional
+        Field angles [rad]; a line from the axis along +y to the edge of the field of view by default.
+    n_pupil : int
+        Points of the pupil, at equal areas; the error of a vignetted pupil is about the inverse of it times ten.
+
+    Raises
+    ------
+    DomainError
+        If no light reaches the detector on the axis.
+    """
+    count = require_count(n_pupil, "n_pupil", 16, 10**6)
+    line = field_line(telescope) if fields is None else fields
+    request = Request.of(
+        telescope, line, wavelength, sampling="spiral", n_pupil=count, projection=projection, threads=threads
+    )
+    everything = replace(request, fields=np.concatenate([np.zeros((1, 2)), request.fields]))
+    solid, lit = [], []
+    for field in everything.fields:
+        area, fraction = _projected(replace(everything, fields=field[None]))
+        solid.append(area)
+        lit.append(fraction)
+    if not solid[0] > 0:
+        raise DomainError(f"telescope {telescope.name}: expected one with light on the axis; all of it is vignetted")
+    cosine = -request.directions[:, 2]
+    return RelativeIllumination(request, np.array(solid[1:]), solid[0], np.array(lit[1:]), cosine)
+
+
+def _projected(request: Request) -> tuple[float, float]:
+    """Return projected solid angle [sr] and lit fraction of one field."""
+    telescope, sample, wavelength = request.telescope, request.pupil, request.wavelength
+    lit = request.bundles(wavelength).lit[0]
+    if not lit.any():
+        return 0.0, 0.0
+    points = sample.points[lit]
+    steps = _STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    beside = replace(request, fields=request.slopes + steps, projection="gnomonic")
+    landing = beside.bundles(wavelength, points).landing()
+    cosines = beside.launch(wavelength, points).direction.reshape(4, -1, 3)[..., :2]
+    # Both over the same change of the field: their ratio is per metre of the detector.
+    ratio = _determinant(cosines) / _determinant(landing)
+    known = np.isfinite(ratio)
+    index = float(telescope.medium_before.index(wavelength))
+    area = np.pi * (0.5 * telescope.pupil_diameter * index) ** 2 * (1.0 - telescope.pupil_obscuration**2)
+    fraction = float(sample.weights[lit].sum())
+    mean = float(np.average(ratio[known], weights=sample.weights[lit][known])) if known.any() else 0.0
+    return area * fraction * mean, fraction
+
+
+def _determinant(values: np.ndarray) -> np.ndarray:
+    """Return the size of the Jacobian [n] of values [4, n, 2] at fields on either side in x, and in y."""
+    (a, b), (c, d) = (values[0] - values[1]).T, (values[2] - values[3]).T
+    return np.abs(a * d - b * c)

@@ -1,0 +1,142 @@
+"""Strehl ratios: from the rms wavefront, from the wavefront itself, and from the peak of the diffraction image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.plotting import BLUE
+from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
+from ..drawing import finish_axes, wavelength_colors
+from ..images.diffraction import fft_psf
+from .analysis import Analysis, Columns
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True)
+class StrehlRatios(Analysis):
+    """Strehl ratios of field points and wavelengths.
+
+    Attributes
+    ----------
+    rms_wavefront : ndarray, shape [n_field, n_wave]
+        Root mean square of the wavefront over the lit pupil without piston and tilt [m].
+    wavefront : ndarray, shape [n_field, n_wave]
+        Squared modulus of the mean of exp(2 pi i W / wavelength) over the lit pupil, piston and tilt removed.
+    psf : ndarray, shape [n_field, n_wave]
+        Peak of the diffraction image over that of the same lit pupil with a perfect wavefront; NaN where not asked for.
+    """
+
+    rms_wavefront: np.ndarray
+    wavefront: np.ndarray
+    psf: np.ndarray
+
+    @property
+    def marechal(self) -> np.ndarray:
+        """Marechal's approximation in Mahajan's form, exp(-(2 pi rms / wavelength)^2), shape [n_field, n_wave].
+
+        Mahajan 1983, J. Opt. Soc. Am. 73, 860; good to some per cent above 0.3.
+        """
+        return np.exp(-((2.0 * np.pi * self.rms_wavefront / self.wavelengths) ** 2))
+
+    @property
+    def _title(self) -> str:
+        return "Strehl ratio"
+
+    def _columns(self) -> Columns:
+        return {
+            **self._field_columns(1),
+            "wavelength": (self.wavelengths * 1e9, "nm"),
+            "rms_wavefront": (self.rms_wavefront * 1e9, "nm"),
+            "strehl_of_rms": (self.marechal, ""),
+            "strehl_of_wavefront": (self.wavefront, ""),
+            "strehl_of_psf": (self.psf, ""),
+        }
+
+    def _values(self) -> dict[str, Any]:
+        return {
+            "rms_wavefront_nm": self.rms_wavefront * 1e9,
+            "rms_wavefront_waves": self.rms_wavefront / self.wavelengths,
+            "strehl_of_rms": self.marechal,
+            "strehl_of_wavefront": self.wavefront,
+            "strehl_of_psf": self.psf,
+        }
+
+    def _draw(self, panels: Sequence[Axes]) -> None:
+        (axes,) = panels
+        angle = np.rad2deg(self.off_axis_angle)
+        order = np.argsort(angle, kind="stable")
+        colors = wavelength_colors(len(self.wavelengths)) if len(self.wavelengths) > 1 else [BLUE]
+        for w, color in enumerate(colors):
+            name = f"{self.wavelengths[w] * 1e9:.4g} nm"
+            axes.plot(angle[order], self.wavefront[order, w], "-", color=color, label=f"{name}, wavefront")
+            axes.plot(angle[order], self.marechal[order, w], ":", color=color, label=f"{name}, exp(-(2πσ)²)")
+            if np.isfinite(self.psf[:, w]).any():
+                axes.plot(angle[order], self.psf[order, w], "o", color=color, markersize=4, label=f"{name}, PSF")
+        axes.axhline(0.8, color="0.5", linewidth=0.7)
+        finish_axes(axes, xlim=(0, None), ylim=(0, 1.02), xlabel="field [deg]", ylabel="Strehl ratio")
+        axes.legend(fontsize=7)
+
+
+@check_arguments
+def strehl(
+    telescope: Telescope,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
+    *,
+    from_psf: bool = True,
+    sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> StrehlRatios:
+    """Compute Strehl ratios from wavefronts and diffraction images.
+
+    Parameters
+    ----------
+    telescope, fields, wavelengths, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`; the points of the pupil are those of the wavefronts.
+    from_psf : bool
+        Make diffraction images too (:func:`pachon.fft_psf`).
+
+    Raises
+    ------
+    DomainError
+        If no light of a field passes, or the aberrations are too large for a diffraction image.
+    """
+    request = Request.of(
+        telescope, fields, wavelengths, sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads
+    )
+    shape = (len(request.fields), len(request.wavelengths))
+    rms, ratio, peak = (np.full(shape, np.nan) for _ in range(3))
+    for w, wavelength in enumerate(map(float, request.wavelengths)):
+        bundles = request.bundles(wavelength)
+        opd = bundles.opd(telescope.reference_sphere_radius)
+        for i, lit in enumerate(bundles.lit):
+            rms[i, w], ratio[i, w] = _without_tilt(opd[i], lit, request, wavelength)
+        if from_psf:
+            how: dict[str, Any] = {"projection": projection, "threads": threads, "pixels": 64}
+            peak[:, w] = fft_psf(telescope, request.fields, wavelength, **how).strehl
+    return StrehlRatios(request, rms, ratio, peak)
+
+
+def _without_tilt(opd: np.ndarray, lit: np.ndarray, request: Request, wavelength: float) -> tuple[float, float]:
+    """Return rms [m] and Strehl ratio of a wavefront over its lit points, the best plane taken off."""
+    if lit.sum() < 3:
+        return np.nan, np.nan
+    weight = request.pupil.weights[lit] / request.pupil.weights[lit].sum()
+    root = np.sqrt(weight)
+    plane = np.stack([np.ones(len(weight)), *request.unit_pupil[lit].T], axis=-1) * root[:, None]
+    value = opd[lit] * root
+    rest = (value - plane @ np.linalg.lstsq(plane, value, rcond=None)[0]) / root
+    phase = np.exp(2j * np.pi * rest / wavelength)
+    return float(np.sqrt((weight * rest**2).sum())), float(np.abs((weight * phase).sum()) ** 2)

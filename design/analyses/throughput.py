@@ -1,0 +1,243 @@
+"""Throughput: light that reaches the detector, with losses at surfaces, in glass and by vignetting.
+
+A lens surface without a coating transmits after Fresnel (Born & Wolf, Principles of Optics, section 1.5.3), at the
+angle of each ray::
+
+    R_s = ((n1 cos i - n2 cos t) / (n1 cos i + n2 cos t))^2,   R_p = ((n2 cos i - n1 cos t) / (n2 cos i + n1 cos t))^2
+
+Light is taken as unpolarised before each surface, so transmissions are the means of both polarisations. A mirror or
+detector without a coating loses nothing. Light that is reflected twice within a lens is not added (see `ghosts`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.errors import DomainError, unknown_name
+from ...core.plotting import BLUE, plain_text
+from ...models.surface import Interaction, Surface
+from ...models.telescope import Telescope
+from ...raytrace.pack.surfaces import refractive_indices
+from ...raytrace.rays import RayStatus
+from ...raytrace.trace import TraceResult, trace
+from ...wavefront.pupil_sampling import PupilSampling
+from ...wavefront.request import Request
+from ..drawing import field_colors, field_text, finish_axes
+from .analysis import Analysis, Columns, band_wavelengths
+from .coatings import Coatings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Wavelengths across the band where none are given.
+_WAVELENGTHS = 21
+
+
+@dataclass(frozen=True)
+class Throughput(Analysis):
+    """Light that reaches the detector over light that falls on the entrance pupil.
+
+    Attributes
+    ----------
+    value : ndarray, shape [n_field, n_wave]
+        Fraction of the light of the annular entrance pupil, losses and vignetting included.
+    lit_fraction : ndarray, shape [n_field, n_wave]
+        Fraction of the entrance pupil that is lit.
+    surfaces : tuple of str
+        Surfaces with a loss, and glasses with absorption, in the order of the light.
+    efficiency : ndarray, shape [n_surface, n_field, n_wave]
+        Mean efficiency of each over the lit rays; NaN without light.
+    """
+
+    value: np.ndarray
+    lit_fraction: np.ndarray
+    surfaces: tuple[str, ...]
+    efficiency: np.ndarray
+
+    @property
+    def _title(self) -> str:
+        return "throughput, unpolarised light"
+
+    @property
+    def _grid(self) -> tuple[int, int]:
+        return 1, 2
+
+    @property
+    def _size(self) -> tuple[float, float]:
+        return 10.0, 0.8 + max(4.0, 0.19 * len(self.surfaces))
+
+    def _columns(self) -> Columns:
+        return {
+            **self._field_columns(1),
+            "wavelength": (self.wavelengths * 1e9, "nm"),
+            "throughput": (self.value, ""),
+            "lit_fraction": (self.lit_fraction, ""),
+        }
+
+    def _values(self) -> dict[str, Any]:
+        return {
+            "throughput": self.value,
+            "lit_fraction": self.lit_fraction,
+            "surfaces": list(self.surfaces),
+            "efficiency": self.efficiency,
+        }
+
+    def _draw(self, panels: Sequence[Axes]) -> None:
+        curves, bars = panels
+        nm = self.wavelengths * 1e9
+        for i, (field, color) in enumerate(zip(self.fields, field_colors(len(self.fields)), strict=True)):
+            marker = "." if len(nm) == 1 else ""
+            curves.plot(nm, 100 * self.value[i], color=color, marker=marker, label=field_text(field))
+        finish_axes(curves, ylim=(0, 100), xlabel="wavelength [nm]", ylabel="throughput [%]")
+        curves.legend(fontsize=7.5, loc="lower right")
+        loss = 100 * (1.0 - np.nanmean(self.efficiency, axis=(1, 2))) if self.surfaces else np.zeros(0)
+        bars.barh(np.arange(len(loss)), loss, color=BLUE, height=0.7)
+        bars.set_yticks(np.arange(len(loss)), [plain_text(n) for n in self.surfaces], fontsize=7)
+        bars.invert_yaxis()
+        finish_axes(bars, xlabel="mean loss [%]", xlim=(0, None))
+        bars.set_axisbelow(True)
+
+
+@check_arguments
+def throughput(
+    telescope: Telescope,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
+    *,
+    coatings: Coatings | str | os.PathLike[str] | None = None,
+    sampling: str | PupilSampling = "gauss",
+    n_pupil: int | None = None,
+    projection: str = "zemax",
+    threads: int | None = None,
+) -> Throughput:
+    """Trace the throughput with reflection losses, coatings and absorption.
+
+    Parameters
+    ----------
+    telescope, fields, sampling, n_pupil, projection, threads
+        As in :meth:`pachon.Request.of`.
+    wavelengths : array_like or Quantity, shape [n_wave], optional
+        Vacuum wavelengths [m]; those of the telescope's file, or 21 across its band, by default.
+    coatings : Coatings or path, optional
+        Coatings of surfaces and absorption of glasses, or their file (:mod:`~pachon.design.analyses.coatings`). Lens
+        surfaces without one reflect as bare glass; mirrors without one are perfect.
+
+    Raises
+    ------
+    ConfigError
+        If the file is malformed.
+    UnknownNameError
+        If a coating belongs to no surface, or absorption to no glass.
+    DomainError
+        If a table does not cover a wavelength.
+    """
+    known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
+    names = telescope.surface_names
+    glasses = [s.medium_after.name for s in telescope.surfaces if s.medium_after.name]
+    for name in known.surfaces:
+        if name not in names:
+            raise unknown_name(f"surface of {telescope.name}", name, names)
+    for name in known.glasses:
+        if name not in glasses:
+            raise unknown_name(f"glass of {telescope.name}", name, dict.fromkeys(glasses) or ("none",))
+    request = Request.of(
+        telescope,
+        fields,
+        band_wavelengths(telescope, wavelengths, _WAVELENGTHS),
+        sampling=sampling,
+        n_pupil=n_pupil,
+        projection=projection,
+        threads=threads,
+    )
+    value, lit, factors = [], [], []
+    for _, some in request.parts():
+        found = [_passed(some, known, float(w)) for w in request.wavelengths]
+        value.append(np.stack([f[0] for f in found], axis=-1))
+        lit.append(np.stack([f[1] for f in found], axis=-1))
+        factors.append([f[2] for f in found])
+    steps = list(factors[0][0])
+    efficiency = [np.concatenate([np.stack([f[name] for f in p], axis=-1) for p in factors]) for name in steps]
+    shape = (len(request.fields), len(request.wavelengths))
+    stacked = np.array(efficiency).reshape(len(steps), *shape)
+    return Throughput(request, np.concatenate(value), np.concatenate(lit), tuple(steps), stacked)
+
+
+def _passed(
+    request: Request, known: Coatings, wavelength: float
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return throughput and lit fraction [n_field], and the mean efficiency of each step [n_field] by its name."""
+    telescope = request.telescope
+    rays = request.launch(wavelength)
+    results = trace(telescope, rays, "all", threads=request.threads)
+    index = refractive_indices(telescope, wavelength)
+    lit = (results[-1].status == RayStatus.OK).reshape(len(request.fields), -1)
+    weight = np.where(lit, request.pupil.weights, 0.0)
+    fraction = weight.sum(axis=1)
+    left = np.ones(lit.shape)
+    steps: dict[str, np.ndarray] = {}
+    before: TraceResult | None = None
+    for k, (surface, result) in enumerate(zip(telescope.surfaces, results, strict=True)):
+        found: dict[str, np.ndarray] = {}
+        glass = telescope.surfaces[k - 1].medium_after.name if k else ""
+        if before is not None and glass in known.glasses:
+            path = np.linalg.norm(result.position - before.position, axis=-1)
+            found[f"in {glass} before {surface.name}"] = known.glasses[glass].through(path, wavelength)
+        direction = rays.direction if before is None else before.direction
+        if surface.name in known.surfaces:
+            found[surface.name] = np.full(len(rays), known.surfaces[surface.name].at(wavelength))
+        elif surface.interaction == Interaction.REFRACT and index[k] != index[k + 1]:
+            found[surface.name] = fresnel_transmission(_incidence(surface, result, direction), index[k], index[k + 1])
+        for name, efficiency in found.items():
+            each = np.where(lit, efficiency.reshape(lit.shape), 0.0)
+            left = left * each
+            with np.errstate(invalid="ignore"):
+                steps[name] = (weight * each).sum(axis=1) / fraction
+        before = result
+    return (weight * left).sum(axis=1), fraction, steps
+
+
+def _incidence(surface: Surface, result: TraceResult, direction: np.ndarray) -> np.ndarray:
+    """Return the cosine of the angle of incidence of rays on a surface, shape [n]."""
+    x, y, _ = surface.to_local(result.position).T
+    slope_x, slope_y = surface.shape.gradient(x, y)
+    normal = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1) / np.sqrt(1.0 + slope_x**2 + slope_y**2)[:, None]
+    return np.abs(np.einsum("ni,ni->n", direction @ surface.matrix, normal))
+
+
+@check_arguments
+def fresnel_transmission(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
+    """Return the transmission of a bare interface for unpolarised light.
+
+    Parameters
+    ----------
+    cosine : array_like
+        Cosine of the angle of incidence.
+    n1, n2 : float
+        Refractive indices before and behind.
+
+    Returns
+    -------
+    ndarray
+        Transmitted power over incident power, mean of both polarisations; 0 where reflection is total.
+
+    Raises
+    ------
+    DomainError
+        If an index is not positive.
+    """
+    if not (n1 > 0 and n2 > 0):
+        raise DomainError(f"n1 = {n1!r}, n2 = {n2!r}: expected positive refractive indices")
+    ci = np.asarray(cosine, dtype=np.float64)
+    square = 1.0 - (n1 / n2) ** 2 * (1.0 - ci**2)
+    ct = np.sqrt(np.maximum(square, 0.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        s = ((n1 * ci - n2 * ct) / (n1 * ci + n2 * ct)) ** 2
+        p = ((n2 * ci - n1 * ct) / (n2 * ci + n1 * ct)) ** 2
+    return np.where(square > 0, 1.0 - 0.5 * (s + p), 0.0)

@@ -1,0 +1,130 @@
+"""Prescription and first-order data as tables of text, in a unit of length and with the signs of lens design.
+
+The z axis points along the incoming light, as in Zemax: a thickness is the distance to the next vertex along it,
+negative after a mirror, and a positive radius has its centre behind the surface. In the telescope frame z points the
+other way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import DomainError
+from ...core.units import ARCSEC
+from ...models.first_order import first_order, seidel_sums
+from ...models.media.medium import ConstantIndex
+from ...models.shapes.shape import Rotational
+from ...models.surface import Interaction, Surface
+from ...models.telescope import Telescope
+
+COLUMNS = ("surface", "type", "radius", "thickness", "medium", "index", "semi-diameter", "conic", "coefficients, place")
+_TYPES = {
+    Interaction.MIRROR: "mirror",
+    Interaction.REFRACT: "lens surface",
+    Interaction.DETECTOR: "detector",
+    Interaction.PASS: "baffle",
+    Interaction.PHASE: "phase screen",
+}
+#: Diameter of the pupil below which lengths are in millimetres [m].
+_SMALL = 1.0
+
+
+def length_unit(telescope: Telescope) -> tuple[str, float]:
+    """Return the unit of length of a telescope's tables, and its length [m]: mm for pupils under a metre, else m."""
+    return ("mm", 1e-3) if telescope.pupil_diameter < _SMALL else ("m", 1.0)
+
+
+def prescription_rows(telescope: Telescope, wavelength: float, semi_diameters: dict[str, float]) -> list[list[str]]:
+    """Return a row of text for each surface, in the order of :data:`COLUMNS`.
+
+    Semi-diameters are in metres by name of the surface; the wavelength [m] is that of the indices.
+    """
+    _, unit = length_unit(telescope)
+    surfaces = telescope.surfaces
+    rows = []
+    for i, surface in enumerate(surfaces):
+        shape, mirror = surface.shape, surface.interaction == Interaction.MIRROR
+        thickness = (surface.vertex[2] - surfaces[i + 1].vertex[2]) / unit if i + 1 < len(surfaces) else math.nan
+        medium = surface.medium_after
+        index = float(medium.index(wavelength))
+        bare = isinstance(medium, ConstantIndex) and not medium.name
+        name = "mirror" if mirror else medium.name or ("" if bare and index == 1.0 else "glass")
+        rows.append(
+            [
+                surface.name,
+                _TYPES[surface.interaction],
+                _number(-1.0 / shape.curvature / unit) if shape.curvature else "flat",
+                _number(thickness),
+                name,
+                "" if index == 1.0 else f"{index:.6f}",
+                _number(semi_diameters.get(surface.name, math.nan) / unit, 6),
+                f"{shape.conic:.8g}" if isinstance(shape, Rotational) and shape.conic else "",
+                _more(surface, unit),
+            ]
+        )
+    return rows
+
+
+def _number(value: float, digits: int = 8) -> str:
+    return f"{value:.{digits}g}" if math.isfinite(value) else ""
+
+
+def _more(surface: Surface, unit: float) -> str:
+    """Return coefficients, kind of shape, decentre and tilt of a surface as text."""
+    shape, parts = surface.shape, []
+    if isinstance(shape, Rotational):
+        # Lengths over powers of lengths; z has the other sign.
+        powers = range(4, 4 + 2 * len(shape.coefficients), 2)
+        pairs = zip(powers, shape.coefficients, strict=True)
+        parts += [f"r^{n}: {-a * unit ** (n - 1):.6g}" for n, a in pairs if a]
+    else:
+        parts.append(type(shape).__name__)
+    x, y, _ = surface.vertex
+    if x or y:
+        parts.append(f"decentred by x {x / unit:.6g}, y {y / unit:.6g}")
+    tilt = math.degrees(math.acos(min(1.0, float(surface.matrix[2, 2]))))
+    if not np.array_equal(surface.matrix, np.eye(3)):
+        parts.append(f"axis tilted by {tilt:.6g}°")
+    return "; ".join(parts)
+
+
+def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str, str]]:
+    """Return names and values of the first-order data at a wavelength [m]; of centred telescopes all of them."""
+    name, unit = length_unit(telescope)
+
+    def text(value: float) -> str:
+        return f"{value / unit:.8g} {name}" if math.isfinite(value) else "at infinity"
+
+    low, high = telescope.band or telescope.wavelength_range
+    rows = [
+        ("wavelength", f"{wavelength * 1e9:.6g} nm; band {low * 1e9:.6g} to {high * 1e9:.6g} nm"),
+        ("field of view", f"radius {math.degrees(telescope.field_radius):.6g}°"),
+        ("entrance pupil", f"diameter {text(telescope.pupil_diameter)}, obscuration {telescope.pupil_obscuration:.5g}"),
+    ]
+    if math.isfinite(telescope.object_distance):
+        rows.append(("object", f"{text(telescope.object_distance - telescope.stop_z)} from the entrance pupil"))
+    with contextlib.suppress(DomainError):
+        optics = first_order(telescope, wavelength)
+        detector = telescope.surfaces[-1].vertex[2]
+        rows += [
+            ("effective focal length", text(optics.focal_length)),
+            ("focal ratio", f"f/{abs(optics.f_number):.6g}"),
+            ("back focus", text(optics.back_focus)),
+            ("plate scale", f"{abs(optics.plate_scale) / ARCSEC * unit:.6g} arcsec/{name}"),
+            ("exit pupil", f"{text(detector - optics.exit_pupil_z)} from the detector along the incoming light"),
+            ("diameter of the exit pupil", text(optics.exit_pupil_diameter)),
+            ("Petzval radius", text(_petzval_radius(telescope, wavelength))),
+            ("effective area", f"{optics.effective_area / unit**2:.6g} {name}²"),
+        ]
+    return rows
+
+
+def _petzval_radius(telescope: Telescope, wavelength: float) -> float:
+    """Return the radius of the Petzval surface [m]: H^2 over the fourth Seidel sum (Welford, section 8.7)."""
+    total: Any = seidel_sums(telescope, wavelength, 1e-3).total[3]
+    lagrange = 0.5 * telescope.pupil_diameter * math.tan(1e-3) * float(telescope.medium_before.index(wavelength))
+    return abs(lagrange**2 / total) if abs(total) > 1e-12 * lagrange**2 else math.inf

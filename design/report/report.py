@@ -1,0 +1,111 @@
+"""Design report: one HTML page with everything in it, pictures included, that prints well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.errors import PachonError
+from ...core.page import Picture, render
+from ...core.plotting import picture_bytes
+from ...core.version import VERSION
+from ...models.telescope import Telescope
+from ...wavefront.pupil_sampling import CHIEF_RAY
+from ...wavefront.request import Request
+from ..layout.layout import layout
+from .prescription_table import COLUMNS, first_order_rows, length_unit, prescription_rows
+from .sections import SECTIONS, Section, Where
+
+#: Longest drawing that is kept as one [byte]; a longer one becomes pixels.
+_MOST_SVG = 150_000
+#: Steps of a report: the tables, and each section.
+STEPS = 1 + len(SECTIONS)
+
+
+@check_arguments
+def design_report(
+    telescope: Telescope,
+    fields: ArrayLike | None = None,
+    wavelengths: ArrayLike | None = None,
+    *,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> str:
+    """Make the design report of a telescope.
+
+    Prescription table, first-order data, layout and all analyses. One that a telescope does not admit, such as the
+    Seidel sums of tilted surfaces, says why in its place.
+
+    Parameters
+    ----------
+    telescope, fields, wavelengths, threads
+        As in :meth:`pachon.Request.of`; where no wavelengths are given, colour is studied across the band.
+    progress : callable, optional
+        Called with 1 after each of the :data:`STEPS` steps.
+
+    Returns
+    -------
+    str
+        An HTML page that refers to no other file.
+
+    Raises
+    ------
+    DomainError
+        If a field or wavelength lies outside what the telescope covers.
+    """
+    # Wrong fields or wavelengths are an error of the report, not of each of its sections.
+    request = Request.of(telescope, fields, wavelengths, sampling=CHIEF_RAY, threads=threads)
+    where = Where(
+        telescope,
+        None if fields is None else request.fields,
+        None if wavelengths is None else request.wavelengths,
+        threads,
+    )
+    step = progress or (lambda count: None)
+    reach = _semi_diameters(where)
+    rows = prescription_rows(telescope, request.middle, reach)
+    first = first_order_rows(telescope, request.middle)
+    step(1)
+    pictures: list[Picture] = []
+    problems: list[tuple[str, str]] = []
+    for section in SECTIONS:
+        try:
+            pictures.append(_picture(section, where))
+        except PachonError as error:
+            problems.append((section.title, str(error)))
+        step(1)
+    return render(
+        Path(__file__).parent / "templates",
+        "design_report.html",
+        telescope=telescope,
+        unit=length_unit(telescope)[0],
+        columns=COLUMNS,
+        rows=rows,
+        first_order=first,
+        fields=[tuple(f) for f in np.rad2deg(request.fields)],
+        wavelengths=[float(w) * 1e9 for w in request.wavelengths],
+        pictures=pictures,
+        problems=problems,
+        version=VERSION,
+    )
+
+
+def _semi_diameters(where: Where) -> dict[str, float]:
+    """Return the radius of each surface, that of its aperture or of the light on it [m]; empty if no light passes."""
+    try:
+        return layout(where.telescope, where.fields, where.one_wavelength, threads=where.threads).reach
+    except PachonError:
+        return {}
+
+
+def _picture(section: Section, where: Where) -> Picture:
+    figure: Any = section.draw(where)
+    drawing = picture_bytes(figure, "svg")
+    if len(drawing) <= _MOST_SVG:
+        return Picture(section.title, drawing, section.shows, kind="svg")
+    return Picture(section.title, picture_bytes(figure, "png"), section.shows)

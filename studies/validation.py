@@ -1,0 +1,194 @@
+"""Validation of files: all problems of a prescription, configuration, sweep or table of heights at once, with lines."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from ..core.arguments import check_arguments
+from ..core.errors import ConfigError, HeightWarning, PachonError, PrescriptionError, PrescriptionWarning, check_choice
+from ..core.json_schema import json_schema
+from ..core.schema import problems_of
+from ..core.yaml_reader import line_of, read_mapping
+from ..imaging.config import ImagesConfig, load_images_configuration
+from ..models.camera.focal_plane import FocalPlane
+from ..models.io.prescription import ENDINGS, load_telescope
+from ..models.io.site_file import SiteFile, load_site
+from ..models.io.yaml.reader import MAX_BYTES, Prescription
+from ..pipeline.config import Configuration, load_configuration, with_run
+from ..pipeline.experiment import Experiment
+from .alignment.config import AlignConfig, load_align_configuration
+from .sweep.file import SweepFile, load_sweep
+from .visits.config import VisitsConfig, load_visits_configuration
+
+#: Endings of YAML files, and of tables of heights.
+_YAML, _TABLES = (".yaml", ".yml"), (".csv", ".ecsv", ".fits", ".fit", ".fz", ".txt", ".dat")
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """A kind of YAML file: its model, its errors, and what loads it for checks across keys."""
+
+    name: str
+    model: type[BaseModel]
+    load: Callable[[Path], Any]
+    error: type[PachonError] = ConfigError
+    prepare: Callable[[dict[str, Any], Path], dict[str, Any]] = lambda content, path: content
+
+
+def _load_run(path: Path) -> None:
+    Experiment.from_config(load_configuration(path), path.parent)
+
+
+#: In the order in which they are chosen where a file could be of two kinds.
+KINDS = (
+    FileKind("prescription", Prescription, load_telescope, PrescriptionError),
+    FileKind("run", Configuration, _load_run),
+    FileKind("sweep", SweepFile, load_sweep),
+    FileKind("images", ImagesConfig, load_images_configuration, prepare=with_run),
+    FileKind("visits", VisitsConfig, load_visits_configuration, prepare=with_run),
+    FileKind("align", AlignConfig, load_align_configuration),
+    FileKind("site", SiteFile, load_site, PrescriptionError),
+)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Problems of a file.
+
+    Attributes
+    ----------
+    path : str
+        The file.
+    kind : str
+        What it was taken for, by its ending and keys: a name of :data:`KINDS`, "lens file" or "heights".
+    problems : tuple of PachonError
+        Every problem, with the line in :attr:`~pachon.PachonError.place` where it is known.
+    """
+
+    path: str
+    kind: str
+    problems: tuple[PachonError, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the problems as JSON has them."""
+        return {
+            "file": self.path,
+            "kind": self.kind,
+            "problems": [{"place": p.place, "key": p.key, "problem": p.problem} for p in self.problems],
+        }
+
+
+@check_arguments
+def validate_file(path: str | os.PathLike[str]) -> Validation:
+    """Find all problems of a file.
+
+    Prescriptions (YAML, Zemax, CODE V), run configurations, sweeps, configurations of images, visits and alignment,
+    sites, and tables of CCD heights; which of them it is, its ending and its keys tell. Values that contradict one
+    another are reported once everything else is in order.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Raises
+    ------
+    ConfigError
+        If it is of no kind that is known.
+    """
+    file = Path(path)
+    ending = file.suffix.lower()
+    if ending in _YAML:
+        return _yaml_file(file)
+    if ending in ENDINGS:
+        return Validation(str(file), "lens file", tuple(_lens_file(file)))
+    if ending in _TABLES:
+        return Validation(str(file), "heights", tuple(_caught(FocalPlane.from_file, file, HeightWarning)))
+    raise ConfigError(f"expected a file that ends in {', '.join((*ENDINGS, *_TABLES))}", file=file)
+
+
+@check_arguments
+def file_schema(kind: str) -> dict[str, Any]:
+    """Return the JSON schema of a kind of YAML file, for editors.
+
+    Parameters
+    ----------
+    kind : {"prescription", "run", "sweep", "images", "visits", "align", "site"}
+        Kind of file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such kind.
+    """
+    check_choice("kind", kind, [k.name for k in KINDS])
+    (found,) = (k for k in KINDS if k.name == kind)
+    return json_schema(found.model, f"pachon {kind}")
+
+
+def _yaml_file(path: Path) -> Validation:
+    try:
+        content = read_mapping(path, ConfigError, max_bytes=MAX_BYTES)
+    except PachonError as error:
+        return Validation(str(path), "YAML", (error,))
+    if "opticalSystem" in content:
+        return Validation(str(path), "lens file", tuple(_lens_file(path)))
+    kind = max(KINDS, key=lambda k: len(set(content) & _keys(k)))
+    if not set(content) & _keys(kind):
+        raise ConfigError(f"none of the keys of a {', '.join(k.name for k in KINDS)} is in it", file=path)
+    found = _schema_problems(kind, content, path)
+    if not found:
+        found = _caught(kind.load, path, HeightWarning)
+    return Validation(str(path), kind.name, tuple(_with_line(error, path) for error in found))
+
+
+def _keys(kind: FileKind) -> set[str]:
+    return {field.alias or name for name, field in kind.model.model_fields.items()}
+
+
+def _schema_problems(kind: FileKind, content: dict[str, Any], path: Path) -> list[PachonError]:
+    """Return the problems of single keys; of prescriptions also those of single media and surfaces."""
+    try:
+        prepared = kind.prepare(deepcopy(content), path)
+    except PachonError as error:
+        return [error]
+    context = {"folder": path.parent}
+    found = problems_of(kind.model, prepared, str(path), kind.error, context)
+    if found or kind.model is not Prescription:
+        return found
+    made = Prescription.model_validate(prepared, context=context)
+    return [error.within(file=path) for error in made.problems()]
+
+
+def _lens_file(path: Path) -> list[PachonError]:
+    """Return what a lenient reader warns of, and the error that stops it."""
+    return _caught(lambda file: load_telescope(file, lenient=True), path, PrescriptionWarning)
+
+
+def _caught(load: Callable[[Path], Any], path: Path, warning: type[Warning]) -> list[PachonError]:
+    """Return warnings of a kind, and the error that ends the loading of a file."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", warning)
+        error: list[PachonError] = []
+        try:
+            load(path)
+        except PachonError as problem:
+            error = [problem]
+    return [*(PrescriptionError(str(w.message)) for w in caught if issubclass(w.category, warning)), *error]
+
+
+def _with_line(error: PachonError, path: Path) -> PachonError:
+    """Return an error of a key with the line of the key, where the file has it."""
+    if error.place is not None or not error.key or error.file != str(path):
+        return error
+    line = line_of(path, error.key)
+    place = None if line is None else f"line {line}"
+    return type(error)(error.problem, subject=error.subject, file=error.file, place=place, key=error.key)

@@ -1,0 +1,23 @@
+import numpy as np
+import pytest
+
+import pachon
+
+
+def test_defocus_in_closed_form(paraboloid):
+    f_number, wavelength, shift = 20.0, 5e-7, 2e-4
+    result = pachon.strehl(paraboloid(2.0, f_number, shift=shift), [(0.0, 0.0)], wavelength)
+    rim = shift / (8 * f_number**2)
+    # W = rim rho^2: rms rim / sqrt(12), Strehl sinc^2; at f/20 to (1 / 4N)^2 and its square.
+    assert result.rms_wavefront[0, 0] == pytest.approx(rim / np.sqrt(12), rel=1e-3)
+    assert result.wavefront[0, 0] == pytest.approx(np.sinc(rim / wavelength) ** 2, rel=1e-3)
+    assert result.marechal[0, 0] == pytest.approx(np.exp(-((2 * np.pi * rim / wavelength) ** 2) / 12), rel=1e-3)
+    # The lattice of the image, 128 points across.
+    assert result.psf[0, 0] == pytest.approx(result.wavefront[0, 0], abs=5e-3)
+
+
+def test_the_image_may_be_left_out(paraboloid):
+    result = pachon.strehl(paraboloid(2.0, 20.0), [(0.0, 0.0)], [4e-7, 6e-7], from_psf=False)
+    assert np.isnan(result.psf).all()
+    assert result.wavefront == pytest.approx(1.0, abs=1e-9)
+    assert result.summary()["strehl_of_psf"] == [[None, None]]
