@@ -83,7 +83,7 @@ def draw_ccd(
     galaxies: Sources | GalaxiesIn,
     *,
     exposure: Exposure | None = None,
-    pointing: ArrayLike = (0.0, 0.0),
+    pointing: Any = (0.0, 0.0),
     position_angle: ArrayLike = 0.0,
     window: Window | None = None,
     way: str = "direct",

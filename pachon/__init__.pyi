@@ -65,6 +65,7 @@ from .imaging.scene import draw_ccd as draw_ccd
 from .imaging.simulate import simulate_images as simulate_images
 from .imaging.wcs import CcdWcs as CcdWcs
 from .imaging.wcs import ccd_wcs as ccd_wcs
+from .imaging.wcs import wcs as wcs
 from .models.aperture import Annulus as Annulus
 from .models.aperture import Circle as Circle
 from .models.aperture import Complement as Complement
@@ -180,6 +181,7 @@ from .sky.catalogue import read_galaxies as read_galaxies
 from .sky.catalogue import write_galaxies as write_galaxies
 from .sky.galaxies import Galaxies as Galaxies
 from .sky.mosaic import GalaxyStamps as GalaxyStamps
+from .sky.pointing import Pointing as Pointing
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
 from .studies.alignment.config import AlignConfig as AlignConfig

@@ -19,6 +19,7 @@ from ..core.files import parsing, read_bytes, write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
 from ..core.units import radians
 from .galaxies import Galaxies
+from .pointing import Pointing
 
 #: Endings of the files of tables.
 FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
@@ -137,18 +138,10 @@ def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndar
     DomainError
         If a position is 90 degrees or more from the pointing.
     """
-    ra, dec = radians(ra, "ra"), radians(dec, "dec")
-    center = radians(pointing, "pointing")
-    if center.shape != (2,):
-        raise DomainError(f"pointing = {pointing}: expected right ascension and declination")
-    turn = ra - center[0]
-    sine, cosine = np.sin(center[1]), np.cos(center[1])
-    depth = sine * np.sin(dec) + cosine * np.cos(dec) * np.cos(turn)
-    if not np.all(depth > 0.0):
+    sky = Pointing.of(pointing).from_celestial(ra, dec)
+    if not np.isfinite(sky).all():
         raise DomainError("ra, dec: expected positions within 90 deg of the pointing")
-    east = np.cos(dec) * np.sin(turn)
-    north = cosine * np.sin(dec) - sine * np.cos(dec) * np.cos(turn)
-    return east / depth, north / depth
+    return sky[..., 0], sky[..., 1]
 
 
 def _format(path: Path) -> str:
