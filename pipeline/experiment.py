@@ -252,7 +252,7 @@ class Experiment:
         content["telescope"] = name if name in bundled_names() else prescription_digest(name)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["active_optics"] = hashed_states(content["active_optics"])
-        content["stars"] = _hashed_stars(content["stars"])
+        content["stars"] = hashed_stars(content["stars"])
         if self.config.pointing is None:
             del content["pointing"]
         content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())
@@ -276,7 +276,7 @@ def hashed_states(section: dict[str, Any]) -> dict[str, Any]:
     return rest if name is None else rest | {"states": _name_or_content(name, (), STATE_ENDINGS)}
 
 
-def _hashed_stars(section: dict[str, Any]) -> dict[str, Any]:
+def hashed_stars(section: dict[str, Any]) -> dict[str, Any]:
     """Return the section of the stars for a hash: a catalogue by its content, no keys of it where there is none."""
     name = section["catalogue"]
     if name is None:

@@ -147,7 +147,8 @@ def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tu
     """Return where chief rays meet the nominal detector [m], shape [n, 2], NaN where none does, and whether they do."""
     with np.errstate(invalid="ignore"):
         inside = np.flatnonzero(np.hypot(*np.arctan(slopes).T) <= telescope.field_limit)
-    end = chief_rays(telescope, field_direction(*slopes[inside].T, "gnomonic"), wavelength)
+    light = field_direction(slopes[inside, 0], slopes[inside, 1], "gnomonic")
+    end = chief_rays(telescope, light, wavelength)
     lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
     places = np.full(slopes.shape, np.nan)
     places[inside[~lost]] = telescope.surfaces[-1].to_local(end.position)[~lost, :2]

@@ -99,7 +99,8 @@ def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
     center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], CAMERA.half_size
     rim = half - (RIM - 0.5) * CAMERA.pixel_size
     inside = half - (RIM + 0.5) * CAMERA.pixel_size
-    places = center + [[0, 0], [0, 0], [0, 0], [np.nan, 0], [rim, 0], [inside, 0], [0.0211, 0], [0, 0]]
+    offsets = np.array([[0, 0], [0, 0], [0, 0], [np.nan, 0], [rim, 0], [inside, 0], [0.0211, 0], [0, 0]])
+    places = center + offsets
     magnitudes = np.ma.masked_invalid([18.0, 16.9, 22.1, 18.0, 18.0, 19.0, 18.0, np.nan])
     Table({"x_m": places[:, 0], "y_m": places[:, 1], "mag": magnitudes, "g_r": magnitudes}).write(tmp_path / "a.ecsv")
     found = placed(tmp_path / "a.ecsv", telescope)
