@@ -158,6 +158,8 @@ from .pipeline.measure.star_selection import StarFlag as StarFlag
 from .pipeline.measure.star_selection import flag_stars as flag_stars
 from .pipeline.own_stars.own_stars import OwnStars as OwnStars
 from .pipeline.own_stars.own_stars import fit_own_stars as fit_own_stars
+from .pipeline.piff.comparison import PiffComparison as PiffComparison
+from .pipeline.piff.comparison import compare_with_piff as compare_with_piff
 from .pipeline.piff.psf import PiffPsf as PiffPsf
 from .pipeline.piff.psf import load_piff as load_piff
 from .pipeline.psf_model.model import PsfModel as PsfModel

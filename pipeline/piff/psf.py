@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, ProductError, shown
 from ...core.files import parsing
-from ...core.units import pure_numbers, require_count
+from ...core.units import ARCSEC, pure_numbers, require_count
 from ..psf_model.polynomial import as_positions
 from .interpolants import Interpolant, read_interpolant
 from .profiles import Profile, read_profile
@@ -117,6 +117,12 @@ class PiffPsf:
     def draw(self, x: float, y: float, *, chip: int | None = None, size: int = 25) -> np.ndarray:
         """Draw the PSF at one position; arguments as of :meth:`at`."""
         return self.at(np.array([[x, y]]), chip=chip, size=size)[0]
+
+    @check_arguments
+    def pixel_scale(self, position: ArrayLike, *, chip: int | None = None) -> float:
+        """Return the side of a square as large as a pixel at a position (x, y) [rad]."""
+        jacobian = self._chip(chip).world.at(as_positions(position))[1][0]
+        return float(np.sqrt(abs(np.linalg.det(jacobian))) * ARCSEC)
 
     def _chip(self, chip: int | None) -> PiffChip:
         if chip is None and len(self.chips) == 1:

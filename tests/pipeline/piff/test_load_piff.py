@@ -117,9 +117,7 @@ def test_world_coordinates_follow_the_stars():
 
 
 def test_too_few_stars_have_no_world_coordinates():
-    with pytest.raises(
-        ProductError, match=r"few\.piff: 5 stars, which have the world coordinates: expected at least"
-    ):
+    with pytest.raises(ProductError, match=r"few\.piff: 5 stars, which have the world coordinates: expected at least"):
         StarWorld.fit(FewStars(5), None)
     with pytest.raises(ProductError, match=r"its 12 stars have the world coordinates with errors of 0\.\d+: expected"):
         StarWorld.fit(FewStars(12, noise=0.01), None)
