@@ -191,7 +191,8 @@ def _stars(own: OwnStars, in_fit: np.ndarray, theirs: Shapes) -> Table:
         columns[f"{prefix}e1"] = (shapes.e1, "", f"ellipticity (a-b)/(a+b) along x, {text}")
         columns[f"{prefix}e2"] = (shapes.e2, "", f"ellipticity along x = y, {text}")
         columns[f"{prefix}size"] = (shapes.size / ARCSEC, "arcsec", f"(Q11 Q22 - Q12^2)^(1/4), {text}")
-    return described_table(columns, {"what": "stars, and two PSF models there"})
+    weight = {"weight_fwhm_arcsec": own.weight_fwhm / ARCSEC}
+    return described_table(columns, {"what": "stars, and two PSF models there", **weight})
 
 
 def _rho(own: OwnStars, stars: Shapes, model: Shapes, chosen: np.ndarray, bins: int) -> RhoStatistics:
