@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, error_context
-from ..core.units import ARCSEC
+from ..core.units import ARCSEC, angle
 from ..models.camera.camera import Camera, load_camera
 from ..models.telescope import Telescope
 from ..sky.pointing import Pointing
@@ -266,7 +266,7 @@ def wcs(
         load_camera(chosen),
         ccd,
         pointing=pointing,
-        position_angle=rotation,
+        position_angle=angle(rotation, "rotation"),
         wavelength=wavelength,
         threads=threads,
     )

@@ -154,6 +154,12 @@ def fewest_stars(config: Configuration) -> int:
     return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, term_count(fit.order or 0))
 
 
+def require_drawn_stars(config: Configuration) -> None:
+    """Raise ConfigError if a configuration has a catalogue of stars, where stars must be drawn."""
+    if config.stars.catalogue is not None:
+        raise ConfigError(f"stars.catalogue = {config.stars.catalogue}: expected none, these stars are drawn")
+
+
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     """Return the names of CCDs in the order of the camera, each once; rafts and ``all`` stand for all of theirs.
 

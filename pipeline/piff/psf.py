@@ -125,11 +125,11 @@ class PiffPsf:
         return float(np.sqrt(abs(np.linalg.det(jacobian))) * ARCSEC)
 
     def _chip(self, chip: int | None) -> PiffChip:
-        if chip is None and len(self.chips) == 1:
-            return next(iter(self.chips.values()))
-        if chip not in self.chips:
-            raise DomainError(f"chip = {shown(chip)}: expected one of {', '.join(map(str, self.chips))}")
-        return self.chips[chip]
+        known = tuple(self.chips)
+        number = known[0] if chip is None and len(known) == 1 else chip
+        if number is None or number not in known:
+            raise DomainError(f"chip = {shown(chip)}: expected one of {', '.join(map(str, known))}")
+        return self.chips[number]
 
 
 @check_arguments

@@ -19,6 +19,8 @@ from pachon.pipeline.run_folder import write_ccd
 from pachon.pipeline.simulate.ccd_exposure import ccd_stars
 from pachon.pipeline.simulate.ccd_loop import simulate_ccds
 from pachon.pipeline.star_list import RIM, place_stars
+from pachon.studies.psf_choice.plan import make_plan
+from pachon.studies.psf_choice.study import study_experiment
 
 CAMERA = pachon.lsst_camera()
 LIGHT = 620e-9
@@ -303,3 +305,10 @@ def test_images_have_the_stars_of_the_catalogue(catalogue, sky, places):
     assert distance.max() * 3600.0 < 3e-4
     with pytest.raises(PachonError, match=r"run\.pointing: expected none"):
         pachon.ImagesConfig(run=Configuration(pointing=POINTING)).experiment()
+
+
+def test_studies_that_draw_their_stars_take_no_catalogue(config):
+    with pytest.raises(PachonError, match=r"stars\.catalogue = .*: expected none, these stars are drawn"):
+        study_experiment(config, make_plan(config))
+    with pytest.raises(PachonError, match=r"run\.stars\.catalogue = .*: expected none"):
+        pachon.VisitsConfig(run=config).experiment()
