@@ -294,6 +294,7 @@ def _star_list(experiment: Experiment) -> StarList:
             Path(given(config.stars.catalogue)),
             experiment.telescope,
             experiment.camera,
+            given(config.ccds),
             wavelength=float(wavelengths[len(wavelengths) // 2]),
             band=given(config.band),
             brightest=given(config.stars.brightest),

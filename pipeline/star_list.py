@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,7 @@ def place_stars(
     path: Path,
     telescope: Telescope,
     camera: Camera,
+    ccds: Sequence[str],
     *,
     wavelength: float,
     band: str,
@@ -83,7 +85,7 @@ def place_stars(
     pointing: Pointing | None,
     columns: dict[str, str],
 ) -> StarList:
-    """Read a catalogue and trace the chief ray of each of its stars to the nominal detector.
+    """Read the stars of a catalogue on some CCDs, by chief rays traced to the nominal detector.
 
     Places are the first of these that the table has, units of the file honoured: right ascension and declination [deg],
     which need a `pointing`; field angles [deg], the slopes of the light as of the columns FIELD_X and FIELD_Y of a run;
@@ -97,21 +99,10 @@ def place_stars(
     ProductError
         If the file cannot be read, or lacks a column: one line with the names that were looked for.
     """
-    table = read_columns(path)
-    with error_context(file=path):
-        given = {key: _column(table, key, columns, band) for key in NAMES}
-        pair, unit = next(
-            ((pair, unit) for pair, unit in _PLACES if all(given[key] for key in pair)),
-            (("ra", "dec"), u.deg),
-        )
-        missing = [key for key in (*pair, "mag") if given[key] is None]
-        if missing:
-            looked = "; ".join(f"{key}: {', '.join(_names(key, columns, band))}" for key in missing)
-            raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
-        magnitude = _values(table, str(given["mag"]), None)
-        places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
-        if pair[0] == "ra" and pointing is None:
-            raise ConfigError("columns of right ascension and declination: expected pointing = {ra_deg, dec_deg}")
+    rows = _read(path, columns, band)
+    places, magnitude = rows.places, rows.magnitude
+    if rows.kind == "ra" and pointing is None:
+        raise ConfigError(f"{path}: right ascension and declination: expected pointing = {{ra_deg, dec_deg}}")
     counts = {"stars": len(places)}
 
     def keep(what: str, good: np.ndarray) -> None:
@@ -122,25 +113,51 @@ def place_stars(
     keep("without_place_or_magnitude", np.isfinite(places).all(axis=1) & np.isfinite(magnitude))
     keep("too_bright", magnitude >= brightest)
     keep("too_faint", magnitude <= faintest)
-    if pair[0] != "x":
-        if pointing is not None and pair[0] == "ra":
-            slopes = pointing.to_slopes(pointing.from_celestial(*places.T))
-        else:
-            slopes = np.tan(places)
+    if rows.kind != "x":
+        aim = pointing if rows.kind == "ra" else None
+        slopes = np.tan(places) if aim is None else aim.to_slopes(aim.from_celestial(*places.T))
         places, lands = _landings(telescope, slopes, wavelength)
         keep("outside_the_field", lands)
     keep("off_the_ccds", camera.ccd_at(*places.T) >= 0)
     ccd = camera.ccd_at(*places.T, margin=-RIM * camera.pixel_size)
     keep("at_the_rim_of_a_ccd", ccd >= 0)
     ccd = ccd[ccd >= 0]
+    chosen = np.isin(ccd, [camera.ccd_index(name) for name in ccds])
+    keep("on_other_ccds", chosen)
+    ccd = ccd[chosen]
     counts["on_the_ccds"] = len(ccd)
     stars = np.concatenate([places, magnitude[:, None]], axis=1)
     # Noise is drawn star by star: the same stars in another order of rows are the same run.
     order = np.lexsort((stars[:, 2], stars[:, 1], stars[:, 0], ccd))
     ccd, stars = ccd[order], stars[order]
-    first = np.searchsorted(ccd, np.arange(len(camera) + 1))
-    by_ccd = {name: stars[first[i] : first[i + 1]].copy() for i, name in enumerate(camera.ccd_names)}
-    return StarList(path.name, by_ccd, counts, tuple(name for name in _COLORS if name in table))
+    by_ccd = {name: stars[ccd == camera.ccd_index(name)] for name in ccds}
+    return StarList(path.name, by_ccd, counts, rows.unused)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a catalogue."""
+
+    kind: str  #: first column of the places: ra, field_x or x
+    places: np.ndarray  #: [n, 2], rad or m
+    magnitude: np.ndarray
+    unused: tuple[str, ...]  #: columns of colours
+
+
+def _read(path: Path, columns: dict[str, str], band: str) -> _Rows:
+    """Read places and magnitudes of all rows; ProductError if a column is missing or none of numbers."""
+    table = read_columns(path)
+    with error_context(file=path):
+        given = {key: _column(table, key, columns, band) for key in NAMES}
+        whole = [(pair, unit) for pair, unit in _PLACES if all(given[key] for key in pair)]
+        pair, unit = whole[0] if whole else _PLACES[0]
+        missing = [key for key in (*pair, "mag") if given[key] is None]
+        if missing:
+            looked = "; ".join(f"{key}: {', '.join(_names(key, columns, band))}" for key in missing)
+            raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
+        magnitude = _values(table, str(given["mag"]), None)
+        places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
+    return _Rows(pair[0], places, magnitude, tuple(name for name in _COLORS if name in table))
 
 
 def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:

@@ -99,7 +99,14 @@ def _use_piff(path):
 
 def _use_stars(path):
     options = {"wavelength": 6e-7, "band": "r", "brightest": 10.0, "faintest": 25.0, "columns": {}}
-    place_stars(path, pachon.load_telescope("lsst_v3.3_r"), CAMERA, pointing=pachon.Pointing(0.93, -0.49), **options)
+    place_stars(
+        path,
+        pachon.load_telescope("lsst_v3.3_r"),
+        CAMERA,
+        ("R22_S11",),
+        pointing=pachon.Pointing(0.93, -0.49),
+        **options,
+    )
 
 
 def _mesh(kind):

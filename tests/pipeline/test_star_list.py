@@ -56,7 +56,8 @@ def sky(telescope, places):
 
 def placed(path, telescope, **options):
     settings = {"brightest": 17.0, "faintest": 22.0, "pointing": AIM, "columns": {}, "band": "r"} | options
-    return place_stars(path, telescope, CAMERA, wavelength=LIGHT, **settings)
+    ccds = settings.pop("ccds", CCDS)
+    return place_stars(path, telescope, CAMERA, ccds, wavelength=LIGHT, **settings)
 
 
 def expect(found, places, magnitudes):
@@ -113,8 +114,10 @@ def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
         "too_faint": 1,
         "off_the_ccds": 1,
         "at_the_rim_of_a_ccd": 1,
+        "on_other_ccds": 0,
         "on_the_ccds": 2,
     }
+    assert placed(tmp_path / "a.ecsv", telescope, ccds=CCDS[1:]).counts["on_other_ccds"] == 2
     assert found.text.endswith("1 off the ccds, 1 at the rim of a ccd, 2 on the ccds; column g_r is not used")
     # The other side of the sky, and 3 degrees from the axis, where the design ends at 2.5.
     Table({"ra": [233.1, 53.1], "dec": [27.8, -24.8], "mag": [18.0, 18.0]}).write(tmp_path / "b.ecsv")
@@ -127,7 +130,7 @@ def test_the_order_of_the_rows_does_not_matter(tmp_path, telescope, places, magn
     table.write(tmp_path / "a.fits")
     table[np.random.default_rng(1).permutation(len(table))].write(tmp_path / "b.fits")
     a, b = (placed(tmp_path / name, telescope) for name in ("a.fits", "b.fits"))
-    assert all(np.array_equal(a.stars[name], b.stars[name]) for name in CAMERA.ccd_names)
+    assert all(np.array_equal(a.stars[name], b.stars[name]) for name in CCDS)
     assert a.counts == b.counts
 
 
