@@ -3,14 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
 from .inputs import configured_experiment
 from .interrupt import interruptible
-from .options import Ccds, Config, Json, ObservedStars, Quiet, Raft, Threads, TruthStars, name_list, one_name_list
+from .options import (
+    Ccds,
+    Config,
+    Gain,
+    Json,
+    MinSnr,
+    ObservedStars,
+    Quiet,
+    Raft,
+    StarImages,
+    StarStamp,
+    StarX,
+    StarY,
+    Threads,
+    TruthStars,
+    name_list,
+    one_name_list,
+)
 from .tables import Rows, print_json, wide_console
 
 app = typer.Typer()
@@ -18,25 +35,44 @@ app = typer.Typer()
 
 @app.command("diagnose")
 def diagnose_command(
-    folder: Annotated[Path, Argument(metavar="RUN_FOLDER", help="Folder of a run, finished or not.")],
-    out: Annotated[Path | None, Option(help="Folder to write to; by default diagnostics, in that of the run.")] = None,
+    folder: Annotated[
+        Path, Argument(metavar="RUN_FOLDER", help="Folder of a run, finished or not; with --piff a table of stars.")
+    ],
+    out: Annotated[
+        Path | None, Option(help="Folder to write to; by default diagnostics, in that of the run, or STARS_piff.")
+    ] = None,
     strict: Annotated[bool, Option("--strict", help="End at the first CCD without a readable product.")] = False,
+    piff: Annotated[Path | None, Option(help="File of Piff, to be compared with our model at the stars.")] = None,
+    chip: Annotated[int | None, Option(help="Chip of the Piff file, where it has several.")] = None,
+    x: StarX = "x",
+    y: StarY = "y",
+    stamp: StarStamp = "stamp",
+    images: StarImages = None,
+    min_snr: MinSnr = 20.0,
+    gain: Gain = 1.0,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Measure the residuals of a run: ellipticity and size of each CCD, correlations, rho statistics, with jackknife.
 
     Side by side: residuals at the stars of the fit, which are too small, leave-one-out residuals, and residuals at
-    holdout positions. Tables (ECSV), plots and all metrics (diagnostics.json) go into one folder.
+    holdout positions. Tables (ECSV), plots and all metrics (diagnostics.json) go into one folder. With `--piff`, a PSF
+    model of Piff and one of ours are compared at the stars of a table, as `pachon model` takes it.
 
     **Examples**
 
     - `pachon diagnose pachon_run`
     - `pachon diagnose pachon_run --out residuals`
     - `pachon diagnose pachon_run --json`: all metrics on standard output
+    - `pachon diagnose stars.fits --piff stars.piff`: Piff and ours side by side
     """
     from ..pipeline.report.diagnostics import diagnose
     from ..pipeline.report.tables import DIAGNOSTICS_CAPTION, DIAGNOSTICS_COLUMNS, diagnostics_rows
 
+    if piff is not None:
+        columns = {"x": x, "y": y, "stamp": stamp, "images": images}
+        _compare(folder, piff, out, columns, {"chip": chip, "min_snr": min_snr, "gain": gain}, quiet, as_json)
+        return
     result = diagnose(folder, out, strict=strict)
     if as_json:
         print_json(result.as_dict())
@@ -46,6 +82,32 @@ def diagnose_command(
         reason = next(iter(result.missing.values()))
         wide_console().print(f"{len(result.missing)} CCDs are left out; the first: {reason}", style="bold")
     print(f"diagnostics: {result.folder.resolve()}")
+
+
+def _compare(
+    stars: Path,
+    piff: Path,
+    out: Path | None,
+    columns: dict[str, Any],
+    options: dict[str, Any],
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Compare a model of Piff with ours at the stars of a table."""
+    from ..pipeline.measure.star_catalogue import load_stars
+    from ..pipeline.piff.comparison import compare_with_piff
+    from ..pipeline.piff.psf import load_piff
+    from ..pipeline.report.tables import PIFF_CAPTION, PIFF_COLUMNS, piff_rows
+
+    folder = stars.with_name(f"{stars.stem}_piff") if out is None else out
+    with interruptible(quiet) as reporter, reporter.stage(f"PSF of {stars.name}"):
+        found = compare_with_piff(load_piff(piff), *load_stars(stars, **columns), **options)
+        found.write(folder)
+    if as_json:
+        print_json(found.as_dict())
+    elif not quiet:
+        Rows(PIFF_COLUMNS, piff_rows(found.models), PIFF_CAPTION).show()
+        print(f"comparison: {folder.resolve()}")
 
 
 @app.command("attribute")

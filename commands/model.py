@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from .interrupt import interruptible
-from .options import Json, Quiet
+from .options import Gain, Json, MinSnr, Quiet, StarImages, StarStamp, StarX, StarY
 from .tables import Rows, print_json
 
 app = typer.Typer()
@@ -20,13 +20,13 @@ def model_command(
     stars: Annotated[Path, Argument(metavar="STARS", help="FITS or ECSV table of stars with stamps.")],
     out: Annotated[Path | None, Option("--out", "-o", help="PSF model to write; STARS_psf.fits by default.")] = None,
     pixel_arcsec: Annotated[float, Option(help="Side of a pixel [arcsec].")] = 0.2,
-    x: Annotated[str, Option(help="Column of x; names of SExtractor and LSST are known.")] = "x",
-    y: Annotated[str, Option(help="Column of y.")] = "y",
-    stamp: Annotated[str, Option(help="Column of the stamps [ny, nx].")] = "stamp",
-    images: Annotated[Path | None, Option(help="FITS cube of the stamps, where the table has none.")] = None,
+    x: StarX = "x",
+    y: StarY = "y",
+    stamp: StarStamp = "stamp",
+    images: StarImages = None,
     size: Annotated[int | None, Option(help="Side of the PSF [pixel], odd; that of the stamps less a rim.")] = None,
-    min_snr: Annotated[float, Option(help="Least S/N of a star.")] = 20.0,
-    gain: Annotated[float, Option(help="Electrons in a unit of the stamps.")] = 1.0,
+    min_snr: MinSnr = 20.0,
+    gain: Gain = 1.0,
     saturation: Annotated[float | None, Option(help="Level from which on a pixel is saturated.")] = None,
     background: Annotated[bool, Option(help="Subtract the median of the outer pixels of each stamp.")] = True,
     quiet: Quiet = False,

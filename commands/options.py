@@ -50,6 +50,12 @@ Picture = Annotated[
     Path | None,
     Option("--picture", "-o", help="Picture to write, .png, .pdf or .svg; by default named after command and model."),
 ]
+StarX = Annotated[str, Option("--x", help="Column of x; names of SExtractor and LSST are known.")]
+StarY = Annotated[str, Option("--y", help="Column of y.")]
+StarStamp = Annotated[str, Option("--stamp", help="Column of the stamps [ny, nx].")]
+StarImages = Annotated[Path | None, Option("--images", help="FITS cube of the stamps, where the table has none.")]
+MinSnr = Annotated[float, Option(help="Least S/N of a star.")]
+Gain = Annotated[float, Option(help="Electrons in a unit of the stamps.")]
 Threads = Annotated[int | None, Option(min=1, help="Threads; all processors by default. No byte depends on it.")]
 Quiet = Annotated[bool, Option("--quiet", help="No progress, no table.")]
 Json = Annotated[bool, Option("--json", help="Print metrics as JSON on standard output, and nothing else there.")]

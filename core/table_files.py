@@ -1,4 +1,4 @@
-"""Tables as ECSV, CSV, FITS and Parquet files."""
+"""Tables as ECSV, CSV, FITS and Parquet files, written and read."""
 
 from __future__ import annotations
 
@@ -7,20 +7,57 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
-from astropy.utils.exceptions import AstropyUserWarning
+from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
-from .errors import ConfigError
-from .files import write_bytes
+from .errors import ConfigError, PachonError, ProductError
+from .files import parsing, read_bytes, write_bytes
 from .products import card_text
 
 #: Formats of astropy, or Parquet, by the ending of the file.
 FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits", ".parquet": "parquet"}
+#: Endings of files that are read.
+ENDINGS = (*FORMATS, ".fit")
 #: Values, unit in FITS notation and description.
 Described = tuple[np.ndarray, str, str]
+
+
+def read_columns(path: Path) -> dict[str, Any]:
+    """Return the columns of a file, of FITS its first table, by their names in small letters.
+
+    Raises
+    ------
+    ProductError
+        If the file has another ending, cannot be read or is damaged, or pyarrow is missing.
+    """
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise ProductError(f"ending {path.suffix!r}: expected one of {', '.join(ENDINGS)}", file=path)
+    kind = FORMATS.get(ending, "fits")
+    data = read_bytes(path, ProductError)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)
+        with parsing(path, f"damaged or no {kind.removeprefix('ascii.').upper()} table", ProductError):
+            if kind == "parquet":
+                content = parquet_module(path, ProductError).read_table(io.BytesIO(data))
+                return {name.lower(): content[name].to_numpy() for name in content.column_names}
+            # Numbers of a CSV file that are left out are masked.
+            source: Any = io.BytesIO(data) if kind == "fits" else data.decode().splitlines()
+            table = Table.read(source, format=kind)
+    return {name.lower(): table[name] for name in table.colnames}
+
+
+def parquet_module(path: Path, error: type[PachonError]) -> Any:
+    """Return pyarrow's module for Parquet, or raise an error that names the file."""
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise error("Parquet needs the package pyarrow: pip install 'pachon[parquet]'", file=path) from None
+    return parquet
 
 
 def write_table(path: Path, table: Table, images: Mapping[str, Described] = MappingProxyType({})) -> None:
@@ -63,11 +100,9 @@ def _encoded(table: Table, kind: str, path: Path, images: Mapping[str, Described
         whole = io.BytesIO()
         hdus.writeto(whole)
         return whole.getvalue()
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        raise ConfigError("Parquet needs the package pyarrow: pip install 'pachon[parquet]'", file=path) from None
+    parquet = parquet_module(path, ConfigError)
+    import pyarrow
+
     arrays = {name: pyarrow.array(np.asarray(table[name]).tolist()) for name in table.colnames}
     parquet.write_table(pyarrow.table(arrays), data)
     return data.getvalue()

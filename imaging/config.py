@@ -20,21 +20,11 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, error_context
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
-from ..pipeline.config import Configuration, digest, section_yaml, with_options, with_run
+from ..pipeline.config import Configuration, PointingConfig, digest, section_yaml, with_options, with_run
 from ..pipeline.experiment import Experiment
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
 PSF_STAMP = 63
-
-_Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=-90, le=90)]
-
-
-class PointingConfig(Section):
-    """Where the telescope looks."""
-
-    ra_deg: Real = Field(0.0, description="right ascension of the optical axis [deg]")
-    dec_deg: _Declination = Field(0.0, description="declination of the optical axis [deg]")
-    position_angle_deg: Real = Field(0.0, description="of the telescope's +y, from north through east [deg]")
 
 
 class GalaxiesConfig(Section):
@@ -89,6 +79,10 @@ class ImagesConfig(Section):
         run = self.run
         if run.psf.stamp is None:
             run = with_options(run, psf__stamp=PSF_STAMP)
+        if run.pointing not in (None, self.pointing):
+            raise ConfigError("run.pointing: expected none, or that of the images, under pointing")
+        if run.stars.catalogue is not None:
+            run = run.model_copy(update={"pointing": self.pointing})
         with error_context(subject="run"):
             return Experiment.from_config(run, folder)
 

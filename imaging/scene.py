@@ -83,7 +83,7 @@ def draw_ccd(
     galaxies: Sources | GalaxiesIn,
     *,
     exposure: Exposure | None = None,
-    pointing: ArrayLike = (0.0, 0.0),
+    pointing: Any = (0.0, 0.0),
     position_angle: ArrayLike = 0.0,
     window: Window | None = None,
     way: str = "direct",
@@ -235,6 +235,8 @@ def _add_stars(
     width = effective_fwhm(psf.model.mean[None], scale)
     provisional = ccd_stars(experiment, ccd, width)
     pixels = to_pixel(experiment, ccd, provisional.observed)
+    if not len(pixels):
+        return {"PIXEL": pixels, "MAG": provisional.magnitude, "FLUX": provisional.magnitude}
     lit = float(psf.lit_fraction(pixels).min())
     if not lit > 0.0:
         raise DomainError("no light reaches some stars: expected a CCD within the field of the telescope")

@@ -1,11 +1,6 @@
 """World coordinates of a CCD: pixels, tangent plane and celestial coordinates, fitted to traced chief rays.
 
-The tangent plane is the gnomonic one about the pointing of the telescope, xi towards east and eta towards north. The
-source of light of slopes (tx, ty) lies the opposite way, at X = -tx, Y = -ty along the axes of the telescope. With the
-position angle rho of the telescope's +y, from north through east,
-
-    xi = X cos(rho) + Y sin(rho),    eta = -X sin(rho) + Y cos(rho).
-
+The tangent plane is that of a :class:`~pachon.Pointing`, whose module has the formulas.
 Headers are TAN, or TAN-SIP (Shupe et al. 2005, ASP Conf. 347, 491) with the pointing as reference point of all CCDs.
 """
 
@@ -13,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import comb
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -21,10 +17,11 @@ from numpy.polynomial.polynomial import polyder, polyval2d
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
-from ..core.errors import DomainError
-from ..core.units import ARCSEC, angle, radians
-from ..models.camera.camera import Camera
+from ..core.errors import ConfigError, DomainError, error_context
+from ..core.units import ARCSEC, angle
+from ..models.camera.camera import Camera, load_camera
 from ..models.telescope import Telescope
+from ..sky.pointing import Pointing
 from ..wavefront.chief_rays import fields_at
 
 #: Largest error of the fit at pixels between those of the fit [rad]. Catalogues are good to a few milliarcseconds.
@@ -98,12 +95,7 @@ class CcdWcs:
     @check_arguments
     def to_celestial(self, sky: ArrayLike) -> np.ndarray:
         """Return right ascension and declination [rad], shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
-        xi, eta = np.atleast_2d(np.asarray(sky, dtype=np.float64)).T
-        ra, dec = self.pointing
-        along = np.cos(dec) - eta * np.sin(dec)
-        alpha = ra + np.arctan2(xi, along)
-        delta = np.arctan2(np.sin(dec) + eta * np.cos(dec), np.hypot(xi, along))
-        return np.stack([alpha % (2.0 * np.pi), delta], axis=1)
+        return Pointing(*self.pointing).to_celestial(sky)
 
     @check_arguments
     def to_header(self, corner: tuple[int, int] = (0, 0)) -> fits.Header:
@@ -149,7 +141,7 @@ def ccd_wcs(
     camera: Camera,
     ccd: str,
     *,
-    pointing: ArrayLike = (0.0, 0.0),
+    pointing: Any = (0.0, 0.0),
     position_angle: ArrayLike = 0.0,
     wavelength: ArrayLike | None = None,
     threads: int | None = None,
@@ -167,7 +159,7 @@ def ccd_wcs(
         The camera.
     ccd : str
         Name of the CCD.
-    pointing : array_like or Quantity, shape [2]
+    pointing : (float, float), Quantity or SkyCoord
         Right ascension and declination of the optical axis [rad].
     position_angle : float or Quantity
         Angle of the telescope's +y from north through east [rad].
@@ -183,12 +175,7 @@ def ccd_wcs(
     DomainError
         If the pointing is no pair of finite angles with a declination up to 90 deg, or no polynomial is good enough.
     """
-    angles, rho = radians(pointing, "pointing"), angle(position_angle, "position_angle")
-    if angles.shape != (2,) or not np.isfinite(angles).all() or abs(angles[1]) > 0.5 * np.pi or not np.isfinite(rho):
-        raise DomainError(
-            f"pointing = {pointing!r}, position_angle = {position_angle!r}: expected finite angles, "
-            "declinations from -90 to 90 deg"
-        )
+    aim = Pointing.of(pointing, position_angle)
     center, pixels = camera.centers[camera.ccd_index(ccd)], camera.pixels
     middle, half = 0.5 * (pixels - 1), 0.5 * pixels
 
@@ -198,9 +185,10 @@ def ccd_wcs(
         line = np.cos(np.pi * (np.arange(points) + 0.5) / points) / np.cos(0.5 * np.pi / points)
         places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         positions = center + half * camera.pixel_size * places
-        slopes = fields_at(telescope, positions, wavelength, projection="gnomonic", threads=threads)
-        x, y = -slopes.T
-        return places, np.stack([x * np.cos(rho) + y * np.sin(rho), y * np.cos(rho) - x * np.sin(rho)], axis=1)
+        with error_context(subject=f"CCD {ccd}"):
+            slopes = fields_at(telescope, positions, wavelength, projection="gnomonic", threads=threads)
+            telescope.check_field(*np.arctan(slopes.T))
+        return places, aim.to_sky(slopes)
 
     fit, check = traced(_FIT_POINTS), traced(_CHECK_POINTS)
     for order in range(1, _MOST + 1):
@@ -219,7 +207,7 @@ def ccd_wcs(
     inverse = _fitted(target, offset, order)
     # Zero point and angles of the pointing modulo a turn: equal skies have equal headers.
     return CcdWcs(
-        pointing=(float(angles[0] % (2.0 * np.pi)), float(angles[1])),
+        pointing=(aim.ra % (2.0 * np.pi), aim.dec),
         shape=(pixels, pixels),
         reference_pixel=reference + middle,
         cd=linear,
@@ -227,6 +215,62 @@ def ccd_wcs(
         inverse=inverse,
         error=error,
     )
+
+
+@check_arguments
+def wcs(
+    telescope: Telescope,
+    ccd: str,
+    pointing: Any,
+    rotation: ArrayLike = 0.0,
+    *,
+    camera: str | Camera | None = None,
+    wavelength: ArrayLike | None = None,
+    threads: int | None = None,
+) -> WCS:
+    """Return the world coordinates of a CCD as the WCS of astropy, TAN or TAN-SIP, without refraction by the air.
+
+    It is :meth:`CcdWcs.astropy` of :func:`ccd_wcs`, whose directions agree with traced chief rays to
+    :data:`TOLERANCE`. The array of a CCD is a mirror image of the sky: the determinant of its CD matrix is positive.
+
+    Parameters
+    ----------
+    telescope : Telescope
+        The telescope, its rotator included (:meth:`~pachon.Telescope.with_rotator`).
+    ccd : str
+        Name of the CCD.
+    pointing : (float, float), Quantity or SkyCoord
+        Right ascension and declination of the optical axis [rad].
+    rotation : float or Quantity
+        Position angle of the telescope's +y, from north through east [rad]; that of the camera's +y is less than it by
+        the angle of the rotator.
+    camera : str or Camera, optional
+        The camera; that of the telescope if not given.
+    wavelength, threads
+        As in :func:`ccd_wcs`.
+
+    Raises
+    ------
+    ConfigError
+        If the telescope has no camera and none is given.
+    UnknownNameError
+        If the camera has no such CCD.
+    DomainError
+        If the pointing is none, a corner of the CCD lies outside the field, or no polynomial is good enough.
+    """
+    chosen = telescope.camera if camera is None else camera
+    if chosen is None:
+        raise ConfigError(f"camera = None: expected a camera for {telescope.name}, which has none of its own")
+    fitted = ccd_wcs(
+        telescope,
+        load_camera(chosen),
+        ccd,
+        pointing=pointing,
+        position_angle=angle(rotation, "rotation"),
+        wavelength=wavelength,
+        threads=threads,
+    )
+    return fitted.astropy()
 
 
 def _forward(places: np.ndarray, sky: np.ndarray, order: int, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

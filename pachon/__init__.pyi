@@ -111,6 +111,7 @@ from .imaging.scene import draw_ccd as draw_ccd
 from .imaging.simulate import simulate_images as simulate_images
 from .imaging.wcs import CcdWcs as CcdWcs
 from .imaging.wcs import ccd_wcs as ccd_wcs
+from .imaging.wcs import wcs as wcs
 from .models.aperture import Annulus as Annulus
 from .models.aperture import Circle as Circle
 from .models.aperture import Complement as Complement
@@ -217,6 +218,10 @@ from .pipeline.measure.star_selection import StarFlag as StarFlag
 from .pipeline.measure.star_selection import flag_stars as flag_stars
 from .pipeline.own_stars.own_stars import OwnStars as OwnStars
 from .pipeline.own_stars.own_stars import fit_own_stars as fit_own_stars
+from .pipeline.piff.comparison import PiffComparison as PiffComparison
+from .pipeline.piff.comparison import compare_with_piff as compare_with_piff
+from .pipeline.piff.psf import PiffPsf as PiffPsf
+from .pipeline.piff.psf import load_piff as load_piff
 from .pipeline.psf_model.model import PsfModel as PsfModel
 from .pipeline.run import RunResult as RunResult
 from .pipeline.run import run as run
@@ -240,6 +245,7 @@ from .sky.catalogue import read_galaxies as read_galaxies
 from .sky.catalogue import write_galaxies as write_galaxies
 from .sky.galaxies import Galaxies as Galaxies
 from .sky.mosaic import GalaxyStamps as GalaxyStamps
+from .sky.pointing import Pointing as Pointing
 from .sky.population import GalaxyPopulation as GalaxyPopulation
 from .sky.population import draw_galaxies as draw_galaxies
 from .studies.alignment.config import AlignConfig as AlignConfig

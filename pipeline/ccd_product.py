@@ -40,6 +40,8 @@ _COLUMNS: dict[str, tuple[str, _Unit, str]] = {
     "y": ("Y", _MM, "detector y"),
     "field_x": ("FIELD_X", _DEG, "field angle, slope of the light along x"),
     "field_y": ("FIELD_Y", _DEG, "field angle, slope of the light along y"),
+    "ra": ("RA", _DEG, "right ascension, ICRS, without refraction"),
+    "dec": ("DEC", _DEG, "declination, ICRS, without refraction"),
     "magnitude": ("MAG", _Unit("mag", 1.0), "AB magnitude"),
     "electrons": ("ELECTRON", _Unit("electron", 1.0), "electrons of the star in the exposure"),
     "snr": ("SNR", _NONE, "signal to noise of PSF photometry"),
@@ -73,9 +75,9 @@ _OWN = {"CCD_E1": "MODEL_E1", "CCD_E2": "MODEL_E2", "CCD_SIZE": "MODELSZ"}
 class Stars:
     """Positions and shapes, one array element a star.
 
-    Where the model is one of the whole focal plane, ``ccd_`` has the ellipticity and size [rad] of the CCD's own model,
-    and ``sigma_`` the uncertainty (standard deviation) that the focal-plane model predicts of its own; else all are
-    None.
+    ``ra`` and ``dec`` are None without a pointing. Where the model is one of the whole focal plane, ``ccd_`` has the
+    ellipticity and size [rad] of the CCD's own model, and ``sigma_`` the uncertainty (standard deviation) that the
+    focal-plane model predicts of its own; else all are None.
     """
 
     x: np.ndarray  #: detector position [m]
@@ -89,6 +91,8 @@ class Stars:
     model_e1: np.ndarray  #: ellipticity of the model at the position of the star
     model_e2: np.ndarray
     model_size: np.ndarray  #: weighted rms size of the model there [rad]
+    ra: np.ndarray | None = field(default=None, kw_only=True)  #: right ascension and declination [rad]
+    dec: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e1: np.ndarray | None = field(default=None, kw_only=True)
     ccd_e2: np.ndarray | None = field(default=None, kw_only=True)
     ccd_size: np.ndarray | None = field(default=None, kw_only=True)

@@ -33,6 +33,7 @@ from ..core.yaml_reader import read_mapping
 
 BandName = Literal["u", "g", "r", "i", "z", "y"]
 _Model = TypeVar("_Model", bound=Section)
+_Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=-90, le=90)]
 
 
 class StarsConfig(Section):
@@ -44,6 +45,27 @@ class StarsConfig(Section):
     neighbours: Fraction = Field(0.0, description="fraction of the observed stars with a neighbour on their stamp")
     cosmic_rays: Fraction = Field(0.0, description="fraction of the observed stars that a cosmic ray crosses")
     saturated: Fraction = Field(0.0, description="fraction of the observed stars, the brightest, with a saturated core")
+
+    catalogue: str | None = Field(
+        None, description="path of a table of stars to observe in place of drawn ones: .ecsv, .csv, .fits, .parquet"
+    )
+    columns: dict[str, str] = Field(
+        default_factory=dict, description="names of its columns: {ra: RAJ2000, dec: DEJ2000, mag: rmag}"
+    )
+    brightest: Real | None = Field(
+        None, description="brightest star of the catalogue [AB mag]; by default the one that saturates"
+    )
+    faintest: Real | None = Field(
+        None, description="faintest star of the catalogue [AB mag]; by default that of snr_min in 0.6 arcsec"
+    )
+
+
+class PointingConfig(Section):
+    """Where the telescope looks."""
+
+    ra_deg: Real = Field(0.0, description="right ascension of the optical axis [deg]")
+    dec_deg: _Declination = Field(0.0, description="declination of the optical axis [deg]")
+    position_angle_deg: Real = Field(0.0, description="of the telescope's +y, from north through east [deg]")
 
 
 class MotionConfig(Section):
@@ -222,6 +244,9 @@ class Configuration(Section):
         default_factory=dict, description="changes of the prescription: {M2.dz_um: 10, Camera.rx_urad: 5, M1.Z5_nm: 20}"
     )
     rotator_deg: Real = Field(0.0, description="angle of the camera, from +x towards +y of the telescope [deg]")
+    pointing: PointingConfig | None = Field(
+        None, description="for celestial coordinates: {ra_deg: 53.1, dec_deg: -27.8, position_angle_deg: 30}"
+    )
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from ..core.errors import ConfigError, error_context
 from ..core.schema import shown
+from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera, load_camera
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
@@ -30,7 +31,9 @@ from .config import BandName, Configuration
 from .psf_model.fit import COMPONENTS, ORDERS
 from .psf_model.polynomial import term_count
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
+from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturation_magnitude
 from .simulate.screen_cover import check_screens
+from .star_list import NAMES
 
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
 DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
@@ -81,6 +84,16 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if active.states is not None:
         active = active.model_copy(update={"states": _absolute(active.states, folder, (), STATE_ENDINGS)})
     site = load_site(site_name)
+    stars = config.stars
+    if stars.catalogue is not None:
+        width, seconds = PROVISIONAL_FWHM, atmosphere.exposure_s
+        stars = _filled(
+            stars.model_copy(update={"catalogue": _absolute(stars.catalogue, folder, (), STAR_ENDINGS)}),
+            {
+                "brightest": round(saturation_magnitude(band, seconds, width), 3),
+                "faintest": round(limiting_magnitude(stars.snr_min, band, seconds, width), 3),
+            },
+        )
     wavelengths = config.wavelengths_nm
     if wavelengths is None:
         low, high = telescope.band or telescope.wavelength_range
@@ -91,6 +104,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "telescope": name,
             "ccds": chosen_ccds(camera, DEFAULT_CCDS if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
+            "stars": stars,
             "focal_plane": plane,
             "active_optics": active,
             "atmosphere": _filled(
@@ -132,6 +146,18 @@ def noise_free_components(config: Configuration) -> int:
     """Return how many principal components describe the noise-free PSFs of a resolved configuration."""
     components = config.reconstruction.components
     return min(COMPONENTS, config.stars.truth - 1) if components is None else components
+
+
+def fewest_stars(config: Configuration) -> int:
+    """Return how many observed stars the PSF model of a resolved configuration needs on a CCD."""
+    fit = config.reconstruction
+    return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, term_count(fit.order or 0))
+
+
+def require_drawn_stars(config: Configuration) -> None:
+    """Raise ConfigError if a configuration has a catalogue of stars, where stars must be drawn."""
+    if config.stars.catalogue is not None:
+        raise ConfigError(f"stars.catalogue = {config.stars.catalogue}: expected none, these stars are drawn")
 
 
 def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
@@ -183,7 +209,21 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         raise ConfigError(
             f"reconstruction.weights = {fit.weights}: expected equal with interpolation = {fit.interpolation}"
         )
-    for kind in ("observed", "truth"):
+    if stars.catalogue is None:
+        for key in ("columns", "brightest", "faintest"):
+            if getattr(stars, key):
+                raise ConfigError(f"stars.{key} = {shown(getattr(stars, key))}: expected stars.catalogue")
+    else:
+        for key in stars.columns:
+            if key not in NAMES:
+                raise ConfigError(
+                    f"stars.columns.{key} = {shown(stars.columns[key])}: expected keys of {', '.join(NAMES)}"
+                )
+        if not given(stars.brightest) < given(stars.faintest):
+            raise ConfigError(
+                f"stars.faintest = {stars.faintest:g}: expected more than stars.brightest = {stars.brightest:g}"
+            )
+    for kind in ("truth",) if stars.catalogue else ("observed", "truth"):
         count = getattr(stars, kind)
         # The noise-free PSFs are always described by principal components.
         components = noise_free_components(config) if kind == "truth" else fit.components

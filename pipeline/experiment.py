@@ -18,6 +18,7 @@ from ..core.errors import ConfigError, PachonError, PrescriptionError, error_con
 from ..core.files import read_bytes
 from ..core.progress import Reporter
 from ..core.random_streams import stream
+from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
 from ..models.camera.focal_plane import FocalPlane
@@ -29,6 +30,7 @@ from ..models.io.prescription import ENDINGS, bundled_names, prescription_digest
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
+from ..sky.pointing import Pointing
 from ..wavefront.aberration import ResidualWavefront
 from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
@@ -38,6 +40,10 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
+from .star_list import StarList, place_stars
+
+#: Keys of the stars that a configuration without a catalogue did not have once.
+_CATALOGUE_KEYS = ("catalogue", "columns", "brightest", "faintest")
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,8 @@ class Experiment:
     atmosphere_only : bool
         Whether an ideal telescope replaces the optics, at the same field angles: without the aberrations of the design,
         the CCD heights and the active optics.
+    star_list : StarList or None
+        Stars of the catalogue of the configuration; None where stars are drawn.
     """
 
     config: Configuration
@@ -70,6 +78,7 @@ class Experiment:
     aberration: ResidualWavefront | None
     site: Site
     atmosphere_only: bool = False
+    star_list: StarList | None = None
 
     @classmethod
     @check_arguments
@@ -95,9 +104,10 @@ class Experiment:
         if config.active_optics.residual_um > 0.0:
             rms = config.active_optics.residual_um * 1e-6
             aberration = ResidualWavefront.draw(telescope, rms, config.seed, config.atmosphere.epoch)
-        return cls(
+        made = cls(
             config, telescope, _focal_plane(config, resolved.camera), _atmosphere(config, site), aberration, site
         )
+        return made if config.stars.catalogue is None else replace(made, star_list=_star_list(made))
 
     @property
     def camera(self) -> Camera:
@@ -113,6 +123,19 @@ class Experiment:
     def pixel_size(self) -> float:
         """Pixel of the stamps [m]."""
         return given(self.config.psf.pixel_um) * 1e-6
+
+    @property
+    def pointing(self) -> Pointing | None:
+        """Where the telescope looks, and its orientation on the sky; None where it does not matter."""
+        aim = self.config.pointing
+        if aim is None:
+            return None
+        return Pointing(*map(math.radians, (aim.ra_deg, aim.dec_deg, aim.position_angle_deg)))
+
+    @check_arguments
+    def observed_count(self, ccd: str) -> int:
+        """Return the number of observed stars on a CCD."""
+        return self.config.stars.observed if self.star_list is None else len(self.star_list.on(ccd)[1])
 
     @property
     def stamp_size(self) -> int:
@@ -229,6 +252,9 @@ class Experiment:
         content["telescope"] = name if name in bundled_names() else prescription_digest(name)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["active_optics"] = hashed_states(content["active_optics"])
+        content["stars"] = hashed_stars(content["stars"])
+        if self.config.pointing is None:
+            del content["pointing"]
         content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())
         return digest(content)
 
@@ -248,6 +274,34 @@ def hashed_states(section: dict[str, Any]) -> dict[str, Any]:
     name = section["states"]
     rest = {key: value for key, value in section.items() if key != "states"}
     return rest if name is None else rest | {"states": _name_or_content(name, (), STATE_ENDINGS)}
+
+
+def hashed_stars(section: dict[str, Any]) -> dict[str, Any]:
+    """Return the section of the stars for a hash: a catalogue by its content, no keys of it where there is none."""
+    name = section["catalogue"]
+    if name is None:
+        return {key: value for key, value in section.items() if key not in _CATALOGUE_KEYS}
+    return {key: value for key, value in section.items() if key != "observed"} | {
+        "catalogue": _name_or_content(name, (), STAR_ENDINGS)
+    }
+
+
+def _star_list(experiment: Experiment) -> StarList:
+    """Return the stars of the catalogue of a configuration on the CCDs of its camera."""
+    config, wavelengths = experiment.config, experiment.wavelengths
+    with error_context(key="stars.catalogue"):
+        return place_stars(
+            Path(given(config.stars.catalogue)),
+            experiment.telescope,
+            experiment.camera,
+            given(config.ccds),
+            wavelength=float(wavelengths[len(wavelengths) // 2]),
+            band=given(config.band),
+            brightest=given(config.stars.brightest),
+            faintest=given(config.stars.faintest),
+            pointing=experiment.pointing,
+            columns=config.stars.columns,
+        )
 
 
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from ..core.errors import ConfigError
 from ..core.memory import available_bytes, readable
 from ..core.threads import thread_count
+from .defaults import given
 from .experiment import Experiment
 
 # Measured on runs of 0.5 to 2.6 GB (both engines, screens of 512 to 8192, 140 to 8000 stars on a CCD): the estimate is
@@ -28,7 +29,7 @@ def screen_bytes(experiment: Experiment) -> int:
 def needed_bytes(experiment: Experiment, threads: int | None = None) -> int:
     """Return an estimate of the peak memory of a run [bytes]."""
     config = experiment.config
-    stars = config.stars.truth + config.stars.observed
+    stars = config.stars.truth + max(map(experiment.observed_count, given(config.ccds)))
     workers = thread_count(threads) if config.psf.engine == "wave" else 0
     stamps = stars * experiment.stamp_size**2 * _STAMP_BYTES
     of_worker = _WAVE_THREAD + (0 if experiment.silicon is None else _SILICON_THREAD)
@@ -52,7 +53,8 @@ def check_memory(experiment: Experiment, threads: int | None = None, *, copies: 
     rest = needed - screen_bytes(experiment)
     stars = experiment.config.stars
     if rest > free or experiment.atmosphere is None:
-        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {stars.observed}: {short}")
+        most = max(map(experiment.observed_count, given(experiment.config.ccds)))
+        raise ConfigError(f"stars.truth = {stars.truth}, stars.observed = {most}: {short}")
     smaller = experiment.atmosphere
     while smaller.screen_size > 16 and rest + screen_bytes(replace(experiment, atmosphere=smaller)) > free:
         smaller = replace(smaller, screen_size=smaller.screen_size // 2)

@@ -123,6 +123,8 @@ def run(
     if missing and workers is None:
         check_memory(experiment, threads)
     claim_run(folder, experiment, resume=resume)
+    if experiment.star_list is not None:
+        reporter.line(experiment.star_list.text)
     if kept:
         reporter.line(f"{len(kept)} of {len(names)} CCDs are finished already")
     failed: dict[str, str] = {}
@@ -164,6 +166,8 @@ def run(
         metrics = run_metrics(products, correlated)
         metrics["all"] |= chi2
         summary = {**origin, **metrics, "not_modelled": failed}
+        if experiment.star_list is not None:
+            summary["catalogue"] = experiment.star_list.counts
         if warnings is not None:
             summary["warnings"] = list(warnings)
         write_json(folder / SUMMARY_NAME, summary)

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import io
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy import units as u
-from astropy.table import Table
-from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError, ProductError, error_context
-from ..core.files import parsing, read_bytes, write_bytes
+from ..core.files import write_bytes
 from ..core.products import Columns, table_hdu, write_ecsv, write_fits
+from ..core.table_files import parquet_module, read_columns
 from ..core.units import radians
 from .galaxies import Galaxies
+from .pointing import Pointing
 
-#: Endings of the files of tables.
+#: Kinds of the files that are written, by their endings.
 FORMATS = {".ecsv": "ECSV", ".fits": "FITS", ".fit": "FITS", ".parquet": "Parquet"}
 #: Names of columns, in any case; the first is the one that messages name.
 NAMES = {
@@ -48,7 +47,7 @@ _PER_COMPONENT = {
 
 @check_arguments
 def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Galaxies:
-    """Read galaxies from a table: ECSV, FITS (its first table) or Parquet.
+    """Read galaxies from a table: ECSV, CSV, FITS (its first table) or Parquet.
 
     Columns of a catalogue, in any case; units of the file are honoured, and where it has none these hold:
 
@@ -82,7 +81,7 @@ def read_galaxies(path: str | Path, *, pointing: ArrayLike | None = None) -> Gal
         If a value is none of a galaxy.
     """
     path = Path(path)
-    columns = _read_columns(path)
+    columns = read_columns(path)
     with error_context(file=path):
         if {"galaxy", "component_radius"} <= set(columns):
             return _from_components(columns)
@@ -101,7 +100,9 @@ def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
         If the ending is another, or the file cannot be written.
     """
     path = Path(path)
-    kind = _format(path)
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise ProductError(f"ending {path.suffix!r}: expected one of {', '.join(FORMATS)}", file=path)
     owner = galaxies.owner
     columns: Columns = {"galaxy": (owner.astype(np.int32), "", "index of the galaxy")}
     columns |= {name: (getattr(galaxies, name)[owner], *text) for name, text in _PER_GALAXY.items()}
@@ -111,7 +112,9 @@ def write_galaxies(path: str | Path, galaxies: Galaxies) -> None:
     elif kind == "FITS":
         write_fits(path, [table_hdu("COMPONENTS", columns)], None, [])
     else:
-        pyarrow, parquet = _pyarrow(path)
+        parquet = parquet_module(path, ProductError)
+        import pyarrow
+
         data = io.BytesIO()
         parquet.write_table(pyarrow.table({name: values for name, (values, _, _) in columns.items()}), data)
         write_bytes(path, data.getvalue())
@@ -137,55 +140,10 @@ def tangent_plane(ra: Any, dec: Any, pointing: Any) -> tuple[np.ndarray, np.ndar
     DomainError
         If a position is 90 degrees or more from the pointing.
     """
-    ra, dec = radians(ra, "ra"), radians(dec, "dec")
-    center = radians(pointing, "pointing")
-    if center.shape != (2,):
-        raise DomainError(f"pointing = {pointing}: expected right ascension and declination")
-    turn = ra - center[0]
-    sine, cosine = np.sin(center[1]), np.cos(center[1])
-    depth = sine * np.sin(dec) + cosine * np.cos(dec) * np.cos(turn)
-    if not np.all(depth > 0.0):
+    sky = Pointing.of(pointing).from_celestial(ra, dec)
+    if not np.isfinite(sky).all():
         raise DomainError("ra, dec: expected positions within 90 deg of the pointing")
-    east = np.cos(dec) * np.sin(turn)
-    north = cosine * np.sin(dec) - sine * np.cos(dec) * np.cos(turn)
-    return east / depth, north / depth
-
-
-def _format(path: Path) -> str:
-    """Return the kind of a file by its ending."""
-    kind = FORMATS.get(path.suffix.lower())
-    if kind is None:
-        raise ProductError(f"ending {path.suffix!r}: expected one of {', '.join(FORMATS)}", file=path)
-    return kind
-
-
-def _pyarrow(path: Path) -> tuple[Any, Any]:
-    """Return pyarrow and its module for Parquet."""
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        raise ProductError("Parquet needs the package pyarrow: pip install 'pachon[parquet]'", file=path) from None
-    return pyarrow, parquet
-
-
-def _read_columns(path: Path) -> dict[str, Any]:
-    """Return the columns of a file by their names in small letters."""
-    kind = _format(path)
-    data = read_bytes(path, ProductError)
-    table: Any
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AstropyWarning)
-        with parsing(path, f"damaged or no {kind} table", ProductError):
-            if kind == "Parquet":
-                content = _pyarrow(path)[1].read_table(io.BytesIO(data))
-                table = {name: content[name].to_numpy() for name in content.column_names}
-            elif kind == "FITS":
-                table = Table.read(io.BytesIO(data), format="fits")
-            else:
-                table = Table.read(data.decode().splitlines(), format="ascii.ecsv")
-    names = table.colnames if isinstance(table, Table) else list(table)
-    return {name.lower(): table[name] for name in names}
+    return sky[..., 0], sky[..., 1]
 
 
 def _values(columns: dict[str, Any], name: str, unit: u.UnitBase | None = None, default: Any = None) -> np.ndarray:

@@ -133,12 +133,22 @@ class OwnStars(Result):
 
     def rho_statistics(self, bins: int = 8) -> RhoStatistics:
         """Return the rho statistics of the held-out residuals; positions must be in pixels of the stamps."""
-        places = (self.positions[self.used] - self.positions[self.used].mean(axis=0)) * self.pixel_scale
-        one, other = (
-            [getattr(s, name)[self.used] for name in ("e1", "e2", "size")] for s in (self.shapes, self.held_out)
-        )
-        longest = float(np.hypot(*np.ptp(places, axis=0)))
-        return rho_statistics(*places.T, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
+        used = self.used
+        one, other = part_of(self.shapes, used), part_of(self.held_out, used)
+        return star_rho_statistics(self.positions[used] * self.pixel_scale, one, other, bins)
+
+
+def part_of(shapes: Shapes, chosen: np.ndarray) -> Shapes:
+    """Return the shapes of some stars, those of a mask [n] or of indices."""
+    return Shapes(**{name: value[chosen] for name, value in vars(shapes).items()})
+
+
+def star_rho_statistics(places: np.ndarray, stars: Shapes, model: Shapes, bins: int) -> RhoStatistics:
+    """Return the rho statistics of a model at stars, whose places on the sky [rad] are [n, 2]."""
+    x, y = (places - places.mean(axis=0)).T
+    one, other = ([getattr(s, name) for name in ("e1", "e2", "size")] for s in (stars, model))
+    longest = float(np.hypot(np.ptp(x), np.ptp(y)))
+    return rho_statistics(x, y, *one, *other, min_sep=longest / 100.0, max_sep=longest, n_bins=bins)
 
 
 @check_arguments

@@ -116,7 +116,7 @@ def models_plot(correlated: Mapping[str, Correlation]) -> bytes:
 
 
 def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
-    """Draw rho statistics, grouped as in Jarvis et al. 2016: ``residual`` above, ``away`` (holdout) below."""
+    """Draw rho statistics, grouped as in Jarvis et al. 2016, one row for each residual or other name."""
     with styled():
         figure = new_figure(11.0, 4.1 * len(rho) + 0.5)
         panels = figure.subplots(len(rho), 2, sharex=True, sharey="col", squeeze=False)
@@ -125,7 +125,7 @@ def rho_plot(rho: Mapping[str, RhoStatistics]) -> bytes:
             for axes, names in zip(row, (("rho1", "rho3", "rho4"), ("rho2", "rho5")), strict=True):
                 for name in names:
                     draw_correlation(axes, found[name], "plus", *_RHO_STYLES[name])
-                log_axes(axes, RESIDUAL_TITLES[kind])
+                log_axes(axes, RESIDUAL_TITLES.get(kind, kind))
                 axes.legend(loc="best")
             row[0].set_ylabel("$|\\rho|$: filled positive, open negative")
         for axes in panels[0]:

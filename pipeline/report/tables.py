@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from astropy.table import Table
+
 from ...models.camera.height_statistics import HeightStatistics
 from ..measure.correlation import SEPARATION_RANGES
 from ..measure.summary import CORRELATED
@@ -144,6 +146,19 @@ def diagnostics_rows(overall: dict[str, Any]) -> list[tuple[str, ...]]:
         )
         for kind, name in names.items()
     ]
+
+
+PIFF_COLUMNS = ("model", "stars", "mean e1", "mean e2", "rms e", "mean dT/T", "rms dT/T")
+PIFF_CAPTION = (
+    "Ellipticity and size T = Q11 + Q22 of stars, less those of the model and, for T, over its own value; rms of one "
+    "component, with the noise of the stars. Residuals at the stars of a fit are too small."
+)
+
+
+def piff_rows(models: Table) -> list[tuple[str, ...]]:
+    """Return a row for each model of a comparison with Piff, in the columns of :data:`PIFF_COLUMNS`."""
+    keys = ("mean_e1", "mean_e2", "rms_e", "mean_dt", "rms_dt")
+    return [(row["model"], str(row["stars"]), *(_power(row[key]) for key in keys)) for row in models]
 
 
 ATTRIBUTION_COLUMNS = (

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...core.errors import DomainError
-from ...core.units import ARCSEC
 from ...models.camera.camera import Camera
 from ...models.ideal_telescope import without_aberration
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engine import center_focal_length
 from ...wavefront.psf.engines import ENGINES
 from ...wavefront.psf.psf import make_psfs
+from ..defaults import given
 from ..experiment import Experiment
 from ..measure.shapes import measure_shapes
 from ..sensor.displacement import displace_stamps
-from .photometry import limiting_magnitude
+from .photometry import PROVISIONAL_FWHM, electrons, limiting_magnitude
 from .star_field import StarField, make_star_field
 
 #: Pixels by which the stamp of an observed star is larger than the final one: room to centre it on a pixel.
@@ -27,8 +27,6 @@ _SHIFT_ROOM = 10
 _RIM = 2
 #: Distance of observed stars from the edge of the CCD [pixel], so that the whole stamp lies on it.
 _MARGIN = 20
-#: FWHM for provisional magnitude limits; positions do not depend on it.
-_PROVISIONAL_FWHM = 0.6 * ARCSEC
 #: Focal ratio of the paraboloid that serves as ideal telescope: 1.75 deg from the axis its astigmatism is 1e-3 arcsec,
 #: and e stays below 3e-4, the distortion of a tangent projection.
 _IDEAL_RATIO = 1e5
@@ -57,7 +55,7 @@ class CcdExposure:
 
 def holdout_positions(experiment: Experiment, name: str) -> np.ndarray:
     """Return the holdout positions of a CCD [m], shape [n, 2]; they depend on the seed alone."""
-    return ccd_stars(experiment, name, _PROVISIONAL_FWHM).holdout
+    return ccd_stars(experiment, name, PROVISIONAL_FWHM).holdout
 
 
 def expose_positions(
@@ -91,7 +89,7 @@ def expose_ccd(
     `stars` are by default drawn over the CCD. No byte depends on the number of threads; `progress` is called with the
     number of PSFs made since the last call.
     """
-    positions = ccd_stars(experiment, name, _PROVISIONAL_FWHM) if stars is None else stars
+    positions = ccd_stars(experiment, name, PROVISIONAL_FWHM) if stars is None else stars
     holdout = expose_centered(experiment, positions.holdout, threads, progress)
     pixel = positions.observed_pixel * (positions.pixel_size / experiment.pixel_size)
     offsets, room = pixel - np.rint(pixel), _SHIFT_ROOM
@@ -193,14 +191,17 @@ def ccd_bounds(camera: Camera, name: str) -> tuple[float, float, float, float]:
 
 
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
-    """Draw the stars of one CCD, the faintest of the S/N limit where vignetting is strongest."""
-    config, camera = experiment.config, experiment.camera
+    """Draw the stars of one CCD, the faintest of the S/N limit where vignetting is strongest.
+
+    Observed stars are those of the catalogue where the configuration has one.
+    """
+    config, camera, listed = experiment.config, experiment.camera, experiment.star_list
     band, exposure = config.band or "r", config.atmosphere.exposure_s
-    return make_star_field(
+    drawn = make_star_field(
         name,
         ccd_bounds(camera, name),
         config.stars.truth,
-        config.stars.observed,
+        config.stars.observed if listed is None else 0,
         config.seed,
         fwhm=width,
         band=band,
@@ -208,4 +209,15 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
         faint=limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light),
         margin=_MARGIN,
         pixel_size=camera.pixel_size,
+    )
+    if listed is None:
+        return drawn
+    positions, magnitude = listed.on(name)
+    return replace(
+        drawn,
+        observed=positions,
+        magnitude=magnitude,
+        electrons=electrons(magnitude, band, exposure),
+        bright=given(config.stars.brightest),
+        faint=given(config.stars.faintest),
     )

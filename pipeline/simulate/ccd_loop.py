@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from ...core.errors import PachonError, ProductError
+from ...core.errors import DomainError, PachonError, ProductError
 from ...core.progress import Reporter
 from ...core.threads import thread_count
+from ..defaults import fewest_stars
 from ..experiment import Experiment
 from .ccd_exposure import CcdExposure, expose_ccd
 from .star_field import StarField
@@ -54,8 +55,16 @@ def simulate_ccds(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     names = (experiment.config.ccds or ()) if names is None else names
     simulated: SimulatedCcds[_T] = SimulatedCcds()
-    each = experiment.config.stars.truth + experiment.config.stars.observed
-    total = each * len(names) if fields is None else sum(len(f.holdout) + len(f.observed) for f in fields.values())
+    if fields is None:
+        for name, reason in _short_of_stars(experiment, names):
+            if strict:
+                raise DomainError(reason, subject=f"CCD {name}")
+            simulated.not_modelled[name] = reason
+            reporter.line(left_out_line(name, reason))
+        names = [name for name in names if name not in simulated.not_modelled]
+        total = sum(experiment.config.stars.truth + experiment.observed_count(name) for name in names)
+    else:
+        total = sum(len(f.holdout) + len(f.observed) for f in fields.values())
     overlap = thread_count(threads) > 1
     bar = reporter.stage(title or f"PSFs of {len(names)} CCDs", total=total)
     with bar as stage, ThreadPoolExecutor(1) as modeller:
@@ -81,6 +90,16 @@ def simulate_ccds(
                     reporter.line(left_out_line(which, error.reason))
             stage.step(name, i, len(names))
     return simulated
+
+
+def _short_of_stars(experiment: Experiment, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield the CCDs on which the catalogue of stars has too few for a PSF model, each with the reason."""
+    if experiment.star_list is not None:
+        least = fewest_stars(experiment.config)
+        for name in names:
+            count = experiment.observed_count(name)
+            if count < least:
+                yield name, f"{count} stars of {experiment.star_list.name} lie on it: expected at least {least}"
 
 
 def left_out_line(name: str, reason: str) -> str:

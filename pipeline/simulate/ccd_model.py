@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..defaults import noise_free_components
+from ..defaults import fewest_stars, noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
 from ..psf_model.checks import snr_weights
 from ..psf_model.model import CLIP_SIGMA, PsfModel
-from ..psf_model.polynomial import term_count
 from .ccd_exposure import CcdExposure, ccd_stars
 from .ccd_observation import Observation, collected_images, observe_ccd
 from .photometry import effective_fwhm, signal_to_noise
@@ -62,12 +61,12 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         pixel_scale=holdout.pixel_scale,
         noise=observation.noise,
         holdout=HoldoutStars(
-            **_positions(positions.holdout, holdout.fields),
+            **_positions(experiment, positions.holdout, holdout.fields),
             **_shapes(holdout_shapes, at_holdout),
             fwhm=fwhm(holdout.image, holdout.pixel_scale),
         ),
         observed=ObservedStars(
-            **_positions(stars.observed, observed.fields),
+            **_positions(experiment, stars.observed, observed.fields),
             **_shapes(observation.shapes, at_stars),
             magnitude=stars.magnitude,
             electrons=electrons,
@@ -90,8 +89,7 @@ def fit_ccd_model(
 ) -> PsfModel:
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
     fit, used = experiment.config.reconstruction, observation.used
-    least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
-    require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
+    require_stars(used, observation.defects, fewest_stars(experiment.config))
     images = observation.images[used]
     if fit.interpolation == "kriging":  # which needs the photons
         images = images * stars.electrons[used, None, None]
@@ -108,8 +106,13 @@ def fit_ccd_model(
     )
 
 
-def _positions(positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
-    return {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
+def _positions(experiment: Experiment, positions: np.ndarray, fields: np.ndarray) -> dict[str, np.ndarray]:
+    """Return positions on the detector and of the sky; celestial ones where the configuration has a pointing."""
+    found = {"x": positions[:, 0], "y": positions[:, 1], "field_x": fields[:, 0], "field_y": fields[:, 1]}
+    aim = experiment.pointing
+    if aim is not None:
+        found["ra"], found["dec"] = aim.to_celestial(aim.to_sky(np.tan(fields))).T
+    return found
 
 
 def _shapes(measured: Shapes, model: Shapes) -> dict[str, np.ndarray]:

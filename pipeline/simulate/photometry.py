@@ -31,6 +31,8 @@ DARK_CURRENT = 0.2
 FULL_WELL = 1.0e5
 """Largest signal of an unsaturated pixel [e-]: just under the lower of the two measured turn-offs of the photon
 transfer curve, 103 000 (e2v) and 129 000 (ITL) (SITCOMTN-148, Table 6)."""
+PROVISIONAL_FWHM = 0.6 * ARCSEC
+"""Effective FWHM of stars [rad] for magnitude limits before any star is drawn."""
 # Noise-equivalent pixels of a Gaussian whose FWHM is one pixel (SMTN-002).
 _PIXELS_PER_SQUARE_FWHM = 2.266
 

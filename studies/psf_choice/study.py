@@ -18,6 +18,7 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError, PachonError
 from ...core.progress import Reporter
 from ...pipeline.config import Configuration, with_options
+from ...pipeline.defaults import require_drawn_stars
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.model import FocalPlanePsf
 from ...pipeline.memory import check_memory
@@ -81,8 +82,9 @@ class Study:
 def study_experiment(config: Configuration, plan: Plan) -> Experiment:
     """Return the experiment of a plan, with as many observed stars as the largest case needs.
 
-    Stars with defects are a ConfigError, since the study adds its own noise.
+    Stars with defects, or of a catalogue, are a ConfigError, since the study draws them and adds its own noise.
     """
+    require_drawn_stars(config)
     for key in ("neighbours", "cosmic_rays", "saturated"):
         if (value := getattr(config.stars, key)) > 0.0:
             raise ConfigError(f"stars.{key} = {value:g}: expected 0, the stars of a study have noise but no defects")

@@ -19,6 +19,7 @@ from ...core.errors import ConfigError, error_context
 from ...core.schema import Count, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
 from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
+from ...pipeline.defaults import require_drawn_stars
 from ...pipeline.experiment import Experiment
 from .plan import Visit, plan_visits
 
@@ -57,6 +58,7 @@ class VisitsConfig(Section):
         if run.ccds is None:
             run = with_options(run, ccds=(CENTRAL_RAFT,))
         with error_context(key="run"):
+            require_drawn_stars(run)
             return Experiment.from_config(run, folder)
 
     def resolved(self, experiment: Experiment) -> VisitsConfig:

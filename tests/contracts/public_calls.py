@@ -52,6 +52,9 @@ class _Made:
     def make_opd(self):
         return pachon.wavefront_opd(self.tel, (0.0, 0.0), WAVELENGTH, grid=16)
 
+    def make_piff(self):
+        return pachon.load_piff(ROOT / "tests/data/piff/gaussian.piff")
+
     def make_stamps(self):
         y, x = np.mgrid[-7:8, -7:8]
         widths = np.linspace(1.5, 2.0, 12)[:, None, None]
@@ -248,6 +251,18 @@ def calls(folder):
         "load_degrees_of_freedom": (pachon.load_degrees_of_freedom, {"name_or_path": "lsst"}),
         "thermal": (pachon.thermal, {"telescope": tel, "expansion": 1e-6, "dn_dt": {}}),
         "load_images_configuration": (pachon.load_images_configuration, {"path": m.folder / "none.yaml"}),
+        "load_piff": (pachon.load_piff, {"path": m.folder / "none.piff"}),
+        "PiffPsf.at": (m.piff.at, {"positions": [(10.0, 20.0)], "size": 5, "properties": {}}),
+        "PiffPsf.draw": (m.piff.draw, {"x": 10.0, "y": 20.0, "size": 5}),
+        "compare_with_piff": (pachon.compare_with_piff, {"psf": m.piff, "stamps": m.own,
+                              "positions": 1000.0 + 900.0 * m.places, "pixel_scale": 1e-6, "bins": 3}),
+        "wcs": (pachon.wcs, {"telescope": m.lsst, "ccd": "R22_S11", "pointing": (0.0, 0.0), "rotation": 0.1,
+                "camera": "lsst", "wavelength": w, "threads": 1}),
+        "Pointing": (pachon.Pointing, {"ra": 1.0, "dec": 0.5, "position_angle": 0.1}),
+        "Pointing.to_sky": (pachon.Pointing(1.0, 0.5).to_sky, {"slopes": on_axis}),
+        "Pointing.to_slopes": (pachon.Pointing(1.0, 0.5).to_slopes, {"sky": on_axis}),
+        "Pointing.to_celestial": (pachon.Pointing(1.0, 0.5).to_celestial, {"sky": on_axis}),
+        "Pointing.from_celestial": (pachon.Pointing(1.0, 0.5).from_celestial, {"ra": [1.0], "dec": [0.5]}),
         "ccd_wcs": (pachon.ccd_wcs, {"telescope": m.lsst, "camera": m.camera, "ccd": "R22_S11", "pointing": (0.0, 0.0),
                     "position_angle": 0.0, "wavelength": w, "threads": 1}),
         "lsst_camera": (pachon.lsst_camera, {}),

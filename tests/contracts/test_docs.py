@@ -18,7 +18,7 @@ BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
 LENSES = Path(__file__).parents[1] / "data" / "zmx"
 GLASSES = DATA / "glasses.agf"
 #: Pages whose examples need files of the reader's own, and run with files of ours in other tests.
-WITH_FILES = {"psf_models.md", "zemax.md", "perturbations.md", "focal_plane_psf.md"}
+WITH_FILES = {"psf_models.md", "zemax.md", "perturbations.md", "focal_plane_psf.md", "from_piff.md"}
 EXAMPLES = [name for name, text in PAGES.items() if BLOCK.search(text) and name not in WITH_FILES]
 
 
@@ -46,6 +46,13 @@ def test_the_zemax_page_runs_on_a_lens(tmp_path, monkeypatch):
     for block in BLOCK.findall(PAGES["zemax.md"]):
         exec(compile(block, "zemax.md", "exec"), {})
     assert (tmp_path / "again.zmx").stat().st_size > 500
+
+
+def test_the_page_of_piff_runs_on_a_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(LENSES.parent / "piff" / "moffat.piff", tmp_path / "psf.piff")
+    exec(compile(BLOCK.findall(PAGES["from_piff.md"])[0], "from_piff.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("PiffPsf(1 chips, ")
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from pachon.imaging.image_file import OBJECT_COLUMNS
 from pachon.models.io.grid_file import read_grid, write_grid
 from pachon.models.io.prescription import DATA
 from pachon.models.mesh_file import load_mesh
+from pachon.pipeline.star_list import place_stars
 from pachon.sky.cutouts import read_mosaic
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store, readable_rows
@@ -89,6 +90,23 @@ def _use_store(path):
     finally:
         # What an export saves of a damaged store.
         list(readable_rows(path))
+
+
+def _use_piff(path):
+    psf = pachon.load_piff(path)
+    psf.draw(100.0, 100.0, chip=next(iter(psf.chips)), size=5)
+
+
+def _use_stars(path):
+    options = {"wavelength": 6e-7, "band": "r", "brightest": 10.0, "faintest": 25.0, "columns": {}}
+    place_stars(
+        path,
+        pachon.load_telescope("lsst_v3.3_r"),
+        CAMERA,
+        ("R22_S11",),
+        pointing=pachon.Pointing(0.93, -0.49),
+        **options,
+    )
 
 
 def _mesh(kind):
@@ -170,6 +188,8 @@ def _cases(folder):
         "obj": (".obj", _mesh("obj"), lambda p: load_mesh(p, merged=True)),
         "ply": (".ply", _mesh("ply"), lambda p: load_mesh(p, merged=True)),
         "off": (".off", _mesh("off"), lambda p: load_mesh(p, merged=True)),
+        "piff": (".piff", (ROOT / "tests/data/piff/gaussian.piff").read_bytes(), _use_piff),
+        "star_list": (".csv", b"ra,dec,mag\n53.1,-27.8,18\n53.2,-27.9,19.5\n", _use_stars),
         "store": (".sweep", _written(_store, ".sweep", folder), _use_store),
     }  # fmt: skip
 
@@ -177,7 +197,7 @@ def _cases(folder):
 NAMES = (
     "zmx", "seq", "agf", "baseline", "site", "images", "visits", "degrees", "heights_ecsv", "heights_fits",
     "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image", "psf_model", "stl", "glb", "gltf", "obj",
-    "ply", "off", "store",
+    "ply", "off", "piff", "star_list", "store",
 )  # fmt: skip
 TOKENS = [
     b"", b"0", b"-1", b"1e400", b"nan", b"inf", b"-0.0", b"9" * 60, b"null", b"[]", b"{}", b"[" * 50, b'"', b"'", b"\0",

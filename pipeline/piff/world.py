@@ -1,0 +1,85 @@
+"""World coordinates of a Piff file, from those of its stars: the WCS itself is pickled there, and never read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..psf_model.polynomial import design_matrix, term_count
+from .tables import PiffTables
+
+#: Columns of a star: field position [arcsec], d(u, v)/d(x, y) [arcsec/pixel].
+_COLUMNS = ("u", "v", "dudx", "dudy", "dvdx", "dvdy")
+#: Largest order of the polynomials, and stars needed beyond the number of terms.
+_MOST, _SPARE = 5, 3
+#: Relative errors at which no higher order is tried, and from which on the coordinates are refused.
+_ENOUGH, _TOO_MUCH = 1e-10, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class StarWorld:
+    """Field positions and Jacobians as polynomials of x and y through those of the stars of a chip.
+
+    Attributes
+    ----------
+    extent : tuple of float
+        (xmin, xmax, ymin, ymax) of the stars [pixel].
+    order : int
+        Order of the polynomials.
+    coefficients : ndarray, shape [n_term, 6]
+        Of u, v [arcsec] and d(u, v)/d(x, y) [arcsec/pixel].
+    error : float
+        Largest error at a star left out of the fit: of the Jacobian, relative to it, and of u and v over the extent.
+    """
+
+    extent: tuple[float, float, float, float]
+    order: int
+    coefficients: np.ndarray
+    error: float
+
+    @classmethod
+    def fit(cls, tables: PiffTables, chip: int | None) -> StarWorld:
+        """Fit the stars of a file, on one chip of several, by the order with the smallest error."""
+        names = tables.table("stars").names
+        stars = np.stack([tables.column("stars", name) for name in ("x", "y", *_COLUMNS)], axis=1)
+        if chip is not None and "chipnum" in names:
+            stars = stars[tables.column("stars", "chipnum") == chip]
+        stars = stars[np.isfinite(stars).all(axis=1)]
+        if len(stars) < term_count(1) + _SPARE:
+            raise tables.error(
+                f"{len(stars)} stars, which have the world coordinates: expected at least {term_count(1) + _SPARE} "
+                "(the WCS is pickled, and never read)"
+            )
+        places, values = stars[:, :2], stars[:, 2:]
+        low = places.min(axis=0)
+        high = np.maximum(places.max(axis=0), low + 1.0)
+        extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+        scale = np.abs(values[:, 2:]).max()
+        span = scale * max(np.ptp(places, axis=0).max(), 1.0)
+        sizes = np.array([span, span, scale, scale, scale, scale])
+        found = None
+        for order in range(1, _MOST + 1):
+            if term_count(order) + _SPARE > len(stars):
+                break
+            terms = design_matrix(places, extent, order)
+            inverse = np.linalg.pinv(terms)
+            left = (values - terms @ (inverse @ values)) / sizes
+            own = np.einsum("ij,ji->i", terms, inverse)[:, None]
+            error = float(np.abs(left / np.maximum(1.0 - own, 1e-6)).max())
+            if found is None or error < found.error:
+                found = cls(extent, order, inverse @ values, error)
+            if error < _ENOUGH:
+                break
+        assert found is not None
+        if found.error > _TOO_MUCH:
+            raise tables.error(
+                f"its {len(stars)} stars have the world coordinates with errors of {found.error:.1g}: expected more "
+                "stars (the WCS is pickled, and never read)"
+            )
+        return found
+
+    def at(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return u, v [arcsec], shape [n, 2], and Jacobians [arcsec/pixel], shape [n, 2, 2], at pixels [n, 2]."""
+        values = design_matrix(positions, self.extent, self.order) @ self.coefficients
+        return values[:, :2], values[:, 2:].reshape(-1, 2, 2)

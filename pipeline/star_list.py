@@ -1,0 +1,199 @@
+"""Stars of a user's catalogue at their places on the CCDs of a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.table import Column
+
+from ..core.errors import ConfigError, ProductError, error_context
+from ..core.table_files import read_columns
+from ..core.units import metres, pure_numbers, radians
+from ..models.camera.camera import Camera
+from ..models.telescope import Telescope
+from ..raytrace.rays import RayStatus, field_direction
+from ..sky.pointing import Pointing
+from ..wavefront.chief_rays import chief_rays
+
+#: Names that columns have in files, in small letters, the first one first; ``{band}`` is that of the run.
+NAMES: dict[str, tuple[str, ...]] = {
+    "ra": ("ra", "ra_deg", "ra_icrs", "raj2000", "alpha_j2000"),
+    "dec": ("dec", "dec_deg", "de_icrs", "decl", "dej2000", "delta_j2000"),
+    "field_x": ("field_x_deg", "field_x"),
+    "field_y": ("field_y_deg", "field_y"),
+    "x": ("x_m",),
+    "y": ("y_m",),
+    "mag": ("mag", "{band}", "mag_{band}", "{band}_mag", "{band}mag", "magnitude"),
+}
+#: Pairs of columns that give a place, and the unit of those without one; the first pair that is there counts.
+_PLACES = ((("ra", "dec"), u.deg), (("field_x", "field_y"), u.deg), (("x", "y"), u.m))
+#: Columns of colours, which are not used.
+_COLORS = ("color", "colour", "bp_rp", "g_r", "g_i")
+#: Distance of stars from the edge of a CCD [pixel], so that their stamps lie on it (as of drawn ones, rim included).
+RIM = 22
+
+
+@dataclass(frozen=True, eq=False)
+class StarList:
+    """Stars of a catalogue, by CCD.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file.
+    stars : dict of str to ndarray
+        x, y [m] on the detector and AB magnitude of the stars of each CCD, [n, 3], in the order of x, y and magnitude.
+    counts : dict of str to int
+        Rows of the table, how many of them were left out, and how many are on the CCDs.
+    unused : tuple of str
+        Columns of colours in the table, which nothing is made of.
+    """
+
+    name: str
+    stars: dict[str, np.ndarray]
+    counts: dict[str, int]
+    unused: tuple[str, ...] = ()
+
+    def on(self, ccd: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions on the detector [m], shape [n, 2], and magnitudes of the stars of a CCD."""
+        stars = self.stars.get(ccd, np.zeros((0, 3)))
+        return stars[:, :2], stars[:, 2]
+
+    @property
+    def text(self) -> str:
+        """One line that counts the stars."""
+        found = ", ".join(f"{n} {what.replace('_', ' ')}" for what, n in self.counts.items() if n)
+        note = f"; column {', '.join(self.unused)} is not used" if self.unused else ""
+        return f"{self.name}: {found or 'no stars'}{note}"
+
+
+def place_stars(
+    path: Path,
+    telescope: Telescope,
+    camera: Camera,
+    ccds: Sequence[str],
+    *,
+    wavelength: float,
+    band: str,
+    brightest: float,
+    faintest: float,
+    pointing: Pointing | None,
+    columns: dict[str, str],
+) -> StarList:
+    """Read the stars of a catalogue on some CCDs, by chief rays traced to the nominal detector.
+
+    Places are the first of these that the table has, units of the file honoured: right ascension and declination [deg],
+    which need a `pointing`; field angles [deg], the slopes of the light as of the columns FIELD_X and FIELD_Y of a run;
+    positions on the detector [m]. Rows without a finite place or magnitude, stars outside the limits, and those within
+    :data:`RIM` pixels of the edge of a CCD are left out and counted. The order of the rows does not matter.
+
+    Raises
+    ------
+    ConfigError
+        If the places are celestial and there is no pointing.
+    ProductError
+        If the file cannot be read, or lacks a column: one line with the names that were looked for.
+    """
+    rows = _read(path, columns, band)
+    places, magnitude = rows.places, rows.magnitude
+    if rows.kind == "ra" and pointing is None:
+        raise ConfigError(f"{path}: right ascension and declination: expected pointing = {{ra_deg, dec_deg}}")
+    counts = {"stars": len(places)}
+
+    def keep(what: str, good: np.ndarray) -> None:
+        nonlocal places, magnitude
+        counts[what] = int((~good).sum())
+        places, magnitude = places[good], magnitude[good]
+
+    keep("without_place_or_magnitude", np.isfinite(places).all(axis=1) & np.isfinite(magnitude))
+    keep("too_bright", magnitude >= brightest)
+    keep("too_faint", magnitude <= faintest)
+    if rows.kind != "x":
+        aim = pointing if rows.kind == "ra" else None
+        slopes = np.tan(places) if aim is None else aim.to_slopes(aim.from_celestial(*places.T))
+        places, lands = _landings(telescope, slopes, wavelength)
+        keep("outside_the_field", lands)
+    keep("off_the_ccds", camera.ccd_at(*places.T) >= 0)
+    ccd = camera.ccd_at(*places.T, margin=-RIM * camera.pixel_size)
+    keep("at_the_rim_of_a_ccd", ccd >= 0)
+    ccd = ccd[ccd >= 0]
+    chosen = np.isin(ccd, [camera.ccd_index(name) for name in ccds])
+    keep("on_other_ccds", chosen)
+    ccd = ccd[chosen]
+    counts["on_the_ccds"] = len(ccd)
+    stars = np.concatenate([places, magnitude[:, None]], axis=1)
+    # Noise is drawn star by star: the same stars in another order of rows are the same run.
+    order = np.lexsort((stars[:, 2], stars[:, 1], stars[:, 0], ccd))
+    ccd, stars = ccd[order], stars[order]
+    by_ccd = {name: stars[ccd == camera.ccd_index(name)] for name in ccds}
+    return StarList(path.name, by_ccd, counts, rows.unused)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a catalogue."""
+
+    kind: str  #: first column of the places: ra, field_x or x
+    places: np.ndarray  #: [n, 2], rad or m
+    magnitude: np.ndarray
+    unused: tuple[str, ...]  #: columns of colours
+
+
+def _read(path: Path, columns: dict[str, str], band: str) -> _Rows:
+    """Read places and magnitudes of all rows; ProductError if a column is missing or none of numbers."""
+    table = read_columns(path)
+    with error_context(file=path):
+        given = {key: _column(table, key, columns, band) for key in NAMES}
+        whole = [(pair, unit) for pair, unit in _PLACES if all(given[key] for key in pair)]
+        pair, unit = whole[0] if whole else _PLACES[0]
+        missing = [key for key in (*pair, "mag") if given[key] is None]
+        if missing:
+            looked = "; ".join(f"{key}: {', '.join(_names(key, columns, band))}" for key in missing)
+            raise ProductError(f"no column {', '.join(missing)} ({looked}); columns are {', '.join(table) or 'none'}")
+        magnitude = _values(table, str(given["mag"]), None)
+        places = np.stack([_values(table, str(given[key]), unit) for key in pair], axis=1)
+    return _Rows(pair[0], places, magnitude, tuple(name for name in _COLORS if name in table))
+
+
+def _landings(telescope: Telescope, slopes: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return where chief rays meet the nominal detector [m], shape [n, 2], NaN where none does, and whether they do."""
+    with np.errstate(invalid="ignore"):
+        inside = np.flatnonzero(np.hypot(*np.arctan(slopes).T) <= telescope.field_limit)
+    light = field_direction(slopes[inside, 0], slopes[inside, 1], "gnomonic")
+    end = chief_rays(telescope, light, wavelength)
+    lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
+    places = np.full(slopes.shape, np.nan)
+    places[inside[~lost]] = telescope.surfaces[-1].to_local(end.position)[~lost, :2]
+    return places, np.isfinite(places[:, 0])
+
+
+def _names(key: str, columns: dict[str, str], band: str) -> tuple[str, ...]:
+    """Return the names that a column may have, in small letters."""
+    if key in columns:
+        return (columns[key].lower(),)
+    return tuple(name.format(band=band) for name in NAMES[key])
+
+
+def _column(table: dict[str, Any], key: str, columns: dict[str, str], band: str) -> str | None:
+    """Return the name of a column in a table, or None."""
+    return next((name for name in _names(key, columns, band) if name in table), None)
+
+
+def _values(table: dict[str, Any], name: str, unit: u.UnitBase | None) -> np.ndarray:
+    """Return a column in rad or m, or as it is without `unit`, that of a column that has none; NaN where masked."""
+    column = table[name]
+    if column.ndim != 1:
+        raise ProductError(f"column {name!r}: expected one number in every row")
+    numbers = pure_numbers(column.data if isinstance(column, Column) else column, f"column {name}")
+    if unit is None:
+        return numbers
+    own = getattr(column, "unit", None)
+    if isinstance(own, u.UnrecognizedUnit):
+        raise ProductError(f"column {name!r} in {own}: expected a unit that converts to {unit}")
+    quantity = u.Quantity(numbers, own or unit)
+    return metres(quantity, f"column {name}") if unit == u.m else radians(quantity, f"column {name}")

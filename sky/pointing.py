@@ -1,0 +1,111 @@
+"""The pointing of a telescope: slopes of light, tangent plane and celestial coordinates.
+
+The tangent plane is the gnomonic one about the pointing, xi towards east and eta towards north. The source of light of
+slopes (tx, ty) lies the opposite way, at X = -tx, Y = -ty along the axes of the telescope. With the position angle rho
+of the telescope's +y, from north through east,
+
+    xi = X cos(rho) + Y sin(rho),    eta = -X sin(rho) + Y cos(rho).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from numpy.typing import ArrayLike
+
+from ..core.arguments import check_arguments
+from ..core.errors import DomainError, shown
+from ..core.units import angle, broadcast_together, radians
+
+
+@check_arguments
+@dataclass(frozen=True)
+class Pointing:
+    """Direction of the optical axis, and orientation of the telescope on the sky.
+
+    Attributes
+    ----------
+    ra, dec : float
+        Right ascension and declination of the optical axis, ICRS [rad].
+    position_angle : float
+        Angle of the telescope's +y from north through east [rad].
+
+    Raises
+    ------
+    DomainError
+        If an angle is not finite, or the declination beyond a pole.
+    """
+
+    ra: float
+    dec: float
+    position_angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        angles = (self.ra, self.dec, self.position_angle)
+        if not np.isfinite(angles).all() or abs(self.dec) > 0.5 * np.pi:
+            raise DomainError(
+                f"pointing = {angles[:2]!r}, position_angle = {self.position_angle!r}: expected finite angles, "
+                "declinations from -90 to 90 deg"
+            )
+
+    @classmethod
+    def of(cls, pointing: Any, position_angle: Any = 0.0) -> Pointing:
+        """Return the pointing of a SkyCoord, or of right ascension and declination [rad] or Quantities."""
+        if isinstance(pointing, SkyCoord):
+            if not pointing.isscalar:
+                raise DomainError(f"pointing has shape {pointing.shape}: expected one position")
+            pointing = (pointing.icrs.ra, pointing.icrs.dec)
+        center = radians(pointing, "pointing")
+        if center.shape != (2,):
+            raise DomainError(f"pointing = {shown(pointing)}: expected right ascension and declination, finite angles")
+        return cls(float(center[0]), float(center[1]), angle(position_angle, "position_angle"))
+
+    @check_arguments
+    def to_sky(self, slopes: ArrayLike) -> np.ndarray:
+        """Return (xi, eta) [rad] of the sources of light of gnomonic slopes (tx, ty), both shape [n, 2]."""
+        x, y = -_pairs(slopes, "slopes").T
+        cosine, sine = np.cos(self.position_angle), np.sin(self.position_angle)
+        return np.stack([x * cosine + y * sine, y * cosine - x * sine], axis=1)
+
+    @check_arguments
+    def to_slopes(self, sky: ArrayLike) -> np.ndarray:
+        """Return the gnomonic slopes (tx, ty) of the light of sources at (xi, eta) [rad], both shape [n, 2]."""
+        xi, eta = _pairs(sky, "sky").T
+        cosine, sine = np.cos(self.position_angle), np.sin(self.position_angle)
+        return np.stack([eta * sine - xi * cosine, -xi * sine - eta * cosine], axis=1)
+
+    @check_arguments
+    def to_celestial(self, sky: ArrayLike) -> np.ndarray:
+        """Return right ascension, from 0 to 2 pi, and declination [rad] of (xi, eta) [rad], both shape [n, 2]."""
+        xi, eta = _pairs(sky, "sky").T
+        along = np.cos(self.dec) - eta * np.sin(self.dec)
+        alpha = self.ra + np.arctan2(xi, along)
+        delta = np.arctan2(np.sin(self.dec) + eta * np.cos(self.dec), np.hypot(xi, along))
+        return np.stack([alpha % (2.0 * np.pi), delta], axis=1)
+
+    @check_arguments
+    def from_celestial(self, ra: ArrayLike, dec: ArrayLike) -> np.ndarray:
+        """Return (xi, eta) [rad], shape [n, 2], of right ascensions and declinations [rad] (gnomonic projection).
+
+        The formula is that of Calabretta & Greisen 2002 (A&A 395, 1077, sec. 5.1.3). Positions 90 degrees or more from
+        the pointing are NaN.
+        """
+        alpha, delta = broadcast_together({"ra": radians(ra, "ra"), "dec": radians(dec, "dec")})
+        turn = alpha - self.ra
+        sine, cosine = np.sin(self.dec), np.cos(self.dec)
+        depth = sine * np.sin(delta) + cosine * np.cos(delta) * np.cos(turn)
+        depth = np.where(depth > 0.0, depth, np.nan)
+        east = np.cos(delta) * np.sin(turn)
+        north = cosine * np.sin(delta) - sine * np.cos(delta) * np.cos(turn)
+        return np.stack([east / depth, north / depth], axis=-1)
+
+
+def _pairs(values: ArrayLike, name: str) -> np.ndarray:
+    """Return angles as [n, 2]; one pair may be given as [2]."""
+    found = np.atleast_2d(radians(values, name))
+    if found.ndim != 2 or found.shape[1] != 2:
+        raise DomainError(f"{name} has shape {np.shape(values)}: expected [n, 2]")
+    return found
