@@ -103,7 +103,7 @@ def fit_fields(
             polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel)
         elif interpolation == "kriging":
             mapped_points = mapped(points, span)
-            deviations = coefficients @ stars.basis.vectors
+            deviations = coefficients if basis == "pixels" else coefficients @ stars.basis.vectors
             numbers, filters = kriging.shape_numbers(stars.basis.mean.reshape(ny, nx), deviations)
             noise = kriging.star_noise(images, deviations, stars.basis.mean.reshape(ny, nx), filters, gain)
             noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..defaults import noise_free_components
+from ..defaults import given, noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
@@ -91,16 +91,17 @@ def fit_ccd_model(
     """Fit the PSF model of the configuration to the observed stars of one CCD, S/N [n], that can be used."""
     fit, used = experiment.config.reconstruction, observation.used
     least = 1 + (fit.components or 0) if fit.basis == "pca" else 2
-    require_stars(used, observation.defects, max(least, term_count(fit.order or 0)))
+    terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
+    require_stars(used, observation.defects, max(least, terms))
     images = observation.images[used]
     if fit.interpolation == "kriging":  # which needs the photons
         images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
         images,
         stars.observed[used],
-        basis=fit.basis,
-        interpolation=fit.interpolation,
-        weights=snr_weights(fit.weights, snr[used]),
+        basis=given(fit.basis),
+        interpolation=given(fit.interpolation),
+        weights=snr_weights(given(fit.weights), snr[used]),
         n_components=fit.components,
         order=fit.order,
         extent=stars.bounds,

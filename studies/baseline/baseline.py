@@ -22,7 +22,7 @@ from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
-from ...pipeline.defaults import as_configured
+from ...pipeline.defaults import as_configured, with_paper_model
 from ...pipeline.experiment import Experiment, hashed_heights, hashed_states
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
@@ -241,7 +241,8 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
     base = load_configuration(configuration)
     engine = "long_exposure" if base.atmosphere.enabled else None
     try:
-        config = with_options(base, telescope=model, psf__engine=engine)
+        # Kriging looks for its covariance in steps that rounding may change; metrics need a model of one solution.
+        config = with_options(with_paper_model(base), telescope=model, psf__engine=engine)
         experiment = Experiment.from_config(config, configuration.parent)
         return replace(experiment, telescope=as_configured(telescope, experiment.config))
     except PachonError as error:
