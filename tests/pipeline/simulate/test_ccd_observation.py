@@ -122,7 +122,7 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
         chosen = configured(experiment, stars__truth=60, **options)
     product = model_ccd(chosen, exposure)
     model = product.model
-    assert (model.basis, model.n_components, model.order) == (basis, components, 2 if options is None else 1)
+    assert (model.basis, model.n_components, model.order) == (basis, components, 4 if options is None else 1)
     assert (model.kernel is not None) == (options is None or "reconstruction__interpolation" in options)
     if options is None:
         # Kriging weighs stars by their own noise, of which a bright one has less.
@@ -175,7 +175,7 @@ def test_defaults_follow_basis_and_interpolation(tiny):
     # Nothing given: kriging of pixels. Any key of the paper's way brings the others.
     by_default = Experiment.from_config(type(config)()).config.reconstruction
     assert (by_default.basis, by_default.interpolation, by_default.weights) == ("pixels", "kriging", "equal")
-    assert (by_default.components, by_default.order) == (None, 2)
+    assert (by_default.components, by_default.order) == (None, 4)
     paper = {"basis": "pca", "components": 20, "interpolation": "polynomial", "weights": "equal", "order": 3}
     for key, value in paper.items():
         found = Experiment.from_config(type(config)(**{"reconstruction": {key: value}})).config.reconstruction
