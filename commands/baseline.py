@@ -46,15 +46,26 @@ def baseline_save(
     ccds: Annotated[
         str | None, Option(metavar="NAMES", help="CCDs for PSFs, with commas; the first is modelled.")
     ] = None,
+    tolerance: Annotated[
+        list[str] | None,
+        Option(metavar="TEXT", help="Tolerance: '1 %' of all values, or 'spot rms = 0.1 um'; again for more."),
+    ] = None,
+    limit: Annotated[
+        list[str] | None, Option(metavar="TEXT", help="Requirement: 'spot rms < 10 um'; again for more.")
+    ] = None,
     threads: Threads = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compute the metrics of a telescope, and write them with their tolerances.
+    """Compute the metrics of a telescope, and write them with their tolerances and limits.
+
+    By default the tolerance of a metric is what another machine may change. `--tolerance` gives a wider one, `--limit`
+    a requirement that the metric must meet: both of all metrics whose names begin with the words given.
 
     **Examples**
 
     - `pachon baseline save telescope.yaml -o telescope.baseline.json --config run.yaml --ccds R22_S11,R02_S01`
+    - `pachon baseline save telescope.yaml -o design.baseline.json --tolerance "1 %" --limit "spot rms < 10 um"`
     """
     from ..studies.baseline.baseline import make_baseline
     from ..studies.baseline.file import write_baseline
@@ -70,12 +81,16 @@ def baseline_save(
             fields=field_list(field_deg),
             wavelengths=[nm / 1e9 for nm in wavelength_nm] if wavelength_nm else None,
             ccds=None if ccds is None else name_list(ccds, "--ccds"),
+            tolerances=tolerance or (),
+            limits=limit or (),
             threads=threads,
             progress=stage.advance,
         )
     write_baseline(out, baseline)
     for kind, why in left_out.items():
         typer.echo(f"pachon: warning: no metrics of kind {kind}: {why}", err=True)
+    broken = [name for name, m in baseline.figures.items() if m.limit is not None and not m.limit.holds(m.value)]
+    _warn_broken(broken)
     if as_json:
         print_json({"baseline": str(out), "figures": len(baseline.figures), "left_out": left_out})
     elif not quiet:
@@ -101,10 +116,17 @@ def baseline_update(
     with interruptible(quiet or as_json) as reporter, reporter.stage(str(path)) as stage:
         baseline, check = updated_baseline(path, threads=threads, progress=stage.advance)
     write_baseline(path, baseline)
+    _warn_broken([d.name for d in check.deviations if d.broken])
     if as_json:
-        print_json({"baseline": str(path), "updated": [d.name for d in check.out]})
+        print_json({"baseline": str(path), "updated": [d.name for d in check.moved]})
     elif not quiet:
-        print(f"{path}: {len(check.out)} of {len(check.deviations)} metrics updated")
+        print(f"{path}: {len(check.moved)} of {len(check.deviations)} metrics updated")
+
+
+def _warn_broken(names: list[str]) -> None:
+    """Print a warning for metrics that do not meet their requirements."""
+    if names:
+        typer.echo(f"pachon: warning: {len(names)} metrics are beyond their limits, such as {names[0]}", err=True)
 
 
 @app.command("check")
@@ -119,10 +141,11 @@ def check_command(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compute the metrics of baselines again, and list those that have moved by more than their tolerances.
+    """Compute the metrics of baselines again, and list those that are out of tolerance or beyond their limits.
 
-    Worst first. Exit status 1 when a metric is out of tolerance. Without a file, the bundled baselines of the LSST are
-    checked, whose metrics agree with Zemax, batoid and GalSim as far as those have them.
+    By cause: requirements broken, metrics missing, inputs changed; worst first. Exit status 1 when there are any.
+    Without a file, the bundled baselines of the LSST are checked, whose metrics agree with Zemax, batoid and GalSim as
+    far as those have them.
 
     **Examples**
 

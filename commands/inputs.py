@@ -17,12 +17,18 @@ if TYPE_CHECKING:
     from ..pipeline.experiment import Experiment
 
 
-def configured_experiment(config: Path | None, **options: object) -> Experiment:
-    """Return the experiment of a configuration file and of options by key, None where not given."""
+def configured_experiment(config: Path | None, *, paper_model: bool = False, **options: object) -> Experiment:
+    """Return the experiment of a configuration file and of options by key, None where not given.
+
+    With `paper_model` the PSF model is that of Jee & Tyson 2011 where the file names none.
+    """
     from ..pipeline.config import Configuration, load_configuration, with_options
+    from ..pipeline.defaults import with_paper_model
     from ..pipeline.experiment import Experiment
 
     base = Configuration() if config is None else load_configuration(config)
+    if paper_model:
+        base = with_paper_model(base)
     settings = with_options(base, **options)
     try:
         with warnings_shown(HeightWarning):

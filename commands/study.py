@@ -77,7 +77,10 @@ def study_command(
 
     names = STUDY_CCDS if config is None and ccds is None else one_name_list(ccds=ccds)
     model = "focal_plane" if focal_plane else None
-    resolved = configured_experiment(config, ccds=names, stars__truth=truth_stars, reconstruction__model=model).config
+    # Around polynomials, which have the order, components and weights to study.
+    resolved = configured_experiment(
+        config, paper_model=True, ccds=names, stars__truth=truth_stars, reconstruction__model=model
+    ).config
     plan = make_plan(
         resolved,
         stars=_numbers(stars, "--stars", int),

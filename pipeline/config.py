@@ -205,7 +205,7 @@ class SensorConfig(Section):
 
 
 class ReconstructionConfig(Section):
-    """How the PSF is measured and modelled."""
+    """How the PSF is measured and modelled: pixels and kriging, or Jee & Tyson 2011 where basis, ... are given."""
 
     model: Literal["ccd", "focal_plane"] = Field(
         "ccd", description="ccd (each CCD by itself), focal_plane (one more model, of the shapes on all CCDs together)"
@@ -213,17 +213,17 @@ class ReconstructionConfig(Section):
     flag_stars: Switch = Field(
         False, description="leave out stars with neighbours, cosmic rays and saturated cores, as far as they are seen"
     )
-    basis: Literal["pca", "pixels", "shapelets"] = Field(
-        "pca", description="what stars are described in: pca (eigen-PSFs), pixels (each on its own), shapelets"
+    basis: Literal["pca", "pixels", "shapelets"] | None = Field(
+        None, description="what stars are described in: pca (eigen-PSFs), pixels (each on its own), shapelets"
     )
     components: Count | None = Field(None, description="components kept on each CCD, 20 by default; none of pixels")
-    interpolation: Literal["polynomial", "gp", "kriging"] = Field(
-        "polynomial",
+    interpolation: Literal["polynomial", "gp", "kriging"] | None = Field(
+        None,
         description="over the CCD: polynomial, gp (Gaussian process over a polynomial trend), kriging (one process and "
         "trend for all, with the noise of each star)",
     )
-    weights: Literal["equal", "snr", "softened"] = Field(
-        "equal", description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
+    weights: Literal["equal", "snr", "softened"] | None = Field(
+        None, description="of the stars in the polynomials: equal, snr (S/N squared), softened (snr up to about 100)"
     )
     order: Whole | None = Field(
         None,

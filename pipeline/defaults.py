@@ -27,7 +27,7 @@ from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import in_state
-from .config import BandName, Configuration
+from .config import BandName, Configuration, ReconstructionConfig
 from .psf_model.fit import COMPONENTS, ORDERS
 from .psf_model.polynomial import term_count
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
@@ -38,6 +38,10 @@ from .star_list import NAMES
 #: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
 DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
 _WAVELENGTHS = 5
+# Keys of the PSF model of a CCD: where none is given it is _KRIGING, else _PAPER fills the other ones.
+_MODEL_KEYS = ("basis", "components", "interpolation", "weights", "order")
+_KRIGING = {"basis": "pixels", "interpolation": "kriging"}
+_PAPER = {"basis": "pca", "interpolation": "polynomial", "weights": "equal"}
 # The optics alone as in Fig. 8 of Jee & Tyson 2011: without charge diffusion, which would dilute most of their
 # ellipticity, and on pixels fine enough for a weight of 0.3".
 _WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "pixel_um": 10.0, "stamp": 31, "diffusion_pixels": 0.4}
@@ -116,20 +120,38 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
                 (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
                 | _ENGINE_DEFAULTS.get(config.psf.engine, {}),
             ),
-            "reconstruction": _filled(
-                config.reconstruction,
-                {
-                    "weight_fwhm_arcsec": 0.7 if atmosphere.enabled else 0.3,
-                    "components": None if config.reconstruction.basis == "pixels" else COMPONENTS,
-                    "order": ORDERS[config.reconstruction.interpolation],
-                },
-            ),
+            "reconstruction": _reconstruction(config.reconstruction, 0.7 if atmosphere.enabled else 0.3),
         }
     )
     telescope = as_configured(telescope, resolved)
     _check(resolved, telescope)
     check_screens(resolved, telescope, camera, site)
     return ResolvedConfiguration(resolved, telescope, camera, site)
+
+
+def _reconstruction(fit: ReconstructionConfig, weight_fwhm_arcsec: float) -> ReconstructionConfig:
+    """Return the section with its defaults: the best model that needs no optics, or the paper's once one key is given.
+
+    Kriging leaves half as much between the stars (docs/psf_models.md). A choice of basis, components, interpolation,
+    weights or order belongs to the way of Jee & Tyson 2011, which fills the other ones.
+    """
+    if _names_no_model(fit):
+        fit = fit.model_copy(update=_KRIGING)
+    fit = _filled(fit, _PAPER | {"weight_fwhm_arcsec": weight_fwhm_arcsec})
+    components = None if fit.basis == "pixels" else COMPONENTS
+    return _filled(fit, {"components": components, "order": ORDERS[given(fit.interpolation)]})
+
+
+def with_paper_model(config: Configuration) -> Configuration:
+    """Return the configuration with the PSF model of Jee & Tyson 2011 for each CCD where it names none."""
+    fit = config.reconstruction
+    if not _names_no_model(fit):
+        return config
+    return config.model_copy(update={"reconstruction": fit.model_copy(update=_PAPER)})
+
+
+def _names_no_model(fit: ReconstructionConfig) -> bool:
+    return all(getattr(fit, key) is None for key in _MODEL_KEYS)
 
 
 def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
@@ -151,7 +173,8 @@ def noise_free_components(config: Configuration) -> int:
 def fewest_stars(config: Configuration) -> int:
     """Return how many observed stars the PSF model of a resolved configuration needs on a CCD."""
     fit = config.reconstruction
-    return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, term_count(fit.order or 0))
+    terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
+    return max(1 + (fit.components or 0) if fit.basis == "pca" else 2, terms)
 
 
 def require_drawn_stars(config: Configuration) -> None:

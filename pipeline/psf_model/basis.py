@@ -43,7 +43,17 @@ def principal_components(mean: np.ndarray, deviations: np.ndarray, count: int) -
 
 def pixel_grid(mean: np.ndarray, deviations: np.ndarray) -> Basis:
     """Return the basis in which every pixel is its own component."""
-    return Basis(mean, np.eye(len(mean)), np.linalg.svd(deviations, compute_uv=False))
+    return Basis(mean, identity(len(mean)), np.linalg.svd(deviations, compute_uv=False))
+
+
+def identity(count: int) -> np.ndarray:
+    """Return the unit matrix [count, count], read-only, in the memory of two of its rows.
+
+    Every model of pixels has one: thousands of pixels would need a hundred megabytes each.
+    """
+    unit = np.zeros(2 * count - 1)
+    unit[count - 1] = 1.0
+    return np.lib.stride_tricks.sliding_window_view(unit, count)[::-1]
 
 
 def shapelets(

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 
 from ...core.errors import ProductError
-from .basis import BASES
+from .basis import BASES, identity
 
 
 def model_hdus(fields: Mapping[str, Any], name: str) -> list[fits.ImageHDU | fits.BinTableHDU]:
@@ -66,7 +66,7 @@ def model_fields(hdus: Iterable[Any], name: str) -> dict[str, Any]:
             raise ProductError(f"PSF model {name!r}: BASIS = {basis!r}, expected one of {', '.join(BASES)}")
         polynomial, image = _native(part("POLY").data), _native(mean.data)
         if basis == "pixels":
-            components = np.eye(image.size).reshape(image.size, *image.shape)
+            components = identity(image.size).reshape(image.size, *image.shape)
         else:
             components = _native(part("EIGEN").data)
         k = len(components)

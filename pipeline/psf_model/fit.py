@@ -13,7 +13,7 @@ from . import gaussian_process, kriging
 from .basis import BASES
 from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms
 from .description import describe
-from .polynomial import as_positions, design_matrix, mapped
+from .polynomial import as_positions, design_matrix, mapped, term_count
 
 #: Components of principal components and of shapelets where no number is given (Jee & Tyson 2011, sec. 3).
 COMPONENTS = 20
@@ -21,6 +21,8 @@ COMPONENTS = 20
 INTERPOLATIONS = ("polynomial", "gp", "kriging")
 #: Degree of the polynomials, or of the trend under a process, where none is given.
 ORDERS = {"polynomial": 3, "gp": 0, "kriging": kriging.ORDER}
+# Order of the polynomials that predict outliers and masked pixels in kriging.
+_DESCRIBED_ORDER = 2
 #: Most components from which an automatic choice is made.
 _MOST_COMPONENTS = 65
 # Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
@@ -84,10 +86,12 @@ def fit_fields(
     with one_blas_thread():
         if interpolation != "kriging":  # which shrinks terms that the stars do not determine
             check_terms(terms, order, points, star_weights)
+        # Few stars would follow their own outliers under a high order.
+        smooth = terms[:, : term_count(_DESCRIBED_ORDER)] if interpolation == "kriging" else terms
         stars = describe(
             images,
             bad,
-            terms,
+            smooth,
             basis=basis,
             count=count,
             scale=scale,
@@ -103,7 +107,7 @@ def fit_fields(
             polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel)
         elif interpolation == "kriging":
             mapped_points = mapped(points, span)
-            deviations = coefficients @ stars.basis.vectors
+            deviations = coefficients if basis == "pixels" else coefficients @ stars.basis.vectors
             numbers, filters = kriging.shape_numbers(stars.basis.mean.reshape(ny, nx), deviations)
             noise = kriging.star_noise(images, deviations, stars.basis.mean.reshape(ny, nx), filters, gain)
             noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)

@@ -27,15 +27,20 @@ import scipy.optimize
 from ...core.errors import DomainError
 
 #: Degree of the trend by default.
-ORDER = 2
-#: Columns of the kernel: variance and length of the process, noise that all stars have, variances of the trend's
-#: terms of degree 1, and of degree 2 (falling by e for each degree more). Lengths where the extent is 2 wide.
+ORDER = 4
+#: Fewest columns of the kernel: variance and length of the process, noise that all stars have, variances of the
+#: trend's terms of degree 1 and 2, and so on to its order. Lengths where the extent is 2 wide.
 COLUMNS = 5
 # Mean and standard deviation of the logarithms of these before the stars are seen: wide but for the length, which
-# forty stars hardly determine.
-_PRIOR = np.array([(-2.0, 2.0), (math.log(0.7), 0.7), (-4.0, 1.5), (0.0, 4.0), (-1.0, 4.0)])
-# Where the search starts: nearly all trend, nearly all process.
-_STARTS = np.array([(-4.0, math.log(0.7), -4.0, 2.0, 1.0), (0.0, math.log(0.7), -4.0, 1.0, -1.0)])
+# forty stars hardly determine. Variances of the trend fall with the degree: nothing is expected of degrees 3 and 4, so
+# that they cost nothing where the stars show nothing.
+_PRIOR = np.array([(-2.0, 2.0), (math.log(0.7), 0.7), (-4.0, 1.5)])
+_TREND_WIDTH = 4.0
+# Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms of
+# the trend's variances start, up to the degree given, at the second number for degree 1 and fall by the third for each
+# degree more; beyond, where they are expected.
+_TREND, _PROCESS = (-4.0, math.log(0.7), -4.0), (0.0, math.log(0.7), -4.0)
+_STARTS = ((_TREND, 2, 2.0, 1.0), (_PROCESS, 2, 1.0, 2.0), (_TREND, math.inf, 3.0, 0.5))
 # Variance of the trend's constant: as good as unknown.
 _CONSTANT = 1e4
 # More stars than this add little to the covariance, and cost their cube; the brightest are taken.
@@ -93,7 +98,7 @@ def star_noise(
 
 
 def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return the covariance [5], columns as in :data:`COLUMNS`, most probable for shape numbers [n, 3].
+    """Return the covariance, columns as in :data:`COLUMNS`, most probable for shape numbers [n, 3].
 
     `points` [n, 2] are mapped to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those
     of the trend.
@@ -101,6 +106,10 @@ def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms
     unit = np.median(noise, axis=0)
     chosen = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
     distance = _distances(points[chosen], points[chosen])
+    degrees = np.arange(1, max(order_of(terms.shape[1]), COLUMNS - 3) + 1)
+    expected = np.where(degrees < 3, 1.0 - degrees, 3.0 - 3.0 * degrees)
+    middle = np.concatenate([_PRIOR[:, 0], expected])
+    width = np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)])
     values, own = numbers[chosen] / np.sqrt(unit), (noise[chosen] / unit).mean(axis=1)
 
     def surprise(logarithms: np.ndarray) -> float:
@@ -111,12 +120,13 @@ def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms
             return 1e12
         whitened = scipy.linalg.solve_triangular(root, values, lower=True, check_finite=False)
         likelihood = 0.5 * (whitened**2).sum() + values.shape[1] * np.log(np.diagonal(root)).sum()
-        return float(likelihood + 0.5 * (((logarithms - _PRIOR[:, 0]) / _PRIOR[:, 1]) ** 2).sum())
+        return float(likelihood + 0.5 * (((logarithms - middle) / width) ** 2).sum())
 
     found = []
-    for start in _STARTS:
-        simplex = start + 1.5 * np.vstack([np.zeros(COLUMNS), np.eye(COLUMNS)])
-        options = {"maxfev": 300, "xatol": 0.1, "fatol": 0.02, "initial_simplex": simplex}
+    for process, last, first, fall in _STARTS if len(degrees) > 2 else _STARTS[:2]:
+        start = np.concatenate([process, np.where(degrees <= last, first - fall * (degrees - 1), expected)])
+        simplex = start + 1.5 * np.vstack([np.zeros(len(start)), np.eye(len(start))])
+        options = {"maxfev": 60 * len(start), "xatol": 0.1, "fatol": 0.02, "initial_simplex": simplex}
         found.append(scipy.optimize.minimize(surprise, start, method="Nelder-Mead", options=options))
     return np.exp(min(found, key=lambda each: each.fun).x)
 
@@ -159,9 +169,13 @@ def _covariance(kernel: np.ndarray, distance: np.ndarray, terms: np.ndarray, noi
 
 def _trend_variances(kernel: np.ndarray, count: int) -> np.ndarray:
     """Return the variance of each term of the trend, [n_terms]: terms stand by degree, d + 1 of degree d."""
-    order = math.isqrt(8 * count + 1) // 2 - 1
-    of_degree = [_CONSTANT, kernel[3], *(kernel[4] * math.exp(2.0 - d) for d in range(2, order + 1))][: order + 1]
-    return np.repeat(of_degree, np.arange(1, order + 2))
+    order = order_of(count)
+    return np.repeat([_CONSTANT, *kernel[3 : 3 + order]], np.arange(1, order + 2))
+
+
+def order_of(count: int) -> int:
+    """Return the order of polynomials of so many terms."""
+    return math.isqrt(8 * count + 1) // 2 - 1
 
 
 def _distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:

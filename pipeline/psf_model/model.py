@@ -69,7 +69,7 @@ class PsfModel(PicturedModel):
         Of the stars in the polynomials, [n]; under kriging their inverse variances, in units of the middle star's.
     kernel : array or None
         Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
-        the noise, [k, 3]; under kriging [k, :data:`.kriging.COLUMNS`]. None where there are only polynomials.
+        the noise, [k, 3]; under kriging those of :data:`.kriging.COLUMNS`. None where there are only polynomials.
     alpha : array or None
         Dual coefficients of the Gaussian process: inverse covariance times coefficients less trend, [n, k].
     """
@@ -375,7 +375,7 @@ class PsfModel(PicturedModel):
 
     @property
     def _kriged(self) -> bool:
-        return self.kernel is not None and self.kernel.shape[1] == kriging.COLUMNS
+        return self.kernel is not None and self.kernel.shape[1] >= kriging.COLUMNS
 
     def _combine(self, amplitudes: np.ndarray) -> np.ndarray:
         """Return mean plus amplitudes times components, one component after the other so that no batch size matters."""

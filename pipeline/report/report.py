@@ -11,7 +11,7 @@ import numpy as np
 from ...core.page import Picture, render
 from ..ccd_product import CcdProduct
 from ..config import ReconstructionConfig, to_yaml
-from ..defaults import noise_free_components
+from ..defaults import given, noise_free_components
 from ..experiment import Experiment
 from ..measure.correlation import Correlation
 from ..measure.summary import CORRELATED, of_focal_plane
@@ -59,11 +59,12 @@ def build_report(experiment: Experiment, summary: dict[str, Any], pictures: Sequ
 def _model_words(fit: ReconstructionConfig) -> str:
     """Return the PSF model in words."""
     described = {"pca": "principal components a CCD", "shapelets": "shapelets a CCD", "pixels": "each pixel on its own"}
-    basis = described[fit.basis] if fit.components is None else f"{fit.components} {described[fit.basis]}"
-    process = {"polynomial": "", "gp": "a Gaussian process over ", "kriging": "kriging over "}[fit.interpolation]
+    kind = described[given(fit.basis)]
+    basis = kind if fit.components is None else f"{fit.components} {kind}"
+    process = {"polynomial": "", "gp": "a Gaussian process over ", "kriging": "kriging over "}[given(fit.interpolation)]
     weights = {"equal": "", "snr": ", weights (S/N)²", "softened": ", weights (S/N)², softened for bright stars"}
     whole = "; ellipticity and size from one model of the whole focal plane" if fit.model == "focal_plane" else ""
-    return f"{basis}, {process}polynomials of order {fit.order}{weights[fit.weights]}{whole}"
+    return f"{basis}, {process}polynomials of order {fit.order}{weights[given(fit.weights)]}{whole}"
 
 
 #: Where the heights come from, measured ones or a budget.
@@ -86,11 +87,13 @@ def draw_pictures(
     components = noise_free_components(config)
     jackknife = all(c.n_patches for c in correlated.values())
     errors = "by jackknife over the CCDs" if jackknife else "from the scatter of the ellipticities of one CCD alone"
+    fit = config.reconstruction
+    unweighted = fit.interpolation == "polynomial" and fit.weights == "equal"
     at_stars = (
-        "Residuals at the stars hold the noise of each star, some of which the model has followed"
-        if whole
-        else "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
+        "Residuals at the stars of a CCD sum to zero by construction, so their correlation between CCDs cancels "
         "whatever the error of the model is"
+        if unweighted and not whole
+        else "Residuals at the stars hold the noise of each star, some of which the model has followed"
     )
     pictures = [
         Picture(
@@ -168,8 +171,7 @@ def draw_pictures(
             stamps_plot(close),
             "Observed stamps from the brightest to the faintest star of three CCDs, the model at their places, and "
             "the difference in units of each pixel's noise: where the model is right to within the star's own noise, "
-            "only that noise is left. A bright star can show more: mean and components are fitted without weights, "
-            "so the noise of the faint stars is in the model."
+            "only that noise is left. A bright star can show more: the noise of fainter stars is in the model."
             + (" The model here is the CCD's own: that of the focal plane has shapes only." if whole else ""),
         ),
     ]
@@ -179,13 +181,17 @@ def draw_pictures(
                 "Residuals of both models",
                 models_plot(correlated),
                 "ξ+ of the residuals of the two models, fitted to the same stars: of the whole focal plane, which all "
-                "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative. Residuals at the "
-                "stars sum to zero over each CCD where it has a model of its own, so their correlation between CCDs "
-                "cancels whatever the error of that model is.",
+                "other plots show, and CCD by CCD. Filled symbols are positive, open ones negative."
+                + (
+                    " Residuals at the stars sum to zero over each CCD where it has a model of its own, so their "
+                    "correlation between CCDs cancels whatever the error of that model is."
+                    if unweighted
+                    else ""
+                ),
             )
         )
     # Single pixels and shapelets look the same whatever the stars are.
-    return [p for p in pictures if config.reconstruction.basis == "pca" or p.title != OBSERVED_COMPONENTS]
+    return [p for p in pictures if fit.basis == "pca" or p.title != OBSERVED_COMPONENTS]
 
 
 def closest_middle_farthest(products: Sequence[CcdProduct]) -> list[CcdProduct]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..ccd_product import CcdProduct, HoldoutStars, ObservedStars
-from ..defaults import fewest_stars, noise_free_components
+from ..defaults import fewest_stars, given, noise_free_components
 from ..experiment import Experiment
 from ..measure.shapes import Shapes, fwhm, measure_shapes
 from ..measure.star_selection import require_stars
@@ -96,9 +96,9 @@ def fit_ccd_model(
     return PsfModel.fit(
         images,
         stars.observed[used],
-        basis=fit.basis,
-        interpolation=fit.interpolation,
-        weights=snr_weights(fit.weights, snr[used]),
+        basis=given(fit.basis),
+        interpolation=given(fit.interpolation),
+        weights=snr_weights(given(fit.weights), snr[used]),
         n_components=fit.components,
         order=fit.order,
         extent=stars.bounds,

@@ -22,7 +22,7 @@ from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
-from ...pipeline.defaults import as_configured
+from ...pipeline.defaults import as_configured, with_paper_model
 from ...pipeline.experiment import Experiment, hashed_heights, hashed_states
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
@@ -30,10 +30,13 @@ from ..metrics.optics import OPTICS
 from ..metrics.scene import Scene, make_plan
 from .check import BaselineCheck, Deviation
 from .file import Baseline, BaselineMetric, read_baseline, rounded
+from .requirements import check_used, given_limit, given_tolerance, parse_rules
 
 #: End of the names of baselines.
 SUFFIX = ".baseline.json"
 _BUNDLED = Path(__file__).parent / "bundled"
+# What metrics depend on, and where the file has its stamp.
+_STAMPS = {"pachon": "pachon", "prescription": "model_sha256", "configuration": "configuration_sha256"}
 
 
 def bundled_baselines() -> tuple[Path, ...]:
@@ -52,6 +55,8 @@ def make_baseline(
     ccds: Sequence[str] | None = None,
     pupil: Sequence[tuple[float, float]] | None = None,
     checked: Mapping[str, str] | None = None,
+    tolerances: Sequence[str] = (),
+    limits: Sequence[str] = (),
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[Baseline, dict[str, str]]:
@@ -75,6 +80,11 @@ def make_baseline(
         Points of the entrance pupil, in units of its radius; four by default.
     checked : mapping of str to str, optional
         Independent sources of metrics, by the start of their names.
+    tolerances : sequence of str, optional
+        Tolerances in place of those of rounding: ``1 %`` of the values of all metrics, ``spot rms = 0.1 um`` of those
+        whose names begin with these words.
+    limits : sequence of str, optional
+        Requirements: ``spot rms < 10 um``, ``vignetting > 0.5``.
     threads : int, optional
         Number of threads; results do not depend on it.
     progress : callable, optional
@@ -89,8 +99,10 @@ def make_baseline(
     Raises
     ------
     PachonError
-        If the telescope or the configuration cannot be read, or no metric can be computed.
+        If the telescope or the configuration cannot be read, no metric can be computed, or a tolerance or a limit is
+        that of none.
     """
+    tolerance_rules, limit_rules = parse_rules("tolerance", tolerances), parse_rules("limit", limits)
     telescope, folder = load_telescope(model), Path(folder)
     configuration = None if configuration is None else Path(configuration)
     experiment = None if configuration is None else _experiment(configuration, _absolute(model, Path()), telescope)
@@ -102,13 +114,19 @@ def make_baseline(
 
     def stored(name: str, value: float, tolerance: float, metric: Metric) -> BaselineMetric:
         against = next((text for start, text in (checked or {}).items() if name.startswith(start)), None)
+        given = given_tolerance(tolerance_rules, name, metric.unit, value, tolerance)
         return BaselineMetric(
+            # Digits of the metric's own tolerance: a given one says what matters, not what is known.
             value=rounded(value, tolerance),
             unit=metric.unit,
-            tolerance=tolerance,
-            reason=metric.reason,
+            tolerance=tolerance if given is None else given,
+            limit=given_limit(limit_rules, name, metric.unit),
+            reason=metric.reason if given is None else "given",
             checked_against=against,
         )
+
+    for rules in (tolerance_rules, limit_rules):
+        check_used(rules, found)
 
     metrics = {name: stored(name, *each) for name, each in found.items()}
     baseline = Baseline(
@@ -160,10 +178,13 @@ def check_baseline(
     def deviation(key: str, metric: BaselineMetric) -> Deviation:
         now = found[key][0] if key in found else None
         problem = None if key in found else problems.get(key.partition(" ")[0], "no such metric")
-        return Deviation(key, metric.unit, metric.value, metric.tolerance, now, metric.checked_against, problem)
+        against, limit = metric.checked_against, metric.limit
+        return Deviation(key, metric.unit, metric.value, metric.tolerance, now, against, problem, limit)
 
     deviations = sorted((deviation(*item) for item in baseline.figures.items()), key=lambda d: (-d.ratio, d.name))
-    return BaselineCheck(str(path), name, tuple(deviations), _notes(baseline, _stamps(telescope, experiment)))
+    now = _stamps(telescope, experiment)
+    changed = tuple(name for name, key in _STAMPS.items() if now[key] != getattr(baseline, key))
+    return BaselineCheck(str(path), name, tuple(deviations), _notes(baseline, changed), changed)
 
 
 def updated_baseline(
@@ -171,13 +192,13 @@ def updated_baseline(
 ) -> tuple[Baseline, BaselineCheck]:
     """Replace the metrics of a baseline that are out of tolerance; return it and the check.
 
-    Plan, tolerances and reasons stay, as do metrics within their tolerances. Replaced metrics lose their independent
-    source.
+    Plan, tolerances, limits and reasons stay, as do metrics within their tolerances. Replaced metrics lose their
+    independent source.
     """
     baseline = read_baseline(path)
     check = check_baseline(path, threads=threads, progress=progress)
     metrics = dict(baseline.figures)
-    for d in check.out:
+    for d in check.moved:
         if d.found is None:
             raise ConfigError(f"figures.{d.name}: {d.problem}; remove its line, or save the baseline anew", file=path)
         update = {"value": rounded(d.found, d.tolerance), "checked_against": None}
@@ -241,7 +262,8 @@ def _experiment(configuration: Path, model: str, telescope: Telescope) -> Experi
     base = load_configuration(configuration)
     engine = "long_exposure" if base.atmosphere.enabled else None
     try:
-        config = with_options(base, telescope=model, psf__engine=engine)
+        # Kriging looks for its covariance in steps that rounding may change; metrics need a model of one solution.
+        config = with_options(with_paper_model(base), telescope=model, psf__engine=engine)
         experiment = Experiment.from_config(config, configuration.parent)
         return replace(experiment, telescope=as_configured(telescope, experiment.config))
     except PachonError as error:
@@ -262,15 +284,14 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
     return {"pachon": VERSION, "model_sha256": prescription_hash(telescope), "configuration_sha256": hashed}
 
 
-def _notes(baseline: Baseline, now: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a line for each stamp that has changed."""
-    notes = []
-    if now["pachon"] != baseline.pachon:
-        notes.append(f"pachon: {baseline.pachon} -> {now['pachon']}")
-    for key, name in (("model_sha256", "prescription"), ("configuration_sha256", "configuration")):
-        if now[key] != getattr(baseline, key):
-            notes.append(f"the {name} is not the one that the baseline was made from")
-    return tuple(notes)
+def _notes(baseline: Baseline, changed: Sequence[str]) -> tuple[str, ...]:
+    """Return a line for each input that has changed."""
+    return tuple(
+        f"pachon: {baseline.pachon} -> {VERSION}"
+        if name == "pachon"
+        else f"the {name} is not the one that the baseline was made from"
+        for name in changed
+    )
 
 
 def _absolute(name: str, folder: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.plotting import BLUE, GREY, RED, axes_at, plain_text, styled
 from ...core.result import Result
+from .file import Limit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,7 +19,9 @@ if TYPE_CHECKING:
 
 #: Rows of a table that are shown by default; fewer where all metrics pass.
 _SHOWN, _SHOWN_PASSED = 20, 3
-_COLUMNS = ("metric", "now", "baseline", "tolerance", "unit", "deviation / tolerance", "checked against")
+_COLUMNS = ("metric", "now", "baseline", "tolerance", "limit", "unit", "deviation / tolerance", "checked against")
+#: Causes of failures besides drift, which :attr:`BaselineCheck.drift` names.
+BROKEN, MISSING = "requirement broken", "metric missing"
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class Deviation:
         Independent source of the stored value.
     problem : str or None
         Reason why it cannot be computed.
+    limit : Limit or None
+        Requirement of the present value.
     """
 
     name: str
@@ -47,19 +53,30 @@ class Deviation:
     found: float | None
     checked_against: str | None
     problem: str | None = None
+    limit: Limit | None = None
 
     @property
     def ratio(self) -> float:
         """Change in units of the tolerance; infinite where the metric cannot be computed."""
         return np.inf if self.found is None else abs(self.found - self.stored) / self.tolerance
 
+    @property
+    def moved(self) -> bool:
+        """True where the metric is out of tolerance, or cannot be computed."""
+        return not self.ratio <= 1.0
+
+    @property
+    def broken(self) -> bool:
+        """True where the present value does not meet its requirement."""
+        return self.limit is not None and self.found is not None and not self.limit.holds(self.found)
+
     def texts(self) -> list[str]:
         """Return its row of a table."""
         digits = max(0, 1 - int(np.floor(np.log10(self.tolerance))))
         found = self.problem or "none" if self.found is None else f"{self.found:.{digits}f}"
         ratio = f"{self.ratio:.2f}" if self.ratio < 1e4 else f"{self.ratio:.1e}"
-        against = self.checked_against or ""
-        return [self.name, found, f"{self.stored:.{digits}f}", f"{self.tolerance:g}", self.unit, ratio, against]
+        against, limit = self.checked_against or "", "" if self.limit is None else str(self.limit)
+        return [self.name, found, f"{self.stored:.{digits}f}", f"{self.tolerance:g}", limit, self.unit, ratio, against]
 
 
 @dataclass(frozen=True)
@@ -74,6 +91,8 @@ class BaselineCheck(Result):
         Worst first.
     notes : tuple of str
         Other changes since: version, prescription, configuration.
+    changed : tuple of str
+        What has changed since: ``pachon``, ``prescription``, ``configuration``.
     """
 
     _row_type = Deviation
@@ -82,24 +101,49 @@ class BaselineCheck(Result):
     model: str
     deviations: tuple[Deviation, ...]
     notes: tuple[str, ...]
+    changed: tuple[str, ...] = ()
+
+    @property
+    def moved(self) -> tuple[Deviation, ...]:
+        """Metrics out of tolerance, or that cannot be computed, worst first."""
+        return tuple(d for d in self.deviations if d.moved)
 
     @property
     def out(self) -> tuple[Deviation, ...]:
-        """Metrics out of tolerance, worst first."""
-        return tuple(d for d in self.deviations if not d.ratio <= 1.0)
+        """Metrics out of tolerance or beyond their limits, worst first."""
+        return tuple(d for d in self.deviations if d.moved or d.broken)
 
     @property
     def passed(self) -> bool:
-        """True where all metrics are within their tolerances."""
+        """True where all metrics are within their tolerances and limits."""
         return not self.out
+
+    @property
+    def drift(self) -> str:
+        """Cause of metrics out of tolerance: inputs that have changed, else the version or the machine."""
+        inputs = [name for name in self.changed if name != "pachon"]
+        if inputs:
+            return f"{' and '.join(inputs)} changed"
+        return "pachon changed" if self.changed else "drift of the same inputs (machine, libraries)"
+
+    @property
+    def causes(self) -> dict[str, tuple[Deviation, ...]]:
+        """Failures by their causes, each once: broken requirements, missing metrics, drift."""
+        found: dict[str, list[Deviation]] = {BROKEN: [], MISSING: [], self.drift: []}
+        for d in self.out:
+            found[BROKEN if d.broken else MISSING if d.found is None else self.drift].append(d)
+        return {cause: tuple(each) for cause, each in found.items() if each}
 
     @property
     def verdict(self) -> str:
         """Result in one line."""
-        count = len(self.deviations)
+        count, broken = len(self.deviations), sum(d.broken for d in self.deviations)
         if self.passed:
-            return f"{self.path}: all {count} metrics of {self.model} within their tolerances"
-        return f"{self.path}: {len(self.out)} of {count} metrics of {self.model} out of tolerance"
+            limits = " and limits" if any(d.limit for d in self.deviations) else ""
+            return f"{self.path}: all {count} metrics of {self.model} within their tolerances{limits}"
+        parts = [f"{len(self.moved)} of {count} metrics of {self.model} out of tolerance"] if self.moved else []
+        parts += [f"{broken} of {count} metrics of {self.model} beyond their limits"] if broken else []
+        return f"{self.path}: {', '.join(parts)}"
 
     def _label(self) -> str:
         return self.verdict
@@ -128,6 +172,7 @@ class BaselineCheck(Result):
 
     def _summary(self) -> dict[str, Any]:
         """Return the result as plain numbers, deviations worst first."""
+        cause = {d.name: name for name, each in self.causes.items() for d in each}
         return {
             "baseline": self.path,
             "model": self.model,
@@ -135,14 +180,38 @@ class BaselineCheck(Result):
             "figures": len(self.deviations),
             "out": len(self.out),
             "notes": list(self.notes),
-            "deviations": [{**vars(d), "deviation_over_tolerance": d.ratio} for d in self.deviations],
+            "causes": {name: len(each) for name, each in self.causes.items()},
+            "deviations": [
+                {
+                    **vars(d),
+                    "limit": None if d.limit is None else d.limit.model_dump(exclude_none=True),
+                    "deviation_over_tolerance": d.ratio,
+                    "cause": cause.get(d.name),
+                }
+                for d in self.deviations
+            ],
         }
 
     @check_arguments
     def text(self, everything: bool = False) -> str:
-        """Return verdict, notes and a table of the worst metrics, or of all."""
-        shown = None if everything else _SHOWN_PASSED if self.passed else _SHOWN
-        rows = [list(_COLUMNS), *(d.texts() for d in self.deviations[:shown])]
-        widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
-        table = ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-        return "\n".join([self.verdict, *self.notes, *table])
+        """Return verdict, notes and the worst metrics of each cause, or all metrics."""
+        lines = [self.verdict, *self.notes]
+        if self.passed:
+            return "\n".join(lines + _table(self.deviations[: None if everything else _SHOWN_PASSED]))
+        groups = self.causes
+        if everything:
+            groups["within"] = tuple(d for d in self.deviations if not (d.moved or d.broken))
+        for name, each in groups.items():
+            kinds = Counter(d.name.partition(" ")[0] for d in each)
+            lines.append(f"{name}: {', '.join(f'{kind} {count}' for kind, count in kinds.items()) or 'none'}")
+            lines += _table(each[: None if everything else _SHOWN])
+        return "\n".join(lines)
+
+
+def _table(deviations: tuple[Deviation, ...]) -> list[str]:
+    """Return lines of a table, with a column of limits where there are any."""
+    rows = [d.texts() for d in deviations]
+    columns = [k for k, name in enumerate(_COLUMNS) if name != "limit" or any(row[k] for row in rows)]
+    rows = [[row[k] for k in columns] for row in (list(_COLUMNS), *rows)] if rows else []
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]

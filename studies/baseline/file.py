@@ -10,9 +10,9 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
@@ -21,8 +21,29 @@ from ...core.schema import Positive, Real, Section, validated
 from ..metrics.scene import Plan
 
 FORMAT = "pachon baseline"
-#: Version of the format, raised when an older pachon could not read the file.
-VERSION = 1
+#: Versions of the format: 2 has limits, which an older pachon could not read, and is written for these alone.
+VERSIONS = (1, 2)
+
+
+class Limit(Section):
+    """Requirement of a metric, in its unit: the largest or the least accepted value, or both."""
+
+    max: Real | None = Field(None, description="largest accepted value")
+    min: Real | None = Field(None, description="least accepted value")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.max is None and self.min is None:
+            raise ValueError("expected max or min")
+        return self
+
+    def holds(self, value: float) -> bool:
+        """Return whether a value is within the limit."""
+        return (self.max is None or value <= self.max) and (self.min is None or value >= self.min)
+
+    def __str__(self) -> str:
+        bounds = (("<=", self.max), (">=", self.min))
+        return ", ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
 
 
 class BaselineMetric(Section):
@@ -31,6 +52,7 @@ class BaselineMetric(Section):
     value: Real = Field(description="value of the metric")
     unit: str = Field(description="unit; empty for a pure number")
     tolerance: Positive = Field(description="largest accepted change, in the same unit")
+    limit: Limit | None = Field(None, description="requirement that the present value must meet, in the same unit")
     reason: str = Field(description="reason of the tolerance: a key of reasons")
     checked_against: str | None = Field(None, description="independent source of the value, and its agreement")
 
@@ -39,7 +61,7 @@ class Baseline(Section):
     """Metrics of a telescope, and their origin."""
 
     format: Literal["pachon baseline"] = Field("pachon baseline", description="name of the format")
-    version: int = Field(VERSION, description="version of the format")
+    version: int = Field(VERSIONS[0], description="version of the format")
     pachon: str = Field(description="version of pachon that computed the metrics")
     model: str = Field(description="bundled telescope, or path of its file from the folder of this one")
     model_sha256: str = Field(description="SHA-256 of the prescription as pachon writes it")
@@ -62,9 +84,11 @@ def read_baseline(path: str | os.PathLike[str]) -> Baseline:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else type(content).__name__
         raise ConfigError(f"format = {found!r}: expected {FORMAT!r}, as pachon baseline save writes it", file=path)
-    if content.get("version") != VERSION:
+    if content.get("version") not in VERSIONS:
         found, writer = content.get("version"), content.get("pachon")
-        problem = f"version = {found!r}: expected {VERSION}; the file was written by pachon {writer}"
+        problem = (
+            f"version = {found!r}: expected {VERSIONS[0]} or {VERSIONS[1]}; the file was written by pachon {writer}"
+        )
         raise ConfigError(problem, file=path, key="version")
     baseline = validated(Baseline, content, str(path))
     for name, figure in baseline.figures.items():
@@ -83,6 +107,7 @@ def write_baseline(path: str | os.PathLike[str], baseline: Baseline) -> None:
 def baseline_text(baseline: Baseline) -> str:
     """Return the file's text."""
     content = baseline.model_dump(mode="json", exclude={"figures"})
+    content["version"] = VERSIONS[any(metric.limit is not None for metric in baseline.figures.values())]
     lines = [f" {_json(key)}: {_block(value)}," for key, value in content.items() if value is not None]
     figures = [
         f"  {_json(name)}: {_json(baseline.figures[name].model_dump(mode='json', exclude_none=True))}"

@@ -17,6 +17,7 @@ REASONS = {
     "seed is fixed: a NumPy that drew other numbers from it would move heights by micrometres.",
     "image": "Stamps and Fourier sums of the long-exposure engine are float32 (6e-8), thousands of terms each.",
     "model": "Singular vectors of float32 stamps: those of the smallest singular values are theirs to rounding.",
+    "given": "Given when the baseline was saved.",
 }
 _PER_METRE = {"m": 1.0, "mm": 1e3, "um": 1e6, "nm": 1e9}
 

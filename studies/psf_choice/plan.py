@@ -9,6 +9,7 @@ from itertools import product
 
 from ...core.errors import ConfigError
 from ...pipeline.config import Configuration
+from ...pipeline.defaults import given
 from ...pipeline.psf_model.basis import BASES
 from ...pipeline.psf_model.fit import COMPONENTS, ORDERS
 from ...pipeline.psf_model.polynomial import term_count
@@ -127,8 +128,8 @@ def make_plan(
     base = Case(
         config.stars.observed,
         config.stars.snr_min,
-        fit.basis,
-        fit.interpolation if fit.interpolation in PROCESSES else fit.weights,
+        given(fit.basis),
+        given(fit.interpolation) if fit.interpolation in PROCESSES else given(fit.weights),
         fit.order or 0,
         fit.components or 0,
     )

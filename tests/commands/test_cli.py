@@ -55,7 +55,7 @@ def test_version(capsys):
         (["run", "none.yaml"], ["none.yaml", "no such file"]),
         (["run", "--seed", "-1"], ["seed = -1", "from 0"]),
         (["run", "--truth-stars", "0"], ["stars.truth = 0"]),
-        (["run", "--observed-stars", "5"], ["reconstruction.components = 20", "stars.observed = 5"]),
+        (["run", "--truth-stars", "5"], ["reconstruction.truth_order = 4", "stars.truth = 5"]),
         (["run", "--ccds", "R22_S1l"], ["'R22_S1l'", "did you mean R22_S"]),
         (["run", "--raft", "R00"], ["'R00'"]),
         (["run", "--ccds", ","], ["--ccds = ','", "R22_S11,R22_S12"]),

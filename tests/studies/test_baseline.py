@@ -177,10 +177,12 @@ def test_a_change_of_a_file_is_caught_by_the_command(mine, capsys, file, old, ne
     what = "prescription" if of_telescope else "configuration"
     assert "out of tolerance" in lines[0]
     assert lines[1] == f"the {what} is not the one that the baseline was made from"
-    ratios = [float(line.split()[-1]) for line in lines[3:]]
+    assert lines[2].startswith(f"{what} changed: ")
+    rows = [line for line in lines[3:] if not line.startswith(("metric ", "within:"))]
+    ratios = [float(line.split()[-1]) for line in rows]
     assert len(ratios) == len(read_baseline(part).figures)
     assert ratios == sorted(ratios, reverse=True)
-    assert kinds <= {line.split()[0] for line, ratio in zip(lines[3:], ratios, strict=True) if ratio > 1}
+    assert kinds <= {line.split()[0] for line, ratio in zip(rows, ratios, strict=True) if ratio > 1}
 
 
 @pytest.mark.parametrize("motion", [{"dz_um": 1}, {"dz_um": -1}])
@@ -326,8 +328,9 @@ def test_another_telescope_is_another(project, capsys):
     assert main(["check", file, "--model", "lsst_v3.3_i"]) == 1
     out = capsys.readouterr().out
     assert "metrics of lsst_v3.3_i out of tolerance" in out
-    # Two notes, and the worst twenty: another band is another configuration too.
-    assert len(out.splitlines()) == 4 + 20
+    # Two notes, one cause, and the worst twenty: another band is another configuration too.
+    assert len(out.splitlines()) == 5 + 20
+    assert "\nprescription and configuration changed: landing" in out
 
 
 def test_a_telescope_alone_and_options(tmp_path, monkeypatch, capsys):
@@ -377,7 +380,9 @@ def first_figure(content):
     ("change", "words"),
     [
         (lambda c: c.update(format="other"), ["format = 'other'", "pachon baseline"]),
-        (lambda c: c.update(version=2), ["version = 2", "expected 1", "pachon 0.1.0"]),
+        (lambda c: c.update(version=3), ["version = 3", "expected 1 or 2", "pachon 0.1.0"]),
+        (lambda c: first_figure(c).update(limit={}), ["limit", "expected max or min"]),
+        (lambda c: first_figure(c).update(limit={"most": 1}), ["limit", "most"]),
         (lambda c: c.update(model="lsst_v3.3_q"), ["lsst_v3.3_q"]),
         (lambda c: c.update(model="none.yaml"), ["none.yaml"]),
         (lambda c: c.update(configuration="none.yaml"), ["none.yaml"]),
@@ -468,8 +473,9 @@ def test_assert_matches_baseline(project):
     with pytest.raises(AssertionError) as caught:
         assert_matches_baseline(moved, path)
     lines = str(caught.value).splitlines()
-    assert lines[2].split()[:3] == ["metric", "now", "baseline"]
-    assert len(lines) == 3 + 20
+    assert lines[2].startswith("prescription changed: landing")
+    assert lines[3].split()[:3] == ["metric", "now", "baseline"]
+    assert len(lines) == 4 + 20
 
 
 def run_pytest(folder, *arguments):

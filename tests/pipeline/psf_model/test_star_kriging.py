@@ -66,6 +66,21 @@ def test_it_is_near_to_the_best_of_all_choices_of_polynomials(count, rough):
     assert np.exp(np.log(ratios).mean()) < 1.1
 
 
+def test_degrees_that_the_stars_do_not_show_cost_nothing_and_others_are_found():
+    # A field that is an exact quadratic, and one with terms of degree 4 as large as the linear ones.
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-1.0, 1.0, (100, 2))
+    terms = design_matrix(points, EXTENT, 4)
+    noise = np.full((100, 3), 1e-4)
+    degrees = np.repeat(np.arange(5), np.arange(1, 6))
+    for amplitudes in ([1.0, 1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0, 1.0]):
+        numbers = terms @ (0.1 * np.array(amplitudes)[degrees][:, None] * rng.normal(size=(15, 3)))
+        kernel = kriging.fit_kernel(points, numbers + 1e-2 * rng.normal(size=(100, 3)), noise, terms)
+        # Variances in units of the noise, 100 where there are terms; fewer than fifty numbers tell each.
+        for found, amplitude in zip(kernel[3:], amplitudes[1:], strict=True):
+            assert (10.0 < found < 1000.0) if amplitude else found < 0.1
+
+
 @pytest.fixture(scope="module")
 def fitted():
     stars, places, _, elsewhere = field(5, 30, 1.0)
@@ -74,9 +89,10 @@ def fitted():
 
 def test_trend_and_process_are_those_of_one_large_gaussian(fitted):
     model, _, elsewhere = fitted
-    variance, length, floor, linear, quadratic = model.kernel[0]
-    prior = np.diag([1e4, linear, linear, quadratic, quadratic, quadratic])
-    at_stars, there = (design_matrix(p, EXTENT, 2) for p in (model.positions, elsewhere))
+    variance, length, floor, *trend = model.kernel[0]
+    assert len(trend) == 4
+    prior = np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5]))
+    at_stars, there = (design_matrix(p, EXTENT, 4) for p in (model.positions, elsewhere))
 
     def covariance(a, b, terms_a, terms_b):
         distance = np.hypot(*np.moveaxis(a[:, None] - b, -1, 0))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError, DomainError
-from pachon.pipeline.config import with_options
+from pachon.pipeline.config import ReconstructionConfig, with_options
+from pachon.pipeline.defaults import with_paper_model
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.star_selection import StarFlag
 from pachon.pipeline.psf_model.checks import snr_weights
@@ -101,11 +102,18 @@ def test_a_ccd_all_of_whose_stars_are_rejected_is_one_line(experiment, exposure)
         ({"reconstruction__weights": "snr"}, "pca", 4, "snr"),
         ({"reconstruction__weights": "softened"}, "pca", 4, "softened"),
         ({"reconstruction__interpolation": "gp"}, "pca", 4, "equal"),
+        (None, "pixels", 961, None),
     ],
 )
 def test_the_configuration_chooses_the_model(experiment, exposure, plain, options, basis, components, weights):
     config = experiment.config
-    if basis == "pixels":
+    if options is None:
+        # Nothing given but the polynomials of the noise-free PSFs.
+        fit = ReconstructionConfig(truth_order=2)
+        chosen = dataclasses.replace(
+            experiment, config=Experiment.from_config(config.model_copy(update={"reconstruction": fit})).config
+        )
+    elif basis == "pixels":
         fit = config.reconstruction.model_copy(update={"components": None, "basis": "pixels"})
         chosen = dataclasses.replace(
             experiment, config=Experiment.from_config(config.model_copy(update={"reconstruction": fit})).config
@@ -114,12 +122,16 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
         chosen = configured(experiment, stars__truth=60, **options)
     product = model_ccd(chosen, exposure)
     model = product.model
-    assert (model.basis, model.n_components, model.order) == (basis, components, 1)
-    assert (model.kernel is not None) == ("reconstruction__interpolation" in options)
-    expected = snr_weights(weights, product.observed.snr)
-    assert (model.weights is None) == (expected is None)
-    if expected is not None:
-        np.testing.assert_array_equal(model.weights, expected)
+    assert (model.basis, model.n_components, model.order) == (basis, components, 4 if options is None else 1)
+    assert (model.kernel is not None) == (options is None or "reconstruction__interpolation" in options)
+    if options is None:
+        # Kriging weighs stars by their own noise, of which a bright one has less.
+        assert np.corrcoef(np.log(model.weights), np.log(product.observed.snr))[0, 1] > 0.95
+    else:
+        expected = snr_weights(weights, product.observed.snr)
+        assert (model.weights is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_array_equal(model.weights, expected)
     assert not np.array_equal(product.holdout.model_e1, plain.holdout.model_e1)
     # The noise-free PSFs are described by principal components all the same.
     assert product.noise_free_model.basis == "pca"
@@ -160,4 +172,14 @@ def test_defaults_follow_basis_and_interpolation(tiny):
         Experiment.from_config(type(config)(**{"reconstruction": {"basis": "pixels"}})).config.reconstruction.components
         is None
     )
-    assert Experiment.from_config(type(config)()).config.reconstruction.order == 3
+    # Nothing given: kriging of pixels. Any key of the paper's way brings the others.
+    by_default = Experiment.from_config(type(config)()).config.reconstruction
+    assert (by_default.basis, by_default.interpolation, by_default.weights) == ("pixels", "kriging", "equal")
+    assert (by_default.components, by_default.order) == (None, 4)
+    paper = {"basis": "pca", "components": 20, "interpolation": "polynomial", "weights": "equal", "order": 3}
+    for key, value in paper.items():
+        found = Experiment.from_config(type(config)(**{"reconstruction": {key: value}})).config.reconstruction
+        assert found.model_dump(include=set(paper)) == paper
+    pinned = with_paper_model(type(config)())
+    assert Experiment.from_config(pinned).config.reconstruction.model_dump(include=set(paper)) == paper
+    assert with_paper_model(fresh) is fresh
