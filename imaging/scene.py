@@ -123,8 +123,8 @@ def draw_ccd(
     Raises
     ------
     ConfigError
-        If the run has no atmosphere, without which PSFs are finer than pixels, or its pixels are not those of the
-        camera.
+        If the run has no atmosphere, without which PSFs are finer than pixels, its pixels are not those of the
+        camera, or the CCD is turned.
     DomainError
         If no light reaches the CCD, or the galaxies bury the sky.
     """
@@ -139,7 +139,13 @@ def draw_ccd(
         )
     if exposure is None:
         exposure = Exposure(config.band or "r", config.atmosphere.exposure_s)
-    part = Window(0, 0, camera.pixels, camera.pixels) if window is None else window
+    index = camera.ccd_index(ccd)
+    if camera.rotation_deg[index]:
+        raise ConfigError(
+            f"CCD {ccd} of {camera.name} is turned by {camera.rotation_deg[index]:g} deg: images expect CCDs along the "
+            "axes of the focal plane"
+        )
+    part = Window(0, 0, *camera.pixels[index].tolist()) if window is None else window
     wcs = ccd_wcs(
         experiment.telescope,
         camera,

@@ -189,7 +189,8 @@ def ccd_wcs(
             f"pointing = {pointing!r}, position_angle = {position_angle!r}: expected finite angles, "
             "declinations from -90 to 90 deg"
         )
-    center, pixels = camera.centers[camera.ccd_index(ccd)], camera.pixels
+    index = camera.ccd_index(ccd)
+    pixels = camera.pixels[index]
     middle, half = 0.5 * (pixels - 1), 0.5 * pixels
 
     def traced(points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +198,8 @@ def ccd_wcs(
         # Chebyshev points: a polynomial through them errs about equally everywhere.
         line = np.cos(np.pi * (np.arange(points) + 0.5) / points) / np.cos(0.5 * np.pi / points)
         places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        positions = center + half * camera.pixel_size * places
+        offset = half * camera.pixel_size * places
+        positions = np.stack(camera.from_local(index, offset[:, 0], offset[:, 1]), axis=1)
         slopes = fields_at(telescope, positions, wavelength, projection="gnomonic", threads=threads)
         x, y = -slopes.T
         return places, np.stack([x * np.cos(rho) + y * np.sin(rho), y * np.cos(rho) - x * np.sin(rho)], axis=1)
@@ -220,7 +222,7 @@ def ccd_wcs(
     # Zero point and angles of the pointing modulo a turn: equal skies have equal headers.
     return CcdWcs(
         pointing=(float(angles[0] % (2.0 * np.pi)), float(angles[1])),
-        shape=(pixels, pixels),
+        shape=(int(pixels[1]), int(pixels[0])),
         reference_pixel=reference + middle,
         cd=linear,
         distortion=distortion,
@@ -229,7 +231,9 @@ def ccd_wcs(
     )
 
 
-def _forward(places: np.ndarray, sky: np.ndarray, order: int, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _forward(
+    places: np.ndarray, sky: np.ndarray, order: int, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return linear part, reference pixel from the middle of the CCD, and distortion of a polynomial of an order."""
     tables = _fitted(half * places, sky, order)
     # The reference pixel is the root of the polynomial.

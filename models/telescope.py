@@ -88,12 +88,14 @@ class Telescope:
     group_frames : mapping of str to (vertex, rotation), optional
         Frame of each group: its pivot [m] and axes. By default that of its first surface.
     camera : str, optional
-        Name of the camera at the focus.
+        Name of the camera at the focus, or path of its file.
     obstructions : tuple of Obstruction
         Meshes that block light between the surfaces.
     object_distance : float
         Height of the plane of the object [m], telescope frame; infinite for the sky. At a finite distance a field angle
         is that of the ray from the object through the centre of the entrance pupil.
+    site : str, optional
+        Name of the site, or path of its file.
     """
 
     name: str
@@ -117,6 +119,7 @@ class Telescope:
     camera: str | None = None
     obstructions: tuple[Obstruction, ...] = ()
     object_distance: float = math.inf
+    site: str | None = None
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.surfaces]

@@ -26,7 +26,8 @@ from ...core.errors import DomainError, ProductError
 from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
-from ...models.camera.camera import Camera, load_camera
+from ...models.camera.camera import Camera
+from ...models.camera.cameras import load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
@@ -99,7 +100,7 @@ class StaticHeights:
             known = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
             grid = _array(hdus["GRID"])
             surfaces = CcdSurfaces(
-                known.half_size,
+                known.half_sizes,
                 _array(hdus["POLYNOMIAL"]),
                 np.zeros((len(known), 2, 4)),
                 grid if grid.size else None,

@@ -24,9 +24,7 @@ def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, s
     distance of the layer.
     """
     air = config.atmosphere
-    chosen = camera.centers[[camera.ccd_index(name) for name in config.ccds or ()]]
-    half = camera.half_size * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-    corners = (chosen[:, None] + half).reshape(-1, 2)
+    corners = camera.corners(camera.ccd_index(name) for name in config.ccds or ()).reshape(-1, 2)
     slopes = np.tan(fields_at(telescope, corners))
     distances = line_of_sight(np.array(site.altitudes), air.ground_lift_m, math.radians(air.zenith_angle_deg))
     wind = np.array(site.wind_speeds) * air.exposure_s

@@ -11,7 +11,6 @@ from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.io.site_file import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
-from pachon.pipeline.defaults import DEFAULT_CCDS
 from pachon.pipeline.experiment import Experiment, hashed_heights
 from pachon.wavefront.aberration import LARGEST_RMS, ResidualWavefront
 
@@ -113,7 +112,7 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     config = experiment.config
     assert config.telescope == "lsst_v3.3_r"
     assert config.band == "r"
-    assert config.ccds == DEFAULT_CCDS
+    assert config.ccds == tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
     assert len(config.ccds) == 9
     # Five equally spaced wavelengths over 545 to 703 nm.
     assert config.wavelengths_nm == (545.0, 584.5, 624.0, 663.5, 703.0)
@@ -121,8 +120,8 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     radius = experiment.field_radius_on_detector
     x, y = experiment.camera.centers[[experiment.camera.ccd_index(n) for n in config.ccds]].T
     nearest, farthest = abs(x[0] + 1j * y[0]), (x**2 + y**2).max() ** 0.5
-    assert nearest <= experiment.camera.ccd_size * 1.1
-    assert farthest + experiment.camera.half_size > radius > farthest
+    assert nearest <= experiment.camera.shortest_side * 1.1
+    assert farthest + (0.5 * experiment.camera.shortest_side) > radius > farthest
 
 
 def test_band_and_telescope_follow_each_other():

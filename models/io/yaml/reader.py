@@ -28,6 +28,7 @@ from .values import (
     Number,
     OptionalAngles,
     OptionalBand,
+    OptionalNameOrFile,
     OptionalPlace,
     OptionalText,
     PositiveAngle,
@@ -167,7 +168,8 @@ class Prescription(Section):
     reference_sphere_radius: PositiveLength
     field: FieldSection
     wavelengths: WavelengthsSection
-    camera: OptionalText = None
+    camera: OptionalNameOrFile = None
+    site: OptionalNameOrFile = None
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
     groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
@@ -204,6 +206,7 @@ class Prescription(Section):
             default_wavelength=self.wavelengths.default,
             band=self.wavelengths.band,
             camera=self.camera,
+            site=self.site,
             medium_before=medium_before,
             groups={name: group.surfaces for name, group in self.groups.items()},
             group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},
