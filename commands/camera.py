@@ -74,12 +74,17 @@ def camera_command(
 
 def _listed_camera(name: str) -> Camera | None:
     """Return the camera of a name or of a camera file; None of anything else."""
+    from ..core.errors import unknown_name
     from ..models.camera.cameras import CAMERAS, ENDINGS, load_camera
     from ..models.io.camera_file import is_camera_file
+    from ..models.io.heights.zernike_table import AS_MEASURED
 
     path = Path(name)
-    if name in CAMERAS or (path.suffix.lower() in ENDINGS and is_camera_file(path)):
+    ending = path.suffix.lower()
+    if name in CAMERAS or (ending in ENDINGS and is_camera_file(path)):
         return load_camera(name)
+    if not ending and name not in AS_MEASURED:
+        raise unknown_name("camera", name, (*CAMERAS, *AS_MEASURED))
     return None
 
 

@@ -29,7 +29,7 @@ from .draw import Window
 from .exposure import Exposure
 from .image_file import is_whole
 from .preview import cutouts_png, preview_png
-from .scene import check_density, draw_ccd, stamped
+from .scene import check_density, draw_ccd, nominal_scale, stamped
 
 #: Limits of the bins over which the light of a population is summed.
 _MAGNITUDES = 200
@@ -182,6 +182,7 @@ def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
             image.exposures,
             gain=image.gain,
             sky=image.sky_mag,
+            pixel_scale=nominal_scale(experiment),
             subtract_background=image.subtract_background,
             noise=image.noise,
         )

@@ -81,8 +81,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     camera_name = None
     if config.camera is not None:
         camera_name = _absolute(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
-    with error_context(key="camera"):
-        camera = _camera_of(telescope, camera_name)
+    camera = _camera_of(telescope, camera_name)
     atmosphere = config.atmosphere
     site_name = _absolute(atmosphere.site or telescope.site or _SITE, folder, ())
     plane = config.focal_plane
@@ -140,7 +139,8 @@ def _camera_of(telescope: Telescope, name: str | None) -> Camera:
             f"telescope = {telescope.name}, which has none: expected a camera: {', '.join(CAMERAS)}, or a file, "
             "e.g. camera: hsc"
         )
-    return load_camera(found)
+    with error_context(key="camera"):
+        return load_camera(found)
 
 
 def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
@@ -149,11 +149,16 @@ def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict
     pixel = camera.pixel_size / fine
     found: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
     if config.psf.stamp is None:
-        axis = field_direction([0.0], [0.0])
-        jacobian = image_jacobians(telescope, axis, telescope.default_wavelength)[0]
-        pixels = side * ARCSEC * math.sqrt(abs(float(np.linalg.det(jacobian)))) / pixel
+        pixels = side * ARCSEC / pixel_angle(telescope, pixel)
         found["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
     return found
+
+
+def pixel_angle(telescope: Telescope, pixel_size: float) -> float:
+    """Return the angle of a pixel [m] in the middle of the field [rad]."""
+    axis = field_direction([0.0], [0.0])
+    jacobian = image_jacobians(telescope, axis, telescope.default_wavelength)[0]
+    return pixel_size / math.sqrt(abs(float(np.linalg.det(jacobian))))
 
 
 def as_configured(telescope: Telescope, config: Configuration) -> Telescope:

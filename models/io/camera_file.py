@@ -63,15 +63,15 @@ class CameraFile(Section):
     def camera(self) -> Camera:
         """Return the camera."""
         rafts = tuple(dict.fromkeys(ccd.raft for ccd in self.ccds if ccd.raft is not None))
-        placement = np.array([(c.dz_um, c.rx_urad, c.ry_urad) for c in self.ccds]) * 1e-6
+        placement = np.array([(c.dz_um, c.rx_urad, c.ry_urad) for c in self.ccds]) / 1e6
         return Camera(
             name=self.name,
             ccd_names=tuple(ccd.name for ccd in self.ccds),
             raft_names=rafts,
             raft_index=np.array([-1 if ccd.raft is None else rafts.index(ccd.raft) for ccd in self.ccds]),
-            centers=np.array([(ccd.x_mm, ccd.y_mm) for ccd in self.ccds]) * 1e-3,
+            centers=np.array([(ccd.x_mm, ccd.y_mm) for ccd in self.ccds]) / 1e3,
             pixels=np.array([self._pixels_of(ccd) for ccd in self.ccds]),
-            pixel_size=self.pixel_um * 1e-6,
+            pixel_size=self.pixel_um / 1e6,
             vendors=self._vendors(),
             rotation_deg=np.array([ccd.rotation_deg for ccd in self.ccds]),
             placement=placement if placement.any() else None,
@@ -80,15 +80,16 @@ class CameraFile(Section):
     def _pixels_of(self, ccd: CcdSection) -> Any:
         found = self.pixels if ccd.pixels is None else ccd.pixels
         if found is None:
-            raise PrescriptionError("expected pixels: [NX, NY], there or for all CCDs", key=f"ccds[{ccd.name}].pixels")
+            key = f"ccds[{ccd.name}].pixels"
+            raise PrescriptionError(f"{key}: expected [NX, NY], there or for all CCDs as pixels", key=key)
         return found
 
     def _vendors(self) -> tuple[str, ...]:
         named = [ccd.name for ccd in self.ccds if ccd.vendor is not None]
         for ccd in self.ccds:
             if named and ccd.vendor is None:
-                text = f"expected a vendor, as {named[0]} has one"
-                raise PrescriptionError(text, key=f"ccds[{ccd.name}].vendor")
+                key = f"ccds[{ccd.name}].vendor"
+                raise PrescriptionError(f"{key}: expected a text, as {named[0]} has one", key=key)
         return tuple(str(ccd.vendor) for ccd in self.ccds) if named else ()
 
 

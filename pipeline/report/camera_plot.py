@@ -21,14 +21,14 @@ def camera_plot(camera: Camera, title: str) -> Figure:
     corners = ccd_corners(camera, indices)
     # Points to a millimetre: the axes are about 0.85 of the figure wide.
     scale = 0.85 * _WIDTH * 72.0 / (2.0 * edge)
-    widths = np.ptp(corners[:, :, 0], axis=1) * scale
+    width = float(np.ptp(corners[:, :, 0], axis=1).min()) * scale
+    size = min(_FILLED * width / (_LETTER * max(map(len, camera.ccd_names))), 11.0)
     with styled():
         figure = new_figure(_WIDTH, _HEIGHT)
         axes = figure.add_subplot()
         draw_outlines(axes, camera, indices, "0.3", 0.8)
         centers = camera.centers * 1e3
-        for name, center, width, first in zip(camera.ccd_names, centers, widths, corners[:, 0], strict=True):
-            size = min(_FILLED * width / (_LETTER * len(name)), 11.0)
+        for name, center, first in zip(camera.ccd_names, centers, corners[:, 0], strict=True):
             axes.annotate(name, center, ha="center", va="center", fontsize=size, color="0.15")
             at = first + 0.06 * (center - first)
             axes.plot(*at, "o", color="0.3", markersize=max(0.03 * width, 0.6))

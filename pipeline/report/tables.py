@@ -48,15 +48,15 @@ def _xi_plus(metrics: dict[str, Any], kind: str, name: str) -> str:
     return f"{_power(metrics[f'xi_plus_{kind}_{name}'])} ± {_power(metrics[f'error_xi_plus_{kind}_{name}'])}"
 
 
-CAMERA_COLUMNS = ("ccd", "x_mm", "y_mm", "rotation_deg", "pixels", "raft", "vendor")
-CAMERA_CAPTION = "Centre on the focal plane, angle from +x towards +y, pixels along x and y of the CCD."
+CAMERA_COLUMNS = ("ccd", "x_mm", "y_mm", "rotation_deg", "nx", "ny", "raft", "vendor")
+CAMERA_CAPTION = "Centre on the focal plane, angle from +x towards +y, pixels along x and y of each."
 
 
 def camera_rows(camera: Camera) -> list[tuple[Any, ...]]:
     """Return rows of the CCDs of a camera, in the columns of :data:`CAMERA_COLUMNS`."""
     vendors = camera.vendors or ("",) * len(camera)
     return [
-        (name, round(1e3 * x, 6), round(1e3 * y, 6), float(angle), f"{nx} x {ny}", raft, vendor)
+        (name, round(1e3 * x, 6), round(1e3 * y, 6), float(angle), nx, ny, raft, vendor)
         for name, (x, y), angle, (nx, ny), raft, vendor in zip(
             camera.ccd_names,
             camera.centers.tolist(),

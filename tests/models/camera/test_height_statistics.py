@@ -10,8 +10,6 @@ from pachon.models.camera.camera import Camera
 from pachon.models.camera.ccd_surfaces import CcdSurfaces
 from pachon.models.camera.lsst import lsst_camera
 
-HALF = 20.48e-3
-
 
 def plane_of(polynomial, vendors=()):
     n = len(polynomial)
@@ -20,7 +18,7 @@ def plane_of(polynomial, vendors=()):
     camera = Camera("toy", names, ("A",), np.zeros(n, dtype=int), centers, np.array([4096, 4096]), 10e-6, vendors)
     padded = np.zeros((n, 10))
     padded[:, : len(polynomial[0])] = polynomial
-    return FocalPlane(camera, CcdSurfaces(HALF, padded, np.zeros((n, 2, 4))), np.ones(n, dtype=bool))
+    return FocalPlane(camera, CcdSurfaces(camera.half_sizes, padded, np.zeros((n, 2, 4))), np.ones(n, dtype=bool))
 
 
 def test_steps_planes_and_bowls_have_their_closed_forms():
