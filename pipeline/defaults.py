@@ -27,6 +27,7 @@ from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
 from ..wavefront.chief_rays import image_jacobians
+from ..wavefront.psf.clear_pupil import check_rings
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .alignment_states import ENDINGS as STATE_ENDINGS
@@ -232,6 +233,9 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     fit, stars = config.reconstruction, config.stars
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
+    if fit.model == "focal_plane":
+        with error_context(subject="reconstruction.model = focal_plane"):
+            check_rings(telescope)
     if fit.basis == "pixels" and fit.components is not None:
         raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
     if fit.interpolation != "polynomial" and fit.weights != "equal":

@@ -18,6 +18,10 @@ from ...wavefront.psf.engines import ENGINES
 from ..config import Configuration
 
 
+#: Fewest samples of a screen across the pupil.
+_LEAST_SAMPLES = 4
+
+
 def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> np.ndarray:
     """Return the length of each layer crossed by the light to the chosen CCDs during the exposure [m], [n_layer].
 
@@ -54,10 +58,17 @@ def _corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) -
 
 
 def check_screens(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> None:
-    """Raise ConfigError, with layer and length, if a periodic screen repeats within the light to the chosen CCDs."""
+    """Raise ConfigError if the screens are too coarse for the pupil, or repeat within the light to the chosen CCDs."""
     air = config.atmosphere
     if not air.enabled or not ENGINES[config.psf.engine].screens:
         return
+    sample, widest = air.screen_length_m / air.screen_size, telescope.pupil_diameter / _LEAST_SAMPLES
+    if sample > widest:
+        raise ConfigError(
+            f"atmosphere.screen_size = {air.screen_size}: expected at least {math.ceil(air.screen_length_m / widest)}, "
+            f"so that a pupil of {telescope.pupil_diameter:g} m has {_LEAST_SAMPLES} samples across, or a shorter "
+            f"atmosphere.screen_length_m than {air.screen_length_m:g}"
+        )
     swept = swept_lengths(config, telescope, camera, site)
     layer = int(np.argmax(swept))
     if swept[layer] <= air.screen_length_m:
