@@ -68,7 +68,7 @@ def correlations(instrument, camera, focus) -> None:
     """Print what three focal planes cost."""
     axis = (np.arange(_PLACES) + 0.5) / _PLACES * 2.0 - 1.0
     v, u = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
-    xy = (camera.centers[:, None] + camera.half_size * np.stack([u, v], axis=1)).reshape(-1, 2)
+    xy = camera.from_uv(np.arange(len(camera))[:, None], np.stack([u, v], axis=1)).reshape(-1, 2)
     fields, ccd = instrument.fields(xy), np.repeat(np.arange(len(camera)), len(u))
     for label, plane in (
         ("plane", pachon.FocalPlane.flat(camera)),

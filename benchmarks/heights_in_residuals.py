@@ -96,7 +96,7 @@ def one_run(folder):
     stars = {"x": table.x, "y": table.y, "values": table.values, "noise": table.noise}
     dz = {}
     for key, of in (("stars", stars), ("holdout", truth)):
-        of["u"], of["v"] = (np.stack([of["x"], of["y"]]) - camera.centers[ccds[key]].T) / camera.half_size
+        of["u"], of["v"] = camera.to_uv(ccds[key], np.stack([of["x"], of["y"]], axis=1)).T
         dz[key] = 1e6 * plane.height(of["x"], of["y"])
     count = np.bincount(ccds["holdout"], minlength=len(camera))
     mean = np.bincount(ccds["holdout"], dz["holdout"], len(camera)) / np.maximum(count, 1)

@@ -13,6 +13,7 @@ from .options import Json, Picture, picture_kind
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
+    from ..models.camera.camera import Camera
     from ..models.camera.focal_plane import FocalPlane
 
 app = typer.Typer()
@@ -21,18 +22,24 @@ app = typer.Typer()
 @app.command("camera")
 def camera_command(
     heights: Annotated[
-        str, Argument(metavar="HEIGHTS", help="lsstcam, an ECSV or FITS file of heights, or a configuration (.yaml).")
+        str,
+        Argument(
+            metavar="CAMERA | HEIGHTS",
+            help="Bundled camera, or camera file (.yaml); lsstcam, or heights (.ecsv, .fits); or a configuration.",
+        ),
     ] = "lsstcam",
     picture: Picture = None,
     as_json: Json = False,
 ) -> None:
-    """Show statistics of the heights of the CCDs, by vendor, and draw a map of them.
+    """List and draw the CCDs of a camera; or show statistics of their heights, by vendor, and draw a map of them.
 
     Heights are along +z of the telescope frame, the direction of the light at the detector.
 
     **Examples**
 
-    - `pachon camera`: LSSTCam as built
+    - `pachon camera hsc`: the CCDs of Hyper Suprime-Cam
+    - `pachon camera my_camera.yaml --json`
+    - `pachon camera`: heights of LSSTCam as built
     - `pachon camera metrology.fits --picture heights.pdf`
     - `pachon camera pachon_run/config.yaml --json`
     """
@@ -44,6 +51,10 @@ def camera_command(
     from ..pipeline.report.tables import HEIGHT_CAPTION, HEIGHT_COLUMNS, height_rows
 
     kind = picture_kind(picture)
+    camera = _listed_camera(heights)
+    if camera is not None:
+        _show_camera(camera, picture, kind, as_json)
+        return
     plane = _focal_plane(heights)
     statistics = height_statistics(plane)
     if as_json:
@@ -61,9 +72,46 @@ def camera_command(
         print(f"picture: {path.resolve()}")
 
 
+def _listed_camera(name: str) -> Camera | None:
+    """Return the camera of a name or of a camera file; None of anything else."""
+    from ..core.errors import unknown_name
+    from ..models.camera.cameras import CAMERAS, ENDINGS, load_camera
+    from ..models.io.camera_file import is_camera_file
+    from ..models.io.heights.zernike_table import AS_MEASURED
+
+    path = Path(name)
+    ending = path.suffix.lower()
+    if name in CAMERAS or (ending in ENDINGS and is_camera_file(path)):
+        return load_camera(name)
+    if not ending and name not in AS_MEASURED:
+        raise unknown_name("camera", name, (*CAMERAS, *AS_MEASURED))
+    return None
+
+
+def _show_camera(camera: Camera, picture: Path | None, kind: str, as_json: bool) -> None:
+    """Print the CCDs of a camera, and draw them."""
+    from ..core.files import write_bytes
+    from ..core.plotting import picture_bytes
+    from ..pipeline.report.camera_plot import camera_plot
+    from ..pipeline.report.tables import CAMERA_CAPTION, CAMERA_COLUMNS, camera_rows
+
+    rows = camera_rows(camera)
+    if as_json:
+        ccds = [dict(zip(CAMERA_COLUMNS, row, strict=True)) for row in rows]
+        print_json({"camera": camera.name, "pixel_um": round(camera.pixel_size * 1e6, 9), "ccds": ccds})
+        if picture is None:
+            return
+    path = Path(f"camera_{camera.name}.png") if picture is None else picture
+    title = f"{camera.name}: {len(camera)} CCDs, pixels of {camera.pixel_size * 1e6:g} um"
+    write_bytes(path, picture_bytes(camera_plot(camera, title), kind))
+    if not as_json:
+        Rows(CAMERA_COLUMNS, [[str(cell) for cell in row] for row in rows], CAMERA_CAPTION).show()
+        print(f"picture: {path.resolve()}")
+
+
 def _focal_plane(heights: str) -> FocalPlane:
     from ..core.errors import HeightWarning
-    from ..models.camera.camera import load_camera
+    from ..models.camera.cameras import load_camera
     from ..pipeline.experiment import measured_focal_plane
 
     if Path(heights).suffix.lower() in (".yaml", ".yml"):

@@ -9,7 +9,7 @@ import galsim
 import galsim.config
 
 from ..core.errors import DomainError, check_choice
-from ..models.camera.camera import load_camera
+from ..models.camera.cameras import load_camera
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.io.prescription import load_telescope

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..core.errors import DomainError
 from ..core.units import ARCSEC, metres, radians, require_positive
-from ..models.camera.camera import load_camera
+from ..models.camera.cameras import load_camera
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.media.silicon import absorption_length, silicon_index
@@ -115,9 +115,13 @@ class PachonOptics(galsim.PhotonOp):
         self.pixel_size = require_positive(metres(side, "pixel_size"), "pixel_size", "metres")
         #: Place on the detector that offsets are counted from [m].
         self.origin = self._chief_ray()
-        if camera is not None and ccd is not None and image_pos is not None:
-            first = camera.centers[camera.ccd_index(ccd)] - 0.5 * (camera.pixels - 1) * camera.pixel_size
-            self.origin = first + (np.array([image_pos.x, image_pos.y]) - 1.0) * camera.pixel_size
+        #: Camera and index of the CCD along whose axes offsets are; those of the focal plane without.
+        self.ccd = None if camera is None or ccd is None else (camera, camera.ccd_index(ccd))
+        if self.ccd is not None and image_pos is not None:
+            camera, index = self.ccd
+            offset = (np.array([image_pos.x, image_pos.y]) - 1.0) * camera.pixel_size
+            first = camera.from_pixel(index, np.zeros(2))
+            self.origin = first + np.stack(camera.along_focal_plane(index, offset[0], offset[1]))
 
     def applyTo(  # noqa: N802 - GalSim's name
         self, photon_array: galsim.PhotonArray, local_wcs: Any = None, rng: galsim.BaseDeviate | None = None
@@ -157,11 +161,17 @@ class PachonOptics(galsim.PhotonOp):
         )
         landed = land_photons(self.telescope, beam, focal_plane=self.focal_plane, threads=self.threads)
         x, y, lit = self._in_silicon(landed, wavelength, rng)
-        photon_array.x = np.where(lit, (x - self.origin[0]) / self.pixel_size, 0.0)
-        photon_array.y = np.where(lit, (y - self.origin[1]) / self.pixel_size, 0.0)
-        photon_array.dxdz = np.where(lit, landed.slope_x, 0.0)
-        photon_array.dydz = np.where(lit, landed.slope_y, 0.0)
+        offset_x, offset_y = self._along_ccd(x - self.origin[0], y - self.origin[1])
+        slope_x, slope_y = self._along_ccd(landed.slope_x, landed.slope_y)
+        photon_array.x = np.where(lit, offset_x / self.pixel_size, 0.0)
+        photon_array.y = np.where(lit, offset_y / self.pixel_size, 0.0)
+        photon_array.dxdz = np.where(lit, slope_x, 0.0)
+        photon_array.dydz = np.where(lit, slope_y, 0.0)
         photon_array.flux *= lit
+
+    def _along_ccd(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the components along the rows and columns of the CCD of vectors of the focal plane."""
+        return (x, y) if self.ccd is None else self.ccd[0].along_ccd(self.ccd[1], x, y)
 
     def _in_silicon(
         self, landed: LandedPhotons, wavelength: np.ndarray, rng: galsim.BaseDeviate | None
@@ -191,8 +201,11 @@ class PachonOptics(galsim.PhotonOp):
             raise DomainError(f"field = {self.field!r} rad: expected an object whose chief ray reaches the detector")
         return place
 
+    def _angle(self) -> float:
+        return 0.0 if self.ccd is None else float(self.ccd[0].rotation_deg[self.ccd[1]])
+
     def _key(self) -> tuple[Any, ...]:
-        arrays = tuple(map(float, (*self.source.ravel(), *self.origin, self.pixel_size)))
+        arrays = tuple(map(float, (*self.source.ravel(), *self.origin, self.pixel_size, self._angle())))
         return self.telescope, _content(self.focal_plane), self.silicon, self.diffusion, arrays
 
     def __eq__(self, other: object) -> bool:

@@ -25,14 +25,14 @@ RIM = 40
 
 @dataclass(frozen=True, eq=False)
 class PsfField:
-    """PSF and lit fraction across one CCD of `pixels` x `pixels`; positions are pixels (x, y) of the CCD.
+    """PSF and lit fraction across one CCD; positions are pixels (x, y) of the CCD.
 
     PSF = mean + sum over k of a_k(x, y) component_k (Jee & Tyson 2011, sec. 3). Polynomials are held constant from
     :data:`RIM` pixels outside the CCD on.
     """
 
     model: PsfModel  #: its positions are pixels of the CCD
-    pixels: int  #: along a side of the CCD
+    pixels: np.ndarray  #: along x and y of the CCD, [2]
     lit: np.ndarray  #: coefficients of the polynomial of the lit fraction
     lit_order: int  #: its order
 
@@ -42,7 +42,7 @@ class PsfField:
         cls,
         stamps: ArrayLike,
         positions: ArrayLike,
-        pixels: int,
+        pixels: ArrayLike,
         *,
         lit_fraction: ArrayLike | None = None,
         n_components: int | None = None,
@@ -57,8 +57,8 @@ class PsfField:
             [n, ny, nx], odd numbers of pixels, the reference point of each at the centre of the middle pixel.
         positions : array
             [n, 2] pixels (x, y) of the CCD.
-        pixels : int
-            Pixels along a side of the CCD.
+        pixels : int or array, shape [2]
+            Pixels along x and y of the CCD; one number where it is square.
         lit_fraction : array, optional
             [n], part of the entrance pupil whose light arrives; 1 by default.
         n_components, order, interpolation
@@ -70,7 +70,8 @@ class PsfField:
             As :meth:`pachon.PsfModel.fit`.
         """
         places = pure_numbers(positions, "positions")
-        extent = (-0.5, pixels - 0.5, -0.5, pixels - 0.5)
+        size = for_each(pure_numbers(pixels, "pixels"), 2, "pixels")
+        extent = (-0.5, float(size[0]) - 0.5, -0.5, float(size[1]) - 0.5)
         model = PsfModel.fit(
             stamps,
             places,
@@ -83,7 +84,7 @@ class PsfField:
         share = 1.0 if lit_fraction is None else lit_fraction
         light = for_each(pure_numbers(share, "lit_fraction"), len(places), "lit_fraction")
         terms = design_matrix(places, extent, order)
-        return cls(model, pixels, np.linalg.lstsq(terms, light, rcond=None)[0], order)
+        return cls(model, size, np.linalg.lstsq(terms, light, rcond=None)[0], order)
 
     @classmethod
     @check_arguments
@@ -108,7 +109,7 @@ class PsfField:
         return cls.fit(
             psfs.image.astype(np.float64),
             to_pixel(experiment, ccd, positions),
-            camera.pixels,
+            camera.pixels[camera.ccd_index(ccd)],
             lit_fraction=psfs.lit_fraction,
             n_components=noise_free_components(config),
             order=config.reconstruction.truth_order,
@@ -160,5 +161,4 @@ class PsfField:
 def to_pixel(experiment: Experiment, ccd: str, positions: np.ndarray) -> np.ndarray:
     """Convert positions on the detector [m] to pixels of a CCD, the first pixel's centre at (0, 0)."""
     camera = experiment.camera
-    center = camera.centers[camera.ccd_index(ccd)]
-    return (positions - center) / camera.pixel_size + 0.5 * (camera.pixels - 1)
+    return camera.to_pixel(camera.ccd_index(ccd), positions)

@@ -13,6 +13,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
+from ..pipeline.defaults import pixel_angle
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
@@ -123,8 +124,8 @@ def draw_ccd(
     Raises
     ------
     ConfigError
-        If the run has no atmosphere, without which PSFs are finer than pixels, or its pixels are not those of the
-        camera.
+        If the run has no atmosphere, without which PSFs are finer than pixels, its pixels are not those of the
+        camera, or the CCD is turned.
     DomainError
         If no light reaches the CCD, or the galaxies bury the sky.
     """
@@ -138,8 +139,14 @@ def draw_ccd(
             f"{camera.pixel_size * 1e6:g} um and an atmosphere"
         )
     if exposure is None:
-        exposure = Exposure(config.band or "r", config.atmosphere.exposure_s)
-    part = Window(0, 0, camera.pixels, camera.pixels) if window is None else window
+        exposure = Exposure(config.band or "r", config.atmosphere.exposure_s, pixel_scale=nominal_scale(experiment))
+    index = camera.ccd_index(ccd)
+    if camera.rotation_deg[index]:
+        raise ConfigError(
+            f"CCD {ccd} of {camera.name} is turned by {camera.rotation_deg[index]:g} deg: images expect CCDs along the "
+            "axes of the focal plane"
+        )
+    part = Window(0, 0, *camera.pixels[index].tolist()) if window is None else window
     wcs = ccd_wcs(
         experiment.telescope,
         camera,
@@ -197,6 +204,11 @@ def draw_ccd(
         config.seed,
         config.atmosphere.epoch,
     )
+
+
+def nominal_scale(experiment: Experiment) -> float:
+    """Return the angle of a pixel [rad] to a thousandth of an arc second, as cameras state it: 0.2 for the LSST."""
+    return round(pixel_angle(experiment.telescope, experiment.camera.pixel_size) / ARCSEC, 3) * ARCSEC
 
 
 def ellipticities(galaxies: Any) -> tuple[np.ndarray, np.ndarray]:

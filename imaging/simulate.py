@@ -29,7 +29,7 @@ from .draw import Window
 from .exposure import Exposure
 from .image_file import is_whole
 from .preview import cutouts_png, preview_png
-from .scene import check_density, draw_ccd, stamped
+from .scene import check_density, draw_ccd, nominal_scale, stamped
 
 #: Limits of the bins over which the light of a population is summed.
 _MAGNITUDES = 200
@@ -87,12 +87,13 @@ def simulate_images(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     experiment = config.experiment() if experiment is None else experiment
     resolved = config.resolved(experiment)
-    window, exposure = _window(config, experiment), _exposure(config, experiment)
+    names = given(experiment.config.ccds)
+    windows, exposure = {name: _window(config, experiment, name) for name in names}, _exposure(config, experiment)
     galaxies = _galaxies(config, experiment, exposure)
-    require_bytes(needed_bytes(experiment, threads) + BYTES_PER_PIXEL * window.width * window.height, "images")
+    most = max(window.width * window.height for window in windows.values())
+    require_bytes(needed_bytes(experiment, threads) + BYTES_PER_PIXEL * most, "images")
     stamp = Stamp(config.digest(experiment), experiment.config.seed)
     _claim(folder, resolved, resume=resume)
-    names = given(experiment.config.ccds)
     paths = {name: folder / f"image_{name}.fits" for name in names}
     kept = tuple(name for name in names if resume and is_whole(paths[name], stamp))
     missing = [name for name in names if name not in kept]
@@ -103,7 +104,16 @@ def simulate_images(
             with bar as stage:
                 for i, name in enumerate(missing, start=1):
                     objects[name] = _image(
-                        config, experiment, name, galaxies, exposure, window, stamp, paths[name], threads, stage.advance
+                        config,
+                        experiment,
+                        name,
+                        galaxies,
+                        exposure,
+                        windows[name],
+                        stamp,
+                        paths[name],
+                        threads,
+                        stage.advance,
                     )
                     stage.advance()
                     stage.step(name, i, len(missing))
@@ -150,14 +160,16 @@ def _image(
     return len(scene.objects["ID"])
 
 
-def _window(config: ImagesConfig, experiment: Experiment) -> Window:
-    """Return the part of each CCD that is drawn."""
-    pixels, side = experiment.camera.pixels, config.image.side
+def _window(config: ImagesConfig, experiment: Experiment, name: str) -> Window:
+    """Return the part of a CCD that is drawn."""
+    camera, side = experiment.camera, config.image.side
+    nx, ny = camera.pixels[camera.ccd_index(name)].tolist()
     if side is None:
-        return Window(0, 0, pixels, pixels)
-    if side > pixels:
-        raise ConfigError(f"image.side = {side}: expected at most {pixels}, the pixels of a CCD", key="image.side")
-    return Window((pixels - side) // 2, (pixels - side) // 2, side, side)
+        return Window(0, 0, nx, ny)
+    if side > min(nx, ny):
+        text = f"image.side = {side}: expected at most {min(nx, ny)}, the pixels of a CCD"
+        raise ConfigError(text, key="image.side")
+    return Window((nx - side) // 2, (ny - side) // 2, side, side)
 
 
 def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
@@ -170,6 +182,7 @@ def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
             image.exposures,
             gain=image.gain,
             sky=image.sky_mag,
+            pixel_scale=nominal_scale(experiment),
             subtract_background=image.subtract_background,
             noise=image.noise,
         )

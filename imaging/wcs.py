@@ -176,7 +176,8 @@ def ccd_wcs(
         If the pointing is no pair of finite angles with a declination up to 90 deg, or no polynomial is good enough.
     """
     aim = Pointing.of(pointing, position_angle)
-    center, pixels = camera.centers[camera.ccd_index(ccd)], camera.pixels
+    index = camera.ccd_index(ccd)
+    pixels = camera.pixels[index]
     middle, half = 0.5 * (pixels - 1), 0.5 * pixels
 
     def traced(points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -184,7 +185,8 @@ def ccd_wcs(
         # Chebyshev points: a polynomial through them errs about equally everywhere.
         line = np.cos(np.pi * (np.arange(points) + 0.5) / points) / np.cos(0.5 * np.pi / points)
         places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        positions = center + half * camera.pixel_size * places
+        offset = half * camera.pixel_size * places
+        positions = np.stack(camera.from_local(index, offset[:, 0], offset[:, 1]), axis=1)
         with error_context(subject=f"CCD {ccd}"):
             slopes = fields_at(telescope, positions, wavelength, projection="gnomonic", threads=threads)
             telescope.check_field(*np.arctan(slopes.T))
@@ -208,7 +210,7 @@ def ccd_wcs(
     # Zero point and angles of the pointing modulo a turn: equal skies have equal headers.
     return CcdWcs(
         pointing=(aim.ra % (2.0 * np.pi), aim.dec),
-        shape=(pixels, pixels),
+        shape=(int(pixels[1]), int(pixels[0])),
         reference_pixel=reference + middle,
         cd=linear,
         distortion=distortion,
@@ -273,7 +275,9 @@ def wcs(
     return fitted.astropy()
 
 
-def _forward(places: np.ndarray, sky: np.ndarray, order: int, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _forward(
+    places: np.ndarray, sky: np.ndarray, order: int, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return linear part, reference pixel from the middle of the CCD, and distortion of a polynomial of an order."""
     tables = _fitted(half * places, sky, order)
     # The reference pixel is the root of the polynomial.

@@ -89,7 +89,7 @@ class Telescope:
     group_frames : mapping of str to (vertex, rotation), optional
         Frame of each group: its pivot [m] and axes. By default that of its first surface.
     camera : str, optional
-        Name of the camera at the focus.
+        Name of the camera at the focus, or path of its file.
     obstructions : tuple of Obstruction
         Meshes that block light between the surfaces.
     object_distance : float
@@ -97,6 +97,8 @@ class Telescope:
         is that of the ray from the object through the centre of the entrance pupil.
     design_data : DesignData
         Aperture, fields, wavelengths and stop as the designer stated them, the defaults of calculations.
+    site : str, optional
+        Name of the site, or path of its file.
     """
 
     #: Function that error messages name to whoever gives a name in place of a telescope.
@@ -124,6 +126,7 @@ class Telescope:
     obstructions: tuple[Obstruction, ...] = ()
     object_distance: float = math.inf
     design_data: DesignData = field(default_factory=DesignData)
+    site: str | None = None
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.surfaces]

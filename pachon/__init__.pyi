@@ -121,12 +121,13 @@ from .models.aperture import Rectangle as Rectangle
 from .models.aperture import Union as Union
 from .models.aperture import Vane as Vane
 from .models.camera.camera import Camera as Camera
-from .models.camera.camera import lsst_camera as lsst_camera
+from .models.camera.cameras import load_camera as load_camera
 from .models.camera.corner_rafts import corner_focal_plane as corner_focal_plane
 from .models.camera.focal_plane import FocalPlane as FocalPlane
 from .models.camera.height_budget import HeightBudget as HeightBudget
 from .models.camera.height_statistics import HeightStatistics as HeightStatistics
 from .models.camera.height_statistics import height_statistics as height_statistics
+from .models.camera.lsst import lsst_camera as lsst_camera
 from .models.camera.sensor_heights import CornerSensor as CornerSensor
 from .models.camera.silicon import Silicon as Silicon
 from .models.design_data import DesignData as DesignData

@@ -158,7 +158,9 @@ class AtmosphereConfig(Section):
     epoch: Whole = Field(
         0, description="number of the visit: turbulence, wind, residual aberration and noise are its own"
     )
-    site: str = Field("cerro_pachon", description="bundled site, or path of a site file")
+    site: str | None = Field(
+        None, description="bundled site, or path of a site file; that of the telescope by default, else cerro_pachon"
+    )
     r0_m: Positive | None = Field(None, description="Fried parameter at 500 nm at the zenith [m]")
     outer_scale_m: Positive | None = Field(None, description="outer scale [m]")
     exposure_s: Positive = Field(15.0, description="exposure time [s]")
@@ -184,7 +186,7 @@ class PsfConfig(Section):
     pixel_um: Positive | None = Field(None, description="pixel [um]")
     stamp: Annotated[int, Field(strict=True, ge=7)] | None = Field(None, description="pixels on a side of a stamp, odd")
     diffusion_pixels: NotNegative | None = Field(
-        None, description="rms of the charge diffusion, in silicon that from its surface [CCD pixels of 10 um]"
+        None, description="rms of the charge diffusion, in silicon that from its surface [CCD pixels]"
     )
     jitter_arcsec: NotNegative = Field(0.0, description="rms of the telescope's pointing along each axis [arcsec]")
 
@@ -238,6 +240,9 @@ class Configuration(Section):
 
     band: BandName | None = Field(None, description="filter: u, g, r, i, z or y")
     telescope: str | None = Field(None, description="bundled model (pachon info lists them), or path of a prescription")
+    camera: str | None = Field(
+        None, description="bundled camera, or path of a camera file, in place of the telescope's own"
+    )
     ccds: tuple[str, ...] | None = Field(None, description="CCDs to compute")
     seed: Whole = Field(1, description="seed of all random numbers")
     changes: dict[str, Real] = Field(

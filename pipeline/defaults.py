@@ -14,8 +14,11 @@ from pydantic import BaseModel
 from ..core.errors import ConfigError, error_context
 from ..core.schema import shown
 from ..core.table_files import ENDINGS as STAR_ENDINGS
+from ..core.units import ARCSEC
 from ..design.parameters.changes import apply_changes
-from ..models.camera.camera import Camera, load_camera
+from ..models.camera.camera import Camera
+from ..models.camera.cameras import CAMERAS, load_camera
+from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
@@ -23,6 +26,9 @@ from ..models.io.site_file import load_site
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
+from ..raytrace.rays import field_direction
+from ..wavefront.chief_rays import image_jacobians
+from ..wavefront.psf.clear_pupil import check_rings
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .alignment_states import ENDINGS as STATE_ENDINGS
@@ -35,17 +41,22 @@ from .simulate.photometry import PROVISIONAL_FWHM, limiting_magnitude, saturatio
 from .simulate.screen_cover import check_screens
 from .star_list import NAMES
 
-#: The middle row of three rafts: from the centre of the field to its edge, with a neighbour on either side.
-DEFAULT_CCDS = tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
 _WAVELENGTHS = 5
 # Keys of the PSF model of a CCD: where none is given it is _KRIGING, else _PAPER fills the other ones.
 _MODEL_KEYS = ("basis", "components", "interpolation", "weights", "order")
 _KRIGING = {"basis": "pixels", "interpolation": "kriging"}
 _PAPER = {"basis": "pca", "interpolation": "polynomial", "weights": "equal"}
+#: Cameras of so many CCDs are computed whole by default.
+_FEW = 9
+#: Site of telescopes that name none.
+_SITE = "cerro_pachon"
 # The optics alone as in Fig. 8 of Jee & Tyson 2011: without charge diffusion, which would dilute most of their
-# ellipticity, and on pixels fine enough for a weight of 0.3".
-_WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "pixel_um": 10.0, "stamp": 31, "diffusion_pixels": 0.4}
-_OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "pixel_um": 2.5, "stamp": 61, "diffusion_pixels": 0.0}
+# ellipticity, and on pixels fine enough for a weight of 0.3", a quarter of those of the CCDs.
+_WITH_ATMOSPHERE = {"n_pupil": PUPIL_POINTS, "diffusion_pixels": 0.4}
+_OPTICS_ALONE = {"n_pupil": PUPIL_POINTS_STILL, "diffusion_pixels": 0.0}
+_FINE = 4
+# Sides of a stamp [arcsec], 31 pixels of the LSST and 61 fine ones; and fewest pixels.
+_SIDE, _SIDE_ALONE, _FEWEST = 6.2, 3.05, 15
 _ENGINE_DEFAULTS: dict[str, dict[str, float]] = {"long_exposure": {"n_pupil": PUPIL_POINTS_LONG}}
 _T = TypeVar("_T")
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -75,11 +86,12 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         name = _absolute(name, folder, bundled_names())
         band = band or _band_of(name)
     telescope = load_telescope(name)
-    if telescope.camera is None:
-        raise ConfigError(f"telescope = {name}: expected a model with a camera, such as lsst_v3.3_{band}")
-    camera = load_camera(telescope.camera)
+    camera_name = None
+    if config.camera is not None:
+        camera_name = _absolute(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
+    camera = _camera_of(telescope, camera_name)
     atmosphere = config.atmosphere
-    site_name = _absolute(atmosphere.site, folder, ())
+    site_name = _absolute(atmosphere.site or telescope.site or _SITE, folder, ())
     plane = config.focal_plane
     if plane.heights is not None:
         heights = _absolute(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
@@ -106,7 +118,8 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         update={
             "band": band,
             "telescope": name,
-            "ccds": chosen_ccds(camera, DEFAULT_CCDS if config.ccds is None else config.ccds),
+            "camera": camera_name,
+            "ccds": chosen_ccds(camera, default_ccds(camera) if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
             "stars": stars,
             "focal_plane": plane,
@@ -118,6 +131,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "psf": _filled(
                 config.psf,
                 (_WITH_ATMOSPHERE if atmosphere.enabled else _OPTICS_ALONE)
+                | _stamps(config, telescope, camera)
                 | _ENGINE_DEFAULTS.get(config.psf.engine, {}),
             ),
             "reconstruction": _reconstruction(config.reconstruction, 0.7 if atmosphere.enabled else 0.3),
@@ -152,6 +166,36 @@ def with_paper_model(config: Configuration) -> Configuration:
 
 def _names_no_model(fit: ReconstructionConfig) -> bool:
     return all(getattr(fit, key) is None for key in _MODEL_KEYS)
+
+
+def _camera_of(telescope: Telescope, name: str | None) -> Camera:
+    """Return the camera of a name or file, by default that of the telescope; ConfigError where there is none."""
+    found = name or telescope.camera
+    if found is None:
+        raise ConfigError(
+            f"telescope = {telescope.name}, which has none: expected a camera: {', '.join(CAMERAS)}, or a file, "
+            "e.g. camera: hsc"
+        )
+    with error_context(key="camera"):
+        return load_camera(found)
+
+
+def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict[str, float]:
+    """Return the default pixels [um] and size of stamps, as large on the sky as those of the LSST."""
+    side, fine = (_SIDE, 1) if config.atmosphere.enabled else (_SIDE_ALONE, _FINE)
+    pixel = camera.pixel_size / fine
+    found: dict[str, float] = {"pixel_um": round(pixel * 1e6, 9)}
+    if config.psf.stamp is None:
+        pixels = side * ARCSEC / pixel_angle(telescope, pixel)
+        found["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
+    return found
+
+
+def pixel_angle(telescope: Telescope, pixel_size: float) -> float:
+    """Return the angle of a pixel [m] in the middle of the field [rad]."""
+    axis = field_direction([0.0], [0.0])
+    jacobian = image_jacobians(telescope, axis, telescope.default_wavelength)[0]
+    return pixel_size / math.sqrt(abs(float(np.linalg.det(jacobian))))
 
 
 def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
@@ -192,13 +236,25 @@ def chosen_ccds(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     for name in names:
         if name == "all":
             indices.update(range(len(camera)))
-        elif "_" not in name:
-            indices.update(camera.ccd_index(n) for n in camera.ccds_of_raft(name))
         else:
-            indices.add(camera.ccd_index(name))
+            indices.update(camera.members(name))
     if not indices:
-        raise ConfigError("ccds = []: expected at least one name, such as R22_S11, or all")
+        raise ConfigError(f"ccds = []: expected at least one name, such as {camera.ccd_names[0]}, or all")
     return tuple(camera.ccd_names[i] for i in sorted(indices))
+
+
+def default_ccds(camera: Camera) -> tuple[str, ...]:
+    """Return CCDs from the centre of the field to its edge, with a neighbour on either side: a row along +x.
+
+    Of the LSST it is the middle row of three rafts; a camera of few CCDs is computed whole.
+    """
+    if len(camera) <= _FEW:
+        return camera.ccd_names
+    x, y = camera.centers.T
+    middle = int(np.argmin(np.hypot(x, y)))
+    width, height = np.ptp(camera.corners([middle])[0], axis=0)
+    row = (np.abs(y - y[middle]) < 0.5 * height) & (x > x[middle] - 1.5 * width)
+    return tuple(camera.ccd_names[i] for i in np.flatnonzero(row))
 
 
 def _check(config: Configuration, telescope: Telescope) -> None:
@@ -226,6 +282,9 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     fit, stars = config.reconstruction, config.stars
     if fit.model == "focal_plane" and not config.atmosphere.enabled:
         raise ConfigError("reconstruction.model = focal_plane: expected atmosphere.enabled = true, whose mean it takes")
+    if fit.model == "focal_plane":
+        with error_context(subject="reconstruction.model = focal_plane"):
+            check_rings(telescope)
     if fit.basis == "pixels" and fit.components is not None:
         raise ConfigError(f"reconstruction.components = {fit.components}: expected null with basis = pixels")
     if fit.interpolation != "polynomial" and fit.weights != "equal":

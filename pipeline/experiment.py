@@ -21,6 +21,8 @@ from ..core.random_streams import stream
 from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
+from ..models.camera.cameras import CAMERAS
+from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.height_budget import load_budget
 from ..models.camera.silicon import Silicon
@@ -171,17 +173,19 @@ class Experiment:
     @check_arguments
     def displacements(self, name: str) -> tuple[Displacement, ...]:
         """Return the static displacements of charge on a CCD; the rings of each CCD have a phase of their own."""
-        sensor = self.config.sensor
+        sensor, camera = self.config.sensor, self.camera
+        index = camera.ccd_index(name)
         found: list[Displacement] = []
         if sensor.tree_rings_um:
             phase = stream(self.config.seed, "tree rings", name).uniform(0.0, 2.0 * math.pi)
-            x, y = sensor.tree_ring_center_mm
-            found.append(
-                TreeRings(sensor.tree_rings_um * 1e-6, sensor.tree_ring_period_um * 1e-6, (x * 1e-3, y * 1e-3), phase)
-            )
+            along_x, along_y = (mm * 1e-3 for mm in sensor.tree_ring_center_mm)
+            x, y = map(float, camera.along_focal_plane(index, along_x, along_y))
+            found.append(TreeRings(sensor.tree_rings_um * 1e-6, sensor.tree_ring_period_um * 1e-6, (x, y), phase))
         if sensor.edge_rolloff_um:
             length = sensor.edge_rolloff_length_um * 1e-6
-            found.append(EdgeRolloff(sensor.edge_rolloff_um * 1e-6, length, self.camera.half_size))
+            a, b = camera.half_sizes[index].tolist()
+            turn = math.radians(camera.rotation_deg[index])
+            found.append(EdgeRolloff(sensor.edge_rolloff_um * 1e-6, length, (a, b), turn))
         return tuple(found)
 
     @property
@@ -250,13 +254,21 @@ class Experiment:
             del content["detector"]
         name = given(self.config.telescope)
         content["telescope"] = name if name in bundled_names() else prescription_digest(name)
+        content = hashed_camera(content)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["active_optics"] = hashed_states(content["active_optics"])
         content["stars"] = hashed_stars(content["stars"])
         if self.config.pointing is None:
             del content["pointing"]
-        content["atmosphere"]["site"] = _name_or_content(self.config.atmosphere.site, ())
+        content["atmosphere"]["site"] = _name_or_content(given(self.config.atmosphere.site), ())
         return digest(content)
+
+
+def hashed_camera(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration for a hash: a camera file by its content; no key where the telescope's own is taken."""
+    name = content["camera"]
+    rest = {key: value for key, value in content.items() if key != "camera"}
+    return rest if name is None else rest | {"camera": _name_or_content(name, CAMERAS, CAMERA_ENDINGS)}
 
 
 def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:

@@ -108,8 +108,9 @@ def corner_stars(
     light = telescope.default_wavelength if wavelength is None else length(wavelength, "wavelength")
     plane = corner_focal_plane(kind, heights)
     camera = plane.camera
-    inner = camera.half_size - _MARGIN
-    along = inner * np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)
-    positions = (camera.centers[:, None] + along[:, None]).reshape(-1, 2)
+    along = np.linspace(-1.0, 1.0, n)[:, None] if n > 1 else np.zeros((1, 1))
+    inner = (camera.half_sizes[:, None] - _MARGIN) * along
+    positions = np.stack(camera.from_local(np.arange(len(camera))[:, None], *np.moveaxis(inner, -1, 0)), axis=-1)
+    positions = positions.reshape(-1, 2)
     sensors = tuple(name for name in camera.ccd_names for _ in range(n))
     return CornerStars(telescope, plane, sensors, positions, fields_at(telescope, positions, light))

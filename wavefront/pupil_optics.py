@@ -97,8 +97,8 @@ def trace_pupils(
     normal[:, 2] = 1.0
     if focal_plane is not None and chief.ccd is not None:
         on_detector = telescope.surfaces[-1].to_local(reference_points)
-        offset = on_detector[:, :2] - focal_plane.camera.centers[chief.ccd]
-        normal[:, :2] = -focal_plane.surfaces.gradient(chief.ccd, offset[:, 0], offset[:, 1])
+        place = focal_plane.camera.to_local(chief.ccd, on_detector[:, 0], on_detector[:, 1])
+        normal[:, :2] = -focal_plane.slopes_on(chief.ccd, *place)
     rotation = telescope.surfaces[-1].matrix
     normal = normal @ rotation.T
 

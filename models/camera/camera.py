@@ -1,70 +1,178 @@
-"""Cameras: where each CCD of a mosaic lies, by name.
+"""Cameras: where each CCD of a mosaic lies, by name, and the maps between its pixels and the focal plane.
 
-Positions are in the frame of the detector: x, y along the telescope's, origin on the optical axis.
+Three frames. That of the focal plane is the detector's: x, y along the telescope's, origin on the optical axis, turned
+by the rotator. That of a CCD has its origin at the centre of the CCD and x, y along its rows and columns, at the angle
+`rotation_deg` from those of the focal plane. Pixels are counted along the latter, the centre of the first at (0, 0).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import unknown_name
+from ...core.errors import ConfigError, DomainError, check_unique, unknown_name
 from ...core.units import plane_points
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
+#: Depth by which CCDs may overlap, which rounding of their places makes [m].
+_TOUCHING = 1e-9
+#: Corners of a CCD in halves of its sides.
+_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+#: Names of CCDs and rafts, which stand in names of files and in lists with commas.
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+_QUARTER_COSINES = np.array([1.0, 0.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """CCDs of one size and angle."""
+
+    index: np.ndarray  #: in the camera, [n]
+    half: np.ndarray  #: halves of their sides [m], [2]
+    centers: np.ndarray  #: along their own axes, from the origin of the focal plane [m], [n, 2]
+    tree: cKDTree  #: of the centres, y in units that make the CCDs square
+
 
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A mosaic of equal square CCDs, on rafts."""
+    """A mosaic of rectangular CCDs, each with its own size and angle, on rafts or without.
+
+    Raises
+    ------
+    DomainError
+        If there are no CCDs, two have one name or overlap, or a number is out of range.
+    """
 
     name: str
     ccd_names: tuple[str, ...]
     raft_names: tuple[str, ...]
-    raft_index: np.ndarray  #: raft of each CCD, [n_ccd]
+    raft_index: np.ndarray  #: raft of each CCD, -1 without one, [n_ccd]
     centers: np.ndarray  #: centres of the CCDs (x, y) [m], [n_ccd, 2]
-    pixels: int  #: pixels along a side of a CCD
+    pixels: np.ndarray  #: pixels along x and y of each CCD, [n_ccd, 2]; or [2] if all are alike
     pixel_size: float  #: side of a pixel [m]
     vendors: tuple[str, ...] = ()  #: maker of each CCD; empty where they are not told apart
+    rotation_deg: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    """Angle of each CCD from +x towards +y [deg], [n_ccd]; or [1] if all are alike. Quarter turns are exact."""
+    placement: np.ndarray | None = None
+    """Nominal height [m] and rotations about x and y of the focal plane [rad] of each CCD, [n_ccd, 3]; zero if None."""
 
     def __post_init__(self) -> None:
-        for array in (self.raft_index, self.centers):
-            array.flags.writeable = False
+        n = len(self.ccd_names)
+        if not n:
+            raise DomainError(f"camera {self.name}: no CCDs: expected at least one")
+        for name in (*self.ccd_names, *self.raft_names):
+            if not _NAME.fullmatch(name) or name == "all":
+                raise DomainError(f"camera {self.name}: {name!r}: expected a name of letters, digits, _, - and dots")
+        check_unique(f"CCD of camera {self.name}", self.ccd_names)
+        check_unique(f"raft of camera {self.name}", self.raft_names)
+        for name in set(self.raft_names).intersection(self.ccd_names):
+            raise DomainError(f"camera {self.name}: {name} names a CCD and a raft: expected different names")
+        shapes = {"raft_index": (n,), "centers": (n, 2), "pixels": (n, 2), "rotation_deg": (n,), "placement": (n, 3)}
+        for key, shape in shapes.items():
+            values = getattr(self, key)
+            if values is None:
+                continue
+            if key in ("pixels", "rotation_deg") and values.shape in (shape[1:], (1,)):
+                values = np.broadcast_to(values, shape).copy()
+                object.__setattr__(self, key, values)
+            if values.shape != shape or not np.isfinite(values).all():
+                raise DomainError(f"camera {self.name}, {key}: expected finite numbers of shape {list(shape)}")
+            values.flags.writeable = False
+        if self.vendors and len(self.vendors) != n:
+            raise DomainError(f"camera {self.name}, vendors: expected none, or one for each of {n} CCDs")
+        if not np.isin(self.raft_index, np.arange(-1, len(self.raft_names))).all():
+            raise DomainError(
+                f"camera {self.name}, raft_index: expected indices of {len(self.raft_names)} rafts, or -1"
+            )
+        if not 0.0 < self.pixel_size < np.inf:
+            raise DomainError(f"camera {self.name}, pixel_size = {self.pixel_size!r}: expected a length above 0")
+        wrong = np.flatnonzero(((self.pixels < 1) | (self.pixels != np.round(self.pixels))).any(axis=1))
+        if wrong.size:
+            found = self.pixels[wrong[0]].tolist()
+            raise DomainError(f"CCD {self.ccd_names[wrong[0]]}, pixels = {found}: expected whole numbers of 1 or more")
+        self._check_overlap()
+
+    def __repr__(self) -> str:
+        rafts = f" on {len(self.raft_names)} rafts" if self.raft_names else ""
+        return f"<Camera {self.name}: {len(self)} CCDs{rafts}>"
 
     def __len__(self) -> int:
         return len(self.ccd_names)
 
-    @property
-    def ccd_size(self) -> float:
-        """Side of a CCD [m]."""
-        return self.pixels * self.pixel_size
+    # ---- sizes and outlines
 
-    @property
-    def half_size(self) -> float:
-        """Half the side of a CCD [m]."""
-        return 0.5 * self.ccd_size
+    @cached_property
+    def half_sizes(self) -> np.ndarray:
+        """Halves of the sides of each CCD along its own x and y [m], shape [n_ccd, 2]."""
+        return 0.5 * (self.pixels * self.pixel_size)
+
+    @cached_property
+    def shortest_side(self) -> float:
+        """Shortest side of all CCDs [m], which sets the scale of drawings."""
+        return 2.0 * float(self.half_sizes.min())
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance of the mosaic from the axis along x or y [m]."""
+        return float(np.abs(self.bounds(range(len(self)))).max())
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of the centre of a CCD from the axis, half the diagonal of a CCD where that is more [m]."""
+        return float(max(np.hypot(*self.centers.T).max(), np.hypot(*self.half_sizes.T).max()))
+
+    @cached_property
+    def alike(self) -> bool:
+        """Whether all CCDs are squares of one size, along the axes of the focal plane."""
+        return self._upright and bool((self.pixels == self.pixels[0, 0]).all())
 
     @cached_property
     def raft_of(self) -> tuple[str, ...]:
-        """Name of the raft of each CCD."""
-        return tuple(self.raft_names[i] for i in self.raft_index)
+        """Name of the raft of each CCD; empty without one."""
+        return tuple((*self.raft_names, "")[i] for i in self.raft_index)
 
-    @cached_property
-    def _index(self) -> dict[str, int]:
-        return {name: i for i, name in enumerate(self.ccd_names)}
+    def corners(self, ccds: Iterable[int]) -> np.ndarray:
+        """Return the corners of CCDs of given index, in order around them [m], shape [n, 4, 2]."""
+        return self.from_uv(np.array(list(ccds), dtype=np.int64)[:, None], _CORNERS)
 
-    @cached_property
-    def _tree(self) -> cKDTree:
-        from scipy.spatial import cKDTree
+    def bounds(self, ccds: Iterable[int]) -> tuple[float, float, float, float]:
+        """Return (xmin, xmax, ymin, ymax) of CCDs of given index, all of them within [m]."""
+        corners = self.corners(ccds)
+        (xmin, ymin), (xmax, ymax) = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        return float(xmin), float(xmax), float(ymin), float(ymax)
 
-        return cKDTree(self.centers)
+    def rectangle(self, ccd: int, rim: float = 0.0) -> tuple[tuple[float, float, float, float], float]:
+        """Return a CCD without a rim [m] as a rectangle along the axes of the focal plane, and its angle.
+
+        Returns
+        -------
+        rectangle : tuple of float
+            (xmin, xmax, ymin, ymax) [m].
+        angle : float
+            By which it is turned about its centre, from +x towards +y [rad]; 0 after quarter turns.
+        """
+        (x, y), (a, b) = self.centers[ccd].tolist(), self.half_sizes[ccd].tolist()
+        quarters = round(float(self.rotation_deg[ccd]) / 90.0)
+        a, b = (b - rim, a - rim) if quarters % 2 else (a - rim, b - rim)
+        return (x - a, x + a, y - b, y + b), float(np.deg2rad(self.rotation_deg[ccd] - 90.0 * quarters))
+
+    def square_pixels(self) -> int:
+        """Return the pixels along a side of equal square CCDs; ConfigError where they are not `alike`."""
+        if not self.alike:
+            raise ConfigError(f"camera = {self.name}: expected equal square CCDs along the axes of the focal plane")
+        return int(self.pixels[0, 0])
+
+    # ---- names
 
     def ccd_index(self, name: str) -> int:
         """Return the index of a CCD, or raise UnknownNameError."""
@@ -79,6 +187,76 @@ class Camera:
             raise unknown_name(f"raft of {self.name}", raft, self.raft_names)
         return tuple(n for n, r in zip(self.ccd_names, self.raft_of, strict=True) if r == raft)
 
+    def members(self, name: str) -> tuple[int, ...]:
+        """Return the indices of the CCDs on a raft, or of the CCD of that name; UnknownNameError without either."""
+        if name in self._index:
+            return (self._index[name],)
+        if name in self.raft_names:
+            return tuple(np.flatnonzero(self.raft_index == self.raft_names.index(name)).tolist())
+        # Rafts of the LSST are R22, its CCDs R22_S11: what looks like neither is compared with both.
+        rafts = self.raft_names if "_" not in name else ()
+        raise unknown_name(f"raft of {self.name}" if rafts else f"CCD of {self.name}", name, rafts or self.ccd_names)
+
+    @cached_property
+    def parts(self) -> dict[str, tuple[int, ...]]:
+        """CCDs of each part that moves as one, by its name: rafts, and CCDs without a raft."""
+        alone = [name for name, raft in zip(self.ccd_names, self.raft_index, strict=True) if raft < 0]
+        return {name: self.members(name) for name in (*self.raft_names, *alone)}
+
+    # ---- maps between the frames; `ccd` is one index or an array of them, which is broadcast with the points
+
+    def along_ccd(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the components along the axes of CCDs of vectors of the focal plane."""
+        if self._upright:
+            return x, y
+        cosine, sine = self._direction[:, ccd]
+        return cosine * x + sine * y, cosine * y - sine * x
+
+    def along_focal_plane(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the components along the axes of the focal plane of vectors along those of CCDs."""
+        if self._upright:
+            return x, y
+        cosine, sine = self._direction[:, ccd]
+        return cosine * x - sine * y, sine * x + cosine * y
+
+    def to_local(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the places in the frames of CCDs [m] of points of the focal plane [m]."""
+        return self.along_ccd(ccd, x - self.centers[ccd, 0], y - self.centers[ccd, 1])
+
+    def from_local(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the points of the focal plane [m] of places in the frames of CCDs [m]."""
+        along_x, along_y = self.along_focal_plane(ccd, x, y)
+        return self.centers[ccd, 0] + along_x, self.centers[ccd, 1] + along_y
+
+    def to_uv(self, ccd: Any, xy: np.ndarray) -> np.ndarray:
+        """Return the places on CCDs, in halves of their sides from -1 to 1, of points [m], shape [..., 2]."""
+        return np.stack(self.to_local(ccd, xy[..., 0], xy[..., 1]), axis=-1) / self.half_sizes[ccd]
+
+    def from_uv(self, ccd: Any, uv: np.ndarray) -> np.ndarray:
+        """Return the points of the focal plane [m] of places on CCDs in halves of their sides, shape [..., 2]."""
+        local = self.half_sizes[ccd] * uv
+        return np.stack(self.from_local(ccd, local[..., 0], local[..., 1]), axis=-1)
+
+    def to_pixel(self, ccd: Any, xy: np.ndarray) -> np.ndarray:
+        """Return the pixels of CCDs of points of the focal plane [m], shape [..., 2]."""
+        local = np.stack(self.to_local(ccd, xy[..., 0], xy[..., 1]), axis=-1)
+        return local / self.pixel_size + 0.5 * (self.pixels[ccd] - 1)
+
+    def from_pixel(self, ccd: Any, pixel: np.ndarray) -> np.ndarray:
+        """Return the points of the focal plane [m] of pixels of CCDs, shape [..., 2]."""
+        local = (pixel - 0.5 * (self.pixels[ccd] - 1)) * self.pixel_size
+        return np.stack(self.from_local(ccd, local[..., 0], local[..., 1]), axis=-1)
+
+    def nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return CCD, x and y in its frame [m] of the nodes of a grid over every CCD, shrunk by a scale; shape [n]."""
+        axis = np.linspace(-1.0, 1.0, cells + 1)
+        ccd, v, u = np.broadcast_arrays(np.arange(len(self))[:, None, None], axis[None, :, None], axis[None, None, :])
+        ccd = ccd.ravel()
+        a, b = (self.half_sizes * scale)[ccd].T
+        return ccd, u.ravel() * a, v.ravel() * b
+
+    # ---- membership
+
     def ccd_at(self, x: ArrayLike, y: ArrayLike, *, margin: float = 0.0) -> np.ndarray:
         """Return the index of the CCD at points; -1 without one.
 
@@ -92,102 +270,75 @@ class Camera:
         px, py = plane_points(x, y)
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
-        if np.any(finite):
-            # Equal squares that do not overlap: the nearest centre in the maximum norm is the only candidate.
-            distance, nearest = self._tree.query(np.stack([px[finite], py[finite]], axis=-1), p=np.inf)
-            index[finite] = np.where(distance <= self.half_size + margin, nearest, -1)
+        if not np.any(finite):
+            return index
+        found = np.full(np.count_nonzero(finite), -1, dtype=np.int64)
+        for kind in self._kinds:
+            u, v = self.along_ccd(kind.index[0], px[finite], py[finite])
+            # Equal rectangles that do not overlap: the nearest centre in the maximum norm is the only candidate.
+            stretch = kind.half[0] / kind.half[1]
+            nearest = kind.tree.query(np.stack([u, v * stretch], axis=-1), p=np.inf)[1]
+            at, (a, b) = kind.centers[nearest], kind.half + margin
+            inside = (np.abs(u - at[:, 0]) <= a) & (np.abs(v - at[:, 1]) <= b)
+            found[inside] = kind.index[nearest[inside]]
+        index[finite] = found
         return index
 
+    def depth(self, ccd: int, xy: np.ndarray) -> np.ndarray:
+        """Return how far inside the nearest rim of a CCD points lie [m], shape [n]; negative beyond."""
+        u, v = self.to_local(ccd, xy[:, 0], xy[:, 1])
+        a, b = self.half_sizes[ccd]
+        return np.minimum(a - np.abs(u), b - np.abs(v))
 
-#: Rafts of the LSST camera whose CCDs are of Imaging Technology Laboratory; the others are Teledyne e2v's.
-_ITL_RAFTS = {"R01", "R02", "R03", "R10", "R20", "R41", "R42", "R43"}
+    # ---- kept
 
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.ccd_names)}
 
-@check_arguments
-@lru_cache(maxsize=1)
-def lsst_camera() -> Camera:
-    """Return the LSST camera: 189 CCDs of 4096 x 4096 pixels of 10 um in 21 rafts of 3 x 3.
+    @cached_property
+    def _upright(self) -> bool:
+        return not self.rotation_deg.any()
 
-    Rafts stand on a 5 x 5 grid of 127.0 mm less its corners, CCDs on a grid of 42.25 mm. ``R<row><column>_S<row>
-    <column>``: rows along +y, columns along +x, R22_S11 at the centre. Order: rafts row by row, then CCDs row by row.
-    Vendors are "itl" and "e2v". (The CCDs as built have 4072 x 4000 and 4096 x 4004 pixels.)
-    """
-    raft_pitch, ccd_pitch = 127.0e-3, 42.25e-3
-    # A corner has both its row and its column at the rim; every other place has at least one that is not.
-    grid = [(row, column) for row in range(5) for column in range(5) if {row, column} - {0, 4}]
-    rafts = [(f"R{row}{column}", row, column) for row, column in grid]
-    names, centers = [], []
-    for raft, row, column in rafts:
-        for s_row, s_column in np.ndindex(3, 3):
-            names.append(f"{raft}_S{s_row}{s_column}")
-            x = (column - 2) * raft_pitch + (s_column - 1) * ccd_pitch
-            y = (row - 2) * raft_pitch + (s_row - 1) * ccd_pitch
-            centers.append((x, y))
-    return Camera(
-        name="lsst",
-        ccd_names=tuple(names),
-        raft_names=tuple(r[0] for r in rafts),
-        raft_index=np.repeat(np.arange(len(rafts)), 9),
-        centers=np.array(centers),
-        pixels=4096,
-        pixel_size=10e-6,
-        vendors=tuple("itl" if name[:3] in _ITL_RAFTS else "e2v" for name in names),
-    )
+    @cached_property
+    def _direction(self) -> np.ndarray:
+        """Cosine and sine of the angle of each CCD, [2, n_ccd]; exact for quarter turns."""
+        quarters = np.round(self.rotation_deg / 90.0).astype(np.int64)
+        rest = np.deg2rad(self.rotation_deg - 90.0 * quarters)
+        cosine, sine = _QUARTER_COSINES[quarters % 4], _QUARTER_COSINES[(quarters - 1) % 4]
+        return np.stack([cosine * np.cos(rest) - sine * np.sin(rest), sine * np.cos(rest) + cosine * np.sin(rest)])
 
+    @cached_property
+    def _kinds(self) -> list[_Kind]:
+        from scipy.spatial import cKDTree
 
-#: Centres of the sensors of raft R00 of the LSST camera [m]; the other corners are quarter turns of it.
-_CORNER_SENSORS = {
-    "SG0": (-212.238e-3, -258.738e-3),
-    "SG1": (-258.738e-3, -212.238e-3),
-    "SW0": (-214.25e-3, -202.6272e-3),
-    "SW1": (-214.25e-3, -225.8728e-3),
-}
-#: Corner rafts, and the quarter turns from +x towards +y that bring R00 there.
-_CORNER_RAFTS = {"R00": 0, "R04": 1, "R40": 3, "R44": 2}
+        kinds = []
+        described = np.column_stack([self.pixels, self.rotation_deg])
+        for row in np.unique(described, axis=0):
+            index = np.flatnonzero((described == row).all(axis=1))
+            half = self.half_sizes[index[0]]
+            centers = np.stack(self.along_ccd(index, *self.centers[index].T), axis=-1)
+            tree = cKDTree(centers * [1.0, half[0] / half[1]])
+            kinds.append(_Kind(index, half, centers, tree))
+        return kinds
 
-
-def _corner_camera(name: str, sensors: tuple[str, ...], pixels: int) -> Camera:
-    """Return the sensors of the corner rafts of the LSST camera whose names in their raft are given."""
-    centers = []
-    for turns in _CORNER_RAFTS.values():
-        for sensor in sensors:
-            x, y = _CORNER_SENSORS[sensor]
-            for _ in range(turns):
-                x, y = -y, x
-            centers.append((x, y))
-    return Camera(
-        name=name,
-        ccd_names=tuple(f"{raft}_{sensor}" for raft in _CORNER_RAFTS for sensor in sensors),
-        raft_names=tuple(_CORNER_RAFTS),
-        raft_index=np.repeat(np.arange(len(_CORNER_RAFTS)), len(sensors)),
-        centers=np.array(centers),
-        pixels=pixels,
-        pixel_size=10e-6,
-    )
-
-
-@lru_cache(maxsize=1)
-def lsst_wavefront_camera() -> Camera:
-    """Return the wavefront sensors of the LSST camera, R00_SW0 to R44_SW1.
-
-    CCDs of a camera are square: of each half of 2000 x 4072 pixels these are the middle 2000 x 2000.
-    """
-    return _corner_camera("lsst_wavefront", ("SW0", "SW1"), 2000)
-
-
-@lru_cache(maxsize=1)
-def lsst_guider_camera() -> Camera:
-    """Return the guiders of the LSST camera, R00_SG0 to R44_SG1: of 4072 x 4000 pixels the middle 4000 x 4000."""
-    return _corner_camera("lsst_guider", ("SG0", "SG1"), 4000)
-
-
-CAMERAS = {"lsst": lsst_camera, "lsst_wavefront": lsst_wavefront_camera, "lsst_guider": lsst_guider_camera}
-
-
-def load_camera(camera: str | Camera) -> Camera:
-    """Return a camera by name, or a camera as it is; an unknown name is an UnknownNameError."""
-    if isinstance(camera, Camera):
-        return camera
-    if camera not in CAMERAS:
-        raise unknown_name("camera", camera, CAMERAS)
-    return CAMERAS[camera]()
+    def _check_overlap(self) -> None:
+        """Raise DomainError, with the names, if two CCDs overlap: if no side of either separates them."""
+        radius = np.hypot(*self.half_sizes.T)
+        x, y = self.centers.T
+        near = np.hypot(x[:, None] - x, y[:, None] - y) < radius[:, None] + radius
+        first, second = np.nonzero(np.triu(near, 1))
+        apart = np.zeros(len(first), dtype=bool)
+        offset = self.centers[second] - self.centers[first]
+        for own, other in ((first, second), (second, first)):
+            away = np.abs(np.stack(self.along_ccd(own, *offset.T), axis=-1))
+            # Half the other rectangle along the axes of this one.
+            turn = np.deg2rad(self.rotation_deg[other] - self.rotation_deg[own])
+            cosine, sine = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+            a, b = self.half_sizes[other].T
+            across = np.stack([cosine * a + sine * b, sine * a + cosine * b], axis=-1)
+            apart |= (away > self.half_sizes[own] + across - _TOUCHING).any(axis=1)
+        if not apart.all():
+            i = int(np.flatnonzero(~apart)[0])
+            one, two = self.ccd_names[first[i]], self.ccd_names[second[i]]
+            raise DomainError(f"camera {self.name}: CCDs {one} and {two} overlap: expected them beside each other")

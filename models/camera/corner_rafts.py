@@ -11,7 +11,8 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import check_choice
 from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
-from .camera import Camera, load_camera
+from .camera import Camera
+from .cameras import load_camera
 from .ccd_surfaces import CcdSurfaces
 from .focal_plane import FocalPlane
 
@@ -45,9 +46,7 @@ def corner_focal_plane(kind: str = "wavefront", heights: str = "nominal") -> Foc
     camera = load_camera(_CAMERAS[kind])
     if heights != "nominal":
         return FocalPlane(camera, *bundled_heights(heights).on(camera))
-    polynomial = np.zeros((len(camera), 10))
-    polynomial[:, 0] = _nominal_heights(camera)
-    surfaces = CcdSurfaces(camera.half_size, polynomial, np.zeros((len(camera), 2, 4)))
+    surfaces = CcdSurfaces.level(camera.half_sizes, _nominal_heights(camera))
     return FocalPlane(camera, surfaces, np.zeros(len(camera), dtype=bool))
 
 

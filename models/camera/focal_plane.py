@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, unknown_name
+from ...core.errors import DomainError
 from ...core.units import metres, plane_points, radians, require_count
-from .camera import Camera, load_camera
+from .camera import Camera
+from .cameras import load_camera
 from .ccd_surfaces import CcdSurfaces
-from .height_budget import TERMS, HeightBudget, draw_heights, load_budget
+from .height_budget import HeightBudget, chosen_terms, draw_heights, load_budget
 from .height_fit import fit_heights, table_column
 from .height_map import HeightMap
 
@@ -105,21 +106,15 @@ class FocalPlane(HeightMap):
         budget = load_budget(budget) if isinstance(budget, str) else budget
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise DomainError(f"seed = {seed!r}: expected a whole number of zero or more")
-        wanted = TERMS if terms is None else (terms,) if isinstance(terms, str) else tuple(terms)
-        for term in wanted:
-            if term not in TERMS:
-                raise unknown_name("height term", term, TERMS)
-        wanted = tuple(term for term in TERMS if term in wanted)
+        wanted = chosen_terms(terms)
         surfaces = draw_heights(camera, budget, int(seed), wanted)
-        return cls(camera, surfaces, np.zeros(len(camera), dtype=bool), wanted, budget, int(seed))
+        return cls(camera, surfaces, np.zeros(len(camera), dtype=bool), wanted, budget, int(seed))._placed()
 
     @classmethod
     def flat(cls, camera: str | Camera = "lsst") -> FocalPlane:
-        """Return a focal plane whose every CCD lies at height zero."""
+        """Return a focal plane of flat CCDs where the camera has them, which is at height zero for most."""
         camera = load_camera(camera)
-        n = len(camera)
-        surfaces = CcdSurfaces(camera.half_size, np.zeros((n, 10)), np.zeros((n, 2, 4)))
-        return cls(camera, surfaces, np.zeros(n, dtype=bool))
+        return cls(camera, CcdSurfaces.level(camera.half_sizes), np.zeros(len(camera), dtype=bool))._placed()
 
     @classmethod
     def as_measured(cls, name: str = "lsstcam") -> FocalPlane:
@@ -139,8 +134,7 @@ class FocalPlane(HeightMap):
         """
         from ..io.heights.zernike_table import AS_MEASURED, bundled_heights
 
-        heights = bundled_heights(name)
-        camera = load_camera(AS_MEASURED[name][0])
+        heights, camera = bundled_heights(name), load_camera(AS_MEASURED[name][0])
         return cls(camera, *heights.on(camera))
 
     @classmethod
@@ -213,8 +207,7 @@ class FocalPlane(HeightMap):
         """Fit the vertices of a surface mesh as `from_heights` does: metres, z positive along +z of the telescope."""
         camera = load_camera(camera)
         x, y, z = np.asarray(mesh.vertices, dtype=np.float64).T
-        surfaces, measured = fit_heights(camera, x, y, z, margin=_MESH_MARGIN)
-        return cls(camera, surfaces, measured)
+        return cls(camera, *fit_heights(camera, x, y, z, margin=_MESH_MARGIN))
 
     def with_terms(self, terms: str | Iterable[str]) -> FocalPlane:
         """Return the focal plane of the same seed and budget with only these terms.
@@ -281,17 +274,26 @@ class FocalPlane(HeightMap):
             If an argument is not one finite number.
         """
         camera = self.camera
-        members = np.array([camera.ccd_index(n) for n in ((name,) if "_" in name else camera.ccds_of_raft(name))])
+        members = np.array(camera.members(name))
         lift, turn_x, turn_y = metres(dz, "dz"), radians(rx, "rx"), radians(ry, "ry")
         for label, value in (("dz", lift), ("rx", turn_x), ("ry", turn_y)):
             if value.ndim or not np.isfinite(value):
                 raise DomainError(f"{name} {label} = {value.tolist()}: expected one finite number")
         x, y = (camera.centers[members] - camera.centers[members].mean(axis=0)).T
+        along_x, along_y = np.broadcast_arrays(-np.tan(turn_y), np.tan(turn_x), x)[:2]
+        slope_u, slope_v = camera.along_ccd(members, along_x, along_y)
         polynomial = self.surfaces.polynomial.copy()
         polynomial[members, 0] += lift + y * np.tan(turn_x) - x * np.tan(turn_y)
-        polynomial[members, 1] -= camera.half_size * np.tan(turn_y)
-        polynomial[members, 2] += camera.half_size * np.tan(turn_x)
+        polynomial[members, 1] += camera.half_sizes[members, 0] * slope_u
+        polynomial[members, 2] += camera.half_sizes[members, 1] * slope_v
         return replace(self, surfaces=replace(self.surfaces, polynomial=polynomial))
+
+    def _placed(self) -> FocalPlane:
+        """Return the focal plane with each CCD at its nominal height and tilt besides."""
+        plane, placement = self, self.camera.placement
+        for name, (lift, turn_x, turn_y) in zip(self.names, () if placement is None else placement, strict=False):
+            plane = plane.with_moved(name, dz=lift, rx=turn_x, ry=turn_y)
+        return plane
 
     def height(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the height of the CCD surface.
@@ -310,18 +312,22 @@ class FocalPlane(HeightMap):
 
     def gradient(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the slopes (dh/dx, dh/dy) of the CCD surface [rad], shape (..., 2); arguments as for `height`."""
-        return self._on_ccds(self.surfaces.gradient, x, y, 2)
+        return self._on_ccds(self.slopes_on, x, y, 2)
 
     def measured_at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return whether (x, y) [m] lies on the measured part of a CCD, which for most heights is all of it."""
         return self._on_ccds(self.surfaces.measured_at, x, y) == 1.0
+
+    def slopes_on(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return the slopes along the axes of the focal plane at places on CCDs [m], shape [n, 2]."""
+        return np.stack(self.camera.along_focal_plane(ccd, *self.surfaces.gradient(ccd, dx, dy).T), axis=-1)
 
     def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""
         px, py = plane_points(x, y)
         ccd = self.camera.ccd_at(px, py)
         lit = ccd >= 0
-        dx, dy = px - self.camera.centers[ccd, 0], py - self.camera.centers[ccd, 1]
+        dx, dy = self.camera.to_local(ccd, px, py)
         out = np.full((*lit.shape, *values), np.nan)
         out[lit] = function(ccd[lit], dx[lit], dy[lit])
         return out
@@ -354,8 +360,8 @@ class FocalPlane(HeightMap):
         """Return an upper bound of the distance between mesh and surface.
 
         On a right triangle with two sides of one cell, linear interpolation is off by at most the largest second
-        derivative in any direction times the square of the cell over 4 (the circumscribed circle's radius squared
-        over 2).
+        derivative in any direction times the square of the cell's diagonal over 8 (the circumscribed circle's radius
+        squared over 2).
 
         Parameters
         ----------
@@ -367,8 +373,8 @@ class FocalPlane(HeightMap):
         ndarray, shape (n_ccd,)
             Upper bound of ``|mesh height - height|`` [m] on each CCD.
         """
-        cell = self.camera.ccd_size / require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
-        return 0.25 * self.surfaces.curvature_bound() * cell**2
+        cell = 2.0 * self.camera.half_sizes / require_count(cells_per_ccd, "cells_per_ccd", 1, _MOST_CELLS)
+        return 0.125 * self.surfaces.curvature_bound() * (cell**2).sum(axis=1)
 
     def to_table(self, cells_per_ccd: int = 32) -> Table:
         """Return heights on a grid of each CCD, as a table that `from_heights` reads.
@@ -391,9 +397,5 @@ class FocalPlane(HeightMap):
 
     def _nodes(self, cells: int, scale: float = 1.0) -> tuple[np.ndarray, ...]:
         """Return CCD index, x, y and height [m] of the nodes of a grid on every CCD."""
-        axis = np.linspace(-1.0, 1.0, cells + 1) * (self.camera.half_size * scale)
-        n = len(self.camera)
-        ccd, dy, dx = np.broadcast_arrays(np.arange(n)[:, None, None], axis[None, :, None], axis[None, None, :])
-        ccd, dx, dy = ccd.ravel(), dx.ravel(), dy.ravel()
-        x, y = self.camera.centers[ccd, 0] + dx, self.camera.centers[ccd, 1] + dy
-        return ccd, x, y, self.surfaces.height(ccd, dx, dy)
+        ccd, dx, dy = self.camera.nodes(cells, scale)
+        return ccd, *self.camera.from_local(ccd, dx, dy), self.surfaces.height(ccd, dx, dy)

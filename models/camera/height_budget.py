@@ -9,13 +9,14 @@ to the last bit. Heights are positive along +z of the telescope frame.
 - ``ccd``: the same for each CCD.
 - ``tilt``: each CCD tilted about x and about y, each angle uniform within half the peak to valley on either side.
 - ``potato_chip``: two crossed cosine waves of equal amplitude on each CCD, of random orientation and phase, each with
-  1 to 2 cycles along a CCD's side, scaled to exactly the peak to valley over the CCD, with zero mean.
+  1 to 2 cycles along a CCD's longer side, scaled to exactly the peak to valley over the CCD, with zero mean.
 
 The paper gives the peak-to-valley sizes and the 1 to 2 cycles; the distributions are ours.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +81,15 @@ def load_budget(name: str) -> HeightBudget:
     return BUDGETS[name]
 
 
+def chosen_terms(terms: str | Iterable[str] | None) -> tuple[str, ...]:
+    """Return terms in the order of :data:`TERMS`, all by default; UnknownNameError for another name."""
+    wanted = TERMS if terms is None else (terms,) if isinstance(terms, str) else tuple(terms)
+    for term in wanted:
+        if term not in TERMS:
+            raise unknown_name("height term", term, TERMS)
+    return tuple(term for term in TERMS if term in wanted)
+
+
 def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[str, ...]) -> CcdSurfaces:
     """Draw the heights of every CCD: the sum of the given terms, of `TERMS`."""
     polynomial = np.zeros((len(camera), 10))
@@ -91,21 +101,25 @@ def draw_heights(camera: Camera, budget: HeightBudget, seed: int, terms: tuple[s
     if "potato_chip" in terms:
         offset, waves = _potato_chip(camera, budget, seed)
         polynomial[:, 0] += offset
-    return CcdSurfaces(camera.half_size, polynomial, waves)
+    return CcdSurfaces(camera.half_sizes, polynomial, waves)
 
 
 def _global(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
-    scale = np.hypot(*camera.centers.T).max()
+    scale = camera.radius
     x, y = camera.centers.T / scale
-    a = camera.half_size / scale
+    a, b = camera.half_sizes.T / scale
     px, py, power, astigmatism, oblique = stream(seed, "focal plane", "global").standard_normal(5)
     xx, yy, xy = power + astigmatism, power - astigmatism, oblique
-    # px X + py Y + xx X^2 + yy Y^2 + xy X Y with X = x + a u, Y = y + a v, in powers of u and v.
+    # px X + py Y + xx X^2 + yy Y^2 + xy X Y with (X, Y) = (x, y) + a u (c, s) + b v (-s, c), in powers of u and v.
+    ccds = np.arange(len(camera))
+    c, s = camera.along_focal_plane(ccds, np.ones(len(camera)), np.zeros(len(camera)))
+    slope_u, slope_v = camera.along_ccd(ccds, px + 2 * xx * x + xy * y, py + 2 * yy * y + xy * x)
     polynomial = np.zeros((len(camera), 10))
     polynomial[:, 0] = px * x + py * y + xx * x**2 + yy * y**2 + xy * x * y
-    polynomial[:, 1] = a * (px + 2 * xx * x + xy * y)
-    polynomial[:, 2] = a * (py + 2 * yy * y + xy * x)
-    polynomial[:, 3], polynomial[:, 4], polynomial[:, 5] = a**2 * xx, a**2 * xy, a**2 * yy
+    polynomial[:, 1], polynomial[:, 2] = a * slope_u, b * slope_v
+    polynomial[:, 3] = a**2 * (c**2 * xx + c * s * xy + s**2 * yy)
+    polynomial[:, 4] = a * b * ((c**2 - s**2) * xy + 2 * c * s * (yy - xx))
+    polynomial[:, 5] = b**2 * (s**2 * xx - c * s * xy + c**2 * yy)
     low, high = _quadratic_range(polynomial)
     polynomial[:, 0] -= 0.5 * (low + high)
     return polynomial * (budget.global_height / (high - low))
@@ -133,7 +147,8 @@ def _raft(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
     half = 0.5 * budget.raft_height
     pistons = np.array([stream(seed, "focal plane", "raft", name).uniform(-half, half) for name in camera.raft_names])
     polynomial = np.zeros((len(camera), 10))
-    polynomial[:, 0] = pistons[camera.raft_index]
+    # Index -1, of CCDs without a raft, is that of the zero at the end.
+    polynomial[:, 0] = np.append(pistons, 0.0)[camera.raft_index]
     return polynomial
 
 
@@ -148,27 +163,26 @@ def _tilt(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
     half = 0.5 * budget.ccd_tilt
     angles = [stream(seed, "focal plane", "tilt", name).uniform(-half, half, 2) for name in camera.ccd_names]
     polynomial = np.zeros((len(camera), 10))
-    polynomial[:, 1:3] = camera.half_size * np.tan(angles)
+    polynomial[:, 1:3] = camera.half_sizes * np.tan(angles)
     return polynomial
 
 
 def _potato_chip(camera: Camera, budget: HeightBudget, seed: int) -> tuple[np.ndarray, np.ndarray]:
     offset = np.zeros(len(camera))
     waves = np.zeros((len(camera), 2, 4))
-    a = camera.half_size
-    axis = np.linspace(-a, a, _POTATO_POINTS)
-    for i, name in enumerate(camera.ccd_names):
+    for i, (name, (a, b)) in enumerate(zip(camera.ccd_names, camera.half_sizes.tolist(), strict=True)):
+        axis_x, axis_y = np.linspace(-a, a, _POTATO_POINTS), np.linspace(-b, b, _POTATO_POINTS)
         rng = stream(seed, "focal plane", "potato_chip", name)
         angle = rng.uniform(0.0, np.pi) + np.array([0.0, 0.5 * np.pi])
-        k = 2 * np.pi * rng.uniform(*budget.potato_chip_cycles, 2) / camera.ccd_size
+        k = 2 * np.pi * rng.uniform(*budget.potato_chip_cycles, 2) / (2.0 * max(a, b))
         phase = rng.uniform(0.0, 2 * np.pi, 2)
         kx, ky = k * np.cos(angle), k * np.sin(angle)
-        along_y, along_x = np.exp(1j * (np.outer(ky, axis) + phase[:, None])), np.exp(1j * np.outer(kx, axis))
+        along_y, along_x = np.exp(1j * (np.outer(ky, axis_y) + phase[:, None])), np.exp(1j * np.outer(kx, axis_x))
         ripple = np.real(along_y[:, :, None] * along_x[:, None, :]).sum(axis=0)
         amplitude = budget.potato_chip / (ripple.max() - ripple.min())
         waves[i] = np.stack([np.full(2, amplitude), kx, ky, phase], axis=-1)
-        # Mean of a cosine over the square: each axis contributes sin(k a) / (k a).
-        offset[i] = -amplitude * np.sum(np.cos(phase) * np.sinc(kx * a / np.pi) * np.sinc(ky * a / np.pi))
+        # Mean of a cosine over the rectangle: each axis contributes sin(k a) / (k a).
+        offset[i] = -amplitude * np.sum(np.cos(phase) * np.sinc(kx * a / np.pi) * np.sinc(ky * b / np.pi))
     return offset, waves
 
 

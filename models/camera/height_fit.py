@@ -55,11 +55,11 @@ def fit_heights(
         if first == last:
             continue
         chosen = order[first:last]
-        u, v = ((np.stack([x[chosen], y[chosen]]).T - camera.centers[i]) / camera.half_size).T
+        u, v = camera.to_uv(i, np.stack([x[chosen], y[chosen]], axis=1)).T
         polynomial[i], rest = _fit_polynomial(u, v, z[chosen], camera.ccd_names[i])
         if grid is not None and bending is not None and last - first >= _SPLINE_POINTS:
             grid[i] = _fit_spline(u, v, rest, bending)
-    return CcdSurfaces(camera.half_size, polynomial, np.zeros((len(camera), 2, 4)), grid), counts > 0
+    return CcdSurfaces(camera.half_sizes, polynomial, np.zeros((len(camera), 2, 4)), grid), counts > 0
 
 
 def table_column(table: Any, name: str) -> np.ndarray:

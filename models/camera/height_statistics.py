@@ -74,10 +74,10 @@ def height_statistics(focal_plane: FocalPlane) -> dict[str, HeightStatistics]:
     DomainError
         If a CCD has fewer than three measured points on the grid.
     """
-    camera, (x, y, heights) = focal_plane.camera, sampled_heights(focal_plane)
+    camera, (u, v, heights) = focal_plane.camera, sampled_heights(focal_plane)
     chosen = np.flatnonzero(focal_plane.measured if focal_plane.measured.any() else np.ones(len(camera), dtype=bool))
     heights = heights[chosen]
-    planes = np.stack([_plane(x, y, row, camera.ccd_names[i]) for i, row in zip(chosen, heights, strict=True)])
+    planes = np.stack([_plane(u, v, row, camera.ccd_names[i]) for i, row in zip(chosen, heights, strict=True)])
     groups = {"all": np.ones(len(chosen), dtype=bool)}
     for vendor in dict.fromkeys(camera.vendors):
         groups[vendor] = np.array([camera.vendors[i] == vendor for i in chosen])
@@ -85,23 +85,23 @@ def height_statistics(focal_plane: FocalPlane) -> dict[str, HeightStatistics]:
 
 
 def sampled_heights(focal_plane: FocalPlane) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a grid about the centre of a CCD, x and y [m], [n], and the heights of all there [m], [n_ccd, n].
+    """Return a grid over a CCD, u and v from -1 to 1, [n], and the heights of all CCDs there [m], [n_ccd, n].
 
     They are NaN where a CCD was not measured.
     """
     camera = focal_plane.camera
-    axis = ((np.arange(_CELLS) + 0.5) / _CELLS - 0.5) * camera.ccd_size
-    y, x = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
-    at = camera.centers[:, :1] + x, camera.centers[:, 1:] + y
-    return x, y, np.where(focal_plane.measured_at(*at), focal_plane.height(*at), np.nan)
+    axis = 2.0 * ((np.arange(_CELLS) + 0.5) / _CELLS - 0.5)
+    v, u = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
+    at = np.moveaxis(camera.from_uv(np.arange(len(camera))[:, None], np.stack([u, v], axis=-1)), -1, 0)
+    return u, v, np.where(focal_plane.measured_at(*at), focal_plane.height(*at), np.nan)
 
 
-def _plane(x: np.ndarray, y: np.ndarray, height: np.ndarray, name: str) -> np.ndarray:
+def _plane(u: np.ndarray, v: np.ndarray, height: np.ndarray, name: str) -> np.ndarray:
     """Return the best plane of one CCD, at all points."""
     known = np.isfinite(height)
     if known.sum() < 3:
         raise DomainError(f"{name}: {known.sum()} measured points: expected 3 or more")
-    design = np.stack([np.ones_like(x), x, y], axis=1) / np.array([1.0, x.max(), y.max()])
+    design = np.stack([np.ones_like(u), u, v], axis=1)
     return design @ np.linalg.lstsq(design[known], height[known], rcond=None)[0]
 
 

@@ -45,21 +45,20 @@ class SensorHeights:
         rows = np.array([index[name] for name in camera.ccd_names if name in index])
         offset = self.center[rows] - camera.centers[measured]
         for name, off, there in zip(np.array(camera.ccd_names)[measured], offset, self.center[rows], strict=True):
-            if np.abs(off).max() > camera.half_size:
+            if (np.abs(off) > camera.half_sizes[camera.ccd_index(name)]).any():
                 x, y = 1e3 * (there - off)
                 raise DomainError(
                     f"{name} at (x, y) = ({1e3 * there[0]:.2f}, {1e3 * there[1]:.2f}) mm of the telescope frame: "
                     f"expected ({x:.2f}, {y:.2f}) mm as in {camera.name}; is the frame of the file right?"
                 )
         n, chosen = len(camera), self.surfaces.chosen(rows)
-        half = camera.half_size
-        radius, origin = np.full(n, half), np.zeros((n, 2))
+        radius, origin = camera.half_sizes[:, 0].copy(), np.zeros((n, 2))
         coefficients = np.zeros((n, *chosen.coefficients.shape[1:]))
-        limits = np.broadcast_to([-half, half], (n, 2, 2)).copy()
+        limits = np.stack([-camera.half_sizes, camera.half_sizes], axis=-1)
         radius[measured], origin[measured], coefficients[measured] = chosen.radius, offset, chosen.coefficients
         limits[measured] = chosen.limits
         zernikes = ZernikeSurfaces(radius, origin, coefficients, limits)
-        return CcdSurfaces(half, np.zeros((n, 10)), np.zeros((n, 2, 4)), zernikes=zernikes), measured
+        return CcdSurfaces(camera.half_sizes, np.zeros((n, 10)), np.zeros((n, 2, 4)), zernikes=zernikes), measured
 
 
 @dataclass(frozen=True, eq=False)

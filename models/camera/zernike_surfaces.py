@@ -63,8 +63,8 @@ class ZernikeSurfaces:
         low, high = np.moveaxis(self.limits[sensor], -1, 0)
         return np.all((position >= low) & (position <= high), axis=-1)
 
-    def curvature_bound(self, half_size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return upper bounds of |d2h/dx2|, |d2h/dy2|, |d2h/dxdy| [1/m] on squares of given half size [m], each [n]."""
+    def curvature_bound(self, half_size: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return upper bounds of |d2h/dx2|, |d2h/dy2|, |d2h/dxdy| [1/m] on squares of half sizes [m], each [n]."""
         # The tangent of a power at the rim nowhere exceeds the power itself, so the bound holds outside the limits too.
         reach = (half_size + np.abs(self.origin).max(axis=1, initial=0.0)) / self.radius
         bounds = np.zeros((3, len(self.radius)))

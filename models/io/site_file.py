@@ -16,7 +16,7 @@ from ..site import Site, Weather
 from .yaml.values import ROWS, Number, OptionalNumber, PositiveNumber, Text
 
 DATA = Path(__file__).parents[1] / "data"
-BUNDLED = ("cerro_pachon",)
+BUNDLED = ("cerro_pachon", "cerro_tololo", "maunakea")
 
 
 class UnitsSection(Section):

@@ -9,7 +9,8 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
-from ...models.camera.camera import Camera, load_camera
+from ...models.camera.camera import Camera
+from ...models.camera.cameras import load_camera
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
 from ...models.telescope import Telescope

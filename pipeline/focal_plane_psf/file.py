@@ -52,9 +52,11 @@ def model_hdus(model: Any) -> list[fits.ImageHDU | fits.BinTableHDU]:
             "name": camera.name,
             "rafts": list(camera.raft_names),
             "raft_index": camera.raft_index.tolist(),
-            "pixels": camera.pixels,
+            "pixels": int(camera.pixels[0, 0]) if camera.alike else camera.pixels.tolist(),
             "pixel_size": camera.pixel_size,
         }
+        if not camera.alike:
+            about["camera"]["rotation_deg"] = camera.rotation_deg.tolist()
     left = model.leave_one_out
     hdus = [
         _image("CENTERS", mosaic.centers),
@@ -126,8 +128,9 @@ def model_fields(hdus: Iterable[Any], path: Path) -> Mapping[str, Any]:
                 tuple(known["rafts"]),
                 np.array(known["raft_index"]),
                 part("CENTERS"),
-                known["pixels"],
+                np.broadcast_to(known["pixels"], (len(about["ccds"]), 2)).copy(),
                 known["pixel_size"],
+                rotation_deg=np.array(known.get("rotation_deg", [0.0])),
             )
         mosaic = Mosaic(tuple(about["ccds"]), part("CENTERS"), about["half_size"], camera)
         places = _places(mosaic, part("POSITION"), part("STAR_CCD"))
@@ -181,7 +184,7 @@ def _optics(about: Mapping[str, Any], part: Any, found: Mapping[str, Any], camer
     )
     cubic = part("HEIGHT_CUBIC")
     grid = part("HEIGHT_SPLINE") if "HEIGHT_SPLINE" in found else None
-    surfaces = CcdSurfaces(camera.half_size, cubic, np.zeros((len(cubic), 2, 4)), grid)
+    surfaces = CcdSurfaces(camera.half_sizes, cubic, np.zeros((len(cubic), 2, 4)), grid)
     wavefront, telescope = part("WAVEFRONT"), instrument.telescope
     return OpticsPart(
         instrument,

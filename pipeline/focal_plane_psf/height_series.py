@@ -69,7 +69,5 @@ class HeightSeries:
 
 def level_plane(plane: FocalPlane, height: float) -> FocalPlane:
     """Return a focal plane of the same camera, all of whose CCDs lie at one height [m]."""
-    polynomial = np.zeros((len(plane.camera), 10))
-    polynomial[:, 0] = height
-    surfaces = CcdSurfaces(plane.camera.half_size, polynomial, np.zeros((len(plane.camera), 2, 4)))
+    surfaces = CcdSurfaces.level(plane.camera.half_sizes, height)
     return FocalPlane(plane.camera, surfaces, np.zeros(len(plane.camera), dtype=bool))

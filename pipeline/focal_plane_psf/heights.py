@@ -6,7 +6,7 @@ exposure), a piston of each raft, and products of Legendre polynomials in u and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -45,7 +45,7 @@ class HeightPrior:
     ccd : ndarray, shape [n_ccd, n_term, n_term]
         Covariance of the coefficients of each CCD [m^2].
     mean : FocalPlane or None
-        Heights about which the prior stands; None for zero.
+        Heights about which the prior stands; None for zero, which are those of most cameras.
     """
 
     camera: Camera
@@ -58,31 +58,31 @@ class HeightPrior:
     def from_budget(cls, camera: Camera, budget: str | HeightBudget = "simulated", degree: int = DEGREE) -> HeightPrior:
         """Return the prior with the covariance of focal planes drawn from a budget of heights."""
         budget = load_budget(budget) if isinstance(budget, str) else budget
+        bare = replace(camera, placement=None)
         # Seeds far from those that people choose, so that no run is fitted with its own heights.
         seeds = range(2**31, 2**31 + _DRAWS)
         ccd = np.zeros((len(powers(degree)), len(powers(degree))))
         for term in ("ccd", "tilt", "potato_chip"):
-            drawn = [
-                project(FocalPlane.from_budget(camera, seed=s, terms=(term,), budget=budget), degree) for s in seeds
-            ]
+            drawn = [project(FocalPlane.from_budget(bare, seed=s, terms=(term,), budget=budget), degree) for s in seeds]
             rows = np.concatenate(drawn)
             ccd += rows.T @ rows / len(rows)
         # The quadratic's coefficients are normal but for a scale; many more draws are needed than of CCDs.
         planes = [
-            _global_terms(FocalPlane.from_budget(camera, seed=s, terms=("global",), budget=budget))
+            _global_terms(FocalPlane.from_budget(bare, seed=s, terms=("global",), budget=budget))
             for s in range(2**31, 2**31 + 16 * _DRAWS)
         ]
         rows = np.array(planes)
         quadratic = rows.T @ rows / len(rows) + _LEAST * np.eye(5)
         own = np.broadcast_to(ccd + _LEAST * np.eye(len(ccd)), (len(camera), *ccd.shape))
-        return cls(camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), own)
+        return cls(camera, quadratic, max(budget.raft_height**2 / 12.0, _LEAST), own, _nominal(camera))
 
     @classmethod
     def broad(cls, camera: Camera, size: float = 10e-6, degree: int = DEGREE) -> HeightPrior:
         """Return a prior that hardly holds heights [m]: independent coefficients that fall as the degree rises."""
         total = np.array([i + j for i, j in powers(degree)])
         ccd = np.diag((size / (1.0 + total) ** 2) ** 2)
-        return cls(camera, size**2 * np.eye(5), size**2, np.broadcast_to(ccd, (len(camera), *ccd.shape)))
+        own = np.broadcast_to(ccd, (len(camera), *ccd.shape))
+        return cls(camera, size**2 * np.eye(5), size**2, own, _nominal(camera))
 
     @classmethod
     def known(cls, plane: FocalPlane, covariance: np.ndarray | None = None) -> HeightPrior:
@@ -156,8 +156,8 @@ class HeightPrior:
         terms = legendre(uv, self.degree)
         projection = terms.T * (np.outer(weights, weights).ravel() / 4.0)
         result = np.empty((len(self.camera), terms.shape[1], terms.shape[1]))
-        for ccd, center in enumerate(self.camera.centers):
-            places = Places(center + self.camera.half_size * uv, np.full(len(uv), ccd), uv)
+        for ccd in range(len(self.camera)):
+            places = Places(self.camera.from_uv(ccd, uv), np.full(len(uv), ccd), uv)
             change = np.concatenate([projection @ self.common_terms(places), np.eye(terms.shape[1])], axis=1)
             columns = np.r_[: self.n_common, self.columns_of(ccd)]
             result[ccd] = change @ covariance[np.ix_(columns, columns)] @ change.T
@@ -178,9 +178,14 @@ class HeightPrior:
         uv = np.stack([u.ravel(), v.ravel()], axis=1)
         ccd = np.repeat(np.arange(len(camera)), len(uv))
         tiled = np.tile(uv, (len(camera), 1))
-        places = Places(camera.centers[ccd] + camera.half_size * tiled, ccd, tiled)
+        places = Places(camera.from_uv(ccd, tiled), ccd, tiled)
         x, y = places.xy.T
         return FocalPlane.from_heights(Table({"x": x, "y": y, "z": self.heights(parameters, places)}), camera)
+
+
+def _nominal(camera: Camera) -> FocalPlane | None:
+    """Return the nominal heights of a camera; None where all are zero."""
+    return None if camera.placement is None else FocalPlane.flat(camera)
 
 
 def powers(degree: int) -> list[tuple[int, int]]:
@@ -199,14 +204,13 @@ def project(plane: FocalPlane, degree: int) -> np.ndarray:
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
     terms = legendre(np.stack([u, v], axis=1), degree) * (np.outer(weights, weights).ravel()[:, None] / 4.0)
-    half = plane.camera.half_size
-    x = plane.camera.centers[:, :1] + half * u * (1.0 - 1e-12)
-    y = plane.camera.centers[:, 1:] + half * v * (1.0 - 1e-12)
+    inner = plane.camera.half_sizes[:, None] * np.stack([u, v], axis=1) * (1.0 - 1e-12)
+    x, y = plane.camera.from_local(np.arange(len(plane.camera))[:, None], inner[..., 0], inner[..., 1])
     return plane.height(x, y) @ terms
 
 
 def _quadratic(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    x, y = (xy / np.hypot(*camera.centers.T).max()).T
+    x, y = (xy / camera.radius).T
     return np.stack([x, y, x * x, x * y, y * y], axis=1)
 
 

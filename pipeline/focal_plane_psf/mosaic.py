@@ -30,9 +30,9 @@ class Mosaic:
     centers : ndarray, shape [n_ccd, 2]
         Their centres on the detector [m].
     half_size : float
-        Half the side of a CCD [m].
+        Half the side of a CCD [m], where there is no camera.
     camera : Camera or None
-        The camera, if known: it converts pixels to positions on the detector.
+        The camera, if known: it converts positions on the detector to those on a CCD, and pixels to both.
     """
 
     names: tuple[str, ...]
@@ -43,7 +43,7 @@ class Mosaic:
     @classmethod
     def of_camera(cls, camera: Camera) -> Mosaic:
         """Return the CCDs of a camera."""
-        return cls(camera.ccd_names, camera.centers, camera.half_size, camera)
+        return cls(camera.ccd_names, camera.centers, 0.5 * camera.shortest_side, camera)
 
     @classmethod
     def of_stars(cls, names: Sequence[str], xy: np.ndarray) -> Mosaic:
@@ -75,12 +75,18 @@ class Mosaic:
             one at (0, 0).
         """
         numbers = self.index(ccd)
-        px, py = (self._metres(value, axis, numbers) for axis, value in enumerate((x, y)))
+        in_pixels = [isinstance(value, u.Quantity) and value.unit == u.pix for value in (x, y)]
+        if any(in_pixels) and (not all(in_pixels) or self.camera is None):
+            axis = "xy"[in_pixels.index(True)]
+            raise DomainError(f"{axis} in pixels: expected a camera, or positions on the detector in metres")
+        px, py = (x.value, y.value) if all(in_pixels) else (metres(x, "x"), metres(y, "y"))
         px, py, numbers = np.broadcast_arrays(np.atleast_1d(px), np.atleast_1d(py), numbers)
-        xy = np.stack([px.ravel(), py.ravel()], axis=1)
+        xy, numbers = np.stack([px.ravel(), py.ravel()], axis=1), numbers.ravel()
+        if all(in_pixels) and self.camera is not None:
+            xy = self.camera.from_pixel(numbers, xy)
         if not np.isfinite(xy).all():
             raise DomainError(f"x, y: {np.count_nonzero(~np.isfinite(xy).all(axis=1))} positions are not finite")
-        places = self.at(xy, numbers.ravel())
+        places = self.at(xy, numbers)
         off = np.flatnonzero((np.abs(places.uv) > 1.0 + _RIM).any(axis=1))
         if self.camera is not None and off.size:
             first = off[0]
@@ -92,16 +98,9 @@ class Mosaic:
 
     def at(self, xy: np.ndarray, ccd: np.ndarray) -> Places:
         """Return the places at positions on the detector [m] on CCDs of given numbers."""
+        if self.camera is not None:
+            return Places(xy, ccd, self.camera.to_uv(ccd, xy))
         return Places(xy, ccd, (xy - self.centers[ccd]) / self.half_size)
-
-    def _metres(self, value: Any, axis: int, ccd: np.ndarray) -> np.ndarray:
-        if not (isinstance(value, u.Quantity) and value.unit == u.pix):
-            return metres(value, "xy"[axis])
-        if self.camera is None:
-            raise DomainError(f"{'xy'[axis]} in pixels: expected a camera, or positions on the detector in metres")
-        middle = 0.5 * (self.camera.pixels - 1)
-        offset = (np.asarray(value.value, dtype=np.float64) - middle) * self.camera.pixel_size
-        return self.centers[ccd, axis] + offset
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,8 @@ from ...core.products import read_fits, write_fits
 from ...core.progress import Reporter
 from ...core.result import Result
 from ...core.threads import one_blas_thread
-from ...models.camera.camera import Camera, load_camera
+from ...models.camera.camera import Camera
+from ...models.camera.cameras import load_camera
 from ...models.camera.ccd_surfaces import CcdSurfaces
 from ...models.camera.focal_plane import FocalPlane
 from ...models.camera.height_budget import HeightBudget
@@ -107,7 +108,7 @@ class StaticHeights(Result):
             known = load_camera(hdus[0].header["CAMERA"] if camera is None else camera)
             grid = _array(hdus["GRID"])
             surfaces = CcdSurfaces(
-                known.half_size,
+                known.half_sizes,
                 _array(hdus["POLYNOMIAL"]),
                 np.zeros((len(known), 2, 4)),
                 grid if grid.size else None,

@@ -30,9 +30,7 @@ RESIDUAL_TITLES = {
 
 def ccd_corners(camera: Camera, indices: Iterable[int]) -> np.ndarray:
     """Return the corners of CCDs [mm], shape [n, 4, 2]."""
-    half = camera.half_size * 1e3
-    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * half
-    return camera.centers[list(indices), None, :] * 1e3 + square
+    return camera.corners(indices) * 1e3
 
 
 def draw_outlines(axes: Axes, camera: Camera, indices: Iterable[int], color: str = "0.6", width: float = 0.5) -> None:

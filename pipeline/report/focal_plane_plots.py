@@ -36,6 +36,8 @@ from .focal_plane_axes import (
 _MANY = 30
 #: Whiskers on one CCD, and a fifth of them where CCDs are many: more make one dark mass.
 _MOST_WHISKERS = 200
+#: Height of a row of a close-up over the width of its panels, least and most.
+_TALL = (0.6, 1.6)
 
 
 def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: float) -> bytes:
@@ -48,7 +50,7 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
     with styled():
         figure = new_figure(8.2, 7.2)
         axes = figure.add_subplot()
-        edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
+        edge = 1.04e3 * camera.reach
         limits = (-edge, edge, -edge, edge)
         image = draw_heights(axes, focal_plane, limits, 900)
         draw_outlines(axes, camera, range(len(camera)), "0.55", 0.3)
@@ -70,10 +72,11 @@ def whiskers_plot(
     the radius of the field of view on the detector [m].
     """
     kinds = ("truth", "observed", "residual") if kinds is None else kinds
-    centers = np.array([p.center for p in products]) * 1e3
-    half = focal_plane.camera.half_size * 1e3
+    camera = focal_plane.camera
+    half = 0.5 * camera.shortest_side * 1e3
     pad = 0.25 * half
-    low, high = centers.min(axis=0) - half - pad, centers.max(axis=0) + half + pad
+    corners = ccd_corners(camera, (camera.ccd_index(p.name) for p in products))
+    low, high = corners.min(axis=(0, 1)) - pad, corners.max(axis=(0, 1)) + pad
     limits = (low[0], high[0], low[1], high[1])
     key = _common_key(products)
     # The key is a third of the half side of a CCD long, but never too short to be legible.
@@ -109,15 +112,20 @@ def close_up_plot(products: Sequence[CcdProduct], focal_plane: FocalPlane) -> by
     camera = focal_plane.camera
     kinds = ("truth", "observed", "residual", "away")
     key = _common_key(products)
-    half = camera.half_size * 1e3
-    scale = 0.2 * half / key
+    scale = 0.2 * 0.5 * camera.shortest_side * 1e3 / key
+    outlines = [ccd_corners(camera, [camera.ccd_index(p.name)])[0] for p in products]
+    sides = np.array([np.ptp(corners, axis=0) for corners in outlines])
+    tall = np.clip(np.round(sides[:, 1] / sides[:, 0], 6), *_TALL)
     with styled():
-        figure = new_figure(13.0, 3.35 * len(products) + 0.4)
-        panels = figure.subplots(len(products), len(kinds), squeeze=False)
+        figure = new_figure(13.0, 3.35 * float(tall.sum()) + 0.4)
+        panels = figure.subplots(len(products), len(kinds), squeeze=False, height_ratios=tall)
         bounds = height_range(focal_plane)
-        for last, row, product in zip(range(len(products) - 1, -1, -1), panels, products, strict=True):
-            x, y = np.array(product.center) * 1e3
-            limits = (x - 1.04 * half, x + 1.04 * half, y - 1.04 * half, y + 1.04 * half)
+        for last, row, product, corners in zip(
+            range(len(products) - 1, -1, -1), panels, products, outlines, strict=True
+        ):
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            rim = 0.02 * (high - low)
+            limits = (low[0] - rim[0], high[0] + rim[0], low[1] - rim[1], high[1] + rim[1])
             for i, (axes, kind) in enumerate(zip(row, kinds, strict=True)):
                 image = draw_heights(axes, focal_plane, limits, 200, alpha=0.35, bounds=bounds)
                 _draw_kind(axes, product, kind, scale, 1.2, _MOST_WHISKERS)
@@ -173,10 +181,10 @@ def height_range(focal_plane: FocalPlane) -> float:
     Where a few heights are more than twice those of 98 % of the area, as at the rims of measured CCDs, those of 98 %.
     """
     camera = focal_plane.camera
-    offsets = np.linspace(-1.0, 1.0, 9) * camera.half_size * (1.0 - 1e-9)
-    x = camera.centers[:, 0, None, None] + offsets
-    y = camera.centers[:, 1, None, None] + offsets[:, None]
-    heights = np.abs(focal_plane.height(x, y)) * 1e6
+    nodes = np.linspace(-1.0, 1.0, 9) * (1.0 - 1e-9)
+    uv = np.stack(np.meshgrid(nodes, nodes), axis=-1)
+    xy = camera.from_uv(np.arange(len(camera))[:, None, None], uv)
+    heights = np.abs(focal_plane.height(xy[..., 0], xy[..., 1])) * 1e6
     largest, usual = float(np.nanmax(heights)), float(np.nanpercentile(heights, 98.0))
     if largest > 2.0 * usual > 0.0:
         largest = usual
@@ -221,7 +229,7 @@ def residual_plot(camera: Camera, columns: Mapping[str, np.ndarray]) -> bytes:
     across = float((high[0] - low[0]) / (high[1] - low[1]))
     means = np.concatenate([np.hypot(columns[f"mean_e1_{k}"], columns[f"mean_e2_{k}"]) for k in RESIDUAL_TITLES])
     key = key_ellipticity(means)
-    scale = 0.7 * camera.half_size * 1e3 / key
+    scale = 0.35 * camera.shortest_side * 1e3 / key
     worst = _largest(np.concatenate([columns[f"rms_e_{k}"] for k in RESIDUAL_TITLES]))
     sizes = _largest(np.abs(np.concatenate([columns[f"mean_dt_{k}"] for k in ("residual", "away")])))
     with styled():

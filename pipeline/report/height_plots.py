@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import cycle
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -24,7 +26,7 @@ def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
     groups = {v: np.array([w == v for w in camera.vendors]) for v in dict.fromkeys(camera.vendors)}
     groups = groups or {"all": np.ones(len(camera), dtype=bool)}
     heights = 1e6 * sampled_heights(focal_plane)[2]
-    colours = dict(zip(groups, _COLOURS, strict=False))
+    colours = dict(zip(groups, cycle(_COLOURS), strict=False))
     with styled():
         figure = new_figure(11.6, 6.6)
         panels: dict[str, Axes] = figure.subplot_mosaic([["map", "all"], ["map", "within"]], width_ratios=[1.75, 1.0])
@@ -55,7 +57,7 @@ def vendor_heights_plot(focal_plane: FocalPlane, title: str) -> Figure:
 
 def _draw_map(axes: Axes, focal_plane: FocalPlane, bound: float) -> None:
     camera = focal_plane.camera
-    edge = 1.03 * float(np.abs(camera.centers).max() + camera.half_size)
+    edge = 1.03 * camera.reach
     axis = np.linspace(-edge, edge, _SAMPLES)
     x, y = np.meshgrid(axis, axis)
     extent = (-1e3 * edge, 1e3 * edge, -1e3 * edge, 1e3 * edge)
@@ -73,7 +75,11 @@ def _draw_borders(axes: Axes, camera: Camera) -> None:
     """Draw the borders between rafts of different vendors, and write the vendors' names."""
     vendor = dict(zip(camera.raft_of, camera.vendors, strict=True))
     centers = {raft: camera.centers[[r == raft for r in camera.raft_of]].mean(axis=0) * 1e3 for raft in vendor}
-    pitch = min(np.hypot(*(a - b)) for r, a in centers.items() for s, b in centers.items() if r != s)
+    pitch = (
+        min(np.hypot(*(a - b)) for r, a in centers.items() for s, b in centers.items() if r != s)
+        if len(centers) > 1
+        else 0.0
+    )
     lines = []
     for raft, at in centers.items():
         axes.annotate(f"{raft} {vendor[raft].upper()}", at, ha="center", va="center", fontsize=6.5, color="0.15")

@@ -7,6 +7,7 @@ from typing import Any
 
 from astropy.table import Table
 
+from ...models.camera.camera import Camera
 from ...models.camera.height_statistics import HeightStatistics
 from ..measure.correlation import SEPARATION_RANGES
 from ..measure.summary import CORRELATED
@@ -47,6 +48,27 @@ def headline(summary: dict[str, Any]) -> list[tuple[str, str]]:
 def _xi_plus(metrics: dict[str, Any], kind: str, name: str) -> str:
     """Return a mean xi+ with its error."""
     return f"{_power(metrics[f'xi_plus_{kind}_{name}'])} ± {_power(metrics[f'error_xi_plus_{kind}_{name}'])}"
+
+
+CAMERA_COLUMNS = ("ccd", "x_mm", "y_mm", "rotation_deg", "nx", "ny", "raft", "vendor")
+CAMERA_CAPTION = "Centre on the focal plane, angle from +x towards +y, pixels along x and y of each."
+
+
+def camera_rows(camera: Camera) -> list[tuple[Any, ...]]:
+    """Return rows of the CCDs of a camera, in the columns of :data:`CAMERA_COLUMNS`."""
+    vendors = camera.vendors or ("",) * len(camera)
+    return [
+        (name, round(1e3 * x, 6), round(1e3 * y, 6), float(angle), nx, ny, raft, vendor)
+        for name, (x, y), angle, (nx, ny), raft, vendor in zip(
+            camera.ccd_names,
+            camera.centers.tolist(),
+            camera.rotation_deg,
+            camera.pixels.tolist(),
+            camera.raft_of,
+            vendors,
+            strict=True,
+        )
+    ]
 
 
 MODELS_COLUMNS = ("", "focal plane", "CCD by CCD")

@@ -83,25 +83,37 @@ class EdgeRolloff(Displacement):
         Displacement at the edge [m].
     length : float
         Distance over which it falls by e [m].
-    half_size : float
-        Half the side of the CCD [m].
+    half_size : float or (float, float)
+        Half the side of the CCD [m], or half of each, along its own axes.
+    turn : float
+        Angle of these axes from x towards y [rad].
     """
 
     amplitude: float
     length: float
-    half_size: float
+    half_size: float | tuple[float, float]
+    turn: float = 0.0
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.amplitude) or not 0.0 < self.length < np.inf or not 0.0 < self.half_size < np.inf:
-            numbers = (self.amplitude, self.length, self.half_size)
+        halves = np.broadcast_to(self.half_size, 2)
+        numbers = (self.amplitude, self.length, *halves.tolist(), self.turn)
+        if not np.isfinite(numbers).all() or not (self.length > 0.0 and (halves > 0.0).all()):
             raise DomainError(f"edge roll-off = {numbers!r}: expected finite numbers, and lengths above 0")
 
     def at(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Return the displacement, as :meth:`Displacement.at` says."""
-        place = np.stack(plane_points(x, y), axis=-1)
+        place = self._turned(np.stack(plane_points(x, y), axis=-1), -self.turn)
         # Beyond an edge, where the rim of a stamp may lie, it stays that of the edge.
         upper, lower = (np.maximum(self.half_size - sign * place, 0.0) for sign in (1.0, -1.0))
-        return self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))
+        moved = self.amplitude * (np.exp(-upper / self.length) - np.exp(-lower / self.length))
+        return self._turned(moved, self.turn)
+
+    @staticmethod
+    def _turned(vectors: np.ndarray, angle: float) -> np.ndarray:
+        if angle == 0.0:
+            return vectors
+        cosine, sine = np.cos(angle), np.sin(angle)
+        return vectors @ np.array([[cosine, sine], [-sine, cosine]])
 
 
 @check_arguments

@@ -183,11 +183,9 @@ def _displaced(experiment: Experiment, middles: np.ndarray, images: np.ndarray) 
     return images
 
 
-def ccd_bounds(camera: Camera, name: str) -> tuple[float, float, float, float]:
-    """Return the part of a CCD on which stars may stand, (xmin, xmax, ymin, ymax) [m]."""
-    x, y = map(float, camera.centers[camera.ccd_index(name)])
-    half = camera.half_size - _RIM * camera.pixel_size
-    return x - half, x + half, y - half, y + half
+def ccd_bounds(camera: Camera, name: str) -> tuple[tuple[float, float, float, float], float]:
+    """Return the part of a CCD on which stars may stand, (xmin, xmax, ymin, ymax) [m], and its angle."""
+    return camera.rectangle(camera.ccd_index(name), _RIM * camera.pixel_size)
 
 
 def ccd_stars(experiment: Experiment, name: str, width: float, least_light: float = 1.0) -> StarField:
@@ -197,9 +195,10 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
     """
     config, camera, listed = experiment.config, experiment.camera, experiment.star_list
     band, exposure = config.band or "r", config.atmosphere.exposure_s
+    bounds, turn = ccd_bounds(camera, name)
     drawn = make_star_field(
         name,
-        ccd_bounds(camera, name),
+        bounds,
         config.stars.truth,
         config.stars.observed if listed is None else 0,
         config.seed,
@@ -209,6 +208,7 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
         faint=limiting_magnitude(config.stars.snr_min, band, exposure, width) + 2.5 * np.log10(least_light),
         margin=_MARGIN,
         pixel_size=camera.pixel_size,
+        turn=turn,
     )
     if listed is None:
         return drawn

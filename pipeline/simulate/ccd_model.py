@@ -43,7 +43,7 @@ def model_ccd(experiment: Experiment, exposure: CcdExposure, *, noisy: bool = Tr
         positions.holdout,
         n_components=noise_free_components(config),
         order=config.reconstruction.truth_order,
-        extent=positions.bounds,
+        extent=positions.extent,
         clip_sigma=None,
     )
 
@@ -101,7 +101,7 @@ def fit_ccd_model(
         weights=snr_weights(given(fit.weights), snr[used]),
         n_components=fit.components,
         order=fit.order,
-        extent=stars.bounds,
+        extent=stars.extent,
         clip_sigma=CLIP_SIGMA if noisy else None,
     )
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.fft
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, DomainError
 from ...models.camera.camera import Camera
 from ...models.site import Site
 from ...models.telescope import Telescope
@@ -17,6 +18,10 @@ from ...wavefront.psf.engines import ENGINES
 from ..config import Configuration
 
 
+#: Fewest samples of a screen across the pupil.
+_LEAST_SAMPLES = 4
+
+
 def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> np.ndarray:
     """Return the length of each layer crossed by the light to the chosen CCDs during the exposure [m], [n_layer].
 
@@ -24,20 +29,46 @@ def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, s
     distance of the layer.
     """
     air = config.atmosphere
-    chosen = camera.centers[[camera.ccd_index(name) for name in config.ccds or ()]]
-    half = camera.half_size * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-    corners = (chosen[:, None] + half).reshape(-1, 2)
-    slopes = np.tan(fields_at(telescope, corners))
+    slopes = np.tan(_corner_fields(telescope, camera, config.ccds or ()))
     distances = line_of_sight(np.array(site.altitudes), air.ground_lift_m, math.radians(air.zenith_angle_deg))
     wind = np.array(site.wind_speeds) * air.exposure_s
     return wind + distances * np.ptp(slopes, axis=0).max() + telescope.pupil_diameter
 
 
+def _corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) -> np.ndarray:
+    """Return the field angles of the corners of CCDs [rad], [n, 2]; ConfigError names those beyond the field."""
+
+    def fields(some: Sequence[str]) -> np.ndarray:
+        return fields_at(telescope, camera.corners(camera.ccd_index(name) for name in some).reshape(-1, 2))
+
+    try:
+        return fields(names)
+    except DomainError:
+        beyond = []
+        for name in names:
+            try:
+                fields([name])
+            except DomainError:
+                beyond.append(name)
+        some = ", ".join(beyond[:6]) + (f" and {len(beyond) - 6} more" if len(beyond) > 6 else "")
+        raise ConfigError(
+            f"ccds: {some or 'those chosen'} of {camera.name} reach beyond the field that {telescope.name} covers, "
+            f"{math.degrees(telescope.field_limit):g} deg from the axis: expected CCDs within it"
+        ) from None
+
+
 def check_screens(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> None:
-    """Raise ConfigError, with layer and length, if a periodic screen repeats within the light to the chosen CCDs."""
+    """Raise ConfigError if the screens are too coarse for the pupil, or repeat within the light to the chosen CCDs."""
     air = config.atmosphere
     if not air.enabled or not ENGINES[config.psf.engine].screens:
         return
+    sample, widest = air.screen_length_m / air.screen_size, telescope.pupil_diameter / _LEAST_SAMPLES
+    if sample > widest:
+        raise ConfigError(
+            f"atmosphere.screen_size = {air.screen_size}: expected at least {math.ceil(air.screen_length_m / widest)}, "
+            f"so that a pupil of {telescope.pupil_diameter:g} m has {_LEAST_SAMPLES} samples across, or a shorter "
+            f"atmosphere.screen_length_m than {air.screen_length_m:g}"
+        )
     swept = swept_lengths(config, telescope, camera, site)
     layer = int(np.argmax(swept))
     if swept[layer] <= air.screen_length_m:

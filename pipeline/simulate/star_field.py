@@ -21,7 +21,7 @@ class StarField:
     """Stars of one CCD."""
 
     ccd_name: str
-    bounds: tuple[float, float, float, float]  #: (xmin, xmax, ymin, ymax), outer edges of the pixels [m]
+    bounds: tuple[float, float, float, float]  #: (xmin, xmax, ymin, ymax), outer edges of the pixels, not turned [m]
     pixel_size: float  #: [m]
     holdout: np.ndarray  #: focal-plane positions (x, y) [m], [n, 2]
     observed: np.ndarray  #: likewise
@@ -31,6 +31,15 @@ class StarField:
     exposure: float  #: [s]
     bright: float  #: magnitude limits of the observed stars
     faint: float
+    turn: float = 0.0  #: angle of the CCD about its centre, quarter turns left out, from +x towards +y [rad]
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """(xmin, xmax, ymin, ymax) that hold all of the CCD [m]."""
+        xmin, xmax, ymin, ymax = self.bounds
+        corners = _turned(np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)]), self.bounds, self.turn)
+        (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
+        return float(x0), float(x1), float(y0), float(y1)
 
     @property
     def observed_pixel(self) -> np.ndarray:
@@ -38,9 +47,13 @@ class StarField:
         return self.to_pixel(self.observed)
 
     def to_pixel(self, positions: Any) -> np.ndarray:
-        """Convert focal-plane positions [m] to CCD pixels: x to the right, y up, the first pixel's centre at (0, 0)."""
+        """Convert focal-plane positions [m] to CCD pixels: x to the right, y up, the first pixel's centre at (0, 0).
+
+        Rows are those that lie along x of the focal plane, but for `turn`.
+        """
         corner = np.array([self.bounds[0], self.bounds[2]])
-        return (np.asarray(positions, dtype=np.float64) - corner) / self.pixel_size - 0.5
+        along = _turned(np.asarray(positions, dtype=np.float64), self.bounds, -self.turn)
+        return (along - corner) / self.pixel_size - 0.5
 
 
 def make_star_field(
@@ -58,6 +71,7 @@ def make_star_field(
     bright: float | None = None,
     faint: float | None = None,
     margin: int = 20,
+    turn: float = 0.0,
 ) -> StarField:
     """Draw the stars of one CCD, uniform over it; counts per magnitude of the observed ones go as 10^(0.2 m).
 
@@ -81,6 +95,8 @@ def make_star_field(
         signal-to-noise ratio is `snr`.
     margin : int
         Distance of observed stars from the edge of the CCD [pixel], so that their stamps fit.
+    turn : float
+        Angle by which the CCD is turned about the centre of `bounds`, from +x towards +y [rad].
     """
     band = photometry.band_named(band)
     edges = _edges(bounds)
@@ -102,14 +118,15 @@ def make_star_field(
         ccd_name=ccd_name,
         bounds=edges,
         pixel_size=pixel,
-        holdout=_uniform(seed, ccd_name, "truth", n_holdout, edges),
-        observed=_uniform(seed, ccd_name, "observed", n_observed, inner),
+        holdout=_turned(_uniform(seed, ccd_name, "truth", n_holdout, edges), edges, turn),
+        observed=_turned(_uniform(seed, ccd_name, "observed", n_observed, inner), edges, turn),
         magnitude=magnitude,
         electrons=photometry.electrons(magnitude, band, exposure),
         band=band.name,
         exposure=float(exposure),
         bright=float(bright),
         faint=float(faint),
+        turn=turn,
     )
 
 
@@ -137,6 +154,15 @@ def _uniform(seed: int, ccd_name: str, kind: str, count: int, edges: tuple[float
         ],
         axis=1,
     )
+
+
+def _turned(positions: np.ndarray, bounds: tuple[float, float, float, float], turn: float) -> np.ndarray:
+    """Return positions [n, 2] turned about the centre of a rectangle."""
+    if turn == 0.0:
+        return positions
+    center = 0.5 * np.array([bounds[0] + bounds[1], bounds[2] + bounds[3]])
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return center + (positions - center) @ np.array([[cosine, sine], [-sine, cosine]])
 
 
 def _edges(bounds: Any) -> tuple[float, float, float, float]:

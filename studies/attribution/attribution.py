@@ -65,8 +65,8 @@ def attribute(
     heights alone; the atmosphere cannot be switched off.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
-    chosen = checked_causes(config, causes)
     full = Experiment.from_config(config)
+    chosen = checked_causes(full.config, causes)
     check_memory(full, threads)
     correlated, metrics = {}, {}
     cases = [FULL, *(c for c in chosen if c != NOISE)]

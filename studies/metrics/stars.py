@@ -32,7 +32,7 @@ _RINGS = ((0.0, 0.5), (0.5, 1.0), (1.0, 1.5), (1.5, 1.8))
 #: Zernike terms of the wavefront, Noll.
 _ZERNIKES = range(4, 12)
 # CCDs are neighbours where their centres are no farther apart than this, over the side of a CCD.
-_NEIGHBOUR = 1.08
+_NEIGHBOUR = 1.15
 # Order of the fit of ellipticity within a CCD, for its value at the border.
 _BORDER_ORDER = 2
 
@@ -66,8 +66,12 @@ def ellipticity_of_rings(scene: Scene) -> dict[str, float]:
 def border_jump(scene: Scene) -> dict[str, float]:
     """Return the rms jump of one component of e across borders between neighbouring CCDs."""
     camera = scene.camera_experiment.camera
-    centers = camera.centers[[camera.ccd_index(name) for name in scene.ccds]]
-    pairs = np.array(sorted(cKDTree(centers).query_pairs(_NEIGHBOUR * camera.ccd_size))).reshape(-1, 2)
+    ccds = [camera.ccd_index(name) for name in scene.ccds]
+    centers = camera.centers[ccds]
+    # In units of their sides CCDs are squares.
+    sides = np.ptp(camera.corners(ccds), axis=1)
+    near = cKDTree(centers / sides.min(axis=0)).query_pairs(_NEIGHBOUR)
+    pairs = np.array(sorted(near)).reshape(-1, 2)
     if not len(pairs):
         return {"border_jump_e": np.nan}
     middles = centers[pairs].mean(axis=1)
@@ -78,8 +82,7 @@ def border_jump(scene: Scene) -> dict[str, float]:
         stars = slice(first[k], first[k + 1])
         e = np.stack([scene.shapes.e1[stars], scene.shapes.e2[stars]], axis=1)
         good, borders = np.isfinite(e).all(axis=1), pairs == k
-        (x, y), half = centers[k], camera.half_size
-        extent = (x - half, x + half, y - half, y + half)
+        extent = camera.bounds([ccds[k]])
         points = np.concatenate([positions[good], middles[borders.any(axis=1)]])
         terms = design_matrix(points, extent, _BORDER_ORDER)
         if good.sum() >= terms.shape[1]:

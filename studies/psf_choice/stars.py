@@ -120,7 +120,7 @@ def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
         n_components=min(case.components, used.sum() - 1) if case.basis == "pca" else case.components or None,
         order=case.order,
         gain=1.0 if photons else None,
-        extent=ccd.exposure.positions.bounds,
+        extent=ccd.exposure.positions.extent,
         clip_sigma=None if case.snr == NOISE_FREE else CLIP_SIGMA,  # without noise there are no outliers
     )
 

@@ -233,16 +233,16 @@ def optics_ellipticity(bench: Bench, positions: np.ndarray) -> np.ndarray:
 
 def _ccd_grid(camera: Camera, per_side: int) -> np.ndarray:
     """Return points on an even grid of every CCD [m], shape [n, 2]."""
-    steps = (2.0 * np.arange(per_side) + 1.0 - per_side) / per_side * camera.half_size
-    x, y = (offset.ravel() for offset in np.meshgrid(steps, steps))
-    return (camera.centers[:, None] + np.stack([x, y], axis=1)).reshape(-1, 2)
+    steps = (2.0 * np.arange(per_side) + 1.0 - per_side) / per_side
+    uv = np.stack([step.ravel() for step in np.meshgrid(steps, steps)], axis=1)
+    return camera.from_uv(np.arange(len(camera))[:, None], uv).reshape(-1, 2)
 
 
 def _borders(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points left of borders between CCDs, 1.5 mm away across them, and as far away within the CCD [m]."""
     centers = camera.centers
     # Gaps are narrowest within a raft; only where aberrations are strong do heights show.
-    distance, right = cKDTree(centers).query(centers + np.array([camera.ccd_size, 0.0]))
+    distance, right = cKDTree(centers).query(centers + np.array([camera.shortest_side, 0.0]))
     radius = np.hypot(*centers.T)
     chosen = np.flatnonzero((distance < 1.4e-3) & (radius > 0.10) & (radius < 0.24))
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
@@ -256,11 +256,11 @@ def _field_whiskers_plot(
 ) -> bytes:
     """Draw whiskers over the whole focal plane."""
     camera = focal_plane.camera
-    edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
+    edge = 1.04e3 * camera.reach
     limits = (-edge, edge, -edge, edge)
     per_side = np.sqrt(len(e) / len(camera))
     key = key_ellipticity(np.abs(e))
-    scale = 0.85 * camera.ccd_size * 1e3 / max(per_side, 1.0) / key
+    scale = 0.85 * camera.shortest_side * 1e3 / max(per_side, 1.0) / key
     with styled():
         figure = new_figure(8.6, 7.6)
         axes = figure.add_subplot()

@@ -134,7 +134,7 @@ def _layout_plot(
         draw_outlines(right, camera, range(len(camera)), "0.25", 0.6)
         _draw_corner_rafts(right, camera)
         draw_field_circle(right, field_radius * 1e3, "")
-        edge = 1.1e3 * float(np.abs(camera.centers).max() + camera.half_size)
+        edge = 1.1e3 * camera.reach
         frame_axes(right, (-edge, edge, -edge, edge))
         right.set_title(f"{len(camera)} CCDs; dashed: field of view of 3.5°, {2e3 * field_radius:.0f} mm", loc="left")
         return png_bytes(figure)
@@ -142,8 +142,8 @@ def _layout_plot(
 
 def _draw_corner_rafts(axes: Axes, camera: Camera) -> None:
     """Draw the rafts of the wavefront sensors, at the corners of the square around the mosaic."""
-    raft = 3.0 * camera.ccd_size * 1e3
-    reach = float(np.abs(camera.centers).max() + camera.half_size) * 1e3 - raft
+    raft = 3.0 * camera.shortest_side * 1e3
+    reach = camera.reach * 1e3 - raft
     for x in (-reach - raft, reach):
         for y in (-reach - raft, reach):
             axes.add_patch(Rectangle((x, y), raft, raft, fill=False, edgecolor="0.6", linestyle=":", linewidth=0.9))

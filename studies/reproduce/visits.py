@@ -49,7 +49,8 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
         "run__atmosphere__time_step_s": bench.scale.time_step,
     }
     experiment = with_options(ImagesConfig(), **options).experiment()
-    corner = (experiment.camera.pixels - _SIDE) // 2
+    columns, rows = experiment.camera.pixels[experiment.camera.ccd_index(_CCD)].tolist()
+    corner = (columns - _SIDE) // 2, (rows - _SIDE) // 2
     galaxies = GalaxyPopulation(_FAINTEST, bench.seed)
     with experiment.screens(bench.threads):
         star = expose_positions(experiment, np.zeros((1, 2)), bench.threads)
@@ -57,7 +58,7 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
             experiment,
             _CCD,
             galaxies.galaxies_in,
-            window=Window(corner, corner, _SIDE, _SIDE),
+            window=Window(*corner, _SIDE, _SIDE),
             threads=bench.threads,
         )
     width = effective_fwhm(star.image, star.pixel_scale)

@@ -22,7 +22,7 @@ class Places:
     """Places on CCDs, with shares of the area."""
 
     ccd: np.ndarray  #: index of the CCD, [n]
-    offset: np.ndarray  #: x, y from its centre [m], [n, 2]
+    offset: np.ndarray  #: x, y from its centre along its own axes [m], [n, 2]
     position: np.ndarray  #: x, y on the focal plane [m], [n, 2]
     weight: np.ndarray  #: of a place, their sum 1, [n]
 
@@ -31,13 +31,15 @@ class Places:
         """Return Gauss-Legendre nodes of an order along both sides of CCDs, those of their measured parts."""
         camera = focal_plane.camera
         nodes, weights = np.polynomial.legendre.leggauss(order)
-        y, x = (camera.half_size * a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
+        v, u = (a.ravel() for a in np.meshgrid(nodes, nodes, indexing="ij"))
         index = np.array([camera.ccd_index(name) for name in names])
-        ccd, offset = np.repeat(index, x.size), np.tile(np.stack([x, y], axis=1), (len(index), 1))
-        weight = np.tile(np.outer(weights, weights).ravel(), len(index))
+        ccd, uv = np.repeat(index, u.size), np.tile(np.stack([u, v], axis=1), (len(index), 1))
+        offset, area = camera.half_sizes[ccd] * uv, camera.pixels[ccd].prod(axis=1)
+        weight = np.tile(np.outer(weights, weights).ravel(), len(index)) * (area / area.max())
         known = focal_plane.surfaces.measured_at(ccd, *offset.T)
         ccd, offset, weight = ccd[known], offset[known], weight[known]
-        return cls(ccd, offset, camera.centers[ccd] + offset, weight / weight.sum())
+        position = np.stack(camera.from_local(ccd, offset[:, 0], offset[:, 1]), axis=1)
+        return cls(ccd, offset, position, weight / weight.sum())
 
     def heights(self, focal_plane: FocalPlane) -> np.ndarray:
         """Return the heights of a focal plane at the places [m]."""

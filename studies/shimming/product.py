@@ -60,7 +60,7 @@ def write_shims(shims: Shims, folder: Path, experiment: Experiment) -> tuple[str
 def shims_plot(shims: Shims) -> bytes:
     """Draw the heights focused as a whole, the motions of the parts, and the heights with them, on one scale."""
     camera = shims.focal_plane.camera
-    edge = 1.04e3 * float(np.abs(camera.centers).max() + camera.half_size)
+    edge = 1.04e3 * camera.reach
     limits = (-edge, edge, -edge, edge)
     flat = FocalPlane.flat(camera)
     for name, motion in shims.motions.items():

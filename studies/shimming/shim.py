@@ -171,9 +171,9 @@ def moved_whole(plane: FocalPlane, motion: Motion) -> FocalPlane:
 
 
 def whole_as_rafts(plane: FocalPlane, motion: Motion) -> dict[str, Motion]:
-    """Return the motions of all rafts that move the focal plane as a whole, about its origin."""
+    """Return the motions of rafts, and of CCDs without one, that move the focal plane as a whole, about its origin."""
     camera = plane.camera
-    centers = {raft: camera.centers[camera.raft_index == i].mean(axis=0) for i, raft in enumerate(camera.raft_names)}
+    centers = {name: camera.centers[list(members)].mean(axis=0) for name, members in camera.parts.items()}
     return {raft: Motion(float(_lift(motion, at)), motion.rx, motion.ry) for raft, at in centers.items()}
 
 
@@ -204,6 +204,9 @@ def _parts(plane: FocalPlane, places: Places, parts: str) -> Sequence[tuple[str,
             (camera.ccd_names[i], camera.centers[i], np.flatnonzero(places.ccd == i)) for i in np.unique(places.ccd)
         ]
     raft = camera.raft_index[places.ccd]
+    if (raft < 0).any():
+        name = camera.ccd_names[places.ccd[raft < 0][0]]
+        raise ConfigError(f"parts = rafts: expected ccds, as {name} of {camera.name} is on no raft")
     centers = {i: camera.centers[camera.raft_index == i].mean(axis=0) for i in np.unique(raft)}
     return [(camera.raft_names[i], center, np.flatnonzero(raft == i)) for i, center in centers.items()]
 

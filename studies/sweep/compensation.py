@@ -36,9 +36,9 @@ def compensated(
         return experiment, {}
     telescope, camera = experiment.telescope, experiment.camera
     chosen = [parse_change(telescope, name) for name in names]
-    centers = camera.centers[[camera.ccd_index(name) for name in experiment.config.ccds or ()]]
-    each = _PLACES if len(centers) <= _FEW else _PLACES[:1]
-    places = (centers[:, None] + each * camera.half_size).reshape(-1, 2)
+    ccds = np.array([camera.ccd_index(name) for name in experiment.config.ccds or ()])
+    each = _PLACES if len(ccds) <= _FEW else _PLACES[:1]
+    places = camera.from_uv(ccds[:, None], each).reshape(-1, 2)
     wavelength = float(experiment.wavelengths[len(experiment.wavelengths) // 2])
     fields = fields_at(telescope, places, wavelength, threads=threads)
     rays = Beams.of(telescope, fields, [wavelength], n_pupil=_RINGS, threads=threads)

@@ -90,6 +90,7 @@ class SweepFile(Section):
         telescope = None
         if isinstance(self.base, dict):
             telescope = self.base.get("telescope")
+            named.append(self.base.get("camera"))
             for section, key in _FILES:
                 content = self.base.get(section)
                 named.append(content.get(key) if isinstance(content, dict) else None)
@@ -109,7 +110,7 @@ def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
         content["base"] = read_mapping(path.parent / content["base"], ConfigError)
     folder = path.parent
     content["design"] = _with_path(content.get("design", {}), "file", folder)
-    base = _with_path(content.get("base", {}), "telescope", folder)
+    base = _with_path(_with_path(content.get("base", {}), "telescope", folder), "camera", folder)
     for section, key in _FILES:
         if isinstance(base, dict) and section in base:
             base = {**base, section: _with_path(base[section], key, folder)}

@@ -167,16 +167,17 @@ def _star_fields(
     # Beyond its field of view a telescope may have no light, and is not asked for.
     lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
     for name in config.ccds or ():
-        depth = camera.half_size - np.abs(xy - camera.centers[camera.ccd_index(name)]).max(axis=1)
+        depth = camera.depth(camera.ccd_index(name), xy)
         stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star & lit)
         margin = np.where(points.star, _STAR_MARGIN, _PLACE_MARGIN) * camera.pixel_size
         here = np.flatnonzero((depth >= margin) & lit)
         if not len(stars):
             continue
         magnitude = magnitudes_at(points.quantile[stars], bright, faint)
+        bounds, turn = ccd_bounds(camera, name)
         fields[name] = StarField(
             ccd_name=name,
-            bounds=ccd_bounds(camera, name),
+            bounds=bounds,
             pixel_size=camera.pixel_size,
             holdout=xy[here],
             observed=xy[stars],
@@ -186,6 +187,7 @@ def _star_fields(
             exposure=seconds,
             bright=bright,
             faint=faint,
+            turn=turn,
         )
         index[name] = here
     return fields, index

@@ -143,16 +143,15 @@ def pixel_scale_of(frame: StackFrame) -> float:
 
 
 def cell_of(experiment: Experiment, frame: StackFrame) -> float:
-    """Return the angle that the side of a CCD has in the middle of the field [rad]."""
-    return float(experiment.camera.ccd_size / experiment.pixel_size * pixel_scale_of(frame))
+    """Return the angle that the shortest side of a CCD has in the middle of the field [rad]."""
+    return float(experiment.camera.shortest_side / experiment.pixel_size * pixel_scale_of(frame))
 
 
 def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFrame) -> SkyPoints:
     """Return stars and places of the sky that the CCDs of a visit can see."""
     camera, names = experiment.camera, experiment.config.ccds or ()
-    centers = camera.centers[[camera.ccd_index(name) for name in names]]
-    corner = (np.abs(centers) + camera.half_size).T
-    reach = min(float(np.hypot(*corner).max()), experiment.field_radius_on_detector)
+    corners = camera.corners(camera.ccd_index(name) for name in names)
+    reach = min(float(np.hypot(*corners.T).max()), experiment.field_radius_on_detector)
     radius = reach / experiment.pixel_size * pixel_scale_of(frame) + np.deg2rad(config.visits.dither_deg)
     settings = config.visits
     return draw_points(experiment.config.seed, radius, cell_of(experiment, frame), settings.stars, settings.places)

@@ -52,7 +52,7 @@ def test_a_configuration_names_its_heights(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["camera", "lsstcm"], "heights = lsstcm: expected lsstcam, or a file ending in .ecsv, .fits, .fit"),
+        (["camera", "lsstcm"], "unknown camera 'lsstcm': did you mean lsstcam or lsst"),
         (["camera", "missing.fits"], "heights: missing.fits: no such file"),
         (["camera", "--picture", "heights.gif"], "expected a name that ends in .png, .pdf or .svg"),
     ],

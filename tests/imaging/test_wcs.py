@@ -108,7 +108,9 @@ def test_a_telescope_without_distortion_needs_no_sip(lsst_r):
 
     # A long paraboloid: its distortion of a tangent projection is below a milliarcsecond on a small CCD on the axis.
     ideal = without_aberration(lsst_r, 1e5)
-    small = pachon.Camera("small", ("A_0",), ("A",), np.array([0]), np.zeros((1, 2)), 512, 10e-6 * 1e5 / 1.23)
+    small = pachon.Camera(
+        "small", ("A_0",), ("A",), np.array([0]), np.zeros((1, 2)), np.array([512, 512]), 10e-6 * 1e5 / 1.23
+    )
     wcs = ccd_wcs(ideal, small, "A_0")
     assert wcs.order == 1
     assert wcs.astropy().wcs.ctype[0] == "RA---TAN"

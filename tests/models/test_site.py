@@ -23,7 +23,7 @@ def test_cerro_pachon_has_the_figures_of_the_paper():
     assert max(site.wind_speeds) == site.wind_speeds[-1] == 20.0
     assert list(site.wind_speeds) == sorted(site.wind_speeds)
     assert (site.weather.pressure_mmhg, site.weather.temperature_c, site.weather.water_vapour_mmhg) == (520, 5, 8)
-    assert site_names() == ("cerro_pachon",)
+    assert site_names() == ("cerro_pachon", "cerro_tololo", "maunakea")
     assert site.wind_directions == (None,) * 6
 
 

@@ -11,7 +11,6 @@ from pachon.models.camera.silicon import Silicon
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.io.site_file import DATA as SITES
 from pachon.pipeline.config import Configuration, differences, digest, load_configuration, to_yaml, with_options
-from pachon.pipeline.defaults import DEFAULT_CCDS
 from pachon.pipeline.experiment import Experiment, hashed_heights, hashed_stars
 from pachon.wavefront.aberration import LARGEST_RMS, ResidualWavefront
 
@@ -93,7 +92,7 @@ def test_numbers_without_a_point_are_numbers(tmp_path):
         ({"ccds": ()}, ["ccds = []"]),
         ({"telescope": "lsst_v3.3_q"}, ["unknown telescope", "did you mean"]),
         ({"telescope": "paul_baker"}, ["telescope = paul_baker", "a camera"]),
-        ({"atmosphere__site": "cerro_pachn"}, ["unknown site", "did you mean cerro_pachon?"]),
+        ({"atmosphere__site": "cerro_pachn"}, ["unknown site", "did you mean cerro_pachon or cerro_tololo?"]),
         ({"atmosphere__time_step_s": 20.0}, ["atmosphere.time_step_s = 20", "atmosphere.exposure_s = 15"]),
     ],
 )
@@ -116,7 +115,7 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     config = experiment.config
     assert config.telescope == "lsst_v3.3_r"
     assert config.band == "r"
-    assert config.ccds == DEFAULT_CCDS
+    assert config.ccds == tuple(f"R2{raft}_S1{column}" for raft in "234" for column in "012")
     assert len(config.ccds) == 9
     # Five equally spaced wavelengths over 545 to 703 nm.
     assert config.wavelengths_nm == (545.0, 584.5, 624.0, 663.5, 703.0)
@@ -124,8 +123,8 @@ def test_the_default_goes_from_the_centre_to_the_edge_of_the_field():
     radius = experiment.field_radius_on_detector
     x, y = experiment.camera.centers[[experiment.camera.ccd_index(n) for n in config.ccds]].T
     nearest, farthest = abs(x[0] + 1j * y[0]), (x**2 + y**2).max() ** 0.5
-    assert nearest <= experiment.camera.ccd_size * 1.1
-    assert farthest + experiment.camera.half_size > radius > farthest
+    assert nearest <= experiment.camera.shortest_side * 1.1
+    assert farthest + (0.5 * experiment.camera.shortest_side) > radius > farthest
 
 
 def test_band_and_telescope_follow_each_other():
@@ -144,9 +143,9 @@ def test_without_an_atmosphere_pixels_and_weight_are_finer():
 def test_charge_diffusion_is_a_fraction_of_the_pixel_of_the_camera():
     experiment = Experiment.from_config(with_options(Configuration(), psf__diffusion_pixels=0.3, **SMALL))
     assert experiment.diffusion == pytest.approx(0.3 * 10e-6)
-    wide = replace(experiment.camera, pixel_size=15e-6)
-    other = replace(experiment, focal_plane=FocalPlane.flat(wide))
-    assert other.diffusion == pytest.approx(0.3 * 15e-6)
+    fine = replace(experiment.camera, pixel_size=9e-6)
+    other = replace(experiment, focal_plane=FocalPlane.flat(fine))
+    assert other.diffusion == pytest.approx(0.3 * 9e-6)
 
 
 def test_ccds_are_put_in_the_order_of_the_camera_each_once():
@@ -235,7 +234,7 @@ def test_silicon_is_off_by_default_and_then_no_part_of_the_hash():
     assert thin.silicon is None
     # Runs of before silicon go on.
     content = plain.config.as_dict()
-    del content["ccds"], content["detector"], content["pointing"]
+    del content["ccds"], content["detector"], content["camera"], content["pointing"]
     content["stars"] = hashed_stars(content["stars"])
     assert list(content["stars"]) == ["truth", "observed", "snr_min", "neighbours", "cosmic_rays", "saturated"]
     content["focal_plane"] = hashed_heights(content["focal_plane"])

@@ -5,8 +5,8 @@ import pytest
 from astropy.table import Table
 
 from pachon.core.errors import ConfigError, PachonError
-from pachon.models.camera.camera import lsst_camera
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.camera.lsst import lsst_camera
 from pachon.pipeline.config import Configuration, load_configuration, to_yaml, with_options
 from pachon.pipeline.experiment import Experiment, hashed_heights
 from pachon.studies.attribution.causes import checked_causes, without

@@ -7,7 +7,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError
-from pachon.models.camera.camera import lsst_camera
+from pachon.models.camera.lsst import lsst_camera
 from pachon.models.media.medium import ConstantIndex
 from pachon.raytrace.rays import RayStatus
 from pachon.wavefront.chief_rays import fields_at

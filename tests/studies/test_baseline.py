@@ -456,7 +456,7 @@ def test_a_telescope_without_a_camera_has_no_heights(tmp_path, capsys):
     (tmp_path / "run.yaml").write_text("seed: 1\n")
     command = ["baseline", "save", "paul_baker", "-o", str(tmp_path / "x.json"), "--config", str(tmp_path / "run.yaml")]
     assert main([*command, "--quiet"]) == 2
-    assert "expected a model with a camera" in capsys.readouterr().err
+    assert "expected a camera: lsst, " in capsys.readouterr().err
 
 
 # --- for other projects ------------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def clear_edges(
     apertures and obstructions are a :class:`DomainError`. ``direction`` [n_star, 3] is that in which the light travels,
     the wavelength that in vacuum [m].
     """
-    _check_rings(telescope)
+    check_rings(telescope)
     n_star, n_spoke = len(direction), len(unit)
     outer = 0.5 * telescope.pupil_diameter
     radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
@@ -109,7 +109,8 @@ def clear_edges(
     return edges
 
 
-def _check_rings(telescope: Telescope) -> None:
+def check_rings(telescope: Telescope) -> None:
+    """Raise DomainError if anything but discs and rings stops light, which the mean over turbulence expects."""
     other = [f"the aperture of {s.name}" for s in telescope.surfaces if clear_ring(s.aperture) is None]
     other += [f"the obstruction {o.name}" for o in telescope.obstructions]
     if other:

@@ -19,7 +19,7 @@ from ....core.yaml_reader import as_number
 from ...media.medium import Medium
 from ...telescope import rotation_matrix
 from ..yaml.reader import FieldSection, GroupSection, WavelengthsSection
-from ..yaml.values import ROWS, Number, OptionalText, PositiveNumber, Text
+from ..yaml.values import ROWS, Number, OptionalNameOrFile, OptionalText, PositiveNumber, Text
 from . import ROOT
 from .apertures import Obscuration
 from .media import AnyMedium
@@ -149,7 +149,8 @@ class Extras(Section):
     version: Text = "1"
     field: FieldSection | None = None
     wavelengths: WavelengthsSection | None = None
-    camera: OptionalText = None
+    camera: OptionalNameOrFile = None
+    site: OptionalNameOrFile = None
     groups: dict[str, GroupSection] = Field(default_factory=dict)
 
 

@@ -79,7 +79,7 @@ def batoid_telescope(content: dict[str, Any], path: Path, *, lenient: bool = Fal
     drop = None
     if lenient:
         known, drop = copy.deepcopy(known), Findings(lenient).report
-    file = validated(BatoidFile, known, str(path), PrescriptionError, {}, drop=drop)
+    file = validated(BatoidFile, known, str(path), PrescriptionError, {"folder": path.parent}, drop=drop)
     with error_context(file=path):
         return _telescope(file, path)
 
@@ -119,6 +119,7 @@ def _telescope(file: BatoidFile, path: Path) -> Telescope:
         default_wavelength=waves.default if waves else default,
         band=waves.band if waves else (max(0.99 * default, low), min(1.01 * default, high)),
         camera=extras.camera,
+        site=extras.site,
         medium_before=first_medium,
         groups=members | {name: group.surfaces for name, group in extras.groups.items()},
         group_frames=frames | {n: (g.pivot, g.rotation) for n, g in extras.groups.items() if g.pivot is not None},

@@ -131,6 +131,7 @@ def _extras(t: Telescope, groups: list[str]) -> dict[str, Any]:
         "field": {"radius": t.field_radius, "limit": t.field_limit},
         "wavelengths": {"range": list(t.wavelength_range), "default": t.default_wavelength, "band": [low, high]},
         "camera": t.camera,
+        "site": t.site,
         "groups": {
             name: {"surfaces": list(t.groups[name]), "pivot": list(pivot), "rotation": [list(row) for row in axes]}
             for name, (pivot, axes) in frames.items()

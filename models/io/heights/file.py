@@ -111,13 +111,14 @@ def _fitted(points: np.ndarray, camera: Camera) -> tuple[MeasuredHeights, np.nda
     surfaces, measured = fit_heights(camera, x, y, z)
     ccd = camera.ccd_at(x, y)
     on = ccd >= 0
-    ccd, local, z = ccd[on], points[:2, on].T - camera.centers[ccd[on]], z[on]
+    ccd, z = ccd[on], z[on]
+    local = np.stack(camera.to_local(ccd, x[on], y[on]), axis=-1)
     count = np.bincount(ccd, minlength=len(camera))
     square = (z - surfaces.height(ccd, *local.T)) ** 2
     with np.errstate(invalid="ignore"):
         residual = np.sqrt(np.bincount(ccd, square, minlength=len(camera)) / count)
     cells = np.clip(np.sqrt(count / _POINTS_PER_CELL).astype(int), 1, _MOST_CELLS)
-    place = np.floor((local / camera.ccd_size + 0.5) * cells[ccd, None]).astype(int)
+    place = np.floor((0.5 * local / camera.half_sizes[ccd] + 0.5) * cells[ccd, None]).astype(int)
     place = np.clip(place, 0, cells[ccd, None] - 1)
     filled = np.zeros((len(camera), _MOST_CELLS, _MOST_CELLS), dtype=bool)
     filled[ccd, place[:, 0], place[:, 1]] = True
@@ -129,8 +130,9 @@ def _measured_fraction(found: MeasuredHeights, camera: Camera) -> np.ndarray:
     """Return the fraction of each CCD within the measured rectangle of its Zernikes."""
     zernikes = found.surfaces.zernikes
     assert zernikes is not None
-    limits = np.clip(zernikes.limits + zernikes.origin[:, :, None], -camera.half_size, camera.half_size)
-    return np.prod(np.diff(limits, axis=2)[..., 0], axis=1) / camera.ccd_size**2
+    half = camera.half_sizes
+    limits = np.clip(zernikes.limits + zernikes.origin[:, :, None], -half[:, :, None], half[:, :, None])
+    return np.prod(np.diff(limits, axis=2)[..., 0] / (2.0 * half), axis=1)
 
 
 def _check_places(images: dict[str, np.ndarray], camera: Camera) -> None:
@@ -157,9 +159,10 @@ def _warn(path: Path, camera: Camera, found: MeasuredHeights, covered: np.ndarra
     if gaps.size:
         parts = [f"{names[i]} ({100 * covered[i]:.0f} % measured)" for i in gaps]
         warnings.warn(f"{path}: gaps, across which heights are continued: {_some(parts)}", HeightWarning, stacklevel=4)
-    axis = np.linspace(-0.9, 0.9, 5) * camera.half_size
-    ccd, y, x = (a.ravel() for a in np.meshgrid(np.arange(len(camera)), axis, axis, indexing="ij"))
-    largest = np.abs(found.surfaces.height(ccd, x, y)).reshape(len(camera), -1).max(axis=1)
+    axis = np.linspace(-0.9, 0.9, 5)
+    ccd, v, u = (a.ravel() for a in np.meshgrid(np.arange(len(camera)), axis, axis, indexing="ij"))
+    a, b = camera.half_sizes[ccd].T
+    largest = np.abs(found.surfaces.height(ccd, a * u, b * v)).reshape(len(camera), -1).max(axis=1)
     if np.any(largest > _LARGEST):
         parts = [f"{names[i]} ({1e3 * largest[i]:.3g} mm)" for i in np.flatnonzero(largest > _LARGEST)]
         text = f"heights of more than {_LARGEST * 1e3:g} mm; is the unit right? {_some(parts)}"

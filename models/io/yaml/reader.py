@@ -30,6 +30,7 @@ from .values import (
     OptionalAngles,
     OptionalBand,
     OptionalLength,
+    OptionalNameOrFile,
     OptionalPlace,
     OptionalText,
     PositiveAngle,
@@ -172,7 +173,8 @@ class Prescription(Section):
     field: FieldSection
     wavelengths: WavelengthsSection
     design: DesignSection = DesignSection()
-    camera: OptionalText = None
+    camera: OptionalNameOrFile = None
+    site: OptionalNameOrFile = None
     medium_before: OptionalText = None
     media: Annotated[dict[str, AnyMedium], BeforeValidator(_no_vacuum)] = Field(default_factory=dict)
     groups: dict[str, Annotated[GroupSection, BeforeValidator(_group)]] = Field(default_factory=dict)
@@ -226,6 +228,7 @@ class Prescription(Section):
             default_wavelength=self.wavelengths.default,
             band=self.wavelengths.band,
             camera=self.camera,
+            site=self.site,
             medium_before=medium_before,
             groups={name: group.surfaces for name, group in self.groups.items()},
             group_frames={name: (g.pivot, g.rotation) for name, g in self.groups.items() if g.pivot is not None},

@@ -124,6 +124,11 @@ ROWS = checked(
 )
 _TEXT = checked(lambda v: v if isinstance(v, str) and v.strip() else None, "a text")
 _BESIDE = AfterValidator(lambda name, info: info.context["folder"] / name)
+_BESIDE_IF_FILE = AfterValidator(
+    lambda name, info: (
+        str((info.context["folder"] / name).resolve()) if name.lower().endswith((".yaml", ".yml")) else name
+    )
+)
 _NAMES = checked(names, "a list of names")
 _NUMBER, _POSITIVE = checked(as_number, "a number"), checked(_positive, "a positive number")
 _LIST, _PAIR, _TRIPLE = (
@@ -135,6 +140,8 @@ _WAVES = WrittenAs(lambda waves: [Wave(w) for w in waves])
 Text = Annotated[str, _TEXT]
 OptionalText = Annotated[str | None, _TEXT]
 OptionalFile = Annotated[Any, _TEXT, _BESIDE]
+#: Bundled name, or a file beside the one that names it.
+OptionalNameOrFile = Annotated[str | None, _TEXT, _BESIDE_IF_FILE]
 Names = Annotated[tuple[str, ...], _NAMES]
 OptionalNames = Annotated[tuple[str, ...] | None, _NAMES]
 Flag = Annotated[bool, checked(lambda v: v if isinstance(v, bool) else None, "true or false")]

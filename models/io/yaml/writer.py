@@ -43,6 +43,7 @@ def telescope_to_yaml(telescope: Telescope) -> str:
         },
         "object_distance": t.object_distance if math.isfinite(t.object_distance) else None,
         "camera": t.camera,
+        "site": t.site,
         "medium_before": names[t.medium_before] if t.medium_before != VACUUM else None,
     }
     lists = {

@@ -226,7 +226,7 @@ def _add_visit(
     reporter: Reporter,
 ) -> None:
     """Draw the CCDs of a visit that touch tiles, and add them to the sums."""
-    pixels, exposure = stack.experiment.camera.pixels, stack.exposure()
+    pixels, exposure = stack.experiment.camera.square_pixels(), stack.exposure()
     nodes = np.linspace(0.0, pixels - 1.0, _NODES)
     grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
     windows = {}
@@ -331,7 +331,7 @@ def _resolved(
     if before is not None:
         side, faintest = side or before.side, faintest or before.faintest
     if side is None:
-        side = experiment.camera.pixels
+        side = experiment.camera.square_pixels()
     if faintest is None:
         faintest = round(stack_limit(experiment, _FAINTEST_SNR, visits.visits.count), 2)
     camera, config = experiment.camera, experiment.config
@@ -369,7 +369,7 @@ def _check_room(stack: ImageStack, threads: int | None) -> None:
     """Raise DomainError where memory or disk cannot hold the tiles."""
     tile, tiles = BYTES * stack.tiles[0].side ** 2, len(stack.tiles)
     # Beside the sums: a CCD that is drawn, and a tile that is stacked and written.
-    pixels = stack.experiment.camera.pixels
+    pixels = stack.experiment.camera.square_pixels()
     ccd = BYTES_PER_PIXEL * max(pixels, stack.tiles[0].side) ** 2
     require_bytes(needed_bytes(stack.experiment, threads) + ccd + tiles * tile, "images")
     # Sums, one of them twice while it is replaced, and the stacks that are kept.

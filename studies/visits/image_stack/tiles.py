@@ -93,8 +93,8 @@ def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int
     """
     camera = experiment.camera
     names = experiment.config.ccds or ()
-    centers = camera.centers[[camera.ccd_index(name) for name in names]]
-    reach = float(np.abs(centers).max()) + camera.half_size
+    ccds = [camera.ccd_index(name) for name in names]
+    reach = float(np.abs(camera.bounds(ccds)).max())
     rows = int(np.ceil(reach / (side * camera.pixel_size)))
     tiles = [Tile(i, j, side) for i in range(-rows, rows + 1) for j in range(-rows, rows + 1)]
     # Those farther out than wanted are not looked at: a field of small tiles has thousands.
@@ -110,7 +110,7 @@ def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int
         seen = 0.0
         for visit in plan:
             at = visit.on_detector(experiment.telescope, sky, wavelength)
-            near = (np.abs(at[:, None] - centers).max(axis=2) <= camera.half_size).any(axis=1)
+            near = np.any([camera.depth(ccd, at) >= 0.0 for ccd in ccds], axis=0)
             seen += near.mean() / len(plan)
         if seen >= 0.5:
             chosen.append(tile)

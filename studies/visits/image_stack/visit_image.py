@@ -90,7 +90,7 @@ def visit_image(
     PachonError
         If the PSF of the CCD cannot be fitted, or no light reaches a star.
     """
-    config, points, pixels = experiment.config, sky.points, experiment.camera.pixels
+    config, points, pixels = experiment.config, sky.points, experiment.camera.square_pixels()
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     at = to_pixel(experiment, name, xy)
     inside = (np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1)

@@ -8,8 +8,8 @@ import pytest
 
 import pachon
 from pachon.core.errors import UnknownNameError
-from pachon.models.camera.camera import lsst_camera
 from pachon.models.camera.focal_plane import FocalPlane
+from pachon.models.camera.lsst import lsst_camera
 from pachon.models.zernike_polynomials import zernike_monomials
 
 FILE = Path(pachon.models.__file__).parent / "data" / "lsstcam_heights.ecsv"

@@ -3,7 +3,8 @@ import pytest
 from astropy import units as u
 
 from pachon.core.errors import DomainError, UnknownNameError
-from pachon.models.camera.camera import load_camera, lsst_camera
+from pachon.models.camera.cameras import load_camera
+from pachon.models.camera.lsst import lsst_camera
 
 LSST = lsst_camera()
 
@@ -16,7 +17,7 @@ def test_the_lsst_has_189_ccds_in_21_rafts_in_order():
     assert not {"R00", "R04", "R40", "R44"} & set(LSST.raft_names)
     assert LSST.ccd_names[:4] == ("R01_S00", "R01_S01", "R01_S02", "R01_S10")
     assert LSST.ccd_names[-1] == "R43_S22"
-    assert LSST.ccd_size == pytest.approx(40.96e-3, abs=1e-15)
+    assert LSST.shortest_side == pytest.approx(40.96e-3, abs=1e-15)
 
 
 @pytest.mark.parametrize("name", ["R01_S00", "R22_S11", "R34_S20", "R43_S12"])

@@ -5,7 +5,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import ConfigError
-from pachon.models.camera.camera import load_camera
+from pachon.models.camera.cameras import load_camera
 from pachon.models.camera.corner_rafts import WAVEFRONT_OFFSET, corner_focal_plane
 
 KINDS = ("wavefront", "guider")
@@ -24,10 +24,10 @@ def test_sensors_stand_where_metrology_has_them(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_sensors_do_not_overlap_and_lie_beside_the_mosaic(kind):
     camera, mosaic = load_camera(f"lsst_{kind}"), pachon.lsst_camera()
-    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * camera.half_size
+    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * (0.5 * camera.shortest_side)
     for i, center in enumerate(camera.centers):
         apart = np.abs(np.delete(camera.centers, i, axis=0) - center).max(axis=1)
-        assert apart.min() > camera.ccd_size
+        assert apart.min() > camera.shortest_side
         assert (mosaic.ccd_at(*(center + corners).T) < 0).all()
 
 
@@ -48,7 +48,7 @@ def test_measured_heights_are_those_of_each_sensor(kind):
     for sensor in pachon.corner_sensors("lsstcam"):
         if sensor.kind == kind:
             # Within the squares and the measured part.
-            reach = np.minimum(plane.camera.half_size, np.array(sensor.half_size)) - 0.5e-3
+            reach = np.minimum((0.5 * plane.camera.shortest_side), np.array(sensor.half_size)) - 0.5e-3
             x, y = (sensor.center + reach * rng.uniform(-1.0, 1.0, (20, 2))).T
             assert plane.height(x, y) == pytest.approx(sensor.height(x, y), abs=1e-12)
 

@@ -5,9 +5,9 @@ from astropy import units as u
 from astropy.table import Table
 
 from pachon.core.errors import DomainError, UnknownNameError
-from pachon.models.camera.camera import lsst_camera
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.height_budget import SIMULATED, SPECIFICATION, TERMS, HeightBudget
+from pachon.models.camera.lsst import lsst_camera
 
 CAMERA = lsst_camera()
 HALF = 20.48e-3
@@ -345,7 +345,7 @@ def test_a_moved_raft_is_a_rigid_body_and_nothing_else_moves():
     inside = [camera.ccd_index(n) for n in camera.ccds_of_raft("R21")]
     centre = camera.centers[inside].mean(axis=0)
     rng = np.random.default_rng(0)
-    x, y = (camera.centers + rng.uniform(-0.9, 0.9, (189, 2)) * camera.half_size).T
+    x, y = (camera.centers + rng.uniform(-0.9, 0.9, (189, 2)) * (0.5 * camera.shortest_side)).T
     change = moved.height(x, y) - plane.height(x, y)
     # A point at (dx, dy) of a plane turned by rx about x and ry about y rises by dy tan rx - dx tan ry.
     expected = 5e-6 + (y - centre[1]) * np.tan(1e-4) - (x - centre[0]) * np.tan(-2e-4)

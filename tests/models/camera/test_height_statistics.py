@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 
 from pachon import FocalPlane, height_statistics
-from pachon.models.camera.camera import Camera, lsst_camera
+from pachon.models.camera.camera import Camera
 from pachon.models.camera.ccd_surfaces import CcdSurfaces
-
-HALF = 20.48e-3
+from pachon.models.camera.lsst import lsst_camera
 
 
 def plane_of(polynomial, vendors=()):
     n = len(polynomial)
     centers = np.stack([np.arange(n) * 0.05, np.zeros(n)], axis=1)
     names = tuple(f"A_S0{i}" for i in range(n))
-    camera = Camera("toy", names, ("A",), np.zeros(n, dtype=int), centers, 4096, 10e-6, vendors)
+    camera = Camera("toy", names, ("A",), np.zeros(n, dtype=int), centers, np.array([4096, 4096]), 10e-6, vendors)
     padded = np.zeros((n, 10))
     padded[:, : len(polynomial[0])] = polynomial
-    return FocalPlane(camera, CcdSurfaces(HALF, padded, np.zeros((n, 2, 4))), np.ones(n, dtype=bool))
+    return FocalPlane(camera, CcdSurfaces(camera.half_sizes, padded, np.zeros((n, 2, 4))), np.ones(n, dtype=bool))
 
 
 def test_steps_planes_and_bowls_have_their_closed_forms():

@@ -11,12 +11,13 @@ from astropy.table import Table
 import pachon
 from pachon import FocalPlane, HeightWarning
 from pachon.core.errors import DomainError, PachonError, PrescriptionError, UnknownNameError
-from pachon.models.camera.camera import Camera, lsst_camera
+from pachon.models.camera.camera import Camera
+from pachon.models.camera.lsst import lsst_camera
 
 HALF = 20.48e-3
 NAMES = ("A_S00", "A_S01")
 CENTERS = np.array([[-21e-3, 5e-3], [21e-3, 5e-3]])
-SMALL = Camera("small", NAMES, ("A",), np.zeros(2, dtype=int), CENTERS, 4096, 10e-6)
+SMALL = Camera("small", NAMES, ("A",), np.zeros(2, dtype=int), CENTERS, np.array([4096, 4096]), 10e-6)
 
 
 def bowl(ccd, dx, dy):

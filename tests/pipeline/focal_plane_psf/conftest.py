@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from pachon.core.threads import one_blas_thread
-from pachon.models.camera.camera import Camera, load_camera
+from pachon.models.camera.camera import Camera
+from pachon.models.camera.cameras import load_camera
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.focal_plane_psf.response import Instrument
 from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
@@ -24,7 +25,7 @@ def part():
         keep = [i for i, raft in enumerate(whole.raft_of) if raft in rafts]
         index = np.array([rafts.index(whole.raft_of[i]) for i in keep])
         names = tuple(whole.ccd_names[i] for i in keep)
-        return Camera("part", names, rafts, index, whole.centers[keep], whole.pixels, whole.pixel_size)
+        return Camera("part", names, rafts, index, whole.centers[keep], whole.pixels[keep], whole.pixel_size)
 
     return of
 
@@ -46,7 +47,7 @@ class Exposure:
         per_ccd = stars + holdout
         self.ccd = np.repeat(np.arange(len(camera)), per_ccd)
         offsets = places.uniform(-0.97, 0.97, (len(self.ccd), 2))
-        self.xy = camera.centers[self.ccd] + camera.half_size * offsets
+        self.xy = camera.centers[self.ccd] + (0.5 * camera.shortest_side) * offsets
         self.first = np.tile(np.arange(per_ccd) < stars, len(camera))
         self.names = np.array(camera.ccd_names)[self.ccd]
         instrument = Instrument.of(telescope, WAVELENGTHS)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from pachon.models.camera.camera import load_camera
+from pachon.models.camera.cameras import load_camera
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.height_budget import SIMULATED
 from pachon.pipeline.focal_plane_psf.covariance import Places
@@ -14,7 +14,7 @@ NM = 1e-9
 
 
 def at(camera, ccd, uv):
-    return Places(camera.centers[ccd] + camera.half_size * uv, np.asarray(ccd), uv)
+    return Places(camera.centers[ccd] + (0.5 * camera.shortest_side) * uv, np.asarray(ccd), uv)
 
 
 def random_places(camera, n, seed):

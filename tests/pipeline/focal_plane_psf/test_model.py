@@ -119,7 +119,7 @@ def test_the_fit_agrees_with_its_stars(which, exposure, request):
 def test_a_planted_height_is_found(aligned, exposure):
     own = exposure.camera.ccd_index(PLANTED)
     others = np.arange(9) != own
-    grid = np.linspace(-0.9, 0.9, 7) * exposure.camera.half_size
+    grid = np.linspace(-0.9, 0.9, 7) * (0.5 * exposure.camera.shortest_side)
     dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
 
     def above(plane):

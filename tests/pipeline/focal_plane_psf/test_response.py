@@ -35,7 +35,7 @@ def plane(part):
 def stars(plane, n, seed):
     rng = np.random.default_rng(seed)
     ccd = rng.integers(0, len(plane.camera), n)
-    return plane.camera.centers[ccd] + plane.camera.half_size * rng.uniform(-0.95, 0.95, (n, 2))
+    return plane.camera.centers[ccd] + (0.5 * plane.camera.shortest_side) * rng.uniform(-0.95, 0.95, (n, 2))
 
 
 @pytest.mark.long

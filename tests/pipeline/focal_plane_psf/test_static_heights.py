@@ -44,7 +44,7 @@ def both(fit, tmp_path_factory):
 def error(heights, truth):
     """Rms error over the CCDs [m], without the mean height, which is the focus of the exposures."""
     camera = truth.camera
-    grid = np.linspace(-0.9, 0.9, 9) * camera.half_size
+    grid = np.linspace(-0.9, 0.9, 9) * (0.5 * camera.shortest_side)
     dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
     x, y = camera.centers[:, :1] + dx, camera.centers[:, 1:] + dy
     left = heights.focal_plane.height(x, y) - truth.height(x, y)

@@ -8,7 +8,7 @@ from astropy.table import Table
 
 from pachon.commands.cli import main
 from pachon.core.errors import ProductError
-from pachon.models.camera.camera import load_camera
+from pachon.models.camera.cameras import load_camera
 from pachon.pipeline.ccd_product import KINDS, product_path, read_product
 from pachon.pipeline.measure.rho_statistics import rho_statistics
 from pachon.pipeline.measure.shapes import measure_shapes

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import ConfigError
-from pachon.models.camera.camera import load_camera
+from pachon.models.camera.cameras import load_camera
 from pachon.models.io.prescription import load_telescope
 from pachon.models.io.site_file import load_site
 from pachon.pipeline.config import Configuration, with_options
@@ -42,7 +42,7 @@ def test_no_light_leaves_the_swept_length(zenith):
     config = Experiment.from_config(with_options(Configuration(), seed=3, **options)).config
     experiment = Experiment.from_config(config)
     camera = experiment.camera
-    half = camera.half_size * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
+    half = (0.5 * camera.shortest_side) * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
     corners = np.concatenate([camera.centers[camera.ccd_index(n)] + half for n in names])
     direction = field_direction(*fields_at(experiment.telescope, corners).T)
     atmosphere = experiment.atmosphere

@@ -29,7 +29,7 @@ def mean_square(at, motion):
     """Mean square spot radius at centre and quarters of the CCDs, by tracing to detectors moved to each height."""
     total = []
     centers = at.camera.centers[[at.camera.ccd_index(name) for name in CCDS]]
-    within = 0.5 * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * at.camera.half_size
+    within = 0.5 * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * (0.5 * at.camera.shortest_side)
     places = (centers[:, None] + within).reshape(-1, 2)
     fields = fields_at(at.telescope, places, 624e-9)
     heights = at.focal_plane.height(*places.T)

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.dask_cluster import check_versions
 from pachon.core.errors import ConfigError, PachonError
-from pachon.models.camera.camera import CAMERAS, lsst_camera
 from pachon.models.io.prescription import DATA, load_telescope
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
@@ -294,19 +292,15 @@ def test_compensators_are_solved_at_every_point(folder):
     assert moved["rms_e"] == pytest.approx(still["rms_e"], rel=1e-3)
 
 
-def test_motions_are_those_of_the_points_own_camera(folder, monkeypatch):
+_FOUR = ("A_1", "A_2", "B_1", "B_2")
+
+
+def test_motions_are_those_of_the_points_own_camera(folder):
     """A camera of four CCDs named otherwise than the LSST's: its names are motions, the LSST's are none."""
-    lsst = lsst_camera()
-    four = replace(
-        lsst,
-        name="four",
-        ccd_names=("A_1", "A_2", "B_1", "B_2"),
-        raft_names=("A", "B"),
-        raft_index=np.array([0, 0, 1, 1]),
-        centers=lsst.centers[[90, 91, 93, 94]],
-    )
-    monkeypatch.setitem(CAMERAS, "four", lambda: four)
-    text = (DATA / "lsst_v3.3_r.yaml").read_text().replace("camera: lsst", "camera: four")
+    rows = [f"  - {{name: {name}, raft: {name[0]}, x_mm: {40 * i}, y_mm: 0}}" for i, name in enumerate(_FOUR)]
+    camera = ["name: four", "source: test", "pixel_um: 10", "pixels: [3000, 3000]", "ccds:", *rows]
+    (folder / "camera.yaml").write_text("\n".join(camera))
+    text = (DATA / "lsst_v3.3_r.yaml").read_text().replace("camera: lsst", "camera: camera.yaml")
     (folder / "four.yaml").write_text(text)
     base = {"telescope": "four.yaml", "ccds": ["A_1"], "wavelengths_nm": [624]}
 

@@ -16,7 +16,7 @@ def test_positions_are_those_of_the_world_coordinates_of_a_ccd(lsst_r):
         wcs = pachon.ccd_wcs(lsst_r, camera, ccd, position_angle=0.7, wavelength=LIGHT)
         pixels = np.array([[10.0, 20.0], [3000.0, 500.0], [2000.0, 4000.0]])
         found = Visit(1, 1, roll=0.7).on_detector(lsst_r, wcs.to_sky(pixels), LIGHT)
-        corner = camera.centers[camera.ccd_index(ccd)] - camera.half_size
+        corner = camera.centers[camera.ccd_index(ccd)] - (0.5 * camera.shortest_side)
         np.testing.assert_allclose((found - corner) / camera.pixel_size - 0.5, pixels, atol=0.006)
 
 
