@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,8 @@ from ...media.medium import Medium, RelativeToAir
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
-from ..glass_catalogue import GlassCatalogue
+from ..glass_catalogue import MAKERS, GlassCatalogue
+from ..user_glasses import user_catalogues
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
@@ -232,11 +234,11 @@ class _LensReader:
         # up from another surface, a model glass too where it has no name.
         solve = line.number(1, 0.0)
         model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
-        for catalogue in self.catalogues:
-            known = catalogue.spelling(name)
-            if known is not None and not model:
-                return False, catalogue[known]
         if not model:
+            for catalogue in self._searched():
+                known = catalogue.spelling(name)
+                if known is not None:
+                    return False, catalogue[known]
             error = line.problem(f"{line.shown}: the glass is in no catalogue")
             if nd <= 1 or (nd, vd) == PLACEHOLDER:
                 raise error
@@ -245,6 +247,16 @@ class _LensReader:
             return False, replace(model_glass(nd, vd, deviation), name=name)
         except PrescriptionError as problem:
             raise line.problem(f"{line.shown}: {problem}") from None
+
+    def _searched(self) -> Iterator[GlassCatalogue]:
+        """Yield the catalogues in the order of search; those of makers and of the user are read where needed."""
+        yield from self.catalogues
+        yield from map(GlassCatalogue.of_maker, MAKERS)
+        yield from self._user_catalogues
+
+    @cached_property
+    def _user_catalogues(self) -> list[GlassCatalogue]:
+        return [GlassCatalogue.read(path) for path in user_catalogues()]
 
     def _placed(self, surface: Surface, z0: float) -> Surface:
         x, y, z = HALF_TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
