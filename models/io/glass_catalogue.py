@@ -25,6 +25,8 @@ DATA = Path(__file__).parents[1] / "data"
 BUNDLED = DATA / "glasses.agf"
 #: Makers whose catalogues come with the package, in the order in which a glass is looked up.
 MAKERS = ("schott", "ohara", "hoya", "hikari", "sumita", "cdgm")
+#: Catalogue of crystals, semiconductors and liquids, whose names are NAME_AUTHOR.
+SUBSTANCES = "substances"
 DEFAULT_RANGE = (0.3, 2.5)
 
 #: Formula numbers of the format; 2, 6 and 11 are Sellmeier's formula with three, four and five terms.
@@ -109,15 +111,20 @@ class GlassCatalogue:
 
     @classmethod
     def of_maker(cls, maker: str) -> GlassCatalogue:
-        """Return the catalogue of a maker that comes with pachon: schott, ohara, hoya, hikari, sumita or cdgm.
+        """Return the catalogue of a maker that comes with pachon.
+
+        Parameters
+        ----------
+        maker : {"schott", "ohara", "hoya", "hikari", "sumita", "cdgm", "substances"}
+            The maker; "substances" are crystals, semiconductors and liquids, such as ``"CAF2_DAIMON-20"``.
 
         Raises
         ------
         UnknownNameError
             If there is none of that maker.
         """
-        if maker not in MAKERS:
-            raise unknown_name("glass maker", maker, MAKERS)
+        if maker not in (*MAKERS, SUBSTANCES):
+            raise unknown_name("glass maker", maker, (*MAKERS, SUBSTANCES))
         return _of_maker(maker)
 
     def __getitem__(self, name: str) -> Medium:

@@ -14,7 +14,7 @@ from ....core.errors import PrescriptionError
 from ...media.dispersion import Dispersion, model_glass
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...media.tabulated import TabulatedIndex
-from ..glass_catalogue import MAKERS, GlassCatalogue
+from ..glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
 from ..json_items import JsonObject
 from ..zemax.file import Findings
 from ..zemax.placed import Line, PlacedSurfaces
@@ -36,7 +36,7 @@ def glass_lines(material: JsonObject, found: PlacedSurfaces, findings: Findings)
     if kind == "IdealMaterial":
         return found.constant_glass(material.number("index"))
     if kind in ("Material", "MaterialFile"):
-        return _catalogue_glass(material, found)
+        return _catalogue_glass(material, found, findings)
     if kind == "DataMaterial":
         name = material.text("name", "") or f"MATERIAL_{len(found.glasses) + 1}"
         return found.glass(name, _data_medium(material, name))
@@ -50,16 +50,19 @@ def glass_lines(material: JsonObject, found: PlacedSurfaces, findings: Findings)
     )
 
 
-def _catalogue_glass(material: JsonObject, found: PlacedSurfaces) -> list[Line]:
+def _catalogue_glass(material: JsonObject, found: PlacedSurfaces, findings: Findings) -> list[Line]:
     path = re.findall(r"[^/\\]+", material.text("filename", ""))
     name = path[-1].rsplit(".", 1)[0] if path else material.text("name")
     maker = (path[-2] if len(path) > 1 else material.text("reference", "")).lower()
-    if maker in MAKERS and name in GlassCatalogue.of_maker(maker):
+    if "main" in path[:-2]:
+        # Substances stand in folders of their own, a file for each author.
+        name, maker = f"{path[path.index('main') + 1]}_{name}", SUBSTANCES
+    if maker in (*MAKERS, SUBSTANCES) and name in GlassCatalogue.of_maker(maker):
         # Several makers have glasses of one name.
         return found.glass(f"{name} ({maker})", GlassCatalogue.of_maker(maker)[name])
-    if path and maker not in MAKERS and "main" in path:
-        # Substances stand in folders of their own, a file for each author.
-        name = f"{path[path.index('main') + 1]}"
+    if maker:
+        text = f"material {name} of {maker}: not among the bundled glasses"
+        findings.report(material.problem(text), "a glass of that name is taken")
     return [("GLAS", name)]
 
 

@@ -25,11 +25,11 @@ from ...zernike_polynomials import noll_to_nm
 from ..json_items import JsonObject
 from ..zemax.file import Findings
 from ..zemax.placed import Line, numbered
-from ..zemax.shapes import polynomial_powers
+from ..zemax.shapes import MOST_ODD, polynomial_powers
 
 #: Highest degree of polynomials.
 MOST_DEGREE = 40
-#: Parameters of Zemax's aspheres that hold coefficients.
+#: Parameters of Zemax's even aspheres that hold coefficients.
 _PARAMETERS = 8
 
 
@@ -63,8 +63,8 @@ def _even(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
 
 def _odd(geometry: JsonObject, findings: Findings) -> tuple[float, list[Line]]:
     terms = geometry.numbers("coefficients")
-    if any(terms[_PARAMETERS:]):
-        geometry.refuse("coefficients", f"at most {_PARAMETERS} of them")
+    if any(terms[MOST_ODD:]):
+        geometry.refuse("coefficients", f"at most {MOST_ODD} of them")
     return 0.0, [*_base(geometry, "ODDASPHE"), *numbered("PARM", terms)]
 
 

@@ -25,7 +25,7 @@ PUPILS = {("object", "epd"): "ENPD", ("object", "NA"): "OBNA", ("image", "f/#"):
 FIELDS = {("object", "angle"): 0, ("object", "height"): 1, ("image", "height"): 2}
 INTERACTIONS = ("transmit", "reflect", "dummy", "phantom")
 #: Attributes of a surface without effect on the paths of rays.
-IGNORED = ("delta_n", "edge_apertures", "max_aperture")
+IGNORED = ("delta_n", "edge_apertures", "z_type")
 DECENTERS = ("decenter", "reverse", "dec and return", "bend")
 
 
@@ -159,9 +159,10 @@ class _Translation:
         self._pupil(attributes(optics, "pupil"))
         waves = attributes(optics, "spectral_region")
         lengths = numbers(waves, "wavelengths")
-        weights = numbers(waves, "spectral_wts") if "spectral_wts" in waves else [1.0] * len(lengths)
+        weights = numbers(waves, "spectral_wts") if "spectral_wts" in waves else []
+        weights = (weights + [1.0] * len(lengths))[: len(lengths)]
         self._fields(attributes(optics, "field_of_view"), len(lengths))
-        for number, (wave, weight) in enumerate(zip(lengths, weights, strict=False), start=1):
+        for number, (wave, weight) in enumerate(zip(lengths, weights, strict=True), start=1):
             head("WAVM", str(number), wave / 1e3, weight)
         head("PWAV", str(waves.whole("reference_wvl") + 1))
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from ..json_items import JsonObject
 from ..zemax.file import Findings
 from ..zemax.placed import Line, numbered
+from ..zemax.shapes import MOST_ODD
 from .items import attributes, class_name, numbers
 
 #: Zemax type, and power of r of each step of the coefficients.
@@ -19,6 +20,7 @@ POLYNOMIALS = {"EvenPolynomial": ("EVENASPH", 2), "RadialPolynomial": ("ODDASPHE
 #: Attributes that are copies of others or count them.
 _COPIES = ("max_nonzero_coef", *(f"coef{i}" for i in range(1, 21)), "coefs")
 _MOST_TERMS = 10
+#: Parameters of Zemax's even aspheres that hold coefficients.
 _PARAMETERS = 8
 
 
@@ -38,8 +40,8 @@ def profile_lines(profile: JsonObject, findings: Findings) -> list[Line]:
     terms = numbers(values, "coefs") if "coefs" in values else []
     terms = terms or [values.number(f"coef{step * i}", 0.0) for i in range(1, _MOST_TERMS + 1)]
     values.report_rest(findings, _COPIES)
-    if not any(terms[_PARAMETERS:]):
+    if step == 1 and any(terms[MOST_ODD:]):
+        raise profile.problem(f"coefs = {len(terms)} numbers: expected at most {MOST_ODD}")
+    if step == 1 or not any(terms[_PARAMETERS:]):
         return [("TYPE", name), *head, *numbered("PARM", terms)]
-    if step == 1:
-        raise profile.problem(f"coefs = {len(terms)} numbers: expected at most {_PARAMETERS}, up to r^{_PARAMETERS}")
     return [("TYPE", "XASPHERE"), *head, *numbered("XDAT", [float(len(terms)), 1.0, *terms])]

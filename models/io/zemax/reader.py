@@ -26,7 +26,7 @@ from ...media.medium import Medium, RelativeToAir
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
-from ..glass_catalogue import MAKERS, GlassCatalogue
+from ..glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
 from ..user_glasses import user_catalogues
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
@@ -251,7 +251,7 @@ class _LensReader:
     def _searched(self) -> Iterator[GlassCatalogue]:
         """Yield the catalogues in the order of search; those of makers and of the user are read where needed."""
         yield from self.catalogues
-        yield from map(GlassCatalogue.of_maker, MAKERS)
+        yield from map(GlassCatalogue.of_maker, (*MAKERS, SUBSTANCES))
         yield from self._user_catalogues
 
     @cached_property
