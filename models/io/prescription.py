@@ -182,7 +182,7 @@ def _bundled(name: str) -> Telescope:
 
 @check_arguments
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format: str = "") -> None:
-    """Write a prescription file: YAML, ours or batoid's, or a Zemax lens file.
+    """Write a prescription file: YAML, ours or batoid's, a Zemax lens file or a file of optiland.
 
     Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
     it.
@@ -193,8 +193,8 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         Prescription to write.
     path : str or path
         File to write; it is replaced as a whole, or left as it was.
-    format : {"", "pachon", "batoid", "zemax"}
-        Format; by default Zemax's where the name ends in ``.zmx``, else ours.
+    format : {"", "pachon", "batoid", "zemax", "optiland"}
+        Format; by default Zemax's where the name ends in ``.zmx``, optiland's for ``.json``, else ours.
 
     Raises
     ------
@@ -204,8 +204,8 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         If the file cannot be written, or cannot hold the telescope.
     """
     target = Path(path)
-    format = format or ("zemax" if target.suffix.lower() == ".zmx" else "pachon")
-    check_choice("format", format, ("pachon", "batoid", "zemax"))
+    format = format or {".zmx": "zemax", ".json": "optiland"}.get(target.suffix.lower(), "pachon")
+    check_choice("format", format, ("pachon", "batoid", "zemax", "optiland"))
     if format == "zemax":
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
@@ -214,6 +214,10 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         from .batoid.writer import telescope_to_batoid
 
         lens = telescope_to_batoid(telescope)
+    elif format == "optiland":
+        from .optiland.writer import telescope_to_optiland
+
+        lens = telescope_to_optiland(telescope)
     else:
         lens = telescope_to_yaml(telescope)
     write_bytes(target, lens.encode(), PrescriptionError)

@@ -1,4 +1,4 @@
-"""Geometries of optiland as shapes of Zemax surfaces.
+"""Geometries of optiland as shapes of Zemax surfaces, and shapes as geometries.
 
 The sag of each, with the base conic of ``radius`` and ``conic``, ``r^2 = x^2 + y^2`` [mm]:
 
@@ -18,9 +18,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
+from ....core.errors import PrescriptionError
+from ...shapes.freeform import OddAsphere, Toroid, XYPolynomial, ZernikeSag
+from ...shapes.shape import Conic, EvenAsphere, Plane, Shape, Sphere, Sum
 from ...zernike_polynomials import noll_to_nm
 from ..json_items import JsonObject
 from ..zemax.file import Findings
@@ -183,3 +187,52 @@ _KINDS: dict[str, Callable[[JsonObject, Findings], tuple[float, list[Line]]]] = 
     "BiconicGeometry": _biconic,
     "ToroidalGeometry": _toroid,
 }
+
+
+def geometry_items(shape: Shape, unit: float) -> dict[str, Any]:
+    """Return the dictionary of a shape [m], sag along the light, lengths in a unit [m].
+
+    PrescriptionError if optiland has no geometry of this shape.
+    """
+    parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
+    base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag)), Plane())
+    rest = [p for p in parts if p is not base]
+    if not rest:
+        return _alone(base, unit)
+    if len(rest) > 1 or not isinstance(base, Plane | Sphere | Conic):
+        raise PrescriptionError("a sum of several shapes: optiland has no geometry of this shape")
+    head = {"radius": _length(base.curvature, unit), "conic": base.conic}
+    part = rest[0]
+    if isinstance(part, ZernikeSag) and not part.inner_radius:
+        terms = [a / unit for a in part.coefficients]
+        own = {"coefficients": terms, "zernike_type": "noll", "norm_radius": part.outer_radius / unit}
+        return {"type": "ZernikePolynomialGeometry", **head, **own}
+    if isinstance(part, XYPolynomial):
+        table = np.zeros((1 + max(i for i, *_ in part.terms), 1 + max(j for _, j, _ in part.terms)))
+        for i, j, a in part.terms:
+            table[i, j] = a * unit ** (i + j - 1)
+        return {"type": "PolynomialGeometry", **head, "coefficients": table.tolist()}
+    raise PrescriptionError("annular Zernike terms: optiland has those of the full disc")
+
+
+def _length(curvature: float, unit: float) -> float:
+    return 1.0 / (curvature * unit) if curvature else math.inf
+
+
+def _alone(shape: Shape, unit: float) -> dict[str, Any]:
+    """Return the dictionary of a shape that is no sum."""
+    if isinstance(shape, Plane):
+        return {"type": "Plane", "radius": math.inf}
+    if isinstance(shape, Sphere | Conic):
+        return {"type": "StandardGeometry", "radius": shape.radius / unit, "conic": shape.conic}
+    if isinstance(shape, EvenAsphere | OddAsphere):
+        even = isinstance(shape, EvenAsphere)
+        terms = [a * unit ** (2 * i + 3 if even else i) for i, a in enumerate(shape.coefficients)]
+        head = {"radius": shape.radius / unit, "conic": shape.conic}
+        kind = "EvenAsphere" if even else "OddAsphere"
+        return {"type": kind, **head, "coefficients": [0.0, *terms] if even else terms}
+    if isinstance(shape, Toroid):
+        radii = {"radius_x": shape.radius_x / unit, "radius_y": shape.radius_y / unit}
+        own = {"geometry_type": "Toroidal", "conic_yz": shape.conic_y, "coeffs_poly_y": []}
+        return {"type": "ToroidalGeometry", **radii, **own}
+    raise PrescriptionError(f"shape {type(shape).__name__}: optiland has no geometry of this shape")

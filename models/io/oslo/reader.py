@@ -20,10 +20,12 @@ from ....core.errors import PrescriptionError, error_context
 from ...media.dispersion import model_glass
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
+from ..glass_search import find_glass
 from ..zemax.file import Findings, ZemaxFile
 from ..zemax.placed import Line, PlacedSurfaces, numbered
 from ..zemax.text import Record, read_text
 from .frames import surface_frames
+from .solves import AxialRay
 
 UNITS = {1.0: "MM", 10.0: "CM", 25.4: "IN", 1000.0: "METER"}
 APERTURES = ("EBR", "NAO", "FNO", "NAP")
@@ -124,8 +126,7 @@ class _Translation:
         if len(self.surfaces) < 3:
             problem = f"{len(self.surfaces)} surfaces: expected an object, an image and one between, parted by NXT"
             raise self.found.header.problem(problem)
-        for surface in self.surfaces:
-            self._pick_up(surface)
+        self._resolve()
         self._header()
         self._blocks()
         return self.found.file()
@@ -193,6 +194,49 @@ class _Translation:
             target[number - 1 : number] = values
         else:
             raise command.error("one number, and those of the wavelengths before it")
+
+    def _resolve(self) -> None:
+        """Give each surface the values that it picks up, and those that solves of the axial ray make."""
+        for surface in self.surfaces:
+            self._pick_up(surface)
+        if not any(key in s.values for s in self.surfaces for key in ("PY", "PU")):
+            return
+        ray = self._axial_ray()
+        for surface in self.surfaces:
+            # Pick-ups of values that were solved for before.
+            self._pick_up(surface)
+            values = surface.values
+            with error_context(file=self.path, place=surface.place):
+                if surface.number:
+                    after = self._index(surface, ray.index)
+                    if "PU" in values:
+                        values["CV"] = ray.solved_curvature(values["PU"], after)
+                    ray.pass_surface(values.get("CV", 0.0), after)
+                    if "PY" in values:
+                        values["TH"] = ray.solved_thickness(values["PY"])
+                if surface.number or math.isfinite(self.distance):
+                    ray.advance(values.get("TH", 0.0))
+
+    def _axial_ray(self) -> AxialRay:
+        command, finite = self.aperture, math.isfinite(self.distance)
+        key, value = (command.keyword, command.number(0)) if command else ("", 1.0)
+        if not finite:
+            return AxialRay(value, 0.0, 1.0, scaled=key == "EBR")
+        slope = math.tan(math.asin(min(value, 0.999))) if key == "NAO" else value / abs(self.distance)
+        return AxialRay(0.0, slope, 1.0, scaled=key in ("EBR", "NAO"))
+
+    def _index(self, surface: _Surface, before: float) -> float:
+        """Return the index behind a surface at the primary wavelength, negative behind an odd number of mirrors."""
+        if surface.mirror:
+            return -before
+        lines = self._glass_lines(surface)
+        if not lines:
+            return math.copysign(1.0, before)
+        name = str(lines[0][1])
+        medium = self.found.glasses.get(name.upper()) or find_glass(name)
+        if medium is None:
+            raise PrescriptionError(f"{name}: expected a glass of the bundled or the user's catalogues, for the solves")
+        return math.copysign(float(medium.index(self.waves[0] / 1e6)), before)
 
     def _pick_up(self, surface: _Surface) -> None:
         """Take over values of earlier surfaces: ``PK CV n``, ``PK TH n addition``, CVM and THM with the other sign."""
@@ -265,11 +309,6 @@ class _Translation:
         if last.values.get("TH"):
             before = self.surfaces[-2].values
             before["TH"] = before.get("TH", 0.0) + last.values["TH"]
-        for surface in self.surfaces[:-1]:
-            for key, solved in (("PY", "TH"), ("PU", "CV")):
-                if key in surface.values and not surface.values.get(solved):
-                    problem = f"{key}: expected the solution of the solve in the file ({solved})"
-                    raise PrescriptionError(problem, file=str(self.path), place=surface.place)
         with error_context(file=self.path):
             frames = surface_frames([s.values for s in self.surfaces])
         if first.values.get("CV"):

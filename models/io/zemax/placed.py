@@ -36,6 +36,8 @@ class PlacedSurfaces:
         self.header = Block(str(path))
         self.glasses: dict[str, Medium] = {}
         self._blocks: list[Block] = []
+        #: Blocks that are no coordinate breaks, from the first behind the object on.
+        self._surfaces: list[Block] = []
         self._origin = np.zeros(3)
         #: Columns are the local axes; their third is the axis of the light, or its opposite behind a mirror.
         self._frame, self._sign = np.eye(3), 1.0
@@ -77,6 +79,7 @@ class PlacedSurfaces:
             self._add(place, [*_break(values, 0), ("DISZ", 0.0)])
             self._undo = _break([-v for v in values], 1)
         self._add(place, lines)
+        self._surfaces.append(self._blocks[-1])
         if mirror:
             self._reflect(axes[:, 2])
 
@@ -84,6 +87,10 @@ class PlacedSurfaces:
         """Return the parts of the lens file; PrescriptionError if it has fewer than three surfaces."""
         if len(self._blocks) < 3:
             raise self.header.problem(f"{len(self._blocks)} surfaces: expected an object, an image and one between")
+        for number, block in enumerate(self._surfaces[:-1], start=1):
+            if block.last("COMM") is None:
+                # Names count surfaces and no coordinate breaks; the last is the image.
+                block.lines.append(_record(self.path, block.place, ("COMM", f"S{number}")))
         return ZemaxFile(self.path, self.header, self._blocks, Block(str(self.path)), self.glasses)
 
     def _finish(self, place: str, position: np.ndarray) -> None:

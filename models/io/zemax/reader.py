@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +25,8 @@ from ...media.medium import Medium, RelativeToAir
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
-from ..glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
-from ..user_glasses import user_catalogues
+from ..glass_catalogue import GlassCatalogue
+from ..glass_search import find_glass
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
@@ -59,7 +58,7 @@ def read_lens(
         catalogues = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in glass_catalogues]
         beside = path.with_suffix(".agf")
         catalogues += [GlassCatalogue.read(beside)] if beside.is_file() else []
-        return _LensReader(file, findings, [*catalogues, GlassCatalogue.bundled()]).telescope()
+        return _LensReader(file, findings, catalogues).telescope()
 
 
 class _LensReader:
@@ -235,10 +234,9 @@ class _LensReader:
         solve = line.number(1, 0.0)
         model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
         if not model:
-            for catalogue in self._searched():
-                known = catalogue.spelling(name)
-                if known is not None:
-                    return False, catalogue[known]
+            found = find_glass(name, self.catalogues)
+            if found is not None:
+                return False, found
             error = line.problem(f"{line.shown}: the glass is in no catalogue")
             if nd <= 1 or (nd, vd) == PLACEHOLDER:
                 raise error
@@ -247,16 +245,6 @@ class _LensReader:
             return False, replace(model_glass(nd, vd, deviation), name=name)
         except PrescriptionError as problem:
             raise line.problem(f"{line.shown}: {problem}") from None
-
-    def _searched(self) -> Iterator[GlassCatalogue]:
-        """Yield the catalogues in the order of search; those of makers and of the user are read where needed."""
-        yield from self.catalogues
-        yield from map(GlassCatalogue.of_maker, (*MAKERS, SUBSTANCES))
-        yield from self._user_catalogues
-
-    @cached_property
-    def _user_catalogues(self) -> list[GlassCatalogue]:
-        return [GlassCatalogue.read(path) for path in user_catalogues()]
 
     def _placed(self, surface: Surface, z0: float) -> Surface:
         x, y, z = HALF_TURN @ (np.array(surface.vertex) - np.array([0.0, 0.0, z0])) + 0.0
