@@ -1,4 +1,4 @@
-"""Glasses by name, from catalogues in the AGF format of Zemax; a small one of common glasses comes with pachon.
+"""Glasses by name, from catalogues in the AGF format of Zemax: of common glasses and of six makers with pachon, or own.
 
 Catalogues state indices relative to air at a reference temperature (20 deg C for most) and one standard atmosphere,
 by the wavelength in that air. That is how a glass is handed out, and how Zemax uses it: air then has index 1, and so
@@ -21,7 +21,12 @@ from ..media.dispersion import FORMULAS, Dispersion
 from ..media.medium import Medium, RelativeToAir, Sellmeier
 from .zemax.text import Record, read_text, records
 
-BUNDLED = Path(__file__).parents[1] / "data" / "glasses.agf"
+DATA = Path(__file__).parents[1] / "data"
+BUNDLED = DATA / "glasses.agf"
+#: Makers whose catalogues come with the package, in the order in which a glass is looked up.
+MAKERS = ("schott", "ohara", "hoya", "hikari", "sumita", "cdgm")
+#: Catalogue of crystals, semiconductors and liquids, whose names are NAME_AUTHOR.
+SUBSTANCES = "substances"
 DEFAULT_RANGE = (0.3, 2.5)
 
 #: Formula numbers of the format; 2, 6 and 11 are Sellmeier's formula with three, four and five terms.
@@ -83,8 +88,18 @@ class GlassCatalogue:
         PrescriptionError
             If the file cannot be read or has no glass, or a line is not understood: file, line, glass and keyword.
         """
-        source = str(path)
-        glasses = {g.name: g for g in _read_glasses(records(read_text(Path(path)), source))}
+        return cls.parse(read_text(Path(path)), str(path))
+
+    @classmethod
+    def parse(cls, text: str, source: str) -> GlassCatalogue:
+        """Return the catalogue of a text in AGF format; `source` is its name for messages.
+
+        Raises
+        ------
+        PrescriptionError
+            As those of :meth:`read`.
+        """
+        glasses = {g.name: g for g in _read_glasses(records(text, source))}
         if not glasses:
             raise PrescriptionError("expected a glass catalogue, with lines that begin with NM", file=source)
         return cls(glasses, source)
@@ -93,6 +108,24 @@ class GlassCatalogue:
     def bundled(cls) -> GlassCatalogue:
         """Return the catalogue of common glasses that comes with pachon."""
         return _bundled()
+
+    @classmethod
+    def of_maker(cls, maker: str) -> GlassCatalogue:
+        """Return the catalogue of a maker that comes with pachon.
+
+        Parameters
+        ----------
+        maker : {"schott", "ohara", "hoya", "hikari", "sumita", "cdgm", "substances"}
+            The maker; "substances" are crystals, semiconductors and liquids, such as ``"CAF2_DAIMON-20"``.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that maker.
+        """
+        if maker not in (*MAKERS, SUBSTANCES):
+            raise unknown_name("glass maker", maker, (*MAKERS, SUBSTANCES))
+        return _of_maker(maker)
 
     def __getitem__(self, name: str) -> Medium:
         """Return a glass as catalogues state it: relative to air, by wavelength in air.
@@ -143,6 +176,13 @@ class GlassCatalogue:
 def _bundled() -> GlassCatalogue:
     catalogue = GlassCatalogue.read(BUNDLED)
     catalogue.source = "the bundled catalogue"
+    return catalogue
+
+
+@cache
+def _of_maker(maker: str) -> GlassCatalogue:
+    catalogue = GlassCatalogue.read(DATA / "glasses" / f"{maker}.agf")
+    catalogue.source = f"the catalogue of {maker}"
     return catalogue
 
 

@@ -42,8 +42,13 @@ from ..telescope import Telescope
 from .batoid import ROOT as BATOID_ROOT
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
+from .optiland.reader import read_optiland_file
+from .oslo.reader import read_oslo_file
+from .rayoptics.reader import read_rayoptics_file
+from .user_glasses import user_catalogues
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 from .yaml.writer import telescope_to_yaml
+from .zar.reader import read_zemax_archive
 from .zemax.file import read_zemax_file
 from .zemax.reader import read_lens
 from .zemax.writer import catalogue_path, telescope_to_zemax
@@ -63,7 +68,14 @@ BUNDLED = (
 
 
 # Readers of the parts of a lens file, by its ending.
-_LENS_FILES = {".zmx": read_zemax_file, ".seq": read_codev_file}
+_LENS_FILES = {
+    ".zmx": read_zemax_file,
+    ".zar": read_zemax_archive,
+    ".seq": read_codev_file,
+    ".len": read_oslo_file,
+    ".json": read_optiland_file,
+    ".roa": read_rayoptics_file,
+}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
@@ -85,13 +97,13 @@ def load_telescope(
     Parameters
     ----------
     name_or_path : str or path
-        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, ours or batoid's, or of a ``.zmx``
-        (Zemax) or ``.seq`` (CODE V) file.
+        Bundled name such as ``"lsst_v3.3_r"``, or path of a ``.yaml`` file, ours or batoid's, or of a lens file:
+        ``.zmx`` or ``.zar`` (Zemax), ``.seq`` (CODE V), ``.len`` (OSLO), ``.json`` (optiland), ``.roa`` (ray-optics).
     lenient : bool
-        Of a batoid, Zemax or CODE V file: warn about keys or lines that are not understood and go on without them.
+        Of a batoid or lens file: warn about keys or lines that are not understood and go on without them.
     glass_catalogues : iterable of GlassCatalogue or path
-        AGF catalogues to look up the glasses of a Zemax or CODE V file in, first of all; then comes one beside the
-        file that has its name and ends in .agf, then the bundled one.
+        AGF catalogues to look up the glasses of a lens file in, first of all; then comes one beside the file that has
+        its name and ends in .agf, then the bundled ones, then those that the user has configured.
 
     Returns
     -------
@@ -121,14 +133,14 @@ def load_telescope(
         parts = _LENS_FILES[path.suffix.lower()]
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
-        raise PrescriptionError("expected a prescription file that ends in .yaml, .zmx or .seq", file=path)
+        raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
     raise unknown_name("telescope", text, BUNDLED)
 
 
 def prescription_digest(path: str | os.PathLike[str]) -> str:
     """Return the SHA-256 of a prescription file and of the files that it names: grids, meshes, glass catalogues.
 
-    That of a file that names no other is the SHA-256 of its bytes.
+    The catalogues that the user has configured belong to those of a lens file. That of a file that names no other is the SHA-256 of its bytes.
 
     Raises
     ------
@@ -138,7 +150,7 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
     path = Path(path)
     own = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
     if path.suffix.lower() in _LENS_FILES:
-        named = [path.with_suffix(".agf").name]
+        named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
     else:
         named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
     # os.path takes every text, also such as are too long for a name.
@@ -170,7 +182,7 @@ def _bundled(name: str) -> Telescope:
 
 @check_arguments
 def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format: str = "") -> None:
-    """Write a prescription file: YAML, ours or batoid's, or a Zemax lens file.
+    """Write a prescription file: YAML, ours or batoid's, a Zemax lens file or a file of optiland.
 
     Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
     it.
@@ -181,8 +193,8 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         Prescription to write.
     path : str or path
         File to write; it is replaced as a whole, or left as it was.
-    format : {"", "pachon", "batoid", "zemax"}
-        Format; by default Zemax's where the name ends in ``.zmx``, else ours.
+    format : {"", "pachon", "batoid", "zemax", "optiland"}
+        Format; by default Zemax's where the name ends in ``.zmx``, optiland's for ``.json``, else ours.
 
     Raises
     ------
@@ -192,8 +204,8 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         If the file cannot be written, or cannot hold the telescope.
     """
     target = Path(path)
-    format = format or ("zemax" if target.suffix.lower() == ".zmx" else "pachon")
-    check_choice("format", format, ("pachon", "batoid", "zemax"))
+    format = format or {".zmx": "zemax", ".json": "optiland"}.get(target.suffix.lower(), "pachon")
+    check_choice("format", format, ("pachon", "batoid", "zemax", "optiland"))
     if format == "zemax":
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
@@ -202,6 +214,10 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         from .batoid.writer import telescope_to_batoid
 
         lens = telescope_to_batoid(telescope)
+    elif format == "optiland":
+        from .optiland.writer import telescope_to_optiland
+
+        lens = telescope_to_optiland(telescope)
     else:
         lens = telescope_to_yaml(telescope)
     write_bytes(target, lens.encode(), PrescriptionError)

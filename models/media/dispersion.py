@@ -14,10 +14,12 @@ handbook_2      n^2 = a + b x / (x - c) - d x
 herzberger      n = a + b L + c L^2 + d x + e x^2 + f x^3, L = 1 / (x - 0.028)
 conrady         n = a + b / w + c / w^3.5
 cauchy          n = a + b x^-1 + c x^-2 + d x^-3
+buchdahl        n = a + b u + c u^2, u = (w - d) / (1 + 2.5 (w - d))
 =============== =====================================================================================================
 
 These are the formulas of the Zemax glass catalogue format (OpticStudio user guide, "The glass catalog"; its Sellmeier
-1, 3 and 5 are :class:`~pachon.models.media.medium.Sellmeier` of three, four and five terms) and Cauchy's.
+1, 3 and 5 are :class:`~pachon.models.media.medium.Sellmeier` of three, four and five terms), Cauchy's and Buchdahl's
+(1954, Optical Aberration Coefficients) of second order.
 """
 
 from __future__ import annotations
@@ -64,6 +66,12 @@ def _herzberger(x: np.ndarray, a: Sequence[float]) -> np.ndarray:
     return a[0] + a[1] * pole + a[2] * pole**2 + a[3] * x + a[4] * x**2 + a[5] * x**3
 
 
+def _buchdahl(x: np.ndarray, a: Sequence[float]) -> np.ndarray:
+    shift = np.sqrt(x) - a[3]
+    u = shift / (1.0 + 2.5 * shift)
+    return a[0] + a[1] * u + a[2] * u**2
+
+
 FORMULAS = {
     "schott": _Formula(6, True, _powers(0, 1, -1, -2, -3, -4)),
     "sumita": _Formula(6, True, _powers(0, 1, -1, -2, -3, -4)),
@@ -77,6 +85,7 @@ FORMULAS = {
     "herzberger": _Formula(6, False, _herzberger),
     "conrady": _Formula(3, False, _powers(0, -0.5, -1.75)),
     "cauchy": _Formula(4, False, _powers(0, -1, -2, -3)),
+    "buchdahl": _Formula(4, False, _buchdahl),
 }
 
 

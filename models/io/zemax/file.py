@@ -116,7 +116,11 @@ class ZemaxFile:
 
 def read_zemax_file(path: Path, findings: Findings) -> ZemaxFile:
     """Return the parts of a lens file; PrescriptionError if it is not sequential or has fewer than three surfaces."""
-    text = read_text(path)
+    return parse_zemax_file(read_text(path), path, findings)
+
+
+def parse_zemax_file(text: str, path: Path, findings: Findings) -> ZemaxFile:
+    """Return the parts of the text of a lens file, as :func:`read_zemax_file` does; `path` is for messages."""
     source = str(path)
     indented = {i for i, line in enumerate(text.splitlines(), start=1) if line[:1].isspace()}
     header = trailer = Block(source)

@@ -28,6 +28,7 @@ from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
+from ..glass_search import find_glass
 from .apertures import read_aperture
 from .design import Fields, length_unit, read_aiming, read_environment, read_fields, stated_fields
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
@@ -60,7 +61,7 @@ def read_lens(
         catalogues = [c if isinstance(c, GlassCatalogue) else GlassCatalogue.read(c) for c in glass_catalogues]
         beside = path.with_suffix(".agf")
         catalogues += [GlassCatalogue.read(beside)] if beside.is_file() else []
-        return _LensReader(file, findings, [*catalogues, GlassCatalogue.bundled()]).telescope()
+        return _LensReader(file, findings, catalogues).telescope()
 
 
 class _LensReader:
@@ -259,11 +260,10 @@ class _LensReader:
         # up from another surface, a model glass too where it has no name.
         solve = line.number(1, 0.0)
         model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
-        for catalogue in self.catalogues:
-            known = catalogue.spelling(name)
-            if known is not None and not model:
-                return False, catalogue[known]
         if not model:
+            found = find_glass(name, self.catalogues)
+            if found is not None:
+                return False, found
             error = line.problem(f"{line.shown}: the glass is in no catalogue")
             if nd <= 1 or (nd, vd) == PLACEHOLDER:
                 raise error

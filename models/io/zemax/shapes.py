@@ -6,7 +6,7 @@ y^2``:
 ========= ===================================================================================================
 STANDARD  conic of revolution
 EVENASPH  conic + PARM 1 r^2 + PARM 2 r^4 + ... + PARM 8 r^16
-ODDASPHE  conic + PARM 1 r + PARM 2 r^2 + ... + PARM 8 r^8
+ODDASPHE  conic + PARM 1 r + PARM 2 r^2 + ... + PARM 8 r^8; translations of other formats go on beyond
 BICONICX  conics of different curvature along y (CURV, CONI) and x (radius PARM 1, conic PARM 2)
 TOROIDAL  conic in the y, z plane, revolved about an axis at PARM 1; Zernike terms in XDAT
 SZERNSAG  as EVENASPH + sum of XDAT (2 + j) Z_j(x / R, y / R), Noll, R = XDAT 2, XDAT 1 terms
@@ -36,6 +36,7 @@ TYPES = (
     *("SZERNSAG", "XPOLYNOM", "XASPHERE", "TILTSURF", "GRID_SAG"),
 )
 MOST_TERMS = 1000
+MOST_ODD = 30
 MOST_NODES = 4_000_000
 
 
@@ -54,7 +55,7 @@ def read_shape(block: Block, unit: float, findings: Findings) -> Shape:
         powers = [parameters.pop(i, 0.0) * unit ** (1 - 2 * i) for i in range(1, 9)]
         parts = _even_asphere(curvature, conic, powers)
     elif kind == "ODDASPHE":
-        odd = tuple(_trimmed([parameters.pop(i, 0.0) * unit ** (1 - i) for i in range(1, 9)]))
+        odd = tuple(_trimmed([parameters.pop(i, 0.0) * unit ** (1 - i) for i in range(1, MOST_ODD + 1)]))
         parts = [OddAsphere(_radius(curvature), conic, odd)] if odd else parts
     elif kind == "BICONICX":
         radius_x = parameters.pop(1, math.inf) * unit

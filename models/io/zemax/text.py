@@ -12,17 +12,21 @@ from ....core.files import read_bytes
 
 def read_text(path: Path) -> str:
     """Return the text of a file in UTF-16 (with a byte order mark), UTF-8 or ISO 8859-1."""
-    raw = read_bytes(path, PrescriptionError)
+    return decoded(read_bytes(path, PrescriptionError), str(path))
+
+
+def decoded(raw: bytes, source: str) -> str:
+    """Return the text of the bytes of a file, as :func:`read_text` does; `source` is its name for messages."""
     wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = raw.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
         if wide:
-            raise PrescriptionError("not a UTF-16 text file, although it begins like one", file=path) from None
+            raise PrescriptionError("not a UTF-16 text file, although it begins like one", file=source) from None
         # Every byte is a character of ISO 8859-1.
         text = raw.decode("iso-8859-1")
     if "\0" in text:
-        raise PrescriptionError("not a text file", file=path)
+        raise PrescriptionError("not a text file", file=source)
     return text
 
 

@@ -1,0 +1,29 @@
+"""Glasses by name in all catalogues: the bundled ones, then those that the user has configured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from ..media.medium import Medium
+from .glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
+from .user_glasses import user_catalogues
+
+
+def find_glass(name: str, first: Iterable[GlassCatalogue] = ()) -> Medium | None:
+    """Return the glass of that name, which may lack its hyphens, or None.
+
+    Searched are `first`, the common glasses, the catalogues of makers and of substances, and those of the user, which
+    are read only where none before has the glass.
+    """
+    for catalogue in _all(first):
+        known = catalogue.spelling(name)
+        if known is not None:
+            return catalogue[known]
+    return None
+
+
+def _all(first: Iterable[GlassCatalogue]) -> Iterator[GlassCatalogue]:
+    yield from first
+    yield GlassCatalogue.bundled()
+    yield from map(GlassCatalogue.of_maker, (*MAKERS, SUBSTANCES))
+    yield from map(GlassCatalogue.read, user_catalogues())

@@ -1,0 +1,1 @@
+"""Files of optiland (.json), the text of an `Optic`."""

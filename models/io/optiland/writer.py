@@ -1,0 +1,163 @@
+"""Write a telescope as a file of optiland (.json).
+
+The axes are rotated as by the reader of Zemax files: light enters along +z, the first surface is at z = 0. A plane of
+its own in front carries the stop, so that the entrance pupil is that of the telescope; the reader takes it off again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from ....core.errors import PrescriptionError, error_context
+from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle
+from ...surface import Interaction, Surface
+from ...telescope import Telescope
+from ..zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
+from ..zemax.reader import PUPIL_COMMENT
+from .media import material_items
+from .shapes import geometry_items
+
+MM = 1e-3
+
+
+def telescope_to_optiland(telescope: Telescope) -> str:
+    """Return the text of a file of optiland.
+
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in optiland.
+    """
+    t = telescope
+    with error_context(subject=t.name):
+        if t.surfaces[-1].interaction != Interaction.DETECTOR:
+            raise PrescriptionError("a file of optiland needs a detector as its last surface")
+        if t.obstructions:
+            raise PrescriptionError(f"obstruction {t.obstructions[0].name}: a file of optiland cannot hold meshes")
+        first = -t.surfaces[0].vertex[2]
+        before = material_items(t.medium_before)
+        surfaces = [
+            {
+                "type": "ObjectSurface",
+                "geometry": {"type": "Plane", "cs": _system(-t.object_distance - first), "radius": math.inf},
+                "material_post": before,
+                "comment": "",
+            },
+            _items(_system(-t.stop_z - first), {"type": "Plane", "radius": math.inf}, before, PUPIL_COMMENT, stop=True),
+        ]
+        for surface in t.surfaces:
+            with error_context(place=f"surface {surface.name}"):
+                surfaces.append(_surface_items(surface, first))
+    heights = [s["geometry"]["cs"]["z"] for s in surfaces]
+    for surface, here, there in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
+        surface["thickness"] = (there - here) / MM
+    for surface in surfaces:
+        _in_millimetres(surface["geometry"]["cs"])
+    content = {
+        "version": 1.0,
+        "name": t.description or t.name,
+        "aperture": {"type": "EPD", "value": t.pupil_diameter / MM},
+        "fields": {
+            "fields": [_field(fraction * math.degrees(t.field_radius)) for fraction in (0.0, 0.7, 1.0)],
+            "telecentric": False,
+            "field_definition": {"field_type": "AngleField"},
+        },
+        "wavelengths": {"wavelengths": _waves(t), "polarization": "ignore"},
+        "apodization": None,
+        "pickups": [],
+        "solves": {"solves": []},
+        "surface_group": {"surfaces": surfaces},
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def _system(z: float, x: float = 0.0, y: float = 0.0, axes: np.ndarray | None = None) -> dict[str, Any]:
+    """Return a coordinate system [m] [rad]: rotations about x, then the old y, then the old z."""
+    turn = np.eye(3) if axes is None else axes
+    angles = (
+        math.atan2(turn[2, 1], turn[2, 2]),
+        math.asin(max(-1.0, min(1.0, -turn[2, 0]))),
+        math.atan2(turn[1, 0], turn[0, 0]),
+    )
+    places = dict(zip(("x", "y", "z", "rx", "ry", "rz"), (x, y, z, *(v + 0.0 for v in angles)), strict=True))
+    return {**places, "reference_cs": None}
+
+
+def _in_millimetres(system: dict[str, Any]) -> None:
+    for key in "xyz":
+        system[key] /= MM
+
+
+def _items(
+    system: dict[str, Any],
+    geometry: dict[str, Any],
+    material: dict[str, Any],
+    name: str,
+    *,
+    stop: bool = False,
+    mirror: bool = False,
+    aperture: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    return {
+        "type": "Surface",
+        "thickness": 0.0,
+        "geometry": {**geometry, "cs": system},
+        "material_post": material,
+        "is_stop": stop,
+        "aperture": aperture,
+        "comment": name,
+        "interaction_model": {
+            "type": "RefractiveReflectiveModel",
+            "is_reflective": mirror,
+            "coating": None,
+            "bsdf": None,
+        },
+    }
+
+
+def _surface_items(surface: Surface, first: float) -> dict[str, Any]:
+    if surface.interaction == Interaction.PHASE:
+        raise PrescriptionError("phase screens cannot be written")
+    x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex) + 0.0)
+    axes = HALF_TURN @ surface.matrix @ HALF_TURN + 0.0
+    return _items(
+        _system(z - first, x, y, axes),
+        geometry_items(rotated_shape(surface.shape), MM),
+        material_items(surface.medium_after),
+        surface.name,
+        mirror=surface.interaction == Interaction.MIRROR,
+        aperture=None if surface.aperture is None else _aperture_items(rotated_aperture(surface.aperture)),
+    )
+
+
+def _aperture_items(aperture: Aperture) -> dict[str, Any]:
+    region = aperture.part if isinstance(aperture, Complement) else aperture
+    if isinstance(region, Rectangle) and region is aperture and region.angle == 0:
+        ends = {
+            f"{axis}_{end}": (centre + sign * 0.5 * size) / MM
+            for axis, centre, size in (("x", region.x, region.width), ("y", region.y, region.height))
+            for end, sign in (("min", -1), ("max", 1))
+        }
+        return {"type": "RectangularAperture", **ends}
+    if isinstance(region, Circle) or (isinstance(region, Annulus) and region is aperture):
+        inner, outer = (0.0, region.radius) if isinstance(region, Circle) else (region.inner, region.outer)
+        if region is not aperture:
+            inner, outer = outer, math.inf
+        radii = {"r_max": outer / MM, "r_min": inner / MM}
+        if region.x or region.y:
+            return {"type": "OffsetRadialAperture", **radii, "offset_x": region.x / MM, "offset_y": region.y / MM}
+        return {"type": "RadialAperture", **radii}
+    raise PrescriptionError(f"aperture {type(region).__name__}: expected a disc, ring, obscuring disc or rectangle")
+
+
+def _field(angle: float) -> dict[str, float]:
+    return {"x": 0.0, "y": angle, "vx": 0.0, "vy": 0.0, "weight": 1.0}
+
+
+def _waves(t: Telescope) -> list[dict[str, Any]]:
+    """Return the default wavelength and the edges of the band; the decimal point is moved, so that they load equal."""
+    lengths = dict.fromkeys([t.default_wavelength, *(t.band or ())])
+    values = [float(Decimal(repr(float(length))).scaleb(6)) for length in lengths]
+    return [{"value": v, "is_primary": i == 0, "unit": "um", "weight": 1.0} for i, v in enumerate(values)]

@@ -1,0 +1,1 @@
+"""Lens files of OSLO (.len)."""

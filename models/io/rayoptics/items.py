@@ -1,0 +1,34 @@
+"""Objects of ray-optics files: attributes and class names, and arrays of numbers."""
+
+from __future__ import annotations
+
+from ..json_items import JsonObject
+
+
+def attributes(items: JsonObject, key: str | None = None) -> JsonObject:
+    """Return the attributes of an object, or of one that stands within it under a key."""
+    found = items if key is None else items.child(key, items.place or key)
+    return found.child("attributes") if "attributes" in found else found
+
+
+def class_name(items: JsonObject) -> str:
+    """Return the name of the class of an object."""
+    kind = items.get("__instance_type__")
+    if not isinstance(kind, list) or not kind or not isinstance(kind[-1], str):
+        items.refuse("__instance_type__", "the module and the name of a class")
+    return kind[-1]
+
+
+def module_name(items: JsonObject) -> str:
+    """Return the last part of the name of the module of an object's class."""
+    class_name(items)
+    return str(items.get("__instance_type__")[0]).rsplit(".", 1)[-1]
+
+
+def numbers(items: JsonObject, key: str, size: int | None = None) -> list[float]:
+    """Return a list of numbers, which may stand as an array of NumPy; zeros where none is there and a size is given."""
+    if key not in items:
+        return [0.0] * size if size is not None else items.numbers(key)
+    if isinstance(items.get(key), dict):
+        return items.child(key).numbers("__ndarray__", size)
+    return items.numbers(key, size)

@@ -1,0 +1,64 @@
+"""Glass catalogues that a user has configured once, for all lens files.
+
+The environment variable ``PACHON_GLASS_PATH`` lists AGF files, or folders of them, separated as in ``PATH``. Without it
+they stand in the user's configuration, ``$XDG_CONFIG_HOME/pachon/config.yaml`` or ``~/.config/pachon/config.yaml``::
+
+    glass_catalogues:
+      - ~/glasses/schott.agf
+      - ~/glasses/others      # a folder: every .agf file in it, by name
+
+Paths are absolute, or relative to the folder of the configuration.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ...core.errors import ConfigError
+from ...core.schema import Section, validated
+from ...core.yaml_reader import read_mapping
+
+#: Environment variable with the paths of glass catalogues.
+VARIABLE = "PACHON_GLASS_PATH"
+
+
+class UserConfiguration(Section):
+    """The user's configuration."""
+
+    glass_catalogues: tuple[str, ...] = ()
+
+
+def user_configuration_path() -> Path:
+    """Return where the user's configuration stands, if there is one."""
+    base = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    return Path(base).expanduser() / "pachon" / "config.yaml"
+
+
+def user_catalogues() -> tuple[Path, ...]:
+    """Return the paths of the AGF files that the user has configured, in their order.
+
+    Raises
+    ------
+    ConfigError
+        If the configuration cannot be read, or names what is neither an AGF file nor a folder with some.
+    """
+    if VARIABLE in os.environ:
+        listed = [part for part in os.environ[VARIABLE].split(os.pathsep) if part]
+        return tuple(path for part in listed for path in _files(Path(part).expanduser(), VARIABLE))
+    source = user_configuration_path()
+    if not source.is_file():
+        return ()
+    settings = validated(UserConfiguration, read_mapping(source, error=ConfigError), str(source), ConfigError, {})
+    places = [source.parent / Path(text).expanduser() for text in settings.glass_catalogues]
+    return tuple(path for place in places for path in _files(place, f"{source}: glass_catalogues"))
+
+
+def _files(place: Path, key: str) -> list[Path]:
+    if place.is_dir():
+        found = sorted(path for path in place.iterdir() if path.suffix.lower() == ".agf")
+    else:
+        found = [place] if place.is_file() else []
+    if not found:
+        raise ConfigError(f"{key}: {place}: expected an AGF file, or a folder with some")
+    return found
