@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, error_context
 from ..core.units import ARCSEC, angle
-from ..models.camera.camera import Camera, load_camera
+from ..models.camera.camera import Camera
+from ..models.camera.cameras import load_camera
 from ..models.telescope import Telescope
 from ..sky.pointing import Pointing
 from ..wavefront.chief_rays import fields_at

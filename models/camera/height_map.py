@@ -61,7 +61,7 @@ class HeightMap(Result):
 
     @property
     def _edge(self) -> float:
-        return 1.03 * float(np.abs(self.camera.centers).max() + self.camera.half_size)
+        return 1.03 * float(self.camera.reach)
 
     def _sampled(self) -> np.ndarray:
         """Return heights [m] on a square lattice over the camera; NaN in gaps."""
