@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
+from ...core.errors import DomainError
 from ...core.files import plain_values
 from ...core.plotting import figure_of, new_figure, styled
 from ...models.telescope import Telescope
@@ -141,6 +142,12 @@ def band_wavelengths(telescope: Telescope, wavelengths: ArrayLike | None, count:
     if wavelengths is None and len(Request.of(telescope, sampling=CHIEF_RAY).wavelengths) == 1:
         return np.linspace(*(telescope.band or telescope.wavelength_range), count)
     return wavelengths
+
+
+def require_focus(telescope: Telescope, *values: np.ndarray) -> None:
+    """Raise a DomainError where values are not finite since the light of a telescope is parallel."""
+    if not all(np.isfinite(value).all() for value in values):
+        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
 
 
 def tangential_axes(request: Request) -> np.ndarray:

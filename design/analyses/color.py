@@ -18,7 +18,7 @@ from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
 from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths, line_request, tangential_axes
+from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus, tangential_axes
 from .field_curvature import close_foci
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class LateralColor(Analysis):
         Landing point along the field less that of the middle wavelength [m]; positive farther from the axis where the
         image is upright, and where it is inverted closer to it: signs are those of the detector's own x and y.
     airy_radius : ndarray, shape [n_field]
-        Radius of the first dark ring at the middle wavelength [m].
+        Radius of the first dark ring at the middle wavelength [m]; NaN for parallel light.
     """
 
     shift: np.ndarray
@@ -177,7 +177,8 @@ def lateral_color(
     principal = principal_rays_of(request)
     along = np.einsum("fwi,fi->fw", landing, tangential_axes(request)[:, 0])
     shift = along - along[:, len(request.wavelengths) // 2, None]
-    return LateralColor(request, shift, 1.22 * request.middle * principal.mean_f_number)
+    ratio = principal.mean_f_number
+    return LateralColor(request, shift, 1.22 * request.middle * np.where(np.isinf(ratio), np.nan, ratio))
 
 
 @check_arguments
@@ -216,8 +217,7 @@ def chromatic_focus(
     pairs = np.concatenate([up, -up])
     everything = np.append(request.wavelengths, telescope.default_wavelength)
     focus = np.array([close_foci(request, request.bundles(float(w), pairs))[0] for w in everything])
-    if not np.isfinite(focus).all():
-        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
+    require_focus(telescope, focus)
     principal = principal_rays_of(request)
     depth = 2.0 * telescope.default_wavelength * float(principal.mean_f_number[0]) ** 2
     return ChromaticFocus(request, np.concatenate([[0.0], radii]), focus[:-1], float(focus[-1, 0]), depth)

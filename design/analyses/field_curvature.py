@@ -24,7 +24,7 @@ from ...raytrace.rays import RayStatus
 from ...wavefront.bundles import Bundles
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from .analysis import Analysis, Columns, line_request, tangential_axes
+from .analysis import Analysis, Columns, line_request, require_focus, tangential_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,7 +131,7 @@ def field_curvature(
     Raises
     ------
     DomainError
-        If a chief ray, or a ray close to it, does not reach the detector.
+        If a chief ray, or a ray close to it, does not reach the detector, or the light is parallel.
     """
     request = line_request(telescope, fields, wavelengths, projection, threads)
     axes = tangential_axes(request)
@@ -148,6 +148,7 @@ def field_curvature(
         with np.errstate(invalid="ignore", divide="ignore"):
             distortion.append(np.where(slope > 1e-12, 100.0 * (height / (scale * slope) - 1.0), np.nan))
         scales.append(scale)
+    require_focus(telescope, np.array(foci))
     tangential, sagittal = np.moveaxis(np.array(foci), 0, -1).transpose(1, 0, 2)
     return FieldCurvature(request, tangential, sagittal, np.stack(distortion, axis=-1), np.array(scales))
 

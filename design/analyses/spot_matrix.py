@@ -19,7 +19,7 @@ from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from .. import drawing
 from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths
+from .analysis import Analysis, Columns, band_wavelengths, require_focus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,7 +151,7 @@ def spot_matrix(
     ConfigError
         If `against` is another word.
     DomainError
-        If the heights are not a list of finite lengths, or given against the wavelength.
+        If the heights are not a list of finite lengths, or given against the wavelength, or the light is parallel.
     """
     if against == "wavelength":
         if defocus is not None:
@@ -163,6 +163,7 @@ def spot_matrix(
     )
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     ratio = principal_rays_of(request).mean_f_number
+    require_focus(telescope, np.nan_to_num(ratio, posinf=np.inf))
     if against == "wavelength":
         heights = np.zeros(1)
     elif defocus is None:
