@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.files import plain_values
-from ...core.plotting import figure_of, new_figure, styled
+from ...core.errors import DomainError
+from ...core.plotting import axes_at, figure_at, styled
+from ...core.products import described_table
 from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Columns of a table by name: values and their unit, empty for names and pure numbers.
-Columns = dict[str, tuple[Any, str]]
+#: Columns of a table by name: values, their unit, empty for names and pure numbers, and their meaning.
+Columns = dict[str, tuple[Any, str, str]]
 #: Points of curves along the field, and wavelengths across the band, where none are given.
 _ALONG_FIELD, _ACROSS_BAND = 33, 5
 
@@ -33,46 +34,37 @@ _ALONG_FIELD, _ACROSS_BAND = 33, 5
 class Analysis(FieldResult):
     """Base of analyses: a summary, a table and a picture of one or more panels."""
 
-    def summary(self) -> dict[str, Any]:
-        """Return the results by name and unit, as JSON has them; NaN is None."""
-        common = {
-            "telescope": self.telescope,
-            "wavelength_nm": self.wavelengths * 1e9,
-            "field_deg": np.rad2deg(self.fields),
-        }
-        return plain_values(common | self._values())
+    def _summary(self) -> dict[str, Any]:
+        common = {"telescope": self.telescope, "wavelength_nm": self.wavelengths * 1e9, **self.field_items()}
+        return common | self._values()
 
     def to_table(self) -> QTable:
         """Return the results as a table with units, a row for each value of the longest column."""
         from astropy.table import QTable
 
-        return QTable(_table_columns(self._columns()), meta={"telescope": self.telescope})
+        columns = self._table_columns()
+        arrays = np.broadcast_arrays(*(np.asarray(values) for values, _, _ in columns.values()))
+        flat = {
+            name: (np.array(array).ravel(), unit, meaning)
+            for array, (name, (_, unit, meaning)) in zip(arrays, columns.items(), strict=True)
+        }
+        return QTable(described_table(flat, {"telescope": self.telescope}))
 
     @check_arguments
-    def plot(self, ax: Axes | None = None) -> Figure:
-        """Draw the result.
-
-        Parameters
-        ----------
-        ax : matplotlib Axes, optional
-            Axes to draw in; several panels take their place. A figure of its own with a title without them.
-        """
+    def plot(self, *, ax: Axes | Figure | None = None) -> Figure:
+        """Draw the result in a figure of its own, or in the place of given axes."""
         rows, columns = self._grid
         with styled():
-            if ax is None:
-                figure: Any = new_figure(*self._size)
-                self._titled(figure, self._title)
-            elif rows * columns == 1:
-                self._draw([ax])
-                return figure_of(ax)
+            if rows * columns == 1:
+                figure, axes = axes_at(ax, *self._size)
+                panels = [axes]
             else:
-                place = ax.get_subplotspec()
-                assert place is not None
-                ax.set_axis_off()
-                figure = figure_of(ax).add_subfigure(place)
-            panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+                figure = figure_at(ax, *self._size)
+                panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
+            if ax is None:
+                self._titled(figure, self._title)
             self._draw(panels)
-            return figure_of(panels[0])
+            return figure
 
     @property
     def _grid(self) -> tuple[int, int]:
@@ -94,7 +86,7 @@ class Analysis(FieldResult):
         """Draw into panels."""
 
     @abstractmethod
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         """Return the columns of the table; their arrays have shapes that broadcast together."""
 
     @abstractmethod
@@ -102,20 +94,14 @@ class Analysis(FieldResult):
         """Return the entries of the summary behind telescope, wavelengths and fields."""
 
     def _field_columns(self, extra: int = 0) -> Columns:
-        """Return the columns of the field angles, with so many axes of length 1 behind that of the fields."""
-        x, y = (v.reshape(-1, *(1,) * extra) for v in np.rad2deg(self.fields).T)
-        return {"field_x": (x, "deg"), "field_y": (y, "deg")}
-
-
-def _table_columns(columns: Columns) -> dict[str, Any]:
-    from astropy import units as u
-
-    arrays = np.broadcast_arrays(*(np.asarray(values) for values, _ in columns.values()))
-    flat = dict(zip(columns, (np.array(a).ravel() for a in arrays), strict=True))
-    return {
-        name: flat[name] if values.dtype.kind in "Ub" else u.Quantity(flat[name], unit)
-        for name, (values, unit) in ((n, (np.asarray(v), unit)) for n, (v, unit) in columns.items())
-    }
+        """Return the columns of the field points, with so many axes of length 1 behind that of the fields."""
+        points, unit, what = (
+            (np.rad2deg(self.fields), "deg", "field angle")
+            if self.on_sky
+            else (1e3 * self.object_heights, "mm", "place on the object")
+        )
+        x, y = (v.reshape(-1, *(1,) * extra) for v in points.T)
+        return {"field_x": (x, unit, f"{what}, x"), "field_y": (y, unit, f"{what}, y")}
 
 
 def field_line(telescope: Telescope) -> np.ndarray:
@@ -141,6 +127,12 @@ def band_wavelengths(telescope: Telescope, wavelengths: ArrayLike | None, count:
     if wavelengths is None and len(Request.of(telescope, sampling=CHIEF_RAY).wavelengths) == 1:
         return np.linspace(*(telescope.band or telescope.wavelength_range), count)
     return wavelengths
+
+
+def require_focus(telescope: Telescope, *values: np.ndarray) -> None:
+    """Raise a DomainError where values are not finite since the light of a telescope is parallel."""
+    if not all(np.isfinite(value).all() for value in values):
+        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
 
 
 def tangential_axes(request: Request) -> np.ndarray:

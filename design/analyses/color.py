@@ -18,7 +18,7 @@ from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
 from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths, line_request, tangential_axes
+from .analysis import Analysis, Columns, band_wavelengths, line_request, require_focus, tangential_axes
 from .field_curvature import close_foci
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class LateralColor(Analysis):
         Landing point along the field less that of the middle wavelength [m]; positive farther from the axis where the
         image is upright, and where it is inverted closer to it: signs are those of the detector's own x and y.
     airy_radius : ndarray, shape [n_field]
-        Radius of the first dark ring at the middle wavelength [m].
+        Radius of the first dark ring at the middle wavelength [m]; NaN for parallel light.
     """
 
     shift: np.ndarray
@@ -55,11 +55,11 @@ class LateralColor(Analysis):
     def _title(self) -> str:
         return f"lateral colour against {self.request.middle * 1e9:.4g} nm"
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         return {
             **self._field_columns(1),
-            "wavelength": (self.wavelengths * 1e9, "nm"),
-            "shift": (self.shift * 1e6, "um"),
+            "wavelength": (self.wavelengths * 1e9, "nm", "vacuum wavelength"),
+            "shift": (self.shift * 1e6, "um", "shift of the chief ray along the field"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -72,16 +72,16 @@ class LateralColor(Analysis):
 
     def _draw(self, panels: Sequence[Axes]) -> None:
         (axes,) = panels
-        angle = np.rad2deg(self.off_axis_angle)
-        order = np.argsort(angle, kind="stable")
+        distance, label = self.axis_distances()
+        order = np.argsort(distance, kind="stable")
         for w, color in enumerate(wavelength_colors(len(self.wavelengths))):
             name = f"{self.wavelengths[w] * 1e9:.4g} nm"
-            axes.plot(self.shift[order, w] * 1e6, angle[order], color=color, label=name)
+            axes.plot(self.shift[order, w] * 1e6, distance[order], color=color, label=name)
         airy = self.airy_radius[order] * 1e6
-        axes.plot(airy, angle[order], ":", color=GREY, linewidth=1.0, label="Airy disc")
-        axes.plot(-airy, angle[order], ":", color=GREY, linewidth=1.0)
+        axes.plot(airy, distance[order], ":", color=GREY, linewidth=1.0, label="Airy disc")
+        axes.plot(-airy, distance[order], ":", color=GREY, linewidth=1.0)
         xlabel = "shift of the chief ray along the field [µm]"
-        finish_axes(axes, ylim=(0.0, max(float(angle.max()), 1e-9)), xlabel=xlabel, ylabel="field [deg]")
+        finish_axes(axes, ylim=(0.0, max(float(distance.max()), 1e-9)), xlabel=xlabel, ylabel=label)
         axes.legend(fontsize=7.5)
 
 
@@ -115,12 +115,12 @@ class ChromaticFocus(Analysis):
     def _title(self) -> str:
         return f"chromatic focal shift against {self.request.telescope.default_wavelength * 1e9:.4g} nm"
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         return {
-            "wavelength": (self.wavelengths[:, None] * 1e9, "nm"),
-            "zone": (self.zones, ""),
-            "focus": (self.focus * 1e6, "um"),
-            "shift": (self.shift * 1e6, "um"),
+            "wavelength": (self.wavelengths[:, None] * 1e9, "nm", "vacuum wavelength"),
+            "zone": (self.zones, "", "pupil zone, 0 for paraxial rays and 1 for the rim"),
+            "focus": (self.focus * 1e6, "um", "focus behind the detector, along the light"),
+            "shift": (self.shift * 1e6, "um", "focus relative to that of the reference wavelength"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -177,7 +177,8 @@ def lateral_color(
     principal = principal_rays_of(request)
     along = np.einsum("fwi,fi->fw", landing, tangential_axes(request)[:, 0])
     shift = along - along[:, len(request.wavelengths) // 2, None]
-    return LateralColor(request, shift, 1.22 * request.middle * principal.mean_f_number)
+    ratio = principal.mean_f_number
+    return LateralColor(request, shift, 1.22 * request.middle * np.where(np.isinf(ratio), np.nan, ratio))
 
 
 @check_arguments
@@ -216,8 +217,7 @@ def chromatic_focus(
     pairs = np.concatenate([up, -up])
     everything = np.append(request.wavelengths, telescope.default_wavelength)
     focus = np.array([close_foci(request, request.bundles(float(w), pairs))[0] for w in everything])
-    if not np.isfinite(focus).all():
-        raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
+    require_focus(telescope, focus)
     principal = principal_rays_of(request)
     depth = 2.0 * telescope.default_wavelength * float(principal.mean_f_number[0]) ** 2
     return ChromaticFocus(request, np.concatenate([[0.0], radii]), focus[:-1], float(focus[-1, 0]), depth)

@@ -24,7 +24,7 @@ from ...raytrace.rays import RayStatus
 from ...wavefront.bundles import Bundles
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
-from .analysis import Analysis, Columns, line_request, tangential_axes
+from .analysis import Analysis, Columns, line_request, require_focus, tangential_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,13 +74,13 @@ class FieldCurvature(Analysis):
     def _size(self) -> tuple[float, float]:
         return 9.0, 4.8
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         return {
             **self._field_columns(1),
-            "wavelength": (self.wavelengths * 1e9, "nm"),
-            "tangential_focus": (self.tangential * 1e6, "um"),
-            "sagittal_focus": (self.sagittal * 1e6, "um"),
-            "distortion": (self.distortion, "percent"),
+            "wavelength": (self.wavelengths * 1e9, "nm", "vacuum wavelength"),
+            "tangential_focus": (self.tangential * 1e6, "um", "tangential focus behind the detector"),
+            "sagittal_focus": (self.sagittal * 1e6, "um", "sagittal focus behind the detector"),
+            "distortion": (self.distortion, "percent", "distortion of the chief ray"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -93,20 +93,21 @@ class FieldCurvature(Analysis):
         }
 
     def _draw(self, panels: Sequence[Axes]) -> None:
-        angle, colors = np.rad2deg(self.off_axis_angle), wavelength_colors(len(self.wavelengths))
+        distance, field_label = self.axis_distances()
+        colors = wavelength_colors(len(self.wavelengths))
         largest = max(float(np.nanmax(np.abs([self.tangential, self.sagittal]))), 1e-9)
         scale, unit = (1e6, "µm") if largest < 1e-3 else (1e3, "mm")
-        order = np.argsort(angle, kind="stable")
+        order = np.argsort(distance, kind="stable")
         for w, color in enumerate(colors if len(colors) > 1 else [BLUE]):
             name = f"{self.wavelengths[w] * 1e9:.4g} nm"
-            panels[0].plot(self.tangential[order, w] * scale, angle[order], color=color, label=f"tangential, {name}")
+            panels[0].plot(self.tangential[order, w] * scale, distance[order], color=color, label=f"tangential, {name}")
             sagittal = self.sagittal[order, w] * scale
-            panels[0].plot(sagittal, angle[order], color=color, linestyle="--", label=f"sagittal, {name}")
-            panels[1].plot(self.distortion[order, w], angle[order], color=color, label=name)
+            panels[0].plot(sagittal, distance[order], color=color, linestyle="--", label=f"sagittal, {name}")
+            panels[1].plot(self.distortion[order, w], distance[order], color=color, label=name)
         for axes, label in zip(panels, (f"focus behind the detector [{unit}]", "distortion [%]"), strict=True):
             axes.axvline(0.0, color="0.5", linewidth=0.7)
-            finish_axes(axes, ylim=(0.0, max(float(angle.max()), 1e-9)), xlabel=label)
-        panels[0].set_ylabel("field [deg]")
+            finish_axes(axes, ylim=(0.0, max(float(distance.max()), 1e-9)), xlabel=label)
+        panels[0].set_ylabel(field_label)
         panels[0].legend(fontsize=7)
 
 
@@ -131,7 +132,7 @@ def field_curvature(
     Raises
     ------
     DomainError
-        If a chief ray, or a ray close to it, does not reach the detector.
+        If a chief ray, or a ray close to it, does not reach the detector, or the light is parallel.
     """
     request = line_request(telescope, fields, wavelengths, projection, threads)
     axes = tangential_axes(request)
@@ -148,6 +149,7 @@ def field_curvature(
         with np.errstate(invalid="ignore", divide="ignore"):
             distortion.append(np.where(slope > 1e-12, 100.0 * (height / (scale * slope) - 1.0), np.nan))
         scales.append(scale)
+    require_focus(telescope, np.array(foci))
     tangential, sagittal = np.moveaxis(np.array(foci), 0, -1).transpose(1, 0, 2)
     return FieldCurvature(request, tangential, sagittal, np.stack(distortion, axis=-1), np.array(scales))
 

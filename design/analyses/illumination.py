@@ -68,11 +68,11 @@ class RelativeIllumination(Analysis):
     def _title(self) -> str:
         return f"relative illumination at {self._nanometres()}"
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         return self._field_columns() | {
-            "relative_illumination": (self.relative, ""),
-            "projected_solid_angle": (self.solid_angle, "sr"),
-            "lit_fraction": (self.lit_fraction, ""),
+            "relative_illumination": (self.relative, "", "illumination of the detector over that on the axis"),
+            "projected_solid_angle": (self.solid_angle, "sr", "projected solid angle of the light"),
+            "lit_fraction": (self.lit_fraction, "", "lit fraction of the entrance pupil"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -86,15 +86,15 @@ class RelativeIllumination(Analysis):
 
     def _draw(self, panels: Sequence[Axes]) -> None:
         (axes,) = panels
-        angle = np.rad2deg(self.off_axis_angle)
-        order = np.argsort(angle, kind="stable")
-        axes.plot(angle[order], 100 * self.relative[order], color=BLUE, linewidth=1.6, label="relative illumination")
+        distance, label = self.axis_distances()
+        order = np.argsort(distance, kind="stable")
+        axes.plot(distance[order], 100 * self.relative[order], color=BLUE, linewidth=1.6, label="relative illumination")
         lit = 100 * self.lit_fraction[order]
-        axes.plot(angle[order], lit, "--", color=ORANGE, linewidth=1.0, label="lit part of the entrance pupil")
+        axes.plot(distance[order], lit, "--", color=ORANGE, linewidth=1.0, label="lit part of the entrance pupil")
         fourth = 100 * self.chief_cosine[order] ** 4
-        axes.plot(angle[order], fourth, ":", color=GREY, linewidth=1.0, label="cos⁴ of the field angle")
+        axes.plot(distance[order], fourth, ":", color=GREY, linewidth=1.0, label="cos⁴ of the field angle")
         top = max(102.0, 1.02 * float(100 * self.relative.max()))
-        finish_axes(axes, xlim=(0, None), ylim=(0, top), xlabel="field [deg]", ylabel="[%]")
+        finish_axes(axes, xlim=(0, None), ylim=(0, top), xlabel=label, ylabel="[%]")
         axes.legend(loc="lower left")
 
 

@@ -16,7 +16,7 @@ from ...models.telescope import Telescope
 from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
-from ..drawing import field_text, finish_axes, wavelength_colors
+from ..drawing import finish_axes, wavelength_colors
 from .analysis import Analysis, Columns, tangential_axes
 
 if TYPE_CHECKING:
@@ -52,10 +52,10 @@ class Fans(Analysis):
     def _fan_columns(self) -> Columns:
         return {
             **self._field_columns(3),
-            "wavelength": (self.wavelengths[:, None, None] * 1e9, "nm"),
-            "fan": (np.array(FANS)[:, None], ""),
-            "pupil": (self.pupil, ""),
-            "lit": (self.lit, ""),
+            "wavelength": (self.wavelengths[:, None, None] * 1e9, "nm", "vacuum wavelength"),
+            "fan": (np.array(FANS)[:, None], "", "diameter of the pupil"),
+            "pupil": (self.pupil, "", "pupil coordinate, 1 at the rim"),
+            "lit": (self.lit, "", "whether light passes"),
         }
 
     def _draw_curves(self, panels: Sequence[Axes], values: np.ndarray, names: Sequence[str]) -> None:
@@ -63,7 +63,7 @@ class Fans(Analysis):
         shown = np.where(self.lit, values, np.nan)
         half = 1.08 * max(float(np.nanmax(np.abs(shown), initial=0.0)), 1e-6)
         colors = wavelength_colors(len(self.wavelengths)) if len(self.wavelengths) > 1 else [BLUE]
-        for i, field in enumerate(self.fields):
+        for i, field in enumerate(self.field_labels()):
             for k, name in enumerate(names):
                 axes = panels[2 * i + k]
                 for w, color in enumerate(colors):
@@ -73,7 +73,7 @@ class Fans(Analysis):
                 axes.axvline(0.0, color="0.5", linewidth=0.6)
                 finish_axes(axes, xlim=(-1, 1), ylim=(-half, half))
                 axes.set_ylabel(name, fontsize=8)
-                axes.set_title(f"{FANS[k]}, {field_text(field)}", loc="left", fontsize=8.5)
+                axes.set_title(f"{FANS[k]}, {field}", loc="left", fontsize=8.5)
         for axes in panels[-2:]:
             axes.set_xlabel("pupil coordinate")
         if len(colors) > 1:
@@ -108,10 +108,10 @@ class RayFans(Fans):
     def _title(self) -> str:
         return f"ray fans, {self._nanometres()}"
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         shift = {
-            "along_field": (self.displacement[..., 0] * 1e6, "um"),
-            "across_field": (self.displacement[..., 1] * 1e6, "um"),
+            "along_field": (self.displacement[..., 0] * 1e6, "um", "transverse aberration along the field"),
+            "across_field": (self.displacement[..., 1] * 1e6, "um", "transverse aberration across the field"),
         }
         return self._fan_columns() | shift
 
@@ -160,8 +160,8 @@ class OpdFans(Fans):
     def _title(self) -> str:
         return f"OPD fans, {self._nanometres()}"
 
-    def _columns(self) -> Columns:
-        return self._fan_columns() | {"opd": (self.value * 1e9, "nm")}
+    def _table_columns(self) -> Columns:
+        return self._fan_columns() | {"opd": (self.value * 1e9, "nm", "optical path difference")}
 
     def _values(self) -> dict[str, Any]:
         return {

@@ -56,15 +56,18 @@ class SeidelDiagram(Analysis):
 
     @property
     def _title(self) -> str:
-        return f"Seidel diagram, field {np.rad2deg(self.off_axis_angle[0]):.4g}°, {self._nanometres()}"
+        return f"Seidel diagram, field {self.field_labels()[0]}, {self._nanometres()}"
 
     @property
     def _size(self) -> tuple[float, float]:
         return min(max(6.5, 1.2 + 0.75 * (len(self.names) + 1)), 24.0), 4.4
 
-    def _columns(self) -> Columns:
-        columns: Columns = {"surface": (np.array(self.names), "")}
-        return columns | {s: (self.waves[:, i], "") for i, s in enumerate(SYMBOLS)}
+    def _table_columns(self) -> Columns:
+        columns: Columns = {"surface": (np.array(self.names), "", "mirror or lens surface")}
+        return columns | {
+            s.replace("λ", "_color"): (self.waves[:, i], "", f"{name} [waves]")
+            for i, (s, name) in enumerate(zip(SYMBOLS, ABERRATIONS, strict=True))
+        }
 
     def _values(self) -> dict[str, Any]:
         return {

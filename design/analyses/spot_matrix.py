@@ -19,7 +19,7 @@ from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from .. import drawing
 from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns, band_wavelengths
+from .analysis import Analysis, Columns, band_wavelengths, require_focus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,13 +75,17 @@ class SpotMatrix(Analysis):
     def _size(self) -> tuple[float, float]:
         return 0.6 + 1.6 * len(self.columns), 0.9 + 1.75 * len(self.fields)
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         nm = self.against == "wavelength"
         scale, unit = (1e9, "nm") if nm else (1e6, "um")
         return {
             **self._field_columns(1),
-            "wavelength" if nm else "defocus": (self.columns * scale, unit),
-            "rms_radius": (self.rms_radius * 1e6, "um"),
+            "wavelength" if nm else "defocus": (
+                self.columns * scale,
+                unit,
+                "vacuum wavelength" if nm else "displacement of the detector",
+            ),
+            "rms_radius": (self.rms_radius * 1e6, "um", "rms radius of the spot"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -111,7 +115,7 @@ class SpotMatrix(Analysis):
             drawing.bare_frame(axes, half)
             axes.set_xlabel(f"{rms[i, c]:.3g} µm rms", fontsize=7, labelpad=1)
             if c == 0:
-                axes.set_ylabel(drawing.field_text(self.fields[i]), fontsize=8.5)
+                axes.set_ylabel(self.field_labels()[i], fontsize=8.5)
             if i == 0:
                 value = self.columns[c]
                 axes.set_title(f"{value * 1e9:.4g} nm" if self.against == "wavelength" else f"{value * 1e6:+.4g} µm")
@@ -151,7 +155,7 @@ def spot_matrix(
     ConfigError
         If `against` is another word.
     DomainError
-        If the heights are not a list of finite lengths, or given against the wavelength.
+        If the heights are not a list of finite lengths, or given against the wavelength, or the light is parallel.
     """
     if against == "wavelength":
         if defocus is not None:
@@ -163,6 +167,7 @@ def spot_matrix(
     )
     bundles = [request.bundles(float(w)) for w in request.wavelengths]
     ratio = principal_rays_of(request).mean_f_number
+    require_focus(telescope, np.nan_to_num(ratio, posinf=np.inf))
     if against == "wavelength":
         heights = np.zeros(1)
     elif defocus is None:

@@ -52,14 +52,14 @@ class StrehlRatios(Analysis):
     def _title(self) -> str:
         return "Strehl ratio"
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         return {
             **self._field_columns(1),
-            "wavelength": (self.wavelengths * 1e9, "nm"),
-            "rms_wavefront": (self.rms_wavefront * 1e9, "nm"),
-            "strehl_of_rms": (self.marechal, ""),
-            "strehl_of_wavefront": (self.wavefront, ""),
-            "strehl_of_psf": (self.psf, ""),
+            "wavelength": (self.wavelengths * 1e9, "nm", "vacuum wavelength"),
+            "rms_wavefront": (self.rms_wavefront * 1e9, "nm", "rms wavefront without piston and tilt"),
+            "strehl_of_rms": (self.marechal, "", "Strehl ratio of a small wavefront error of this rms"),
+            "strehl_of_wavefront": (self.wavefront, "", "Strehl ratio of the wavefront"),
+            "strehl_of_psf": (self.psf, "", "peak of the PSF over that of a perfect wavefront"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -73,17 +73,17 @@ class StrehlRatios(Analysis):
 
     def _draw(self, panels: Sequence[Axes]) -> None:
         (axes,) = panels
-        angle = np.rad2deg(self.off_axis_angle)
-        order = np.argsort(angle, kind="stable")
+        distance, label = self.axis_distances()
+        order = np.argsort(distance, kind="stable")
         colors = wavelength_colors(len(self.wavelengths)) if len(self.wavelengths) > 1 else [BLUE]
         for w, color in enumerate(colors):
             name = f"{self.wavelengths[w] * 1e9:.4g} nm"
-            axes.plot(angle[order], self.wavefront[order, w], "-", color=color, label=f"{name}, wavefront")
-            axes.plot(angle[order], self.marechal[order, w], ":", color=color, label=f"{name}, exp(-(2πσ)²)")
+            axes.plot(distance[order], self.wavefront[order, w], "-", color=color, label=f"{name}, wavefront")
+            axes.plot(distance[order], self.marechal[order, w], ":", color=color, label=f"{name}, exp(-(2πσ)²)")
             if np.isfinite(self.psf[:, w]).any():
-                axes.plot(angle[order], self.psf[order, w], "o", color=color, markersize=4, label=f"{name}, PSF")
+                axes.plot(distance[order], self.psf[order, w], "o", color=color, markersize=4, label=f"{name}, PSF")
         axes.axhline(0.8, color="0.5", linewidth=0.7)
-        finish_axes(axes, xlim=(0, None), ylim=(0, 1.02), xlabel="field [deg]", ylabel="Strehl ratio")
+        finish_axes(axes, xlim=(0, None), ylim=(0, 1.02), xlabel=label, ylabel="Strehl ratio")
         axes.legend(fontsize=7)
 
 

@@ -24,7 +24,7 @@ from ...raytrace.rays import RayStatus, field_direction, straight_bundles
 from ...raytrace.trace import trace
 from ...wavefront.request import RAYS_AT_ONCE, Request
 from ..metrics.principal_rays import principal_rays_of
-from .analysis import Analysis, Columns
+from .analysis import Analysis, Columns, require_focus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,9 +77,13 @@ class TargetImage(Analysis):
     def _size(self) -> tuple[float, float]:
         return 9.0, 4.6
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         along = (np.arange(len(self.image)) - 0.5 * (len(self.image) - 1)) * self.pixel * 1e6
-        return {"x": (along, "um"), "y": (along[:, None], "um"), "light": (self.image, "")}
+        return {
+            "x": (along, "um", "x of the detector from the middle of the image"),
+            "y": (along[:, None], "um", "y of the detector from the middle of the image"),
+            "light": (self.image, "", "light of each pixel"),
+        }
 
     def _values(self) -> dict[str, Any]:
         return {
@@ -176,7 +180,7 @@ def target_image(
     Raises
     ------
     DomainError
-        If the target is not an image with light, a number is out of range, or its middle has no image.
+        If the target is not an image with light, a number is out of range, or no light or parallel light arrives.
     """
     picture = bar_target() if target is None else pure_numbers(target, "target")
     if picture.ndim != 2 or max(picture.shape) > _MOST_PIXELS or not (np.isfinite(picture).all() and picture.size):
@@ -198,6 +202,7 @@ def target_image(
         threads=threads,
     )
     principal = principal_rays_of(request)
+    require_focus(telescope, principal.mean_f_number, principal.mean_plate_scale)
     scale = float(principal.mean_plate_scale[0])
     airy = 1.22 * request.middle * float(principal.mean_f_number[0]) * scale
     across = 60.0 * airy if width is None else one_angle(width, "width")

@@ -29,7 +29,7 @@ from ...raytrace.rays import RayStatus
 from ...raytrace.trace import TraceResult, trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
-from ..drawing import field_colors, field_text, finish_axes
+from ..drawing import field_colors, finish_axes
 from .analysis import Analysis, Columns, band_wavelengths
 from .coatings import Coatings
 
@@ -73,12 +73,12 @@ class Throughput(Analysis):
     def _size(self) -> tuple[float, float]:
         return 10.0, 0.8 + max(4.0, 0.19 * len(self.surfaces))
 
-    def _columns(self) -> Columns:
+    def _table_columns(self) -> Columns:
         return {
             **self._field_columns(1),
-            "wavelength": (self.wavelengths * 1e9, "nm"),
-            "throughput": (self.value, ""),
-            "lit_fraction": (self.lit_fraction, ""),
+            "wavelength": (self.wavelengths * 1e9, "nm", "vacuum wavelength"),
+            "throughput": (self.value, "", "light that arrives over that in the entrance pupil"),
+            "lit_fraction": (self.lit_fraction, "", "lit fraction of the entrance pupil"),
         }
 
     def _values(self) -> dict[str, Any]:
@@ -92,9 +92,9 @@ class Throughput(Analysis):
     def _draw(self, panels: Sequence[Axes]) -> None:
         curves, bars = panels
         nm = self.wavelengths * 1e9
-        for i, (field, color) in enumerate(zip(self.fields, field_colors(len(self.fields)), strict=True)):
+        for i, (field, color) in enumerate(zip(self.field_labels(), field_colors(len(self.fields)), strict=True)):
             marker = "." if len(nm) == 1 else ""
-            curves.plot(nm, 100 * self.value[i], color=color, marker=marker, label=field_text(field))
+            curves.plot(nm, 100 * self.value[i], color=color, marker=marker, label=field)
         finish_axes(curves, ylim=(0, 100), xlabel="wavelength [nm]", ylabel="throughput [%]")
         curves.legend(fontsize=7.5, loc="lower right")
         loss = 100 * (1.0 - np.nanmean(self.efficiency, axis=(1, 2))) if self.surfaces else np.zeros(0)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...core.errors import DomainError
 from ...models.telescope import Telescope
 from ..analyses.analysis import band_wavelengths
 from ..analyses.color import chromatic_focus, lateral_color
@@ -62,6 +63,15 @@ class Section:
 
 def _target(w: Where) -> Figure:
     return target_image(w.telescope, wavelengths=w.colors, n_rays=150, threads=w.threads).plot()
+
+
+def _strehl(w: Where) -> Figure:
+    where = (w.telescope, w.fields, w.one_wavelength)
+    try:
+        return strehl(*where, threads=w.threads).plot()
+    except DomainError:
+        # Aberrations of very many waves have no diffraction image worth its time.
+        return strehl(*where, from_psf=False, threads=w.threads).plot()
 
 
 #: In the order of the report.
@@ -125,7 +135,7 @@ SECTIONS = (
     Section(
         "Strehl ratio",
         "From the wavefront over the lit pupil, from its rms, and from the peak of the diffraction image.",
-        lambda w: strehl(w.telescope, w.fields, w.one_wavelength, threads=w.threads).plot(),
+        _strehl,
     ),
     Section(
         "Encircled energy",

@@ -7,6 +7,7 @@ import pytest
 from pachon.commands.cli import main
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["new", "validate", "schema", "design-report"])
 def test_help_has_examples(capsys, command):
     assert main([command, "--help"]) == 0

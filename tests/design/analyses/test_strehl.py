@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.core.errors import DomainError
 
 
 def test_defocus_in_closed_form(paraboloid):
@@ -21,3 +22,14 @@ def test_the_image_may_be_left_out(paraboloid):
     assert np.isnan(result.psf).all()
     assert result.wavefront == pytest.approx(1.0, abs=1e-9)
     assert result.summary()["strehl_of_psf"] == [[None, None]]
+
+
+def test_parallel_light_is_refused_in_one_line(afocal):
+    telescope, place = afocal(fold=False), [(0.0, 0.0)]
+    for analyse in (pachon.field_curvature, pachon.spot_matrix, pachon.strehl):
+        with pytest.raises(DomainError, match="focus|parallel|image"):
+            analyse(telescope, place)
+    with pytest.raises(DomainError, match="its light is parallel"):
+        pachon.target_image(telescope)
+    # Chief rays have landing points all the same.
+    assert np.isnan(pachon.lateral_color(telescope, place).airy_radius).all()
