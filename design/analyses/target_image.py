@@ -19,8 +19,8 @@ from ...core.plotting import figure_of
 from ...core.units import angle as one_angle
 from ...core.units import arcseconds, length, pure_numbers, require_count, require_positive
 from ...models.telescope import Telescope
-from ...raytrace.aiming import entrance_points, require_aimed
-from ...raytrace.rays import RayStatus, field_direction, straight_bundles
+from ...raytrace.launch import launch_bundles
+from ...raytrace.rays import RayStatus, field_direction
 from ...raytrace.trace import trace
 from ...wavefront.request import RAYS_AT_ONCE, Request
 from ..metrics.principal_rays import principal_rays_of
@@ -241,9 +241,7 @@ def _landings(request: Request, picture: np.ndarray, step: float) -> Any:
         pupil = np.tile(request.pupil.points, (len(angles), 1))[:, None]
         light = np.repeat(picture[row[some], column[some]] / count, count)
         for wavelength, weight in zip(request.wavelengths, request.weights, strict=True):
-            points = entrance_points(telescope, directions, float(wavelength), pupil)
-            require_aimed(telescope, directions, points)
-            rays = straight_bundles(telescope, directions, float(wavelength), points)
+            rays = launch_bundles(telescope, directions, float(wavelength), pupil)
             end = trace(telescope, rays, threads=request.threads)
             lit = end.status == RayStatus.OK
             yield float(weight), detector.to_local(end.position[lit])[:, :2], light[lit]

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.raytrace.rays import field_direction, launch_bundles
+from pachon.raytrace.launch import launch_bundles
+from pachon.raytrace.rays import field_direction
 
 
 def test_a_small_stop_at_the_mirror_gives_the_fourth_power_of_the_cosine(paraboloid):
