@@ -69,7 +69,7 @@ def test_bad_files_are_one_line_with_file_and_name(file, change, words):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(PachonError, match="nothing.yaml"):
+    with pytest.raises(PachonError, match=r"nothing\.yaml"):
         load_camera(tmp_path / "nothing.yaml")
 
 
