@@ -283,12 +283,10 @@ class Camera:
         px, py = plane_points(x, y)
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
-        left = finite
         for kind in self._kinds:
-            if not np.any(left):
-                break
-            index[left] = self._of_kind(kind, px[left], py[left], margin)
-            left = finite & (index < 0)
+            left = finite if kind is self._kinds[0] else finite & (index < 0)
+            if np.any(left):
+                index[left] = self._of_kind(kind, px[left], py[left], margin)
         return index
 
     def _of_kind(self, kind: _Kind, x: np.ndarray, y: np.ndarray, margin: float) -> np.ndarray:

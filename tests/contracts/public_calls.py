@@ -207,6 +207,7 @@ def calls(folder):
         "load_images_configuration": (pachon.load_images_configuration, {"path": m.folder / "none.yaml"}),
         "ccd_wcs": (pachon.ccd_wcs, {"telescope": m.lsst, "camera": m.camera, "ccd": "R22_S11", "pointing": (0.0, 0.0),
                     "position_angle": 0.0, "wavelength": w, "threads": 1}),
+        "load_camera": (pachon.load_camera, {"camera": "comcam"}),
         "lsst_camera": (pachon.lsst_camera, {}),
         "height_statistics": (pachon.height_statistics, {"focal_plane": m.plane}),
         "first_order": (pachon.first_order, {"telescope": tel, "wavelength": w}),
