@@ -141,8 +141,6 @@ def draw_ccd(
         )
     if exposure is None:
         exposure = Exposure(config.band or "r", config.atmosphere.exposure_s, pixel_scale=nominal_scale(experiment))
-    check_upright(camera, ccd)
-    part = Window(0, 0, *camera.pixels[camera.ccd_index(ccd)].tolist()) if window is None else window
     wcs = ccd_wcs(
         experiment.telescope,
         camera,
@@ -152,6 +150,8 @@ def draw_ccd(
         wavelength=experiment.wavelengths[len(experiment.wavelengths) // 2],
         threads=threads,
     )
+    check_upright(camera, ccd)
+    part = Window(0, 0, *camera.pixels[camera.ccd_index(ccd)].tolist()) if window is None else window
     psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
     galaxies = galaxies_near(galaxies, wcs, part)
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))

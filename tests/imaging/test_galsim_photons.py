@@ -329,8 +329,8 @@ def test_bad_arguments_are_refused(lsst_r, arguments, options, message):
 def test_what_is_missing_is_named(lsst_r):
     with pytest.raises(UnknownNameError, match="CCD of lsst 'R99'"):
         pachon.galsim.PachonOptics(lsst_r, (0, 0), ccd="R99", image_pos=galsim.PositionD(1, 1))
-    with pytest.raises(DomainError, match="hsc has no camera: expected a pixel_size"):
-        pachon.galsim.PachonOptics(pachon.load_telescope("hsc"), (0.0, 0.0))
+    with pytest.raises(DomainError, match="paul_baker has no camera: expected a pixel_size"):
+        pachon.galsim.PachonOptics(pachon.load_telescope("paul_baker"), (0.0, 0.0))
     with pytest.raises(DomainError, match="without pupil coordinates"):
         pachon.galsim.PachonOptics(lsst_r, (0.0, 0.0)).applyTo(galsim.PhotonArray(3))
     with pytest.raises(DomainError, match="wavelength = 5000 nm"):
