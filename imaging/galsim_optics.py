@@ -121,7 +121,7 @@ class PachonOptics(galsim.PhotonOp):
             camera, index = self.ccd
             offset = (np.array([image_pos.x, image_pos.y]) - 1.0) * camera.pixel_size
             first = camera.from_pixel(index, np.zeros(2))
-            self.origin = first + np.stack(camera.along_focal_plane(index, offset[0], offset[1]))
+            self.origin = first + np.stack(camera.frame(index).along_focal_plane(*offset))
 
     def applyTo(  # noqa: N802 - GalSim's name
         self, photon_array: galsim.PhotonArray, local_wcs: Any = None, rng: galsim.BaseDeviate | None = None
@@ -171,7 +171,7 @@ class PachonOptics(galsim.PhotonOp):
 
     def _along_ccd(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the components along the rows and columns of the CCD of vectors of the focal plane."""
-        return (x, y) if self.ccd is None else self.ccd[0].along_ccd(self.ccd[1], x, y)
+        return (x, y) if self.ccd is None else self.ccd[0].frame(self.ccd[1]).along_ccd(x, y)
 
     def _in_silicon(
         self, landed: LandedPhotons, wavelength: np.ndarray, rng: galsim.BaseDeviate | None

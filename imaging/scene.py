@@ -13,6 +13,7 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
+from ..models.camera.camera import Camera
 from ..pipeline.defaults import pixel_angle
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
@@ -140,13 +141,6 @@ def draw_ccd(
         )
     if exposure is None:
         exposure = Exposure(config.band or "r", config.atmosphere.exposure_s, pixel_scale=nominal_scale(experiment))
-    index = camera.ccd_index(ccd)
-    if camera.rotation_deg[index]:
-        raise ConfigError(
-            f"CCD {ccd} of {camera.name} is turned by {camera.rotation_deg[index]:g} deg: images expect CCDs along the "
-            "axes of the focal plane"
-        )
-    part = Window(0, 0, *camera.pixels[index].tolist()) if window is None else window
     wcs = ccd_wcs(
         experiment.telescope,
         camera,
@@ -156,6 +150,8 @@ def draw_ccd(
         wavelength=experiment.wavelengths[len(experiment.wavelengths) // 2],
         threads=threads,
     )
+    check_upright(camera, ccd)
+    part = Window(0, 0, *camera.pixels[camera.ccd_index(ccd)].tolist()) if window is None else window
     psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
     galaxies = galaxies_near(galaxies, wcs, part)
     pixels = wcs.to_pixel(np.stack([galaxies.xi, galaxies.eta], axis=1))
@@ -204,6 +200,14 @@ def draw_ccd(
         config.seed,
         config.atmosphere.epoch,
     )
+
+
+def check_upright(camera: Camera, ccd: str) -> None:
+    """Raise ConfigError if a CCD is turned: stamps of stars are drawn along the axes of the focal plane."""
+    turn = camera.rotation_deg[camera.ccd_index(ccd)]
+    if turn:
+        text = f"{ccd} of {camera.name} is turned by {turn:g} deg"
+        raise ConfigError(f"ccds: {text}: images expect CCDs along the axes of the focal plane")
 
 
 def nominal_scale(experiment: Experiment) -> float:

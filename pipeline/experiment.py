@@ -179,7 +179,7 @@ class Experiment:
         if sensor.tree_rings_um:
             phase = stream(self.config.seed, "tree rings", name).uniform(0.0, 2.0 * math.pi)
             along_x, along_y = (mm * 1e-3 for mm in sensor.tree_ring_center_mm)
-            x, y = map(float, camera.along_focal_plane(index, along_x, along_y))
+            x, y = map(float, camera.frame(index).along_focal_plane(along_x, along_y))
             found.append(TreeRings(sensor.tree_rings_um * 1e-6, sensor.tree_ring_period_um * 1e-6, (x, y), phase))
         if sensor.edge_rolloff_um:
             length = sensor.edge_rolloff_length_um * 1e-6

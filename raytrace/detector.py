@@ -83,11 +83,11 @@ def land_bundle(
 def _distance(focal_plane: FocalPlane, ccd: np.ndarray, position: Triple, direction: Triple, steps: int) -> np.ndarray:
     """Return the distances to the surfaces of CCDs, one for each ray or one for all, in lengths of the direction."""
     (x, y, z), (u, v, w) = position, direction
-    camera, t = focal_plane.camera, np.zeros(len(x))
-    across_x, across_y = camera.along_ccd(ccd, u, v)
+    frame, t = focal_plane.camera.frame(ccd), np.zeros(len(x))
+    across_x, across_y = frame.along_ccd(u, v)
     for _ in range(steps):
         # The CCD stays that of the first intersection, so a ray near an edge cannot alternate between two CCDs.
-        dx, dy = camera.to_local(ccd, x + t * u, y + t * v)
+        dx, dy = frame.to_local(x + t * u, y + t * v)
         slope = focal_plane.surfaces.gradient(ccd, dx, dy)
         rate = w - slope[:, 0] * across_x - slope[:, 1] * across_y
         t = t + (focal_plane.surfaces.height(ccd, dx, dy) - (z + t * w)) / rate
@@ -101,7 +101,7 @@ def _bundle_ccds(focal_plane: FocalPlane, x: np.ndarray, y: np.ndarray) -> np.nd
     if not finite.any():
         return np.full(x.shape, -1)
     [most] = focal_plane.ccd_at(np.median(x[finite])[None], np.median(y[finite])[None])
-    ccd = np.where(camera.depth(most, np.stack([x, y], axis=-1)) >= 0.0, most, -1)
+    ccd = np.where(camera.depth(most, x, y) >= 0.0, most, -1)
     others = np.flatnonzero(ccd < 0)
     ccd[others] = focal_plane.ccd_at(x[others], y[others])
     return ccd

@@ -42,6 +42,38 @@ class _Kind:
     tree: cKDTree  #: of the centres, y in units that make the CCDs square
 
 
+@dataclass(frozen=True, eq=False)
+class CcdFrame:
+    """Frames of CCDs, one for each of so many points or one for all."""
+
+    x: Any  #: centres on the focal plane [m]
+    y: Any
+    direction: Any  #: cosine and sine of their angles, shape [2, ...]; None where all are zero
+
+    def along_ccd(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the components along the axes of the CCDs of vectors of the focal plane."""
+        if self.direction is None:
+            return x, y
+        cosine, sine = self.direction
+        return cosine * x + sine * y, cosine * y - sine * x
+
+    def along_focal_plane(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the components along the axes of the focal plane of vectors along those of the CCDs."""
+        if self.direction is None:
+            return x, y
+        cosine, sine = self.direction
+        return cosine * x - sine * y, sine * x + cosine * y
+
+    def to_local(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the places in the frames of the CCDs [m] of points of the focal plane [m]."""
+        return self.along_ccd(x - self.x, y - self.y)
+
+    def from_local(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the points of the focal plane [m] of places in the frames of the CCDs [m]."""
+        along_x, along_y = self.along_focal_plane(x, y)
+        return self.x + along_x, self.y + along_y
+
+
 @check_arguments
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -205,28 +237,17 @@ class Camera:
 
     # ---- maps between the frames; `ccd` is one index or an array of them, which is broadcast with the points
 
-    def along_ccd(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        """Return the components along the axes of CCDs of vectors of the focal plane."""
-        if self._upright:
-            return x, y
-        cosine, sine = self._direction[:, ccd]
-        return cosine * x + sine * y, cosine * y - sine * x
-
-    def along_focal_plane(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        """Return the components along the axes of the focal plane of vectors along those of CCDs."""
-        if self._upright:
-            return x, y
-        cosine, sine = self._direction[:, ccd]
-        return cosine * x - sine * y, sine * x + cosine * y
+    def frame(self, ccd: Any) -> CcdFrame:
+        """Return the frames of CCDs."""
+        return CcdFrame(self.centers[ccd, 0], self.centers[ccd, 1], None if self._upright else self._direction[:, ccd])
 
     def to_local(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the places in the frames of CCDs [m] of points of the focal plane [m]."""
-        return self.along_ccd(ccd, x - self.centers[ccd, 0], y - self.centers[ccd, 1])
+        return self.frame(ccd).to_local(x, y)
 
     def from_local(self, ccd: Any, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the points of the focal plane [m] of places in the frames of CCDs [m]."""
-        along_x, along_y = self.along_focal_plane(ccd, x, y)
-        return self.centers[ccd, 0] + along_x, self.centers[ccd, 1] + along_y
+        return self.frame(ccd).from_local(x, y)
 
     def to_uv(self, ccd: Any, xy: np.ndarray) -> np.ndarray:
         """Return the places on CCDs, in halves of their sides from -1 to 1, of points [m], shape [..., 2]."""
@@ -270,23 +291,28 @@ class Camera:
         px, py = plane_points(x, y)
         index = np.full(px.shape, -1, dtype=np.int64)
         finite = np.isfinite(px) & np.isfinite(py)
-        if not np.any(finite):
-            return index
-        found = np.full(np.count_nonzero(finite), -1, dtype=np.int64)
         for kind in self._kinds:
-            u, v = self.along_ccd(kind.index[0], px[finite], py[finite])
-            # Equal rectangles that do not overlap: the nearest centre in the maximum norm is the only candidate.
-            stretch = kind.half[0] / kind.half[1]
-            nearest = kind.tree.query(np.stack([u, v * stretch], axis=-1), p=np.inf)[1]
-            at, (a, b) = kind.centers[nearest], kind.half + margin
-            inside = (np.abs(u - at[:, 0]) <= a) & (np.abs(v - at[:, 1]) <= b)
-            found[inside] = kind.index[nearest[inside]]
-        index[finite] = found
+            left = finite if kind is self._kinds[0] else finite & (index < 0)
+            if np.any(left):
+                index[left] = self._of_kind(kind, px[left], py[left], margin)
         return index
 
-    def depth(self, ccd: int, xy: np.ndarray) -> np.ndarray:
-        """Return how far inside the nearest rim of a CCD points lie [m], shape [n]; negative beyond."""
-        u, v = self.to_local(ccd, xy[:, 0], xy[:, 1])
+    def _of_kind(self, kind: _Kind, x: np.ndarray, y: np.ndarray, margin: float) -> np.ndarray:
+        """Return the index of the CCD of one kind at points [m], shape [n]; -1 without one."""
+        u, v = self.frame(kind.index[0]).along_ccd(x, y)
+        (a, b), (width, height) = kind.half + margin, kind.half
+        # Equal rectangles that do not overlap: the nearest centre in the maximum norm is the only candidate.
+        distance, nearest = kind.tree.query(np.stack([u, v * (width / height)], axis=-1), p=np.inf)
+        if width == height:
+            inside = distance <= a
+        else:
+            at = kind.centers[nearest]
+            inside = (np.abs(u - at[:, 0]) <= a) & (np.abs(v - at[:, 1]) <= b)
+        return np.where(inside, kind.index[nearest], -1)
+
+    def depth(self, ccd: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return how far inside the nearest rim of a CCD points lie [m]; negative beyond."""
+        u, v = self.to_local(ccd, x, y)
         a, b = self.half_sizes[ccd]
         return np.minimum(a - np.abs(u), b - np.abs(v))
 
@@ -310,17 +336,17 @@ class Camera:
 
     @cached_property
     def _kinds(self) -> list[_Kind]:
+        """CCDs by size and angle, the most numerous first; half turns leave a rectangle as it is."""
         from scipy.spatial import cKDTree
 
         kinds = []
-        described = np.column_stack([self.pixels, self.rotation_deg])
+        described = np.column_stack([self.pixels, self.rotation_deg % 180.0])
         for row in np.unique(described, axis=0):
             index = np.flatnonzero((described == row).all(axis=1))
             half = self.half_sizes[index[0]]
-            centers = np.stack(self.along_ccd(index, *self.centers[index].T), axis=-1)
-            tree = cKDTree(centers * [1.0, half[0] / half[1]])
-            kinds.append(_Kind(index, half, centers, tree))
-        return kinds
+            centers = np.stack(self.frame(index[0]).along_ccd(*self.centers[index].T), axis=-1)
+            kinds.append(_Kind(index, half, centers, cKDTree(centers * [1.0, half[0] / half[1]])))
+        return sorted(kinds, key=lambda kind: -len(kind.index))
 
     def _check_overlap(self) -> None:
         """Raise DomainError, with the names, if two CCDs overlap: if no side of either separates them."""
@@ -331,7 +357,7 @@ class Camera:
         apart = np.zeros(len(first), dtype=bool)
         offset = self.centers[second] - self.centers[first]
         for own, other in ((first, second), (second, first)):
-            away = np.abs(np.stack(self.along_ccd(own, *offset.T), axis=-1))
+            away = np.abs(np.stack(self.frame(own).along_ccd(*offset.T), axis=-1))
             # Half the other rectangle along the axes of this one.
             turn = np.deg2rad(self.rotation_deg[other] - self.rotation_deg[own])
             cosine, sine = np.abs(np.cos(turn)), np.abs(np.sin(turn))

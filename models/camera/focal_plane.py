@@ -281,7 +281,7 @@ class FocalPlane(HeightMap):
                 raise DomainError(f"{name} {label} = {value.tolist()}: expected one finite number")
         x, y = (camera.centers[members] - camera.centers[members].mean(axis=0)).T
         along_x, along_y = np.broadcast_arrays(-np.tan(turn_y), np.tan(turn_x), x)[:2]
-        slope_u, slope_v = camera.along_ccd(members, along_x, along_y)
+        slope_u, slope_v = camera.frame(members).along_ccd(along_x, along_y)
         polynomial = self.surfaces.polynomial.copy()
         polynomial[members, 0] += lift + y * np.tan(turn_x) - x * np.tan(turn_y)
         polynomial[members, 1] += camera.half_sizes[members, 0] * slope_u
@@ -320,7 +320,7 @@ class FocalPlane(HeightMap):
 
     def slopes_on(self, ccd: np.ndarray, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
         """Return the slopes along the axes of the focal plane at places on CCDs [m], shape [n, 2]."""
-        return np.stack(self.camera.along_focal_plane(ccd, *self.surfaces.gradient(ccd, dx, dy).T), axis=-1)
+        return np.stack(self.camera.frame(ccd).along_focal_plane(*self.surfaces.gradient(ccd, dx, dy).T), axis=-1)
 
     def _on_ccds(self, function: Callable[..., np.ndarray], x: ArrayLike, y: ArrayLike, *values: int) -> np.ndarray:
         """Return a function of CCD index and local position [m], with an axis of values, at x, y; NaN off the CCDs."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -111,9 +112,9 @@ def _global(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
     px, py, power, astigmatism, oblique = stream(seed, "focal plane", "global").standard_normal(5)
     xx, yy, xy = power + astigmatism, power - astigmatism, oblique
     # px X + py Y + xx X^2 + yy Y^2 + xy X Y with (X, Y) = (x, y) + a u (c, s) + b v (-s, c), in powers of u and v.
-    ccds = np.arange(len(camera))
-    c, s = camera.along_focal_plane(ccds, np.ones(len(camera)), np.zeros(len(camera)))
-    slope_u, slope_v = camera.along_ccd(ccds, px + 2 * xx * x + xy * y, py + 2 * yy * y + xy * x)
+    frame = camera.frame(np.arange(len(camera)))
+    c, s = frame.along_focal_plane(np.ones(len(camera)), np.zeros(len(camera)))
+    slope_u, slope_v = frame.along_ccd(px + 2 * xx * x + xy * y, py + 2 * yy * y + xy * x)
     polynomial = np.zeros((len(camera), 10))
     polynomial[:, 0] = px * x + py * y + xx * x**2 + yy * y**2 + xy * x * y
     polynomial[:, 1], polynomial[:, 2] = a * slope_u, b * slope_v
@@ -167,11 +168,17 @@ def _tilt(camera: Camera, budget: HeightBudget, seed: int) -> np.ndarray:
     return polynomial
 
 
+@lru_cache(maxsize=16)
+def _potato_axis(half: float) -> np.ndarray:
+    """Return the places along a side of a CCD [m] at which its peak and valley are searched."""
+    return np.linspace(-half, half, _POTATO_POINTS)
+
+
 def _potato_chip(camera: Camera, budget: HeightBudget, seed: int) -> tuple[np.ndarray, np.ndarray]:
     offset = np.zeros(len(camera))
     waves = np.zeros((len(camera), 2, 4))
     for i, (name, (a, b)) in enumerate(zip(camera.ccd_names, camera.half_sizes.tolist(), strict=True)):
-        axis_x, axis_y = np.linspace(-a, a, _POTATO_POINTS), np.linspace(-b, b, _POTATO_POINTS)
+        axis_x, axis_y = _potato_axis(a), _potato_axis(b)
         rng = stream(seed, "focal plane", "potato_chip", name)
         angle = rng.uniform(0.0, np.pi) + np.array([0.0, 0.5 * np.pi])
         k = 2 * np.pi * rng.uniform(*budget.potato_chip_cycles, 2) / (2.0 * max(a, b))

@@ -17,7 +17,6 @@ from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engines import ENGINES
 from ..config import Configuration
 
-
 #: Fewest samples of a screen across the pupil.
 _LEAST_SAMPLES = 4
 

@@ -167,7 +167,7 @@ def _star_fields(
     # Beyond its field of view a telescope may have no light, and is not asked for.
     lit = np.hypot(*xy.T) <= experiment.field_radius_on_detector
     for name in config.ccds or ():
-        depth = camera.depth(camera.ccd_index(name), xy)
+        depth = camera.depth(camera.ccd_index(name), *xy.T)
         stars = np.flatnonzero((depth >= _STAR_MARGIN * camera.pixel_size) & points.star & lit)
         margin = np.where(points.star, _STAR_MARGIN, _PLACE_MARGIN) * camera.pixel_size
         here = np.flatnonzero((depth >= margin) & lit)

@@ -265,6 +265,7 @@ def calls(folder):
         "Pointing.from_celestial": (pachon.Pointing(1.0, 0.5).from_celestial, {"ra": [1.0], "dec": [0.5]}),
         "ccd_wcs": (pachon.ccd_wcs, {"telescope": m.lsst, "camera": m.camera, "ccd": "R22_S11", "pointing": (0.0, 0.0),
                     "position_angle": 0.0, "wavelength": w, "threads": 1}),
+        "load_camera": (pachon.load_camera, {"camera": "comcam"}),
         "lsst_camera": (pachon.lsst_camera, {}),
         "height_statistics": (pachon.height_statistics, {"focal_plane": m.plane}),
         "new_telescope": (pachon.new_telescope, {"kind": "cassegrain", "diameter": 1.0, "f_number": 8.0,

@@ -110,7 +110,7 @@ def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int
         seen = 0.0
         for visit in plan:
             at = visit.on_detector(experiment.telescope, sky, wavelength)
-            near = np.any([camera.depth(ccd, at) >= 0.0 for ccd in ccds], axis=0)
+            near = np.any([camera.depth(ccd, *at.T) >= 0.0 for ccd in ccds], axis=0)
             seen += near.mean() / len(plan)
         if seen >= 0.5:
             chosen.append(tile)

@@ -78,7 +78,7 @@ def test_hsc_ccds_stand_where_the_published_picture_has_them():
 def test_decam_is_the_published_hexagon():
     assert len(DECAM) == 62
     assert (DECAM.pixels == [2048, 4096]).all()
-    # 3.0 mm between long edges, such as S4 and N4, 2.3 mm between short ones, N4 and N5 (NOIRLab, DECam characteristics).
+    # 3.0 mm between long edges, such as S4 and N4, 2.3 mm between short ones, N4 and N5 (NOIRLab, characteristics).
     box = {name: DECAM.bounds([DECAM.ccd_index(name)]) for name in ("S4", "N4", "N5")}
     assert box["N4"][0] - box["S4"][1] == pytest.approx(3.0e-3, abs=0.15e-3)
     assert box["N5"][2] - box["N4"][3] == pytest.approx(2.3e-3, abs=0.16e-3)

@@ -1,9 +1,14 @@
 """Camera files: what they hold, where they are found, and one line for what is wrong."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 from pachon import PachonError, load_camera, load_telescope
+from pachon.models.io.camera_file import CcdSection
 from pachon.models.io.prescription import DATA, prescription_digest, save_telescope
 
 TEXT = """\
@@ -33,6 +38,16 @@ def test_a_file_is_read_with_its_units(file):
     assert np.array_equal(camera.rotation_deg, [0.0, -90.0, 0.0])
     assert (camera.raft_names, camera.raft_of, camera.vendors) == (("A",), ("A", "A", ""), ("x", "y", "x"))
     assert np.allclose(camera.placement, [[0, 0, 0], [0, 0, 0], [12e-6, 50e-6, -20e-6]], rtol=1e-15)
+
+
+def test_the_file_of_the_docs_has_every_key(tmp_path):
+    page = (Path(__file__).parents[3] / "docs" / "camera.md").read_text()
+    path = tmp_path / "my_camera.yaml"
+    path.write_text(re.search(r"```yaml\n(# my_camera.yaml.*?)```", page, flags=re.S).group(1))
+    camera = load_camera(path)
+    assert camera.members("A") == (0, 1)
+    keys = {key for ccd in yaml.safe_load(path.read_text())["ccds"] for key in ccd}
+    assert keys | {"vendor"} == set(CcdSection.keys())
 
 
 def test_an_unchanged_file_is_one_camera_a_changed_one_another(file):
@@ -69,7 +84,7 @@ def test_bad_files_are_one_line_with_file_and_name(file, change, words):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(PachonError, match="nothing.yaml"):
+    with pytest.raises(PachonError, match=r"nothing\.yaml"):
         load_camera(tmp_path / "nothing.yaml")
 
 
