@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy.coordinates import SkyCoord
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
@@ -54,7 +53,8 @@ class Pointing:
     @classmethod
     def of(cls, pointing: Any, position_angle: Any = 0.0) -> Pointing:
         """Return the pointing of a SkyCoord, or of right ascension and declination [rad] or Quantities."""
-        if isinstance(pointing, SkyCoord):
+        # A SkyCoord: astropy.coordinates takes long to import, and who has one has done so.
+        if hasattr(pointing, "icrs"):
             if not pointing.isscalar:
                 raise DomainError(f"pointing has shape {pointing.shape}: expected one position")
             pointing = (pointing.icrs.ra, pointing.icrs.dec)
