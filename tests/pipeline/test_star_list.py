@@ -266,8 +266,10 @@ def pixels(table):
 
 
 @pytest.mark.slow
-def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(tmp_path, config):
-    config = with_options(config, reconstruction__model="focal_plane")
+def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(tmp_path, config, catalogue):
+    path = tmp_path / "stars.csv"
+    path.write_bytes(catalogue.read_bytes())
+    config = with_options(config, reconstruction__model="focal_plane", stars__catalogue=str(path))
     result = run(config, tmp_path / "a")
     assert list(result.not_modelled) == ["R41_S20"]
     assert (result.summary["catalogue"]["on_the_ccds"], result.report.is_file()) == (63, True)
@@ -277,6 +279,11 @@ def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(t
     assert (kept.kept, kept.computed) == (CCDS[:2], ())
     found = diagnose(tmp_path / "a", tmp_path / "residuals")
     assert found.overall["ccds"] == 2
+    # Without its last star, the catalogue is another: no CCD of the old one is kept.
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    other = run(config, tmp_path / "a", resume=True)
+    assert (other.kept, other.computed) == ((), CCDS[:2])
+    assert other.summary["catalogue"]["stars"] == 62
 
 
 @pytest.mark.long
