@@ -102,7 +102,7 @@ def place_stars(
     rows = _read(path, columns, band)
     places, magnitude = rows.places, rows.magnitude
     if rows.kind == "ra" and pointing is None:
-        raise ConfigError(f"{path}: right ascension and declination: expected pointing = {{ra_deg, dec_deg}}")
+        raise ConfigError("right ascension and declination: expected pointing = {ra_deg, dec_deg}", file=path)
     counts = {"stars": len(places)}
 
     def keep(what: str, good: np.ndarray) -> None:

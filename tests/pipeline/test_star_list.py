@@ -139,7 +139,11 @@ def test_the_order_of_the_rows_does_not_matter(tmp_path, telescope, places, magn
     [
         ({"x_m": [0.0], "y_m": [0.0]}, {}, ["stars.ecsv: no column mag (mag: mag, r, mag_r,", "columns are x_m, y_m"]),
         ({"ra": [0.0], "mag": [0.0]}, {}, ["no column dec (dec: dec, dec_deg,"]),
-        ({"ra": [0.0], "dec": [0.0], "mag": [1.0]}, {"pointing": None}, ["expected pointing = {ra_deg, dec_deg}"]),
+        (
+            {"ra": [0.0], "dec": [0.0], "mag": [1.0]},
+            {"pointing": None},
+            ["stars.ecsv: right ascension and declination: expected pointing = {ra_deg, dec_deg}"],
+        ),
         ({"ra": [0.0] * u.kg, "dec": [0.0], "mag": [1.0]}, {}, ["column ra", "expected a unit that converts to rad"]),
         ({"ra": [0.0], "dec": [0.0], "mag": ["bright"]}, {}, ["column mag", "expected real numbers"]),
         ({"ra": [[0.0, 1.0]], "dec": [0.0], "mag": [1.0]}, {}, ["column 'ra': expected one number in every row"]),
@@ -227,6 +231,20 @@ def test_without_a_catalogue_and_a_pointing_the_hash_stays(tiny):
     assert Experiment.from_config(with_options(tiny(), pointing=POINTING)).config_hash != experiment.config_hash
     assert experiment.star_list is None
     assert experiment.pointing is None
+
+
+def test_a_run_without_enough_stars_ends_before_it_begins(tmp_path, config):
+    experiment = Experiment.from_config(with_options(config, ccds=("R41_S20",)))
+    reason = r"CCD R41_S20: 3 stars of stars\.csv lie on it: expected at least 5"
+    with pytest.raises(PachonError, match=reason):
+        run(experiment, tmp_path / "few")
+    assert not (tmp_path / "few").exists()
+    with pytest.raises(PachonError, match=reason):
+        run(config, tmp_path / "strict", strict=True)
+    with pytest.raises(PachonError, match=reason):
+        simulate_ccds(experiment, write_ccd)
+    # A worker has one CCD at a time, and reports it.
+    assert list(simulate_ccds(experiment, write_ccd, strict=False).not_modelled) == ["R41_S20"]
 
 
 def test_electrons_are_those_of_the_magnitudes(config, magnitudes, places):
