@@ -293,7 +293,7 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         )
     if stars.catalogue is None:
         for key in ("columns", "brightest", "faintest"):
-            if getattr(stars, key):
+            if getattr(stars, key) not in (None, {}):
                 raise ConfigError(f"stars.{key} = {shown(getattr(stars, key))}: expected stars.catalogue")
     else:
         for key in stars.columns:

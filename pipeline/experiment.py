@@ -42,7 +42,7 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
-from .star_list import StarList, place_stars
+from .star_list import StarList, listed_stars, pointing_of
 
 #: Keys of the stars that a configuration without a catalogue did not have once.
 _CATALOGUE_KEYS = ("catalogue", "columns", "brightest", "faintest")
@@ -106,10 +106,15 @@ class Experiment:
         if config.active_optics.residual_um > 0.0:
             rms = config.active_optics.residual_um * 1e-6
             aberration = ResidualWavefront.draw(telescope, rms, config.seed, config.atmosphere.epoch)
-        made = cls(
-            config, telescope, _focal_plane(config, resolved.camera), _atmosphere(config, site), aberration, site
+        return cls(
+            config,
+            telescope,
+            _focal_plane(config, resolved.camera),
+            _atmosphere(config, site),
+            aberration,
+            site,
+            star_list=listed_stars(config, telescope, resolved.camera),
         )
-        return made if config.stars.catalogue is None else replace(made, star_list=_star_list(made))
 
     @property
     def camera(self) -> Camera:
@@ -129,10 +134,7 @@ class Experiment:
     @property
     def pointing(self) -> Pointing | None:
         """Where the telescope looks, and its orientation on the sky; None where it does not matter."""
-        aim = self.config.pointing
-        if aim is None:
-            return None
-        return Pointing(*map(math.radians, (aim.ra_deg, aim.dec_deg, aim.position_angle_deg)))
+        return pointing_of(self.config)
 
     @check_arguments
     def observed_count(self, ccd: str) -> int:
@@ -296,24 +298,6 @@ def hashed_stars(section: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in section.items() if key != "observed"} | {
         "catalogue": _name_or_content(name, (), STAR_ENDINGS)
     }
-
-
-def _star_list(experiment: Experiment) -> StarList:
-    """Return the stars of the catalogue of a configuration on the CCDs of its camera."""
-    config, wavelengths = experiment.config, experiment.wavelengths
-    with error_context(key="stars.catalogue"):
-        return place_stars(
-            Path(given(config.stars.catalogue)),
-            experiment.telescope,
-            experiment.camera,
-            given(config.ccds),
-            wavelength=float(wavelengths[len(wavelengths) // 2]),
-            band=given(config.band),
-            brightest=given(config.stars.brightest),
-            faintest=given(config.stars.faintest),
-            pointing=experiment.pointing,
-            columns=config.stars.columns,
-        )
 
 
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:

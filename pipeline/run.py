@@ -31,7 +31,7 @@ from .measure.summary import correlations, run_metrics
 from .memory import check_memory
 from .report.report import build_report, draw_pictures
 from .run_folder import SUMMARY_NAME, claim_run, finished_ccds, stamp_of, write_ccd
-from .simulate.ccd_loop import simulate_ccds
+from .simulate.ccd_loop import check_catalogue, simulate_ccds
 
 _MESH_CELLS = 16
 
@@ -116,6 +116,8 @@ def run(
     number, parts = part
     if not 1 <= number <= parts <= len(names):
         raise DomainError(f"part = {number}/{parts}: expected i/n with i from 1 to n, and n at most {len(names)} CCDs")
+    # Before the screens, which take longer than all of the checks.
+    check_catalogue(experiment, names, strict=strict)
     resume = resume or parts > 1
     kept = finished_ccds(folder, experiment) if resume else ()
     missing = tuple(name for name in names[number - 1 :: parts] if name not in kept)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from ..models.telescope import Telescope
 from ..raytrace.rays import RayStatus, field_direction
 from ..sky.pointing import Pointing
 from ..wavefront.chief_rays import chief_rays
+from .config import Configuration
 
 #: Names that columns have in files, in small letters, the first one first; ``{band}`` is that of the run.
 NAMES: dict[str, tuple[str, ...]] = {
@@ -72,6 +74,37 @@ class StarList:
         return f"{self.name}: {found or 'no stars'}{note}"
 
 
+def pointing_of(config: Configuration) -> Pointing | None:
+    """Return the pointing of a configuration, None without one."""
+    aim = config.pointing
+    if aim is None:
+        return None
+    return Pointing(*map(math.radians, (aim.ra_deg, aim.dec_deg, aim.position_angle_deg)))
+
+
+def listed_stars(config: Configuration, telescope: Telescope, camera: Camera) -> StarList | None:
+    """Return the stars of the catalogue of a resolved configuration, None where stars are drawn.
+
+    Raises what :func:`place_stars` raises, within ``stars.catalogue``.
+    """
+    stars, wavelengths = config.stars, config.wavelengths_nm or ()
+    if stars.catalogue is None:
+        return None
+    with error_context(key="stars.catalogue"):
+        return place_stars(
+            Path(stars.catalogue),
+            telescope,
+            camera,
+            config.ccds or (),
+            wavelength=wavelengths[len(wavelengths) // 2] * 1e-9,
+            band=config.band or "r",
+            brightest=-math.inf if stars.brightest is None else stars.brightest,
+            faintest=math.inf if stars.faintest is None else stars.faintest,
+            pointing=pointing_of(config),
+            columns=stars.columns,
+        )
+
+
 def place_stars(
     path: Path,
     telescope: Telescope,
@@ -102,7 +135,7 @@ def place_stars(
     rows = _read(path, columns, band)
     places, magnitude = rows.places, rows.magnitude
     if rows.kind == "ra" and pointing is None:
-        raise ConfigError(f"{path}: right ascension and declination: expected pointing = {{ra_deg, dec_deg}}")
+        raise ConfigError("right ascension and declination: expected pointing = {ra_deg, dec_deg}", file=path)
     counts = {"stars": len(places)}
 
     def keep(what: str, good: np.ndarray) -> None:

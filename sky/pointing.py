@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from astropy.coordinates import SkyCoord
 from numpy.typing import ArrayLike
 
 from ..core.arguments import check_arguments
@@ -21,16 +20,15 @@ from ..core.errors import DomainError, shown
 from ..core.units import angle, broadcast_together, radians
 
 
-@check_arguments
 @dataclass(frozen=True)
 class Pointing:
     """Direction of the optical axis, and orientation of the telescope on the sky.
 
     Attributes
     ----------
-    ra, dec : float
+    ra, dec : float or Quantity
         Right ascension and declination of the optical axis, ICRS [rad].
-    position_angle : float
+    position_angle : float or Quantity
         Angle of the telescope's +y from north through east [rad].
 
     Raises
@@ -44,24 +42,27 @@ class Pointing:
     position_angle: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("ra", "dec", "position_angle"):
+            object.__setattr__(self, name, angle(getattr(self, name), name))
         angles = (self.ra, self.dec, self.position_angle)
         if not np.isfinite(angles).all() or abs(self.dec) > 0.5 * np.pi:
             raise DomainError(
-                f"pointing = {angles[:2]!r}, position_angle = {self.position_angle!r}: expected finite angles, "
-                "declinations from -90 to 90 deg"
+                f"pointing: ra, dec = {angles[:2]}, position_angle = {self.position_angle}: "
+                "expected finite angles [rad], declinations from -90 to 90 deg"
             )
 
     @classmethod
     def of(cls, pointing: Any, position_angle: Any = 0.0) -> Pointing:
         """Return the pointing of a SkyCoord, or of right ascension and declination [rad] or Quantities."""
-        if isinstance(pointing, SkyCoord):
+        # A SkyCoord: astropy.coordinates takes long to import, and who has one has done so.
+        if hasattr(pointing, "icrs"):
             if not pointing.isscalar:
                 raise DomainError(f"pointing has shape {pointing.shape}: expected one position")
             pointing = (pointing.icrs.ra, pointing.icrs.dec)
         center = radians(pointing, "pointing")
         if center.shape != (2,):
             raise DomainError(f"pointing = {shown(pointing)}: expected right ascension and declination, finite angles")
-        return cls(float(center[0]), float(center[1]), angle(position_angle, "position_angle"))
+        return cls(float(center[0]), float(center[1]), position_angle)
 
     @check_arguments
     def to_sky(self, slopes: ArrayLike) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from scipy.spatial import cKDTree
 from ...core.arguments import check_arguments
 from ...core.files import make_folder, write_bytes, write_json
 from ...core.products import Columns, described_table, write_ecsv
+from ...core.table_files import write_table
 from ...core.units import ARCSEC, pure_numbers
 from ..measure.rho_statistics import RhoStatistics, trace_of_moments
 from ..measure.shapes import Shapes, measure_shapes
@@ -29,7 +29,7 @@ from .psf import PiffPsf
 #: Farthest that a star of the table may be from that of the file [pixel]: programs count pixels from 0 or from 1.
 _NEAR = 2.0
 #: Fewest reserved stars at which models are compared.
-FEWEST_RESERVED = 5
+_FEWEST_RESERVED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class PiffComparison:
         make_folder(folder)
         each = {f"{name}: {key}": c for name, rho in self.rho.items() for key, c in rho.items()}
         for name, table in (("stars.ecsv", self.stars), ("models.ecsv", self.models)):
-            write_bytes(folder / name, _ecsv(table))
+            write_table(folder / name, table)
         write_ecsv(folder / "rho.ecsv", correlation_columns(each), {"what": "rho statistics 1 to 5"})
         write_bytes(folder / "rho.png", rho_plot(self.rho))
         write_json(folder / "comparison.json", self.as_dict())
@@ -122,7 +122,7 @@ def compare_with_piff(
     rows = [("pachon, star held out", held_out, everywhere)]
     if in_fit.any():
         rows.append(("Piff, stars of its fit", theirs, in_fit))
-    if (~in_fit).sum() >= FEWEST_RESERVED:
+    if (~in_fit).sum() >= _FEWEST_RESERVED:
         if in_fit.sum() >= FEWEST_STARS:
             some = np.flatnonzero(used)[in_fit]
             model = fit_own_stars(np.asarray(stamps)[some], places[some], scale, **options).model
@@ -199,9 +199,3 @@ def _rho(own: OwnStars, stars: Shapes, model: Shapes, chosen: np.ndarray, bins: 
     """Return the rho statistics of a model at some stars; separations are those on the detector."""
     places = own.positions[own.used][chosen] * own.pixel_scale
     return star_rho_statistics(places, part_of(stars, chosen), part_of(model, chosen), bins)
-
-
-def _ecsv(table: Table) -> bytes:
-    text = io.StringIO()
-    table.write(text, format="ascii.ecsv")
-    return text.getvalue().encode()

@@ -9,6 +9,9 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+from scipy.special import j0, j1
 
 from .tables import PiffTables
 
@@ -16,6 +19,8 @@ from .tables import PiffTables
 _NODES = 7
 #: Harmonics by which GalSim keeps a constant constant under Lanczos interpolation.
 _HARMONICS = 5
+#: Radius from which on a Kolmogorov profile is its power law [half-light radii].
+_TAIL = 30.0
 #: Most lobes of a Lanczos function, and pixels along a side of a grid.
 _MOST_LOBES, _MOST_PIXELS = 50, 1000
 
@@ -112,6 +117,19 @@ class Moffat(Gaussian):
         return (self.beta - 1.0) / (math.pi * a2) * (1.0 + square / a2) ** -self.beta
 
 
+@dataclass(frozen=True)
+class Kolmogorov(Gaussian):
+    """An elliptical Kolmogorov profile, of the transform exp(-(k/k0)^(5/3)); the first parameter is as of Moffat."""
+
+    def brightness(self, square: np.ndarray) -> np.ndarray:
+        """Return the surface brightness of unit flux and half-light radius by the square of the radius."""
+        radius = np.sqrt(square)
+        spline, tail = _kolmogorov_profile()
+        # Far out it falls as the power of a kink of the transform at zero (Roddier 1981, Progress in Optics 19, 281).
+        far = tail * np.maximum(radius, _TAIL) ** (-11.0 / 3.0)
+        return np.where(radius < _TAIL, spline(np.minimum(radius, _TAIL)), far)
+
+
 def read_profile(tables: PiffTables) -> Profile:
     """Read the model of a file; ProductError names one that is unknown, or what of it is."""
     settings = tables.settings("model")
@@ -129,6 +147,8 @@ def read_profile(tables: PiffTables) -> Profile:
     shape = (bool(settings.get("centered", 1)), flux, bool(settings.get("include_pixel", 1)))
     if kind == "Gaussian":
         return Gaussian(*shape)
+    if kind == "Kolmogorov":
+        return Kolmogorov(*shape)
     if kind == "Moffat":
         if settings.get("trunc"):
             raise tables.error(f"model trunc = {settings['trunc']}: expected a Moffat function without truncation")
@@ -136,7 +156,7 @@ def read_profile(tables: PiffTables) -> Profile:
         if beta <= 1.0:
             raise tables.error(f"model beta = {beta:g}: expected more than 1")
         return Moffat(*shape, beta=beta)
-    raise tables.error(f"model = {kind}: expected one of PixelGrid, Gaussian, Moffat")
+    raise tables.error(f"model = {kind}: expected one of PixelGrid, Gaussian, Moffat, Kolmogorov")
 
 
 def lanczos(x: np.ndarray, n: int, *, conserve: bool) -> np.ndarray:
@@ -161,3 +181,21 @@ def _lanczos_spectrum(n: int) -> tuple[float, ...]:
     w = np.tile(weights, n)
     value = np.sinc(x) * np.sinc(x / n)
     return tuple(float((w * value * np.cos(2.0 * np.pi * j * x)).sum()) for j in range(1, _HARMONICS + 1))
+
+
+@lru_cache
+def _kolmogorov_profile() -> tuple[CubicSpline, float]:
+    """Return the surface brightness of unit flux over the radius in half-light radii, and the factor of its tail."""
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    # Panels that are finest at the kink at zero. Beyond 12 k0 the transform is below 1e-27.
+    edges = 12.0 * np.linspace(0.0, 1.0, 121) ** 2
+    half_widths = 0.5 * np.diff(edges)[:, None]
+    k = (edges[:-1, None] + half_widths * (nodes + 1.0)).ravel()
+    w = (half_widths * weights).ravel()
+    transform = np.exp(-(k ** (5.0 / 3.0)))
+    # Flux within r is r times the integral of the transform and J1(k r).
+    half = brentq(lambda r: float(r * (w * transform * j1(k * r)).sum()) - 0.5, 0.5, 5.0, xtol=1e-14)
+    # Close to each other where the profile is steep.
+    r = _TAIL * np.linspace(0.0, 1.0, 1500) ** 2
+    value = half**2 / (2.0 * math.pi) * np.array([(w * transform * k * j0(k * half * one)).sum() for one in r])
+    return CubicSpline(r, value), float(value[-1] * _TAIL ** (11.0 / 3.0))

@@ -136,9 +136,9 @@ class PiffPsf:
 def load_piff(path: str | Path) -> PiffPsf:
     """Read a PSF model of Piff from its FITS file, without Piff and without pickle.
 
-    Types Simple and SingleChip, models PixelGrid (Lanczos), Gaussian and Moffat, and interpolants BasisPolynomial,
-    Polynomial and Mean are read. Piff pickles the WCS of a chip; in its place stand polynomials through the world
-    coordinates of the chip's stars, which have columns of their own.
+    Types Simple and SingleChip, models PixelGrid (Lanczos), Gaussian, Moffat and Kolmogorov, and interpolants
+    BasisPolynomial, Polynomial and Mean are read. Piff pickles the WCS of a chip; in its place stand polynomials
+    through the world coordinates of the chip's stars, which have columns of their own.
 
     Raises
     ------

@@ -56,9 +56,9 @@ def simulate_ccds(
     names = (experiment.config.ccds or ()) if names is None else names
     simulated: SimulatedCcds[_T] = SimulatedCcds()
     if fields is None:
+        if strict:
+            check_catalogue(experiment, names, strict=True)
         for name, reason in _short_of_stars(experiment, names):
-            if strict:
-                raise DomainError(reason, subject=f"CCD {name}")
             simulated.not_modelled[name] = reason
             reporter.line(left_out_line(name, reason))
         names = [name for name in names if name not in simulated.not_modelled]
@@ -90,6 +90,17 @@ def simulate_ccds(
                     reporter.line(left_out_line(which, error.reason))
             stage.step(name, i, len(names))
     return simulated
+
+
+def check_catalogue(experiment: Experiment, names: Sequence[str], *, strict: bool) -> None:
+    """Raise DomainError if no CCD has enough stars of the catalogue for its model, or with `strict` if one has not.
+
+    Nothing is checked where stars are drawn.
+    """
+    short = dict(_short_of_stars(experiment, names))
+    if short and (strict or len(short) == len(names)):
+        name, reason = next(iter(short.items()))
+        raise DomainError(reason, subject=f"CCD {name}")
 
 
 def _short_of_stars(experiment: Experiment, names: Sequence[str]) -> Iterator[tuple[str, str]]:

@@ -55,6 +55,7 @@ def models(piff, galsim):
         "grid_color": (piff.SimplePSF(grid, color), affine, None),
         "grid_chips": (piff.SingleChipPSF(piff.SimplePSF(piff.PixelGrid(0.3, 8), piff.Mean())), celestial, aim),
         "moffat": (piff.SimplePSF(piff.Moffat(beta=3.0), piff.Polynomial(1, poly_type="chebyshev")), affine, None),
+        "kolmogorov": (piff.SimplePSF(piff.Kolmogorov(), piff.Mean()), affine, None),
         "gaussian": (piff.SimplePSF(piff.Gaussian(include_pixel=False, centered=False), piff.Mean()), affine, None),
     }
 

@@ -139,7 +139,11 @@ def test_the_order_of_the_rows_does_not_matter(tmp_path, telescope, places, magn
     [
         ({"x_m": [0.0], "y_m": [0.0]}, {}, ["stars.ecsv: no column mag (mag: mag, r, mag_r,", "columns are x_m, y_m"]),
         ({"ra": [0.0], "mag": [0.0]}, {}, ["no column dec (dec: dec, dec_deg,"]),
-        ({"ra": [0.0], "dec": [0.0], "mag": [1.0]}, {"pointing": None}, ["expected pointing = {ra_deg, dec_deg}"]),
+        (
+            {"ra": [0.0], "dec": [0.0], "mag": [1.0]},
+            {"pointing": None},
+            ["stars.ecsv: right ascension and declination: expected pointing = {ra_deg, dec_deg}"],
+        ),
         ({"ra": [0.0] * u.kg, "dec": [0.0], "mag": [1.0]}, {}, ["column ra", "expected a unit that converts to rad"]),
         ({"ra": [0.0], "dec": [0.0], "mag": ["bright"]}, {}, ["column mag", "expected real numbers"]),
         ({"ra": [[0.0, 1.0]], "dec": [0.0], "mag": [1.0]}, {}, ["column 'ra': expected one number in every row"]),
@@ -229,6 +233,20 @@ def test_without_a_catalogue_and_a_pointing_the_hash_stays(tiny):
     assert experiment.pointing is None
 
 
+def test_a_run_without_enough_stars_ends_before_it_begins(tmp_path, config):
+    experiment = Experiment.from_config(with_options(config, ccds=("R41_S20",)))
+    reason = r"CCD R41_S20: 3 stars of stars\.csv lie on it: expected at least 5"
+    with pytest.raises(PachonError, match=reason):
+        run(experiment, tmp_path / "few")
+    assert not (tmp_path / "few").exists()
+    with pytest.raises(PachonError, match=reason):
+        run(config, tmp_path / "strict", strict=True)
+    with pytest.raises(PachonError, match=reason):
+        simulate_ccds(experiment, write_ccd)
+    # A worker has one CCD at a time, and reports it.
+    assert list(simulate_ccds(experiment, write_ccd, strict=False).not_modelled) == ["R41_S20"]
+
+
 def test_electrons_are_those_of_the_magnitudes(config, magnitudes, places):
     stars = ccd_stars(Experiment.from_config(config), "R22_S11", 3e-6)
     order = np.argsort(places[::3, 0])
@@ -266,8 +284,10 @@ def pixels(table):
 
 
 @pytest.mark.slow
-def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(tmp_path, config):
-    config = with_options(config, reconstruction__model="focal_plane")
+def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(tmp_path, config, catalogue):
+    path = tmp_path / "stars.csv"
+    path.write_bytes(catalogue.read_bytes())
+    config = with_options(config, reconstruction__model="focal_plane", stars__catalogue=str(path))
     result = run(config, tmp_path / "a")
     assert list(result.not_modelled) == ["R41_S20"]
     assert (result.summary["catalogue"]["on_the_ccds"], result.report.is_file()) == (63, True)
@@ -277,6 +297,11 @@ def test_a_whole_run_of_a_catalogue_goes_on_and_has_a_model_of_the_focal_plane(t
     assert (kept.kept, kept.computed) == (CCDS[:2], ())
     found = diagnose(tmp_path / "a", tmp_path / "residuals")
     assert found.overall["ccds"] == 2
+    # Without its last star, the catalogue is another: no CCD of the old one is kept.
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    other = run(config, tmp_path / "a", resume=True)
+    assert (other.kept, other.computed) == ((), CCDS[:2])
+    assert other.summary["catalogue"]["stars"] == 62
 
 
 @pytest.mark.long

@@ -54,3 +54,10 @@ def test_a_sky_coord_counts_in_icrs():
 def test_a_pointing_that_is_none_is_refused(wrong):
     with pytest.raises(DomainError, match="pointing"):
         pachon.Pointing.of(wrong)
+
+
+def test_quantities_are_angles():
+    aim = pachon.Pointing(np.rad2deg(RA) * u.deg, DEC * u.rad, np.rad2deg(ROLL) * 60.0 * u.arcmin)
+    assert np.allclose((aim.ra, aim.dec, aim.position_angle), (RA, DEC, ROLL), rtol=1e-15)
+    with pytest.raises(DomainError, match=r"dec = 1\.0 kg: expected a unit that converts to rad"):
+        pachon.Pointing(1.0, 1.0 * u.kg)

@@ -10,13 +10,13 @@ from astropy.io import fits
 
 import pachon
 from pachon.core.errors import DomainError, PachonError, ProductError
-from pachon.pipeline.piff.profiles import Gaussian, Moffat, lanczos
+from pachon.pipeline.piff.profiles import Gaussian, Kolmogorov, Moffat, lanczos
 from pachon.pipeline.piff.world import StarWorld
 
 DATA = Path(__file__).parents[2] / "data" / "piff"
-#: Largest difference from what Piff draws, as a fraction of the peak. GalSim convolves Moffat functions with pixels by
+#: Largest difference from what Piff draws, as a fraction of the peak. GalSim convolves profiles with pixels by
 #: FFT, and stores the Gaussian of no pixel as it is; the WCS of chips of the sky is a polynomial through 16 stars here.
-TOLERANCES = {"grid_color": 1e-12, "grid_chips": 1e-6, "moffat": 1e-5, "gaussian": 1e-12}
+TOLERANCES = {"grid_color": 1e-12, "grid_chips": 1e-6, "moffat": 1e-5, "kolmogorov": 1e-5, "gaussian": 1e-12}
 
 
 def expected(name):
@@ -77,6 +77,20 @@ def test_profiles_have_unit_flux_and_the_moments_of_their_shear(profile):
     covariance = 0.36 * shear @ shear.T + jacobian @ jacobian.T / 12.0
     found = [[(image * a * b).sum() for b in (u, v)] for a in (u, v)]
     assert np.allclose(found, covariance, rtol=1e-8)
+
+
+def test_a_kolmogorov_profile_holds_half_of_its_light_in_its_half_light_radius():
+    profile = Kolmogorov(True, False, False)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    inner, outer = 0.5 * (nodes + 1.0), 1.0 + 14.5 * (nodes + 1.0)
+    light = [
+        scale * float((weights * 2.0 * np.pi * r * profile.brightness(r**2)).sum())
+        for scale, r in ((0.5, inner), (14.5, outer))
+    ]
+    assert light[0] == pytest.approx(0.5, abs=1e-9)
+    # Beyond 30 radii r^(-11/3) leaves 2 pi I(30) 30^2 (3/5).
+    beyond = 2.0 * np.pi * 900.0 * 0.6 * float(profile.brightness(np.array([900.0]))[0])
+    assert sum(light) + beyond == pytest.approx(1.0, abs=1e-5)
 
 
 class FewStars:
@@ -142,7 +156,13 @@ def changed(tmp_path, name, table, column, value):
     ("name", "table", "column", "value", "text"),
     [
         ("moffat", "psf", "type", "Sum", "type = Sum: expected one of Simple, SingleChip"),
-        ("moffat", "psf_model", "type", "Kolmogorov", "model = Kolmogorov: expected one of PixelGrid, Gaussian, Moff"),
+        (
+            "moffat",
+            "psf_model",
+            "type",
+            "Optical",
+            "model = Optical: expected one of PixelGrid, Gaussian, Moffat, Kolm",
+        ),
         ("moffat", "psf_interp", "type", "GP", "interp = GP: expected one of BasisPolynomial, Polynomial, Mean"),
         ("grid_color", "psf_model", "interp", "galsim.Quintic()", "model interp = galsim.Quintic(): expected Lanczos"),
         ("moffat", "psf_model", "type", "Gaussian", None),
