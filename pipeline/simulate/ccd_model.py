@@ -94,7 +94,7 @@ def fit_ccd_model(
     terms = 0 if fit.interpolation == "kriging" else term_count(fit.order or 0)
     require_stars(used, observation.defects, max(least, terms))
     images = observation.images[used]
-    if fit.interpolation == "kriging":  # which needs the photons
+    if fit.interpolation != "polynomial":  # a process needs the photons
         images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
         images,
