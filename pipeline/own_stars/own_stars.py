@@ -218,7 +218,7 @@ def fit_own_stars(
     require_stars(used, flags, FEWEST_STARS)
 
     def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
-        return PsfModel.fit(centred[chosen], places[chosen], extent=span, **({"gain": gain} | kind))
+        return PsfModel.fit(centred[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
 
     def predict(kind: Mapping[str, Any]) -> np.ndarray:
         predicted = np.empty((len(which), size, size))

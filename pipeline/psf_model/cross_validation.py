@@ -73,9 +73,12 @@ def choose(
             summed = np.concatenate([np.zeros_like(predicted[:, :1]), np.cumsum(predicted, axis=1)], axis=1)
             found = (stars.deviations[held] + (stars.mean - basis.mean)) @ shapes.filters.T
             left[held, i] = found[:, None] - summed[:, np.minimum(counts, len(basis.vectors))]
-    squares = (left**2).mean(axis=-1)
-    best = np.unravel_index(np.argmin(squares.mean(axis=0)), squares.shape[1:])
+    # One column for each order and number of components.
+    squares = (left**2).mean(axis=-1).reshape(len(terms), -1)
+    residuals = left.reshape(len(terms), -1, 3)
+    best = int(np.argmin(squares.mean(axis=0)))
     for _ in range(2):
-        weight = (shapes.model_variance(left[:, *best]) + shapes.noise) ** -2
-        best = np.unravel_index(np.argmin(np.tensordot(weight, squares, 1)), squares.shape[1:])
-    return orders[int(best[0])], int(counts[best[1]])
+        weight = (shapes.model_variance(residuals[:, best]) + shapes.noise) ** -2
+        best = int(np.argmin(weight @ squares))
+    order, count = divmod(best, len(counts))
+    return orders[order], int(counts[count])

@@ -80,20 +80,19 @@ def fit_fields(
         check_apart(points, interpolation)
     if gain is not None and not (np.isfinite(gain) and gain > 0.0):
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
-    if order is None:
-        order = ORDERS[interpolation]
-    automatic = "auto" in (order, n_components)
+    fixed = None if order == "auto" else int(ORDERS[interpolation] if order is None else order)
+    automatic = fixed is None or n_components == "auto"
     # Those of polynomials; under a process they serve to choose components, and to weigh stars in eigen-PSFs.
-    orders = [int(order)] if interpolation == "polynomial" and order != "auto" else automatic_orders(n_stars)
+    orders = [fixed] if interpolation == "polynomial" and fixed is not None else automatic_orders(n_stars)
+    needed = orders[-1] if fixed is None else fixed
     by_noise = isinstance(weights, str) or interpolation == "gp" or (automatic and star_weights is None)
     span = as_extent(extent, points)
-    terms = design_matrix(points, span, orders[-1] if order == "auto" else max(orders[-1], order))
+    terms = design_matrix(points, span, max(orders[-1], needed))
     with one_blas_thread():
         if interpolation != "kriging":  # which shrinks terms that the stars do not determine
-            needed = orders[-1] if order == "auto" else order
             check_terms(terms[:, : term_count(needed)], needed, points, star_weights)
         # Few stars would follow their own outliers under a high order.
-        smooth = _SMOOTH_ORDER if interpolation == "kriging" or order == "auto" else order
+        smooth = _SMOOTH_ORDER if interpolation == "kriging" or fixed is None else fixed
         stars = clean(
             images,
             bad,
@@ -113,13 +112,12 @@ def fit_fields(
         if shapes is not None and automatic:
             counts = np.arange(1, count + 1) if n_components == "auto" else np.array([count])
             chosen, count = choose(stars, terms, shapes, orders, counts, basis_of, star_weights)
-        if order == "auto":
-            order = chosen
         basis_weights = None
         if shapes is not None and by_noise:
             basis_weights = shapes.star_weights(stars.deviations, terms[:, : term_count(chosen)])
             stars = stars.about_weighted_mean(basis_weights)
             star_weights = basis_weights
+        order = chosen if fixed is None else fixed
         terms = terms[:, : term_count(order)]
         found = basis_of(stars, basis_weights, count)
         coefficients, unexplained = project(stars, found, basis)
@@ -150,7 +148,7 @@ def fit_fields(
             polynomial=polynomial,
             eigenvalues=found.spectrum[:limit] ** 2 / (n_stars - 1),
             positions=points,
-            order=int(order),
+            order=order,
             extent=span,
             unexplained=unexplained,
             rejected=stars.rejected.sum(axis=1),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -48,7 +49,7 @@ def fit_kernels(
         own = rest[:, group] / np.sqrt(power)
         tried = [_likelihood(each, own, _RATIOS_TRIED)[0] for each in spectra]
         i, j = np.unravel_index(np.argmax(tried), np.shape(tried))
-        length = _best_between(lambda t, own=own, j=j: _best_ratio(spectrum(t), own, j)[0], _LENGTHS_TRIED, int(i))
+        length = _best_between(partial(_best_likelihood, spectrum, own, int(j)), _LENGTHS_TRIED, int(i))
         _, ratio = _best_ratio(spectrum(length), own, int(j))
         variance = power * float(_likelihood(spectrum(length), own, np.array([ratio]))[1][0])
         result[group] = (variance, length, variance * ratio)
@@ -79,6 +80,13 @@ def _best_ratio(spectrum: tuple[np.ndarray, np.ndarray], values: np.ndarray, nea
 
     ratio = _best_between(likelihood, _RATIOS_TRIED, near)
     return likelihood(ratio), ratio
+
+
+def _best_likelihood(
+    spectrum: Callable[[float], tuple[np.ndarray, np.ndarray]], values: np.ndarray, near: int, length: float
+) -> float:
+    """Return the largest likelihood of a length, near a ratio of the grid."""
+    return _best_ratio(spectrum(length), values, near)[0]
 
 
 def _best_between(function: Callable[[float], float], grid: np.ndarray, near: int) -> float:

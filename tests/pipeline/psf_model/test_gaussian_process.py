@@ -130,7 +130,7 @@ def test_bright_stars_count_by_their_noise(basis):
     model, truth = PsfModel.fit(stars, places, **options), psf(elsewhere)
     assert np.corrcoef(np.log(model.weights), np.log(electrons))[0, 1] > 0.97
     left = np.sqrt(((model.at(elsewhere) - truth) ** 2).mean())
-    assert left < 0.5 * np.sqrt(((truth - truth.mean(axis=0)) ** 2).mean())
+    assert left < 0.6 * np.sqrt(((truth - truth.mean(axis=0)) ** 2).mean())
     # Faint stars that were nothing but noise would change nothing that the bright ones know.
     faint = electrons < np.quantile(electrons, 0.2)
     stars[faint] += 30.0 * rng.normal(size=stars[faint].shape)
