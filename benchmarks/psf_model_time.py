@@ -51,7 +51,7 @@ def main() -> None:
     products = [read_product(path, holdout_images=False) for path in sorted(arguments.run.glob("ccd_*.fits"))]
     stars = [int(p.observed.used.sum()) for p in products]
     print(
-        f"pachon {version('pachon')}, numpy {np.__version__}, scikit-learn {version('scikit-learn')}, "
+        f"pachon {version('pachon')}, numpy {np.__version__}, "
         f"{platform.machine()}, {arguments.threads} threads: "
         f"{arguments.ccds} CCDs of {min(stars)} to {max(stars)} stars"
     )

@@ -34,9 +34,10 @@ def model_command(
 ) -> None:
     """Model the PSF of an image from a table of its stars, and show how well it predicts stars that were held out.
 
-    Stars are centred, those with neighbours, cosmic rays and saturated cores left out, and every pixel is interpolated
-    by kriging, which has nothing to choose. It leaves the model, STARS_psf.fits; a picture beside it, .png; and all
-    stars with their shapes and what the model made without them predicts, .ecsv.
+    Stars are centred, those with neighbours, cosmic rays and saturated cores left out. The kind of model is the one
+    that predicts held-out stars best: kriging of pixels, unless another is clearly better. It leaves the model,
+    STARS_psf.fits; a picture beside it, .png; and all stars with their shapes and what the model made without them
+    predicts, .ecsv.
 
     **Examples**
 
@@ -71,6 +72,7 @@ def model_command(
     elif not quiet:
         flagged = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in found["flagged"].items() if n)
         rows = [
+            ("kind of model", str(found["kind"])),
             ("stars, used", f"{found['stars']}, {found['used']}"),
             ("flagged", flagged or "none"),
             ("S/N, median", f"{found['median_snr']:.0f}"),

@@ -229,7 +229,7 @@ class ReconstructionConfig(Section):
     )
     order: Whole | None = Field(
         None,
-        description="order of the polynomials fitted to the observed stars, 3; under a process 0, in kriging 2",
+        description="order of the polynomials fitted to the observed stars, 3; of the trend under a gp 0, in kriging 4",
     )
     truth_order: Whole = Field(4, description="order of the polynomials fitted to the noise-free PSFs")
     weight_fwhm_arcsec: Positive | None = Field(None, description="FWHM of the weight of the moments [arcsec]")

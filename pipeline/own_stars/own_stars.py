@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ from ..psf_model.checks import as_extent
 from ..psf_model.model import PsfModel
 from ..psf_model.polynomial import as_positions
 from ..simulate.stamps import center_stamps
+from .candidates import CANDIDATES, KRIGING, choose_candidate
 
 #: Fewest stars that a model is made of.
 FEWEST_STARS = 5
@@ -62,6 +64,8 @@ class OwnStars(Result):
         Noise of a component of the ellipticity, and of the relative size, of the used stars, [n_used].
     pixel_scale, weight_fwhm : float
         Of the stamps [rad], and of the weight of the moments [rad].
+    kind : str
+        Kind of model that was chosen, one of :data:`~.own_stars.candidates.CANDIDATES`; ``given`` where options said.
     """
 
     _images = ("stamps", "predicted")
@@ -79,6 +83,7 @@ class OwnStars(Result):
     sigma_size: np.ndarray
     pixel_scale: float
     weight_fwhm: float
+    kind: str
 
     def table(self) -> Table:
         """Return all stars with their shapes and residuals."""
@@ -119,6 +124,7 @@ class OwnStars(Result):
         d1, d2, size = self.residuals()
         counts = {str(f.name).lower(): int(((self.flags & f) > 0).sum()) for f in StarFlag if f}
         return {
+            "kind": self.kind,
             "stars": len(self.used),
             "used": int(self.used.sum()),
             "flagged": counts,
@@ -168,6 +174,9 @@ def fit_own_stars(
 ) -> OwnStars:
     """Centre stars, leave out those with defects, model the PSF, and predict each star from others.
 
+    The kind of model is chosen by the stars that are held out: kriging of pixels, unless pixels of order 0 to 2 or
+    principal components, with the noise of each star, predict them better by two standard errors.
+
     Parameters
     ----------
     stamps, positions : array
@@ -189,7 +198,7 @@ def fit_own_stars(
     seed : int
         Of the parts that are held out.
     **options
-        Other options of :meth:`~.PsfModel.fit`; kriging of pixels by default.
+        Options of :meth:`~.PsfModel.fit`, for kriging of pixels or another kind of model, without a choice.
 
     Raises
     ------
@@ -227,20 +236,26 @@ def fit_own_stars(
     snr = _signal_to_noise(centred, rms, gain)
     used = (flags == 0) & (snr >= min_snr)
     require_stars(used, flags, FEWEST_STARS)
-    defaults = {"basis": "pixels", "interpolation": "kriging"} | options
-    if defaults["interpolation"] == "kriging":
-        defaults["gain"] = gain
 
-    def fit(chosen: np.ndarray) -> PsfModel:
-        return PsfModel.fit(centred[chosen], places[chosen], extent=span, **defaults)
+    def fit(chosen: np.ndarray, kind: Mapping[str, Any]) -> PsfModel:
+        return PsfModel.fit(centred[chosen], places[chosen], extent=span, **{"gain": gain, **kind})
+
+    def predict(kind: Mapping[str, Any]) -> np.ndarray:
+        predicted = np.empty((len(which), size, size))
+        for part in parts:
+            rest = np.setdiff1d(np.arange(len(which)), part)
+            predicted[part] = fit(which[rest], kind).at(places[which[part]])
+        return predicted
 
     span = as_extent(extent, places[used])
     which = np.flatnonzero(used)
-    predicted = np.empty((len(which), size, size))
     parts = np.array_split(stream(require_seed(seed), "held-out stars").permutation(len(which)), min(FOLDS, len(which)))
-    for part in parts:
-        rest = np.setdiff1d(np.arange(len(which)), part)
-        predicted[part] = fit(which[rest]).at(places[which[part]])
+    if options:
+        name, kind = "given", KRIGING | options
+        predicted = predict(kind)
+    else:
+        name, predicted = choose_candidate(predict, centred[used], gain)
+        kind = CANDIDATES[name]
     psf = predicted.mean(axis=0)
     variance = (weight / scale / 2.354820045) ** 2
     deviations = (centred[used] / centred[used].sum(axis=(1, 2), keepdims=True) - psf).reshape(len(which), -1)
@@ -251,8 +266,9 @@ def fit_own_stars(
     good = centred[used]
     stamps_used = good / good.sum(axis=(1, 2), keepdims=True)
     sigmas = np.sqrt((sigma[:, :2] ** 2).mean(axis=1)), sigma[:, 2]
+    model = fit(which, kind)
     return OwnStars(
-        fit(which), places, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight
+        model, places, snr, flags, used, shapes, held_out, stamps_used, predicted, *sigmas, scale, weight, name
     )
 
 

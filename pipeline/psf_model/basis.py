@@ -30,11 +30,16 @@ class Basis:
     scale: float = np.nan  #: of shapelets [pixel]
 
 
-def principal_components(mean: np.ndarray, deviations: np.ndarray, count: int) -> Basis:
+def principal_components(
+    mean: np.ndarray, deviations: np.ndarray, count: int, weights: np.ndarray | None = None
+) -> Basis:
     """Return the `count` eigen-PSFs of largest eigenvalue, the element of largest magnitude of each positive.
 
-    `deviations` [n_stars, n_pixels] are the stars less their mean [n_pixels].
+    `deviations` [n_stars, n_pixels] are the stars less their mean [n_pixels]. With `weights` [n_stars], of mean 1, each
+    star counts in the covariance by its own.
     """
+    if weights is not None:
+        deviations = deviations * np.sqrt(weights)[:, None]
     _, singular, vectors = np.linalg.svd(deviations, full_matrices=False)
     vectors = vectors[:count]
     largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)

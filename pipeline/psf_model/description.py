@@ -12,33 +12,37 @@ from .outliers import find_outliers, restore_predicted
 
 
 @dataclass(frozen=True, eq=False)
-class Description:
-    """Stars in a basis."""
+class CleanStars:
+    """Stars of unit sum without outliers and masked pixels."""
 
-    basis: Basis
-    coefficients: np.ndarray  #: projections of the stars, [n_stars, k]
-    unexplained: np.ndarray  #: squares of the residual summed over pixels, [n_stars]
+    mean: np.ndarray  #: mean of the stars, [n_pixels], unit sum
+    deviations: np.ndarray  #: of the stars from it, [n_stars, n_pixels]
     rejected: np.ndarray  #: outliers, [n_stars, n_pixels] bool
 
+    def of_stars(self, chosen: np.ndarray) -> CleanStars:
+        """Return some of the stars, about the same mean."""
+        return CleanStars(self.mean, self.deviations[chosen], self.rejected[chosen])
 
-def describe(
+    def about_weighted_mean(self, weights: np.ndarray) -> CleanStars:
+        """Return the stars about their mean with weights [n_stars]."""
+        shift = weights @ self.deviations / weights.sum()
+        return CleanStars(self.mean + shift, self.deviations - shift, self.rejected)
+
+
+def clean(
     images: np.ndarray,
     masked: np.ndarray,
     terms: np.ndarray,
     *,
-    basis: str,
-    count: int,
-    scale: float | None,
     clip_sigma: float | None,
     max_iterations: int,
     replacement: str,
-) -> Description:
-    """Describe the stars of a CCD in a basis; options as in :meth:`~.PsfModel.fit`.
+) -> CleanStars:
+    """Return the stars of a CCD without outliers; options as in :meth:`~.PsfModel.fit`.
 
     `images` [n_stars, ny, nx] are finite and of any flux; pixels in `masked` are not used. The polynomial terms at the
     stars [n_stars, n_terms] keep stars whose deviation the others predict, and fill masked pixels.
     """
-    shape = images.shape[1:]
     pixels, missing = images.reshape(len(images), -1), masked.reshape(len(images), -1)
     if missing.any():
         guess, flux = mean_and_flux(pixels, missing)
@@ -58,13 +62,31 @@ def describe(
         stars = fill_masked(mean + deviations, missing, by_mean, terms)
         mean = stars.mean(axis=0)
         deviations = np.where(by_mean, 0.0, stars - mean)
+    return CleanStars(mean, deviations, rejected)
+
+
+def make_basis(
+    stars: CleanStars,
+    shape: tuple[int, int],
+    basis: str,
+    count: int,
+    scale: float | None,
+    weights: np.ndarray | None = None,
+) -> Basis:
+    """Return a basis of stars of a shape (ny, nx); `weights` [n_stars] are those of the stars in eigen-PSFs."""
     if basis == "pixels":
-        return Description(pixel_grid(mean, deviations), deviations, np.zeros(len(deviations)), rejected)
+        return pixel_grid(stars.mean, stars.deviations)
     if basis == "pca":
-        found = principal_components(mean, deviations, count)
-    else:
-        found = shapelets(mean, deviations, count, shape, scale)
-        deviations = deviations + (mean - found.mean)  # its mean is not that of the stars
+        return principal_components(stars.mean, stars.deviations, count, weights)
+    return shapelets(stars.mean, stars.deviations, count, shape, scale)
+
+
+def project(stars: CleanStars, found: Basis, basis: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the projections of stars on a basis of theirs [n_stars, k], and squares of what is left [n_stars]."""
+    deviations = stars.deviations
+    if basis == "pixels":
+        return deviations, np.zeros(len(deviations))
+    if basis == "shapelets":
+        deviations = deviations + (stars.mean - found.mean)  # its mean is not that of the stars
     coefficients = deviations @ found.vectors.T
-    unexplained = ((deviations - coefficients @ found.vectors) ** 2).sum(axis=1)
-    return Description(found, coefficients, unexplained, rejected)
+    return coefficients, ((deviations - coefficients @ found.vectors) ** 2).sum(axis=1)

@@ -10,10 +10,12 @@ import scipy.linalg
 from ...core.errors import ConfigError, DomainError
 from ...core.threads import one_blas_thread
 from . import gaussian_process, kriging
-from .basis import BASES
+from .basis import BASES, Basis
 from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms
-from .description import describe
+from .cross_validation import automatic_orders, choose
+from .description import CleanStars, clean, make_basis, project
 from .polynomial import as_positions, design_matrix, mapped, term_count
+from .shape_noise import ShapeNoise
 
 #: Components of principal components and of shapelets where no number is given (Jee & Tyson 2011, sec. 3).
 COMPONENTS = 20
@@ -21,8 +23,8 @@ COMPONENTS = 20
 INTERPOLATIONS = ("polynomial", "gp", "kriging")
 #: Degree of the polynomials, or of the trend under a process, where none is given.
 ORDERS = {"polynomial": 3, "gp": 0, "kriging": kriging.ORDER}
-# Order of the polynomials that predict outliers and masked pixels in kriging.
-_DESCRIBED_ORDER = 2
+# Order of the polynomials that predict outliers and masked pixels in kriging, and where the order is to be chosen.
+_SMOOTH_ORDER = 2
 #: Most components from which an automatic choice is made.
 _MOST_COMPONENTS = 65
 # Variance of a star's noise over that of its shape, at least: stars without noise would make the covariance singular.
@@ -38,7 +40,7 @@ def fit_fields(
     weights: Any,
     masks: Any,
     n_components: Any,
-    order: int | None,
+    order: int | str | None,
     extent: Any,
     scale: float | None,
     gain: float | None,
@@ -46,10 +48,7 @@ def fit_fields(
     max_iterations: int,
     replacement: str,
 ) -> dict[str, Any]:
-    """Return the fields of a model; arguments and errors as those of :meth:`~.PsfModel.fit`.
-
-    An automatic number of components is left at the most from which it is to be chosen.
-    """
+    """Return the fields of a model; arguments and errors as those of :meth:`~.PsfModel.fit`."""
     images, bad = as_stamps(stamps, masks)
     n_stars, ny, nx = images.shape
     points = as_positions(positions)
@@ -70,46 +69,70 @@ def fit_fields(
         raise ConfigError(f"clip_sigma = {clip_sigma}: expected a positive number or None")
     if max_iterations < 1:
         raise ConfigError(f"max_iterations = {max_iterations}: expected at least 1")
-    if order is None:
-        order = ORDERS[interpolation]
-    star_weights = as_weights(weights, n_stars)
+    star_weights = None if isinstance(weights, str) else as_weights(weights, n_stars)
     if interpolation != "polynomial":
-        if star_weights is not None:
+        if weights is not None:
             raise ConfigError(
                 f"weights: expected none with interpolation = {interpolation!r}, which fits the noise itself"
             )
+        if order == "auto":
+            raise ConfigError(f"order = 'auto': expected a number or None with interpolation = {interpolation!r}")
         check_apart(points, interpolation)
     if gain is not None and not (np.isfinite(gain) and gain > 0.0):
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
+    fixed = None if order == "auto" else int(ORDERS[interpolation] if order is None else order)
+    automatic = fixed is None or n_components == "auto"
+    # Those of polynomials; under a process they serve to choose components, and to weigh stars in eigen-PSFs.
+    orders = [fixed] if interpolation == "polynomial" and fixed is not None else automatic_orders(n_stars)
+    needed = orders[-1] if fixed is None else fixed
+    by_noise = isinstance(weights, str) or interpolation == "gp" or (automatic and star_weights is None)
     span = as_extent(extent, points)
-    terms = design_matrix(points, span, order)
+    terms = design_matrix(points, span, max(orders[-1], needed))
     with one_blas_thread():
         if interpolation != "kriging":  # which shrinks terms that the stars do not determine
-            check_terms(terms, order, points, star_weights)
+            check_terms(terms[:, : term_count(needed)], needed, points, star_weights)
         # Few stars would follow their own outliers under a high order.
-        smooth = terms[:, : term_count(_DESCRIBED_ORDER)] if interpolation == "kriging" else terms
-        stars = describe(
+        smooth = _SMOOTH_ORDER if interpolation == "kriging" or fixed is None else fixed
+        stars = clean(
             images,
             bad,
-            smooth,
-            basis=basis,
-            count=count,
-            scale=scale,
+            terms[:, : term_count(smooth)],
             clip_sigma=clip_sigma,
             max_iterations=max_iterations,
             replacement=replacement,
         )
-        coefficients = stars.coefficients
+
+        def basis_of(some: CleanStars, weights: np.ndarray | None, count: int) -> Basis:
+            return make_basis(some, (ny, nx), basis, count, scale, weights)
+
+        shapes = None
+        if by_noise or automatic:
+            shapes = ShapeNoise.of(images, stars.deviations, stars.mean.reshape(ny, nx), _gain(images, gain))
+        chosen = min(orders[-1], _SMOOTH_ORDER) if interpolation == "gp" else orders[-1]
+        if shapes is not None and automatic:
+            counts = np.arange(1, count + 1) if n_components == "auto" else np.array([count])
+            chosen, count = choose(stars, terms, shapes, orders, counts, basis_of, star_weights)
+        basis_weights = None
+        if shapes is not None and by_noise:
+            basis_weights = shapes.star_weights(stars.deviations, terms[:, : term_count(chosen)])
+            stars = stars.about_weighted_mean(basis_weights)
+            star_weights = basis_weights
+        order = chosen if fixed is None else fixed
+        terms = terms[:, : term_count(order)]
+        found = basis_of(stars, basis_weights, count)
+        coefficients, unexplained = project(stars, found, basis)
         kernel = alpha = None
-        if interpolation == "gp":
-            mapped_points = mapped(points, span)
-            kernel = gaussian_process.fit_kernels(mapped_points, coefficients, terms, shared=basis == "pixels")
-            polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel)
+        mapped_points = mapped(points, span)
+        if interpolation == "gp" and shapes is not None:
+            kernel = gaussian_process.fit_kernels(
+                mapped_points, coefficients, terms, shapes.noise, shared=basis == "pixels"
+            )
+            polynomial, alpha, _ = gaussian_process.krige(mapped_points, coefficients, terms, kernel, shapes.noise)
+            star_weights = 1.0 / shapes.noise
         elif interpolation == "kriging":
-            mapped_points = mapped(points, span)
-            deviations = coefficients if basis == "pixels" else coefficients @ stars.basis.vectors
-            numbers, filters = kriging.shape_numbers(stars.basis.mean.reshape(ny, nx), deviations)
-            noise = kriging.star_noise(images, deviations, stars.basis.mean.reshape(ny, nx), filters, gain)
+            deviations = coefficients if basis == "pixels" else coefficients @ found.vectors
+            numbers, filters = kriging.shape_numbers(found.mean.reshape(ny, nx), deviations)
+            noise = kriging.star_noise(images, deviations, found.mean.reshape(ny, nx), filters, gain)
             noise = np.maximum(noise, _LEAST_NOISE * (numbers**2).mean(axis=0) + np.finfo(float).tiny)
             covariance = kriging.fit_kernel(mapped_points, numbers, noise, terms)
             star_noise = (noise / np.median(noise, axis=0)).mean(axis=1)
@@ -119,22 +142,27 @@ def fit_fields(
             q, r = np.linalg.qr(weighted(terms, star_weights))
             polynomial = scipy.linalg.solve_triangular(r, q.T @ weighted(coefficients, star_weights))
         return dict(
-            mean=stars.basis.mean.reshape(ny, nx),
-            components=stars.basis.vectors.reshape(-1, ny, nx),
+            mean=found.mean.reshape(ny, nx),
+            components=found.vectors.reshape(-1, ny, nx),
             coefficients=coefficients,
             polynomial=polynomial,
-            eigenvalues=stars.basis.spectrum[:limit] ** 2 / (n_stars - 1),
+            eigenvalues=found.spectrum[:limit] ** 2 / (n_stars - 1),
             positions=points,
-            order=int(order),
+            order=order,
             extent=span,
-            unexplained=stars.unexplained,
+            unexplained=unexplained,
             rejected=stars.rejected.sum(axis=1),
             basis=basis,
-            scale=stars.basis.scale,
+            scale=found.scale,
             weights=star_weights,
             kernel=kernel,
             alpha=alpha,
         )
+
+
+def _gain(images: np.ndarray, gain: float | None) -> float | None:
+    """Return the gain; None for stamps that are not in electrons, whose photon noise is unknown."""
+    return gain if gain is not None and np.median(images.sum(axis=(1, 2))) * gain >= kriging.FEWEST_ELECTRONS else None
 
 
 def weighted(rows: np.ndarray, weights: np.ndarray | None) -> np.ndarray:

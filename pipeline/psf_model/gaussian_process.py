@@ -1,89 +1,105 @@
-"""Gaussian processes of a position on a CCD, over a polynomial trend (universal kriging)."""
+"""Gaussian processes of a position on a CCD, over a polynomial trend, with the noise of each star (kriging)."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
-from ...core.errors import ConfigError
-
-# Bounds of the correlation length, in units in which the CCD is 2 wide, and of the noise's variance, in units in which
-# the values have variance 1. The noise keeps the covariance of near stars from being singular.
-_LENGTHS = (0.05, 20.0)
-_NOISES = (1e-10, 10.0)
-_VARIANCES = (1e-3, 1e6)
-_BOUNDS = (_VARIANCES, _LENGTHS, _NOISES)
-# The likelihood is evaluated on a grid of lengths and of ratios of the noise's variance to the process's, and then
-# maximised within this factor of the best of these, which is several of their steps.
-_NEAR = 8.0
-_LENGTHS_TRIED, _RATIOS_TRIED = np.geomspace(*_LENGTHS, 25), np.geomspace(1e-8, 1e4, 49)
+# Bounds of the correlation length, in units in which the CCD is 2 wide, and of the variance of the middle star's noise
+# over that of the process. The noise keeps the covariance of near stars from being singular.
+_LENGTHS, _RATIOS = (0.05, 20.0), (1e-8, 1e4)
+# The likelihood is evaluated on a grid of both, and then maximised between the neighbours of the best.
+_LENGTHS_TRIED, _RATIOS_TRIED = np.geomspace(*_LENGTHS, 25), np.geomspace(*_RATIOS, 49)
+# Precision of the logarithms of both.
+_PRECISION = {"xatol": 1e-3}
 
 
-def fit_kernels(points: np.ndarray, values: np.ndarray, terms: np.ndarray, *, shared: bool) -> np.ndarray:
-    """Fit variance, correlation length and noise variance [k, 3] to each column by likelihood (scikit-learn).
+def fit_kernels(
+    points: np.ndarray, values: np.ndarray, terms: np.ndarray, noise: np.ndarray, *, shared: bool
+) -> np.ndarray:
+    """Fit variance, correlation length and noise variance [k, 3] to each column by likelihood.
 
-    `points` [n, 2] are mapped to [-1, 1], `values` are [n, k], and the process is the residual of an unweighted fit of
-    the trend's `terms` [n, n_terms]. With `shared` all columns have one kernel. Variances are zero for a column without
-    any. ConfigError if scikit-learn is not installed.
+    `points` [n, 2] are mapped to [-1, 1], `values` are [n, k], and the process is the residual of a fit of the trend's
+    `terms` [n, n_terms]. `noise` [n] is the variance of each star's noise over that of the middle star, whose own is
+    fitted. With `shared` all columns have one kernel. Variances are zero for a column without any.
     """
-    try:
-        from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-    except ImportError as error:
-        raise ConfigError("interpolation = 'gp' needs scikit-learn: pip install 'pachon[gp]'") from error
-    q, _ = np.linalg.qr(terms)
-    rest = values - q @ (q.T @ values)
+    root = np.sqrt(noise)[:, None]
+    q, _ = np.linalg.qr(terms / root)
+    rest = values / root
+    rest = rest - q @ (q.T @ rest)
     result = np.zeros((values.shape[1], 3))
     result[:, 1] = 1.0
     groups = [np.arange(values.shape[1])] if shared else [np.array([k]) for k in range(values.shape[1])]
-    largest = np.abs(values).max(initial=0.0)
+    largest = np.abs(values / root).max(initial=0.0)
     squares = _squares(points, points)
-    spectra = [np.linalg.eigh(np.exp(-0.5 * squares / length**2)) for length in _LENGTHS_TRIED]
+
+    def spectrum(length: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return eigenvalues and eigenvectors of the correlation of values over the roots of their noise."""
+        return np.linalg.eigh(np.exp(-0.5 * squares / length**2) / (root * root.T))
+
+    spectra = [spectrum(length) for length in _LENGTHS_TRIED]
     for group in groups:
         power = float((rest[:, group] ** 2).mean())
         if np.sqrt(power) <= 1e-15 * largest:
             continue
-        # From near the maximum a few steps are enough. Bounds near it exclude lower maxima and singular covariances.
-        rough = _rough_kernel(spectra, rest[:, group] / np.sqrt(power))
-        near = [(max(v / _NEAR, low), min(v * _NEAR, high)) for v, (low, high) in zip(rough, _BOUNDS, strict=True)]
-        variance, length, noise = rough
-        kernel = ConstantKernel(variance, near[0]) * RBF(length, near[1]) + WhiteKernel(noise, near[2])
-        process = GaussianProcessRegressor(kernel, alpha=0.0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a parameter may end on its bound: no noise, or noise only
-            process.fit(points, rest[:, group] / np.sqrt(power))
-        found = process.kernel_
-        result[group] = (power * found.k1.k1.constant_value, found.k1.k2.length_scale, power * found.k2.noise_level)
+        own = rest[:, group] / np.sqrt(power)
+        tried = [_likelihood(each, own, _RATIOS_TRIED)[0] for each in spectra]
+        i, j = np.unravel_index(np.argmax(tried), np.shape(tried))
+        length = _best_between(partial(_best_likelihood, spectrum, own, int(j)), _LENGTHS_TRIED, int(i))
+        _, ratio = _best_ratio(spectrum(length), own, int(j))
+        variance = power * float(_likelihood(spectrum(length), own, np.array([ratio]))[1][0])
+        result[group] = (variance, length, variance * ratio)
     return result
 
 
-def _rough_kernel(spectra: Sequence[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> tuple[float, float, float]:
-    """Return variance, length and noise of the largest likelihood on a grid of lengths and ratios.
+def _likelihood(
+    spectrum: tuple[np.ndarray, np.ndarray], values: np.ndarray, ratios: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the logarithm of the likelihood, and the most likely variance of the process, for each ratio.
 
-    With the eigenvalues l of the correlation matrix, values y along its eigenvectors and g the ratio of the noise to
-    the variance c, the logarithm of the likelihood of n values is, but for a constant,
-    -(n ln c + sum ln(l + g) + sum y^2/(l + g)/c)/2, and largest for c = sum y^2/(l + g)/n. `spectra` holds eigenvalues
-    and eigenvectors for each of the lengths; `values` [n, k] of one kernel have mean square 1.
+    With the eigenvalues l of the correlation, values y along its eigenvectors and g the ratio of the noise to the
+    variance c, the logarithm for n values is, but for a constant, -(n ln c + sum ln(l + g) + sum y^2/(l + g)/c)/2, and
+    largest for c = sum y^2/(l + g)/n. `values` are [n, k], of one kernel.
     """
-    count = values.shape[0]
-    best, found = -np.inf, (1.0, 1.0, 0.1)
-    for length, (eigenvalues, vectors) in zip(_LENGTHS_TRIED, spectra, strict=True):
-        power = ((vectors.T @ values) ** 2).mean(axis=1)
-        total = np.maximum(eigenvalues, 0.0)[:, None] + _RATIOS_TRIED
-        variances = (power[:, None] / total).mean(axis=0)
-        likelihood = -0.5 * (count * np.log(variances) + np.log(total).sum(axis=0))
-        top = int(np.argmax(likelihood))
-        if likelihood[top] > best:
-            best, found = float(likelihood[top]), (variances[top], length, variances[top] * _RATIOS_TRIED[top])
-    variance, length, noise = (float(np.clip(v, *b)) for v, b in zip(found, _BOUNDS, strict=True))
-    return variance, length, noise
+    eigenvalues, vectors = spectrum
+    power = ((vectors.T @ values) ** 2).mean(axis=1)
+    total = np.maximum(eigenvalues, 0.0)[:, None] + ratios
+    variances = (power[:, None] / total).mean(axis=0)
+    return -0.5 * (len(values) * np.log(variances) + np.log(total).sum(axis=0)), variances
+
+
+def _best_ratio(spectrum: tuple[np.ndarray, np.ndarray], values: np.ndarray, near: int) -> tuple[float, float]:
+    """Return the largest likelihood near a ratio of the grid, and the ratio."""
+
+    def likelihood(ratio: float) -> float:
+        return float(_likelihood(spectrum, values, np.array([ratio]))[0][0])
+
+    ratio = _best_between(likelihood, _RATIOS_TRIED, near)
+    return likelihood(ratio), ratio
+
+
+def _best_likelihood(
+    spectrum: Callable[[float], tuple[np.ndarray, np.ndarray]], values: np.ndarray, near: int, length: float
+) -> float:
+    """Return the largest likelihood of a length, near a ratio of the grid."""
+    return _best_ratio(spectrum(length), values, near)[0]
+
+
+def _best_between(function: Callable[[float], float], grid: np.ndarray, near: int) -> float:
+    """Return where a function is largest between the neighbours of a point of a grid, by Brent's method."""
+    low, high = np.log(grid[max(near - 1, 0)]), np.log(grid[min(near + 1, len(grid) - 1)])
+    found = scipy.optimize.minimize_scalar(
+        lambda t: -function(float(np.exp(t))), bounds=(low, high), method="bounded", options=_PRECISION
+    )
+    return float(np.exp(found.x))
 
 
 def krige(
-    points: np.ndarray, values: np.ndarray, terms: np.ndarray, kernels: np.ndarray
+    points: np.ndarray, values: np.ndarray, terms: np.ndarray, kernels: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve for the trend and the stars' weights, and predict each value from the others.
 
@@ -96,11 +112,11 @@ def krige(
     squares = _squares(points, points)
     for kernel in np.unique(kernels, axis=0):
         group = (kernels == kernel).all(axis=1)
-        variance, length, noise = kernel
+        variance, length, of_middle = kernel
         if variance == 0.0:  # nothing but the trend
-            covariance = np.eye(len(points))
+            covariance = np.diag(noise)
         else:
-            covariance = variance * np.exp(-0.5 * squares / length**2) + noise * np.eye(len(points))
+            covariance = variance * np.exp(-0.5 * squares / length**2) + of_middle * np.diag(noise)
         # Everything in units whitened by the root of the covariance: ordinary least squares.
         root = scipy.linalg.cholesky(covariance, lower=True)
         inverse = scipy.linalg.solve_triangular(root, np.eye(len(points)), lower=True)

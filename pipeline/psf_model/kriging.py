@@ -36,9 +36,9 @@ COLUMNS = 5
 # that they cost nothing where the stars show nothing.
 _PRIOR = np.array([(-2.0, 2.0), (math.log(0.7), 0.7), (-4.0, 1.5)])
 _TREND_WIDTH = 4.0
-# Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms of
-# the trend's variances start, up to the degree given, at the second number for degree 1 and fall by the third for each
-# degree more; beyond, where they are expected.
+# Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms
+# of the trend's variances start, up to the degree given, at the second number for degree 1 and fall by the third for
+# each degree more; beyond, where they are expected.
 _TREND, _PROCESS = (-4.0, math.log(0.7), -4.0), (0.0, math.log(0.7), -4.0)
 _STARTS = ((_TREND, 2, 2.0, 1.0), (_PROCESS, 2, 1.0, 2.0), (_TREND, math.inf, 3.0, 0.5))
 # Variance of the trend's constant: as good as unknown.
@@ -47,8 +47,8 @@ _CONSTANT = 1e4
 _MOST_STARS = 300
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
-# Stars of fewer photons are not in electrons.
-_FEWEST_ELECTRONS = 100.0
+#: Stars of fewer photons are not in electrons.
+FEWEST_ELECTRONS = 100.0
 
 
 def shape_numbers(
@@ -88,7 +88,7 @@ def star_noise(
     noise = rms[:, None] ** 2 * (filters**2).sum(axis=1)
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
-        if np.median(electrons) < _FEWEST_ELECTRONS:
+        if np.median(electrons) < FEWEST_ELECTRONS:
             raise DomainError(
                 f"gain = {gain:g}: the middle star has {np.median(electrons):.3g} electrons; expected stamps in "
                 "electrons, gain in electrons a unit, or gain = None for no photon noise"

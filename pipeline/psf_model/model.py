@@ -66,7 +66,7 @@ class PsfModel(PicturedModel):
     scale : float
         rms width of the Gaussian under shapelets [pixel]; NaN else.
     weights : array or None
-        Of the stars in the polynomials, [n]; under kriging their inverse variances, in units of the middle star's.
+        Of the stars in the polynomials, [n]; under a process their inverse variances, in units of the middle star's.
     kernel : array or None
         Of a Gaussian process for each component: variance, correlation length where the extent is 2 wide, variance of
         the noise, [k, 3]; under kriging those of :data:`.kriging.COLUMNS`. None where there are only polynomials.
@@ -99,10 +99,10 @@ class PsfModel(PicturedModel):
         *,
         basis: Literal["pca", "pixels", "shapelets"] = "pca",
         interpolation: Literal["polynomial", "gp", "kriging"] = "polynomial",
-        weights: ArrayLike | None = None,
+        weights: ArrayLike | Literal["noise"] | None = None,
         masks: NDArray[np.bool_] | None = None,
         n_components: int | Literal["auto"] | None = None,
-        order: int | None = None,
+        order: int | Literal["auto"] | None = None,
         extent: ArrayLike | None = None,
         scale: float | None = None,
         gain: float | None = 1.0,
@@ -113,8 +113,8 @@ class PsfModel(PicturedModel):
         """Fit the model to the stars of one CCD.
 
         Outliers are found pixel by pixel (:func:`~.find_outliers`) and replaced by the mean
-        of the stars that are good there. The polynomials are fitted without weights, since it is the spatial
-        variation that matters and not the brightest star (Jee & Tyson 2011, sec. 3).
+        of the stars that are good there. By default the polynomials are fitted without weights, as in Jee & Tyson 2011,
+        sec. 3.
 
         Parameters
         ----------
@@ -127,27 +127,30 @@ class PsfModel(PicturedModel):
             truncate the wings (Jee & Tyson 2011, sec. 3).
         interpolation : str
             ``polynomial``, or ``gp``: a Gaussian process for each component (one for all pixels) over a polynomial
-            trend; needs scikit-learn. ``kriging``: one rule for all pixels, with the noise of each star
+            trend, with the noise of each star. ``kriging``: one rule for all pixels, with the noise of each star
             (:mod:`~.psf_model.kriging`); with ``basis="pixels"`` the best choice where nothing is known.
-        weights : array, optional
-            [n] of the stars in the polynomials.
+        weights : array or str, optional
+            [n] of the stars in the polynomials. ``noise``: in the mean and the eigen-PSFs, too, each star counts by the
+            inverse of its noise and of what the polynomials leave (:mod:`~.psf_model.shape_noise`); where `order` or
+            `n_components` is ``auto`` this is the default.
         masks : array of bool, optional
             [n, ny, nx], True for pixels to ignore. They are replaced by the polynomial through the stars in which the
             pixel is good, so that they have no influence on the fit.
         n_components : int or str, optional
             Components to keep, 20 where left out: principal ones at most n - 1, of shapelets those of sum zero.
-            ``auto`` takes :attr:`cross_validated_components` of up to 65; :attr:`elbow` is the alternative. None for
-            pixels.
-        order : int, optional
-            Largest total degree of the polynomials, 3 where left out; of the trend 0 under a Gaussian process and 2 in
-            kriging, which shrinks it.
+            ``auto`` takes the number, up to 65, that predicts the shapes of held-out stars best; :attr:`elbow` is the
+            alternative. None for pixels.
+        order : int or str, optional
+            Largest total degree of the polynomials, 3 where left out; of the trend 0 under a Gaussian process and 4 in
+            kriging, which shrinks it. ``auto``: of polynomials the order, up to 4, that predicts held-out stars best.
         extent : tuple of float, optional
             (xmin, xmax, ymin, ymax) of the CCD in the unit of the positions. Where left out, that of the stars.
         scale : float, optional
             rms width of the Gaussian under the shapelets [pixel]; by default the one with the least residual of the
             stars.
         gain : float or None
-            Electrons in a unit of the stamps, for the photon noise in kriging; None for none.
+            Electrons in a unit of the stamps, for the photon noise of the stars; None for none. Kriging refuses stamps
+            that are not in electrons; else their photon noise counts as unknown.
         clip_sigma : float or None
             Pixels that deviate by more standard deviations are rejected; with None, for noise-free stars, none is.
         max_iterations : int
@@ -159,8 +162,8 @@ class PsfModel(PicturedModel):
         Raises
         ------
         ConfigError
-            If there are more components than stars less one, or more polynomial terms than stars, an option has no such
-            value, or scikit-learn is wanted and missing.
+            If there are more components than stars less one, or more polynomial terms than stars, or an option has no
+            such value.
         DomainError
             If an array has the wrong shape, a pixel is not finite, a star has no flux, or the stars do not determine
             the polynomials (all on a line, say).
@@ -181,8 +184,7 @@ class PsfModel(PicturedModel):
             max_iterations=max_iterations,
             replacement=replacement,
         )
-        model = cls(**fitted)
-        return model.truncated(max(1, model.cross_validated_components)) if n_components == "auto" else model
+        return cls(**fitted)
 
     @property
     def n_stars(self) -> int:
@@ -220,12 +222,6 @@ class PsfModel(PicturedModel):
         gained = np.concatenate([[0.0], np.cumsum((left_out - own).sum(axis=0))])
         total = self.unexplained.sum() + own.sum() + gained
         return np.sqrt(np.maximum(total, 0.0) / (self.n_stars * self.mean.size))
-
-    @property
-    def cross_validated_components(self) -> int:
-        """Number of components with the least leave-one-out error, 0 to k; k where the error is not finite."""
-        curve = self.leave_one_out_curve
-        return int(np.argmin(curve)) if np.isfinite(curve).all() else self.n_components
 
     @property
     def leverage(self) -> np.ndarray:
@@ -368,7 +364,9 @@ class PsfModel(PicturedModel):
             with one_blas_thread():
                 if self._kriged and self.weights is not None:
                     return kriging.krige(points, self.coefficients, terms, self.kernel[0], 1.0 / self.weights)[2]
-                return gaussian_process.krige(points, self.coefficients, terms, self.kernel)[2]
+                # Files of older versions have no noise of their stars, which was taken to be the same.
+                noise = np.ones(self.n_stars) if self.weights is None else 1.0 / self.weights
+                return gaussian_process.krige(points, self.coefficients, terms, self.kernel, noise)[2]
         room = 1.0 - self.leverage
         room = np.where(room > 1e-10, room, np.nan)
         return (self.coefficients - self.amplitudes(self.positions)) / room[:, None]

@@ -91,7 +91,7 @@ def fit_ccd_model(
     fit, used = experiment.config.reconstruction, observation.used
     require_stars(used, observation.defects, fewest_stars(experiment.config))
     images = observation.images[used]
-    if fit.interpolation == "kriging":  # which needs the photons
+    if fit.interpolation != "polynomial":  # a process needs the photons
         images = images * stars.electrons[used, None, None]
     return PsfModel.fit(
         images,

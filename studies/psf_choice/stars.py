@@ -107,7 +107,7 @@ def fit(case: Case, ccd: SimulatedCcd, observed: ObservedCcd) -> PsfModel:
     used = used_stars(case, observed)
     process = case.interpolation in PROCESSES
     images = observed.observation.images[used]
-    photons = case.interpolation == "kriging" and case.snr != NOISE_FREE
+    photons = process and case.snr != NOISE_FREE
     if photons:
         images = images * observed.electrons[used, None, None]
     return PsfModel.fit(

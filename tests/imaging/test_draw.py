@@ -156,7 +156,6 @@ def test_psf_and_lit_fraction_are_those_of_the_place(psf, gaussian, psf_covarian
 def test_gaussian_processes_interpolate_too(gaussian, psf_covariance):
     places = np.random.default_rng(3).uniform(0, 4096, (40, 2))
     stamps = np.stack([gaussian(21, psf_covariance(place)) for place in places])
-    pytest.importorskip("sklearn")
     field = PsfField.fit(stamps, places, 4096, interpolation="gp", n_components=6)
     place = (2000.0, 2000.0)
     spectrum = np.einsum("k,kij->ij", field.amplitudes(place)[0], field.transforms(21))

@@ -124,8 +124,8 @@ def test_the_configuration_chooses_the_model(experiment, exposure, plain, option
     model = product.model
     assert (model.basis, model.n_components, model.order) == (basis, components, 4 if options is None else 1)
     assert (model.kernel is not None) == (options is None or "reconstruction__interpolation" in options)
-    if options is None:
-        # Kriging weighs stars by their own noise, of which a bright one has less.
+    if model.kernel is not None:
+        # A process weighs stars by their own noise, of which a bright one has less.
         assert np.corrcoef(np.log(model.weights), np.log(product.observed.snr))[0, 1] > 0.95
     else:
         expected = snr_weights(weights, product.observed.snr)

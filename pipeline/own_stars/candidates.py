@@ -1,0 +1,62 @@
+"""Kinds of PSF models among which the stars of an image choose, by how well each predicts stars that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, DomainError
+from ..psf_model.shape_noise import ShapeNoise
+
+#: The kind of model that needs no choice, and nearly always is the best (docs/psf_models.md).
+KRIGING: dict[str, Any] = {"basis": "pixels", "interpolation": "kriging"}
+#: Options of :meth:`~.PsfModel.fit` by name, the one that is preferred first.
+CANDIDATES: dict[str, dict[str, Any]] = {
+    "kriging of pixels": KRIGING,
+    **{f"pixels, order {order}": {"basis": "pixels", "order": order, "weights": "noise"} for order in range(3)},
+    "principal components": {"n_components": "auto", "order": "auto"},
+}
+# Standard errors by which another kind must be better. With one, chance alone would choose a worse one too often.
+_ERRORS = 2.0
+
+
+def choose_candidate(
+    predict: Callable[[Mapping[str, Any]], np.ndarray], stars: np.ndarray, gain: float
+) -> tuple[str, np.ndarray]:
+    """Return the name of the kind of model that predicts held-out stars best, and what it predicts.
+
+    The preferred kind stays unless another has smaller squares of residuals of the shape numbers, weighted by what each
+    star can tell, by two standard errors of the difference.
+
+    Parameters
+    ----------
+    predict : callable
+        From options of a model to its predictions of each star by others, [n, ny, nx]. It may raise ConfigError or
+        DomainError for kinds that the stars do not determine.
+    stars : array
+        [n, ny, nx], in units of `gain` electrons.
+    """
+    kinds = iter(CANDIDATES.items())
+    chosen, options = next(kinds)
+    best = predict(options)
+    unit = (stars / stars.sum(axis=(1, 2), keepdims=True)).reshape(len(stars), -1)
+    mean = best.mean(axis=0)
+    shapes = ShapeNoise.of(stars, unit - mean.ravel(), mean, gain)
+
+    def residuals(predicted: np.ndarray) -> np.ndarray:
+        return (unit - predicted.reshape(len(stars), -1)) @ shapes.filters.T
+
+    reference = residuals(best)
+    weight = (shapes.model_variance(reference) + shapes.noise) ** -2
+    least = 0.0
+    for name, options in kinds:
+        try:
+            predicted = predict(options)
+        except (ConfigError, DomainError):  # too few stars for its terms
+            continue
+        excess = weight * (residuals(predicted) ** 2 - reference**2).mean(axis=1)
+        if excess.sum() < min(least, -_ERRORS * np.sqrt(len(excess)) * excess.std(ddof=1)):
+            chosen, best, least = name, predicted, excess.sum()
+    return chosen, best

@@ -1,0 +1,84 @@
+"""Order of the polynomials and number of components, by the shapes of stars that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .basis import Basis
+from .description import CleanStars
+from .polynomial import term_count
+from .shape_noise import ShapeNoise
+
+#: Orders from which an automatic choice is made.
+ORDERS = range(5)
+# Parts of the stars that are held out, one after the other; the i-th star is in part i modulo this.
+_FOLDS = 5
+# Most terms of polynomials over the stars that they are fitted to.
+_MOST_TERMS = 0.5
+
+
+def automatic_orders(n_stars: int) -> list[int]:
+    """Return the orders of polynomials that may be chosen for so many stars, ascending."""
+    fitted = n_stars - -(-n_stars // _FOLDS)
+    return [order for order in ORDERS if order == 0 or term_count(order) <= _MOST_TERMS * fitted]
+
+
+def choose(
+    stars: CleanStars,
+    terms: np.ndarray,
+    shapes: ShapeNoise,
+    orders: Sequence[int],
+    counts: np.ndarray,
+    basis_of: Callable[[CleanStars, np.ndarray | None, int], Basis],
+    given: np.ndarray | None,
+) -> tuple[int, int]:
+    """Return the order and the number of components whose models predict the shapes of held-out stars best.
+
+    Parameters
+    ----------
+    stars : CleanStars
+        The stars.
+    terms : array
+        Of polynomials of the highest order at the stars, [n, n_terms].
+    shapes : ShapeNoise
+        Of the stars.
+    orders : sequence of int
+        To choose from, ascending.
+    counts : array of int
+        Numbers of components to choose from, ascending.
+    basis_of : callable
+        From some stars, their weights (None for equal ones) and a number of components to a basis.
+    given : array or None
+        Weights of the stars in the polynomials, [n], with equal ones in the basis; None for those of their noise.
+    """
+    fold = np.arange(len(terms)) % _FOLDS
+    left = np.full((len(terms), len(orders), len(counts), 3), np.nan)
+    for part in range(fold.max() + 1):
+        held = fold == part
+        rest, others = shapes.of_stars(~held), stars.of_stars(~held)
+        for i, order in enumerate(orders):
+            some = terms[:, : term_count(order)]
+            if given is None:
+                weights = rest.star_weights(others.deviations, some[~held])
+                about = others.about_weighted_mean(weights)
+            else:
+                weights, about = given[~held], others.about_weighted_mean(np.ones(len(others.deviations)))
+            basis = basis_of(about, None if given is not None else weights, int(counts[-1]))
+            root = np.sqrt(weights)[:, None]
+            rule = some[held] @ np.linalg.pinv(some[~held] * root) * root.T
+            coefficients = (about.deviations + (about.mean - basis.mean)) @ basis.vectors.T
+            predicted = (rule @ coefficients)[:, :, None] * (basis.vectors @ shapes.filters.T)
+            summed = np.concatenate([np.zeros_like(predicted[:, :1]), np.cumsum(predicted, axis=1)], axis=1)
+            found = (stars.deviations[held] + (stars.mean - basis.mean)) @ shapes.filters.T
+            left[held, i] = found[:, None] - summed[:, np.minimum(counts, len(basis.vectors))]
+    # One column for each order and number of components.
+    squares = (left**2).mean(axis=-1).reshape(len(terms), -1)
+    residuals = left.reshape(len(terms), -1, 3)
+    best = int(np.argmin(squares.mean(axis=0)))
+    for _ in range(2):
+        weight = (shapes.model_variance(residuals[:, best]) + shapes.noise) ** -2
+        best = int(np.argmin(weight @ squares))
+    order, count = divmod(best, len(counts))
+    return orders[order], int(counts[count])
