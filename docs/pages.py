@@ -14,11 +14,16 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 STUB = ROOT / "pachon" / "__init__.pyi"
 BLOCK = re.compile(r"```python\n(.*?)```\n", flags=re.S)
+#: Classes of others whose members are not listed.
+_FOREIGN = "tuple, IntEnum, int, Exception, BaseModel"
 _PICTURE = re.compile(r'savefig\("(.*?\.png)"')
 #: Title and introduction of the reference of each layer.
 LAYERS = {
     "core": ("Errors", "Every error of pachon is a `PachonError`: one line, with `file` and `key` as fields."),
-    "models": ("Models", "What exists: telescopes, surfaces, shapes, apertures, media, sites, cameras and their heights."),
+    "models": (
+        "Models",
+        "What exists: telescopes, surfaces, shapes, apertures, media, sites, cameras and their heights.",
+    ),
     "raytrace": ("Rays", "Launching and tracing rays."),
     "wavefront": ("Wavefronts and PSFs", "Optical path differences, Zernikes, the atmosphere, PSFs."),
     "design": ("Optical design", "Metrics, images, sensitivity, tolerances, optimisation."),
@@ -52,7 +57,10 @@ def api_page(layer: str) -> str:
         if inspect.ismodule(value):
             kind, options = "automodule", "   :members:\n"
         elif inspect.isclass(value):
-            kind, options = "autoclass", "   :members:\n   :inherited-members: tuple, IntEnum, int, Exception, BaseModel\n"
+            kind, options = (
+                "autoclass",
+                f"   :members:\n   :inherited-members: {_FOREIGN}\n",
+            )
         else:
             kind, options = "autofunction", ""
         parts.append(f"## {name}\n\n```{{eval-rst}}\n.. {kind}:: pachon.{name}\n{options}```\n")
@@ -67,8 +75,8 @@ def command_page() -> str:
 
     parts = [
         "# Commands\n",
-        "`pachon COMMAND --help` prints the same; `python -m pachon` is `pachon`. Exit status: 0 done, 1 a check failed, "
-        "2 bad input, in one line. With `--json`, standard output is that JSON and nothing else.\n",
+        "`pachon COMMAND --help` prints the same; `python -m pachon` is `pachon`. Exit status: 0 done, 1 a check "
+        "failed, 2 bad input, in one line. With `--json`, standard output is that JSON and nothing else.\n",
     ]
     for name, command in sorted(_commands(typer.main.get_command(app), "pachon")):
         text = inspect.cleandoc(command.help or "").replace("\b\n", "").replace("**Examples**", "*Examples*")

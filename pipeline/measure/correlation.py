@@ -193,8 +193,8 @@ def shear_correlation(
         The patch of each star, such as the name of its CCD; at least two different ones. Changes the error bars, and
         the correlations only by rounding (or, counting with cells, within the blur of the bins).
     other : pair of arrays, optional
-        A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of ``Re(e f'* + f e'*) / 2`` over the pairs,
-        and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
+        A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of ``Re(e f'* + f e'*) / 2`` over the
+        pairs, and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
 
     Raises
     ------
