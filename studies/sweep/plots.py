@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -55,7 +56,7 @@ def _draw_tornado(axes: Axes, metric: str, curves: Sequence[Curve]) -> None:
                 axes.barh(row, side[farthest], height=0.62, color=color, alpha=0.75)
                 if np.isfinite(errors[farthest]):
                     # Bars to either side share a row: their errors stand a little apart.
-                    bar = {"fmt": "none", "ecolor": "0.15", "elinewidth": 1.0, "capsize": 2.5}
+                    bar: dict[str, Any] = {"fmt": "none", "ecolor": "0.15", "elinewidth": 1.0, "capsize": 2.5}
                     axes.errorbar(side[farthest], row + 0.12 * sign, xerr=errors[farthest], **bar)
         for mark, (_, change) in curve.marks.items():
             color = names.setdefault(mark, _MARKS[len(names) % len(_MARKS)])
