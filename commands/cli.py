@@ -49,7 +49,6 @@ app = typer.Typer(
     name="pachon",
     help="Ray-traced telescope wavefronts, turbulent atmospheres and PSF reconstruction.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )

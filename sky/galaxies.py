@@ -159,7 +159,7 @@ class Galaxies(Result):
     def sheared(self, g1: ArrayLike, g2: ArrayLike, *, positions: bool = False) -> Galaxies:
         """Return the galaxies under a reduced shear that conserves areas.
 
-        A source at theta is seen at S theta, S = [[1 + g1, g2], [g2, 1 - g1]] / sqrt(1 - |g|^2). An ellipticity e
+        A source at theta is seen at S theta, S = [[1 + g1, g2], [g2, 1 - g1]] / sqrt(1 - g^2). An ellipticity e
         becomes (e + g) / (1 + conj(g) e) (Seitz & Schneider 1997). The half-light radius of a whole galaxy is
         kept, which holds to first order in g.
 

@@ -159,10 +159,10 @@ def shear_correlation(
 ) -> Correlation:
     r"""Correlate ellipticities of star pairs (Jee & Tyson 2011, eq. 7).
 
-    xi+ is the mean of Re(e e'*) over the pairs of a bin and xi- that of Re(e e' exp(-4 i phi)), phi being the
+    xi+ is the mean of ``Re(e e'*)`` over the pairs of a bin and xi- that of Re(e e' exp(-4 i phi)), phi being the
     direction of the pair from x towards y; equal weights, flat sky. TreeCorr runs on one thread, since several would
     add the pairs in another order: the same stars give the same bytes. It keeps ellipticities in single precision, so
-    a correlation is good to about 1e-7 of the mean |e|^2.
+    a correlation is good to about 1e-7 of the mean of e squared.
 
     With patches, such as the CCDs, the error bars are those of the delete-one jackknife (Efron 1982; Norberg et
     al. 2009):
@@ -193,8 +193,8 @@ def shear_correlation(
         The patch of each star, such as the name of its CCD; at least two different ones. Changes the error bars, and
         the correlations only by rounding (or, counting with cells, within the blur of the bins).
     other : pair of arrays, optional
-        A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of Re(e f'* + f e'*) / 2 over the pairs,
-        and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
+        A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of ``Re(e f'* + f e'*) / 2`` over the
+        pairs, and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
 
     Raises
     ------

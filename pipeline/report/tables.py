@@ -117,10 +117,11 @@ PER_CCD_COLUMNS = (
     ("stars used", ""),
 )
 PER_CCD_CAPTION = (
-    "Mean |e| of the noise-free PSFs, and rms of one component of the residual: observed - model at the stars; the "
+    "Field: distance of the middle of the CCD from the axis; FWHM: median of the noise-free PSFs. Mean |e| of the "
+    "noise-free PSFs, and rms of one component of the residual: observed - model at the stars; the "
     "same, leave-one-out; noise-free - model at the holdout positions. Variance: part of the variance of the "
     "noise-free PSFs in the components. Elbow: components before the eigenvalues flatten, of the observed stars and of "
-    "the noise-free PSFs."
+    "the noise-free PSFs. Stars used: those that the model was fitted to, of all."
 )
 
 

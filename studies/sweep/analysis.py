@@ -32,8 +32,9 @@ class Curve:
     mean: np.ndarray
     #: Standard deviation over the replicas; NaN with one replica.
     spread: np.ndarray
-    #: Mean change from the nominal point.
+    #: Mean change from the nominal point, and its standard error over the replicas; NaN with one replica.
     change: np.ndarray
+    error: np.ndarray
     #: Value and change of the marks among the values.
     marks: dict[str, tuple[float, float]]
     #: Nominal value of the parameter.
@@ -88,13 +89,13 @@ def curves(table: SweepTable, sweep: SweepFile, metric: str) -> list[Curve]:
         grid[np.searchsorted(seeds, table.seed[alone]), at] = table.metrics[metric][alone]
         change = grid - grid[:, [int(np.searchsorted(values, float(parameter.nominal)))]]
         mean, spread, _ = _over_replicas(grid)
-        mean_change = _over_replicas(change)[0]
+        mean_change, _, error = _over_replicas(change)
         marks = {
             mark: (value, float(mean_change[values == value][0]))
             for mark, value in parameter.marks.items()
             if value in values
         }
-        found.append(Curve(name, metric, values, mean, spread, mean_change, marks, float(parameter.nominal)))
+        found.append(Curve(name, metric, values, mean, spread, mean_change, error, marks, float(parameter.nominal)))
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -48,10 +49,15 @@ def _draw_tornado(axes: Axes, metric: str, curves: Sequence[Curve]) -> None:
     names: dict[str, str] = {}
     for row, curve in enumerate(ordered):
         for sign, color in ((-1, _LOW), (1, _HIGH)):
-            side = curve.change[(curve.value - curve.nominal) * sign > 0]
-            if side.size:
-                end = float(side[np.nanargmax(np.abs(side))]) if np.isfinite(side).any() else 0.0
-                axes.barh(row, end, height=0.62, color=color, alpha=0.75)
+            here = ((curve.value - curve.nominal) * sign > 0) & np.isfinite(curve.change)
+            if here.any():
+                side, errors = curve.change[here], curve.error[here]
+                farthest = int(np.argmax(np.abs(side)))
+                axes.barh(row, side[farthest], height=0.62, color=color, alpha=0.75)
+                if np.isfinite(errors[farthest]):
+                    # Bars to either side share a row: their errors stand a little apart.
+                    bar: dict[str, Any] = {"fmt": "none", "ecolor": "0.15", "elinewidth": 1.0, "capsize": 2.5}
+                    axes.errorbar(side[farthest], row + 0.12 * sign, xerr=errors[farthest], **bar)
         for mark, (_, change) in curve.marks.items():
             color = names.setdefault(mark, _MARKS[len(names) % len(_MARKS)])
             axes.plot([change, change], [row - 0.42, row + 0.42], color=color, linewidth=2.2, solid_capstyle="butt")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +43,7 @@ def write_report(store: SweepStore, folder: Path) -> Path:
         pictures=[picture for _, picture in pictures],
         pachon=store.about["pachon"],
         points=len(store.points()),
-        rows=_rows(table),
+        rows=_rows(table, sweep),
         problems=[(int(n), p) for n, p in zip(table.number, table.problem, strict=True) if p][:20],
     )
     report = folder / "report.html"
@@ -66,7 +66,8 @@ def sweep_pictures(table: SweepTable, sweep: SweepFile) -> list[tuple[str, Pictu
 def _one_at_a_time(table: SweepTable, sweep: SweepFile, drawn: dict[str, list[Curve]]) -> Iterator[tuple[str, Picture]]:
     text = (
         "Change of each metric from its nominal value over the range of each parameter, others nominal: blue below the "
-        "nominal value of the parameter, red above. Vertical strokes are the marks."
+        "nominal value of the parameter, red above. Vertical strokes are the marks. Error bars: standard error of the "
+        "mean over the replicas, which share their random numbers with the nominal point; none with one replica."
     )
     yield "tornado", Picture("What matters most", plots.tornado_plot(drawn), text)
     for metric in list(drawn)[:_SHOWN]:
@@ -123,15 +124,27 @@ def _random(table: SweepTable, numeric: list[str]) -> Iterator[tuple[str, Pictur
             yield f"pairs_{metric}", Picture(f"{metric} over pairs", plots.pairs_plot(table, metric, names), text)
 
 
-def _rows(table: SweepTable) -> list[dict[str, Any]]:
-    """Return range and median of each metric."""
-    return [
-        {
-            "name": name,
-            "low": float(np.nanmin(values)),
-            "median": float(np.nanmedian(values)),
-            "high": float(np.nanmax(values)),
-        }
-        for name, values in table.metrics.items()
-        if np.isfinite(values).any()
-    ]
+def _rows(table: SweepTable, sweep: SweepFile) -> list[dict[str, str]]:
+    """Return range and median of each metric, and its scatter over the replicas, with the digits that it allows."""
+    rows = []
+    for name, values in table.metrics.items():
+        if not np.isfinite(values).any():
+            continue
+        spreads = [c.spread[np.isfinite(c.spread)] for c in curves(table, sweep, name)]
+        known = np.concatenate([np.empty(0), *spreads])
+        scatter = float(np.median(known)) if known.size else np.nan
+        low, middle, high = (float(f(values)) for f in (np.nanmin, np.nanmedian, np.nanmax))
+        texts = {"low": low, "median": middle, "high": high}
+        rows.append(
+            {"name": name, "scatter": f"{scatter:.1e}" if scatter > 0.0 else "-"}
+            | {key: with_digits(value, scatter) for key, value in texts.items()}
+        )
+    return rows
+
+
+def with_digits(value: float, error: float) -> str:
+    """Return a number to the second digit of its error; to three digits where the error is not known."""
+    if value == 0.0 or not error > 0.0:
+        return f"{value:.3g}"
+    digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
+    return f"{value:.{min(max(digits, 1), 9)}g}"

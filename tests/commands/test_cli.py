@@ -286,3 +286,15 @@ def test_ctrl_c_ends_with_130_and_resume_goes_on(finished_run, settings_file, tm
     assert 1 <= len(done) < 18
     if "ccd_R22_S11.fits" in names:
         assert (folder / "ccd_R22_S11.fits").read_bytes() == (finished_run / "ccd_R22_S11.fits").read_bytes()
+
+
+@pytest.mark.long
+def test_shells_complete_commands_and_options(tmp_path):
+    command = [sys.executable, "-m", "pachon"]
+    words = {"pachon zer": "zernikes", "pachon spots --samp": "--sampling"}
+    for typed, completed in words.items():
+        asked = {"_PACHON_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+        done = subprocess.run(command, env=os.environ | asked, capture_output=True, text=True)
+        assert done.stdout.split() == [completed]
+    script = subprocess.run([*command, "--show-completion", "bash"], capture_output=True, text=True)
+    assert "complete -o default -F _pachon_completion pachon" in script.stdout

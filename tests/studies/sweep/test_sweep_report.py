@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from pachon.studies.sweep.analysis import curves
 from pachon.studies.sweep.file import read_sweep
-from pachon.studies.sweep.report import write_report
+from pachon.studies.sweep.report import with_digits, write_report
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store
 from pachon.studies.sweep.sweep import numbered_points
+from pachon.studies.sweep.table import read_table
 
 SWEEP = read_sweep(
     {
@@ -77,3 +79,30 @@ def test_names_are_shown_letter_by_letter(tmp_path):
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert maths in page
+
+
+def test_errors_of_effects_are_those_of_the_mean_over_replicas(tmp_path):
+    points = numbered_points(SWEEP, Path())
+    create_store(tmp_path / "s.sweep", SWEEP, points, {})
+    seeds = sorted({p.seed for p in points})
+    with SweepStore(tmp_path / "s.sweep") as store:
+        for p in points:
+            # The effect of a is once and three times its square, in two replicas.
+            xi = 1e-6 * (1 + 2 * seeds.index(p.seed)) * p.parameters["a"] ** 2
+            store.write(PointResult(p.number, {"xi_raw_short": xi}, None, 0.1, "here"))
+        curve = next(c for c in curves(read_table(store), SWEEP, "xi_raw_short") if c.parameter == "a")
+    # Of two values, the standard error of the mean is half their difference.
+    assert curve.change == pytest.approx(2e-6 * curve.value**2)
+    assert curve.error == pytest.approx(1e-6 * curve.value**2)
+
+
+def test_digits_are_those_that_the_error_allows():
+    for value, error, text in (
+        (1.234567, 0.01, "1.235"),
+        (1.234567e-6, 3e-8, "1.235e-06"),
+        (-0.5678, 0.2, "-0.57"),
+        (0.001, 5.0, "0.001"),
+        (12345.678, 0.0, "1.23e+04"),
+        (0.6543, math.nan, "0.654"),
+    ):
+        assert with_digits(value, error) == text

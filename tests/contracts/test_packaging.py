@@ -1,0 +1,38 @@
+"""Files beside the package: the source archive is whole, citation and version agree, workflows are valid YAML."""
+
+import tomllib
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_the_source_archive_is_whole():
+    listed = (ROOT / "MANIFEST.in").read_text(encoding="utf-8")
+    for folder in ("tests", "docs", "benchmarks", ".ci", ".github"):
+        assert (ROOT / folder).is_dir()
+        assert f"recursive-include {folder} *" in listed
+    for path in ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", ".readthedocs.yaml"):
+        assert (ROOT / path).is_file()
+        assert path in listed
+
+
+def test_citation_and_project_agree():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert str(citation["version"]) == PROJECT["project"]["version"]
+    assert citation["license"] == PROJECT["project"]["license"]
+    assert citation["references"][0]["doi"] in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_workflows_run_what_is_there():
+    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        steps = [step for job in content["jobs"].values() for step in job["steps"]]
+        assert steps
+        for command in (step["run"] for step in steps if step.get("run", "").startswith((".ci/", "pytest"))):
+            target = command.split()[-1] if command.startswith("pytest") else command
+            assert (ROOT / target).exists(), command
+    read_the_docs = yaml.safe_load((ROOT / ".readthedocs.yaml").read_text(encoding="utf-8"))
+    assert (ROOT / read_the_docs["sphinx"]["configuration"]).is_file()
