@@ -64,6 +64,8 @@ BUNDLED = (
 
 # Readers of the parts of a lens file, by its ending.
 _LENS_FILES = {".zmx": read_zemax_file, ".seq": read_codev_file}
+#: Endings of files that a telescope is written to.
+WRITTEN = (".yaml", ".yml", ".zmx")
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
@@ -189,9 +191,11 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     ConfigError
         If there is no such format.
     PrescriptionError
-        If the file cannot be written, or cannot hold the telescope.
+        If the name does not end in .yaml, .yml or .zmx, or the file cannot be written or cannot hold the telescope.
     """
     target = Path(path)
+    if target.suffix.lower() not in WRITTEN:
+        raise PrescriptionError(f"expected a name that ends in {', '.join(WRITTEN)}", file=target)
     format = format or ("zemax" if target.suffix.lower() == ".zmx" else "pachon")
     check_choice("format", format, ("pachon", "batoid", "zemax"))
     if format == "zemax":
