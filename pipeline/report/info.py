@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import asdict
-from itertools import pairwise
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,10 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "groups": {name: list(members) for name, members in telescope.groups.items()},
         "length_unit": telescope.design_data.length_unit,
         "design": asdict(telescope.design_data),
-        "surfaces": [_row(*pair, wavelength) for pair in pairwise([*telescope.surfaces, None])],
+        "surfaces": [
+            _row(surface, following, wavelength)
+            for surface, following in zip_longest(telescope.surfaces, telescope.surfaces[1:])
+        ],
     }
 
 
