@@ -23,7 +23,7 @@ from .rays import field_angles, field_direction, object_points, straight_bundles
 from .trace import trace
 
 #: Step of the differences that the first derivatives come from, in units of the radius of the entrance pupil.
-_DIFFERENCE = 1e-6
+_DIFFERENCE = 1e-4
 #: Steps in the field angle [rad] by which chief rays are followed from the axis; the second where the first fail.
 _FIELD_STEPS = np.deg2rad((10.0, 1.0))
 #: Steps by which rays that are not found at once are followed from the chief ray outwards.
@@ -170,8 +170,9 @@ def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wave
             tx, ty = (np.tan(at)[:, None] * along[left])[going].T
             light = field_direction(tx, ty, "gnomonic")
             landing = stop.landing(telescope, light, wavelength)
-            # The pupil moves steadily with the field: go on as in the step before.
-            guess = (2.0 * points - before)[going] if k > 1 else points[going]
+            # Across the beam the pupil moves steadily with the field: go on as in the step before.
+            ahead = [np.cos(np.minimum((k - i) * step, angle[left]))[:, None] for i in range(3)]
+            guess = ((2.0 * points * ahead[1] - before * ahead[2]) / ahead[0])[going] if k > 1 else points[going]
             moved = points.copy()
             moved[going] = find_points(landing, guess, np.zeros_like(guess), stop.radius, _difference(telescope))
             points, before = moved, np.where(going[:, None], points, moved)

@@ -170,7 +170,7 @@ def range_of_cosines(principal: PrincipalRays) -> float:
     found = float((1.0 / principal.f_number).max())
     if not _PARALLEL < found < np.inf:
         raise DomainError(
-            f"{principal.telescope}: largest range of cosines {found:.3g}, so the light is parallel; expected a focus"
+            f"{principal.telescope}: focal ratio above {1.0 / _PARALLEL:.0e}, the light is parallel; expected a focus"
         )
     return found
 
