@@ -43,7 +43,7 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     if data.aiming == "off":
         return pupil
     stop = stop_of(telescope)
-    n = len(directions)
+    n, difference = len(directions), _difference(telescope)
     chief = _chief_points(telescope, stop, directions, wavelength)
     relative = np.broadcast_to(pupil / (0.5 * telescope.pupil_diameter), (n, *pupil.shape[-2:]))
     target = (stop.radius * relative @ stop.axes.T).reshape(-1, 2)
@@ -51,20 +51,24 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     landing = stop.landing(telescope, rays, wavelength)
     start = np.repeat(chief, relative.shape[1], axis=0)
     # All rays of a field begin with the derivatives at its chief ray.
-    slopes = derivatives(stop.landing(telescope, directions, wavelength), chief, _difference(telescope))
+    slopes = derivatives(stop.landing(telescope, directions, wavelength), chief, difference)
     first = start + solved(np.repeat(slopes, relative.shape[1], axis=0), target)
-    found = find_points(landing, first, target, stop.radius, _difference(telescope))
-    lost = np.flatnonzero(np.isnan(found).any(axis=1))
+    found = find_points(landing, first, target, stop.radius, difference)
+    # The sense of the map from the entrance pupil to the stop is that at the chief ray; where it is the other one, the
+    # search came beyond a fold of the pupil, to a second ray through the same point.
+    sense = np.repeat(determinants(slopes), relative.shape[1], axis=0)
+    lost = np.flatnonzero(~(determinants(derivatives(landing, found, difference, target)) * sense > 0.0))
     if len(lost):
 
         def of_lost(points: np.ndarray, which: np.ndarray) -> np.ndarray:
             return landing(points, lost[which])
 
+        # They are followed from the chief ray outwards.
         points = start[lost]
         for k in range(1, _PUPIL_STEPS + 1):
-            points = find_points(
-                of_lost, points, target[lost] * (k / _PUPIL_STEPS), stop.radius, _difference(telescope)
-            )
+            points = find_points(of_lost, points, target[lost] * (k / _PUPIL_STEPS), stop.radius, difference)
+        turned = ~(determinants(derivatives(of_lost, points, difference, target[lost])) * sense[lost] > 0.0)
+        points[turned] = np.nan
         found[lost] = points
     return found.reshape(n, -1, 2)
 
@@ -76,7 +80,7 @@ def require_aimed(telescope: Telescope, directions: np.ndarray, points: np.ndarr
         first = directions[lost][:1]
         label = field_label(field_angles(first[:, :2] / -first[:, 2:])[0])
         name = telescope.design_data.stop
-        raise DomainError(f"{label}: no ray from this field passes the middle of the stop {name!r} of {telescope.name}")
+        raise DomainError(f"{label}: no ray from this field reaches its point of the stop {name!r} of {telescope.name}")
 
 
 @dataclass(frozen=True, eq=False)

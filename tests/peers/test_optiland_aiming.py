@@ -55,7 +55,8 @@ def converted(optic):
         name=type(optic).__name__, surfaces=tuple(rows),
         stop_z=rows[0].vertex[2] - 1e-3 * float(np.ravel(optic.paraxial.EPL())[0]),
         pupil_diameter=1e-3 * float(np.ravel(optic.paraxial.EPD())[0]), pupil_obscuration=0.0,
-        launch_distance=20.0 * max(abs(s.vertex[2]) for s in rows), reference_sphere_radius=1.0, field_radius=math.radians(largest),
+        launch_distance=20.0 * max(abs(s.vertex[2]) for s in rows), reference_sphere_radius=1.0,
+        field_radius=math.radians(largest),
         field_limit=math.radians(89.0), wavelength_range=(1e-7, 2e-5), default_wavelength=wavelength * 1e-6,
         design_data=DesignData(stop=f"S{stop}", aiming="real"),
     ), wavelength, largest  # fmt: skip
@@ -71,13 +72,16 @@ def test_aimed_rays_land_where_those_of_optiland_do(name):
     compared = 0
     for field in {f.y for f in optic.fields.fields} | {0.7 * largest}:
         for px, py in PUPIL:
-            theirs = optic.trace_generic(Hx=0.0, Hy=field / largest, Px=px, Py=py, wavelength=wavelength)
+            try:
+                theirs = optic.trace_generic(Hx=0.0, Hy=field / largest, Px=px, Py=py, wavelength=wavelength)
+            except ValueError:
+                continue  # optiland finds none
             there = np.array([-float(theirs.x[0]), float(theirs.y[0])]) * 1e-3
             rays = pachon.launch_rays(
                 telescope, (0.0, math.radians(field)), telescope.default_wavelength, ([-px * radius], [py * radius])
             )
             here = detector.to_local(pachon.trace(telescope, rays).position)[0, :2]
-            # A nanometre; where optiland finds no ray there is nothing to compare.
+            # A nanometre.
             if np.isfinite(there).all():
                 compared += 1
                 assert here == pytest.approx(there, abs=1e-9)

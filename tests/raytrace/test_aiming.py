@@ -120,7 +120,7 @@ def test_a_mirror_in_front_of_the_stop_keeps_the_sense_of_the_pupil():
 def test_a_field_that_no_ray_can_reach_is_said(wide):
     beyond = replace(wide, field_limit=np.deg2rad(84.0))
     with pytest.raises(
-        DomainError, match=r"field = \(0, 80\) deg: no ray from this field passes the middle of the stop"
+        DomainError, match=r"field = \(0, 80\) deg: no ray from this field reaches its point of the stop"
     ):
         launched(beyond, np.deg2rad((0.0, 80.0)), PUPIL)
 
