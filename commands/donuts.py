@@ -11,7 +11,17 @@ from typer import Argument, Option
 from ..core.errors import ConfigError
 from .inputs import load_model
 from .interrupt import interruptible
-from .options import Json, Projection, Quiet, Threads, degrees_pair, picture_kind, wavelength_list
+from .options import (
+    GlassCatalogues,
+    Json,
+    Lenient,
+    Projection,
+    Quiet,
+    Threads,
+    degrees_pair,
+    picture_kind,
+    wavelength_list,
+)
 from .tables import Rows, print_json
 
 if TYPE_CHECKING:
@@ -58,6 +68,8 @@ def donuts_command(
     projection: Projection = "zemax",
     out: Annotated[Path | None, Option("--out", "-o", help="Table: .ecsv, .fits, .csv or .parquet.")] = None,
     picture: Annotated[Path | None, Option(help="Picture of the first six donuts: .png, .pdf or .svg.")] = None,
+    glass_catalogue: GlassCatalogues = None,
+    lenient: Lenient = False,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -86,7 +98,7 @@ def donuts_command(
     kind = picture_kind(picture)
     if out is not None and out.suffix.lower() not in FORMATS:
         raise ConfigError(f"--out = {out}: expected a name that ends in {', '.join(FORMATS)}")
-    model = load_model(telescope)
+    model = load_model(telescope, lenient, glass_catalogue or ())
     freedoms = None if degrees_of_freedom is None else load_degrees_of_freedom(degrees_of_freedom)
     given = None if field_deg is None else np.deg2rad(degrees_pair(field_deg, "--field-deg"))
     images, fields, defocus = [], [], []

@@ -54,7 +54,9 @@ class Rows:
 
     def show(self) -> None:
         """Print the table."""
-        console = wide_console()
+        # Columns are never cut: a narrower terminal wraps the lines itself.
+        columns = zip(self.headings, *self.rows, strict=True)
+        console = Console(width=max(wide_console().width, sum(max(map(len, column)) + 2 for column in columns)))
         table = plain_table()
         for i, name in enumerate(self.headings):
             table.add_column(name.replace("[", "\\["), justify="left" if i < self.left else "right", no_wrap=True)

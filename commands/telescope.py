@@ -33,7 +33,14 @@ def info_command(
     - `pachon info lsst_v3.3_r`
     - `pachon info my_telescope.yaml --json`
     """
-    from ..pipeline.report.info import SURFACE_COLUMNS, describe, figure_rows, list_models, surface_rows
+    from ..pipeline.report.info import (
+        coefficient_lines,
+        describe,
+        figure_rows,
+        list_models,
+        surface_columns,
+        surface_rows,
+    )
 
     console = wide_console()
     if model is None:
@@ -54,7 +61,11 @@ def info_command(
         return
     console.print(f"{description['name']}: {description['description']}", highlight=False)
     console.print(f"source: {description['source']}\n", highlight=False)
-    Rows(SURFACE_COLUMNS, surface_rows(description), left=2).show()
+    caption = "In brackets: what a surface is made or drawn to; it stops no light."
+    drawn = any(s["clear_m"] is None and s["semi_diameter_m"] for s in description["surfaces"])
+    Rows(surface_columns(description), surface_rows(description), caption if drawn else "", left=2).show()
+    for line in coefficient_lines(description):
+        console.print(line, highlight=False)
     console.print()
     properties = plain_table(show_header=False)
     for name, value in figure_rows(description):

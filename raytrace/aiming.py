@@ -23,7 +23,7 @@ from .rays import field_angles, field_direction, object_points, straight_bundles
 from .trace import trace
 
 #: Step of the differences that the first derivatives come from, in units of the radius of the entrance pupil.
-_DIFFERENCE = 1e-6
+_DIFFERENCE = 1e-4
 #: Steps in the field angle [rad] by which chief rays are followed from the axis; the second where the first fail.
 _FIELD_STEPS = np.deg2rad((10.0, 1.0))
 #: Steps by which rays that are not found at once are followed from the chief ray outwards.
@@ -43,7 +43,7 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     if data.aiming == "off":
         return pupil
     stop = stop_of(telescope)
-    n = len(directions)
+    n, difference = len(directions), _difference(telescope)
     chief = _chief_points(telescope, stop, directions, wavelength)
     relative = np.broadcast_to(pupil / (0.5 * telescope.pupil_diameter), (n, *pupil.shape[-2:]))
     target = (stop.radius * relative @ stop.axes.T).reshape(-1, 2)
@@ -51,20 +51,24 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     landing = stop.landing(telescope, rays, wavelength)
     start = np.repeat(chief, relative.shape[1], axis=0)
     # All rays of a field begin with the derivatives at its chief ray.
-    slopes = derivatives(stop.landing(telescope, directions, wavelength), chief, _difference(telescope))
+    slopes = derivatives(stop.landing(telescope, directions, wavelength), chief, difference)
     first = start + solved(np.repeat(slopes, relative.shape[1], axis=0), target)
-    found = find_points(landing, first, target, stop.radius, _difference(telescope))
-    lost = np.flatnonzero(np.isnan(found).any(axis=1))
+    found = find_points(landing, first, target, stop.radius, difference)
+    # The sense of the map from the entrance pupil to the stop is that at the chief ray; where it is the other one, the
+    # search came beyond a fold of the pupil, to a second ray through the same point.
+    sense = np.repeat(determinants(slopes), relative.shape[1], axis=0)
+    lost = np.flatnonzero(~(determinants(derivatives(landing, found, difference, target)) * sense > 0.0))
     if len(lost):
 
         def of_lost(points: np.ndarray, which: np.ndarray) -> np.ndarray:
             return landing(points, lost[which])
 
+        # They are followed from the chief ray outwards.
         points = start[lost]
         for k in range(1, _PUPIL_STEPS + 1):
-            points = find_points(
-                of_lost, points, target[lost] * (k / _PUPIL_STEPS), stop.radius, _difference(telescope)
-            )
+            points = find_points(of_lost, points, target[lost] * (k / _PUPIL_STEPS), stop.radius, difference)
+        turned = ~(determinants(derivatives(of_lost, points, difference, target[lost])) * sense[lost] > 0.0)
+        points[turned] = np.nan
         found[lost] = points
     return found.reshape(n, -1, 2)
 
@@ -76,7 +80,7 @@ def require_aimed(telescope: Telescope, directions: np.ndarray, points: np.ndarr
         first = directions[lost][:1]
         label = field_label(field_angles(first[:, :2] / -first[:, 2:])[0])
         name = telescope.design_data.stop
-        raise DomainError(f"{label}: no ray from this field passes the middle of the stop {name!r} of {telescope.name}")
+        raise DomainError(f"{label}: no ray from this field reaches its point of the stop {name!r} of {telescope.name}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +174,9 @@ def _chief_points(telescope: Telescope, stop: Stop, directions: np.ndarray, wave
             tx, ty = (np.tan(at)[:, None] * along[left])[going].T
             light = field_direction(tx, ty, "gnomonic")
             landing = stop.landing(telescope, light, wavelength)
-            # The pupil moves steadily with the field: go on as in the step before.
-            guess = (2.0 * points - before)[going] if k > 1 else points[going]
+            # Across the beam the pupil moves steadily with the field: go on as in the step before.
+            ahead = [np.cos(np.minimum((k - i) * step, angle[left]))[:, None] for i in range(3)]
+            guess = ((2.0 * points * ahead[1] - before * ahead[2]) / ahead[0])[going] if k > 1 else points[going]
             moved = points.copy()
             moved[going] = find_points(landing, guess, np.zeros_like(guess), stop.radius, _difference(telescope))
             points, before = moved, np.where(going[:, None], points, moved)

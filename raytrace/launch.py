@@ -19,6 +19,7 @@ def launch_rays(
     wavelength: ArrayLike,
     pupil: tuple[ArrayLike, ArrayLike],
     projection: str = "zemax",
+    aiming: str | None = None,
 ) -> Rays:
     """Launch a plane wave from one field point through given points of the entrance pupil.
 
@@ -35,6 +36,8 @@ def launch_rays(
         that the rays pass through.
     projection : str
         Meaning of the field angles.
+    aiming : {"off", "paraxial", "real"}, optional
+        Ray aiming at the stop, see :class:`~pachon.DesignData`; as the design data of the telescope say by default.
 
     Returns
     -------
@@ -45,8 +48,12 @@ def launch_rays(
     Raises
     ------
     DomainError
-        If the field or the wavelength lies outside what the telescope covers.
+        If the field or the wavelength lies outside what the telescope covers, or no ray of the field can be aimed.
+    PrescriptionError
+        If the aiming is unknown, or rays are to be aimed and the telescope has no stop.
     """
+    if aiming is not None:
+        telescope = telescope.with_design(aiming=aiming)
     tx, ty = angle(field[0], "field x"), angle(field[1], "field y")
     telescope.check_field(tx, ty)
     wavelength = check_wavelength(wavelength)

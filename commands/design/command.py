@@ -118,12 +118,13 @@ def design_command(
     left: int = 1,
     band: bool = False,
     picture: Any = options.Picture,
+    most: int | None = None,
 ) -> Callable[[Callable[..., Study | Outcome]], Callable[..., Study | Outcome]]:
     """Make a command of a function, with the columns of its table, and add it to :data:`app`.
 
     The caption is a text, with fields of the summary in braces, or a function of the summary; `left` is the number of
     columns of names. With `band` the command takes several wavelengths or the pass band, not one wavelength. `picture`
-    is the annotated type of the option that names the picture.
+    is the annotated type of the option that names the picture. Of a longer table `most` rows are shown.
     """
 
     def rows(result: Study) -> Rows:
@@ -132,7 +133,10 @@ def design_command(
         shown = [column for column in columns if callable(column.values) or column.values in summary]
         cells = [column.texts(result, summary) for column in shown]
         text = caption.format_map(summary) if isinstance(caption, str) else caption(summary)
-        return Rows([column.title(summary) for column in shown], [*zip(*cells, strict=True)], text, left)
+        lines = [*zip(*cells, strict=True)]
+        if most is not None and len(lines) > most:
+            text += f" Shown are the first {most}, {len(lines) - most} more follow them: --json has all."
+        return Rows([column.title(summary) for column in shown], lines[:most], text, left)
 
     def build(compute: Callable[..., Study | Outcome]) -> Callable[..., Study | Outcome]:
         name = compute.__name__.replace("_", "-")

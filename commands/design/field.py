@@ -140,12 +140,16 @@ def draw(
     - `pachon draw my_lens.zmx --field-deg 0 --field-deg 10`
     """
     from ...core.files import write_bytes
+    from ...core.units import field_label
     from ...design.layout.layout import layout
 
     if glb is not None and glb.suffix.lower() != ".glb":
         raise ConfigError(f"--glb = {str(glb)!r}: expected a name that ends in .glb")
     result = layout(*given.where, **given.how)
-    if glb is None:
-        return Outcome(result)
-    write_bytes(glb, result.glb())
-    return Outcome(result, notes=[f"model: {glb.resolve()}"])
+    notes = [f"{field_label(result.fields[i])}: no ray arrives, so none is drawn" for i in result.dark]
+    if notes and given.telescope.design_data.stop and given.telescope.design_data.aiming == "off":
+        notes.append("the rays of these fields may miss the stop: --aiming paraxial aims them at it")
+    if glb is not None:
+        write_bytes(glb, result.glb())
+        notes.append(f"model: {glb.resolve()}")
+    return Outcome(result, notes=notes)

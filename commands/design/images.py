@@ -142,6 +142,7 @@ def mtf(
         f"above the detector. All ghosts together hold {100 * s['total_flux']:.3g} % of the star's light."
     ),
     left=2,
+    most=20,
 )
 def ghosts(
     given: Given,

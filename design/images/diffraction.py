@@ -224,8 +224,8 @@ class _Plan:
         """Return the images of all field points from a function that returns wavelets and their sum."""
         axis = pixel_axis(self.pixel, self.pixels)
         images, lit, strehl = [], [], []
-        for field, center in zip(self.request.fields, self.spots.reference_point, strict=True):
-            one = replace(self.request, fields=field[None])
+        for i, center in enumerate(self.spots.reference_point):
+            one = self.request.at_fields(slice(i, i + 1))
             found: list[tuple[float, Wavelets, _Sum]] = []
             total = np.zeros((self.pixels, self.pixels))
             for wavelength, weight in zip(self.request.wavelengths, self.request.weights, strict=True):

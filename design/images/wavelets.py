@@ -170,7 +170,7 @@ def range_of_cosines(principal: PrincipalRays) -> float:
     found = float((1.0 / principal.f_number).max())
     if not _PARALLEL < found < np.inf:
         raise DomainError(
-            f"{principal.telescope}: focal ratio {1.0 / max(found, 1e-300):.3g}; expected one that makes an image"
+            f"{principal.telescope}: focal ratio above {1.0 / _PARALLEL:.0e}, the light is parallel; expected a focus"
         )
     return found
 

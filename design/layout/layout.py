@@ -68,6 +68,11 @@ class Layout(Result):
     bundles: tuple[np.ndarray, ...]
 
     @property
+    def dark(self) -> list[int]:
+        """Indices of the fields of which no ray arrives, so that none is drawn."""
+        return [i for i, rays in enumerate(zip(self.fans, self.bundles, strict=True)) if not any(map(len, rays))]
+
+    @property
     def size(self) -> np.ndarray:
         """Extent of the surfaces along x, y and z [m], shape [3]; the first is that of y."""
         points = np.concatenate([p[np.isfinite(p).all(axis=1)] for p in self.profiles.values()])
@@ -98,6 +103,7 @@ class Layout(Result):
             "lens_index": np.array([lens.index for lens in self.lenses]),
             "obstruction": [o.name for o in self.telescope.obstructions],
             "rays_drawn": [len(fan) for fan in self.fans],
+            "fields_without_rays_deg": [np.rad2deg(self.fields[i]) for i in self.dark],
         }
 
     def plot(self, ax: Axes | Figure | None = None) -> Figure:
@@ -167,7 +173,7 @@ def layout(
     request = Request.of(telescope, given, wavelength, projection=projection, threads=threads, one_wavelength=True)
     points, w = request.fields, request.wavelength
     lenses = find_lenses(telescope, w)
-    reach = even_edges(telescope, lenses, drawn_radii(telescope, points, w, threads))
+    reach = even_edges(telescope, lenses, drawn_radii(request))
     profiles = {s.name: surface_section(s, reach[s.name]) for s in telescope.surfaces}
     heights = np.concatenate([p[:, 2] for p in profiles.values()])
     heights = np.concatenate([heights[np.isfinite(heights)], [o.height for o in telescope.obstructions]])
@@ -180,7 +186,9 @@ def layout(
     around = (rings * np.cos(angle)).ravel(), (rings * np.sin(angle)).ravel()
 
     def rays(pupil: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
-        return tuple(ray_paths(telescope, f, w, pupil, top, projection, threads) for f in points)
+        through = np.stack(pupil, axis=-1)
+        parts = (request.at_fields(slice(i, i + 1)) for i in range(len(points)))
+        return tuple(ray_paths(telescope, part.launch(w, through), top, threads) for part in parts)
 
     return Layout(
         telescope=telescope,
@@ -233,7 +241,8 @@ def _draw(axes: Axes, drawing: _Drawing, box: np.ndarray, named: set[str], *, be
         axes.add_collection(
             LineCollection(list(drawing(fan) * scale), colors=color, linewidths=0.6, alpha=0.8, zorder=1)
         )
-        axes.plot([], [], color=color, linewidth=1.2, label=_signed_label(field))
+        lost = ": no ray arrives" if i in layout.dark else ""
+        axes.plot([], [], color=color, linewidth=1.2, label=_signed_label(field) + lost)
     for lens in layout.lenses:
         front, back = (drawing(layout.profiles[name]) * scale for name in (lens.front, lens.back))
         outline = np.concatenate([front[np.isfinite(front).all(axis=1)], back[np.isfinite(back).all(axis=1)][::-1]])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,10 +10,10 @@ import numpy as np
 from ...models.aperture import Annulus, Aperture, Circle, Complement, Intersection, Polygon, Rectangle, Union
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
-from ...raytrace.launch import launch_rays
 from ...raytrace.pack.surfaces import refractive_indices
-from ...raytrace.rays import RayStatus
+from ...raytrace.rays import Rays, RayStatus
 from ...raytrace.trace import trace
+from ...wavefront.request import Request
 
 #: Points of a surface in section.
 _POINTS = 241
@@ -38,19 +37,14 @@ class Lens:
 
 def ray_paths(
     telescope: Telescope,
-    field: Sequence[float] | np.ndarray,
-    wavelength: float,
-    pupil: tuple[np.ndarray, np.ndarray],
+    rays: Rays,
     top: float,
-    projection: str = "zemax",
     threads: int | None = None,
 ) -> np.ndarray:
     """Return the paths of the rays that arrive [m], telescope frame, shape [n_ray, n_surface + 1, 3].
 
-    They start at the height `top` [m] in front of the telescope, and pass the intersections with all surfaces. The
-    other arguments are those of :func:`~pachon.raytrace.launch.launch_rays`.
+    They start at the height `top` [m] in front of the telescope, and pass the intersections with all surfaces.
     """
-    rays = launch_rays(telescope, (field[0], field[1]), wavelength, pupil, projection)
     met = trace(telescope, rays, "all", threads=threads)
     back = (top - rays.position[:, 2:]) / rays.direction[:, 2:]
     points = np.stack([rays.position + back * rays.direction, *(m.position for m in met)], axis=1)
@@ -111,28 +105,43 @@ def outer_radius(region: Aperture | None) -> float:
 
 
 def even_edges(telescope: Telescope, lenses: tuple[Lens, ...], reach: dict[str, float]) -> dict[str, float]:
-    """Return radii with surfaces without rims as large as the other surface of their lens."""
+    """Return radii with surfaces whose size is not stated as large as the other of their lens, if they do not cross."""
     found = dict(reach)
     for lens in lenses:
         both = max(found[lens.front], found[lens.back])
         for name in (lens.front, lens.back):
             surface = telescope.surface(name)
-            rim = np.linspace(0.0, both, _POINTS)
-            if surface.aperture is None and np.isfinite(surface.shape.sag(np.zeros_like(rim), rim)).all():
+            stated = surface.aperture is not None or surface.semi_diameter is not None
+            if not stated and _apart(telescope.surface(lens.front), telescope.surface(lens.back), both):
                 found[name] = both
     return found
 
 
-def drawn_radii(telescope: Telescope, fields: np.ndarray, wavelength: float, threads: int | None) -> dict[str, float]:
-    """Return the radius to which each surface is drawn [m]: its rim, or the light of all fields."""
+def _apart(front: Surface, back: Surface, reach: float) -> bool:
+    """Return whether two surfaces exist and do not cross out to a radius [m], in the section x = 0."""
+    y = np.linspace(-reach, reach, _POINTS)
+    one, other = (
+        s.to_telescope(np.stack([np.zeros_like(y), y, s.shape.sag(np.zeros_like(y), y)], axis=-1))[:, 2]
+        for s in (front, back)
+    )
+    gap = one - other
+    return bool(np.isfinite(gap).all() and (gap * gap[len(y) // 2] > 0).all())
+
+
+def drawn_radii(request: Request) -> dict[str, float]:
+    """Return the radius to which each surface is drawn [m]: its rim, its semi-diameter, or the light of all fields.
+
+    The light is that of the fields of the request and, where the telescope states none, of the edge of its field.
+    """
+    telescope, threads = request.telescope, request.threads
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
+    everywhere = [request] if telescope.design_data.fields else [request, request.at_fields(edge)]
     angle = 2.0 * np.pi * np.arange(16) / 16
     radius = 0.5 * telescope.pupil_diameter
+    rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     lit = np.zeros(len(telescope.surfaces))
-    for field in np.concatenate([edge, fields]):
-        rays = launch_rays(
-            telescope, (field[0], field[1]), wavelength, (radius * np.cos(angle), radius * np.sin(angle))
-        )
+    for some in everywhere:
+        rays = some.launch(request.wavelength, rim)
         for k, met in enumerate(trace(telescope, rays, "all", threads=threads)):
             local = telescope.surfaces[k].to_local(met.position)
             # Vignetted light counts too, where there is nothing else.
@@ -144,7 +153,9 @@ def drawn_radii(telescope: Telescope, fields: np.ndarray, wavelength: float, thr
         if surface.interaction == Interaction.PASS:
             blocked = outer_radius(surface.aperture.part) if isinstance(surface.aperture, Complement) else np.inf
             bound = blocked if np.isfinite(blocked) else _RIM * (bound if np.isfinite(bound) else light)
-        found[surface.name] = bound if np.isfinite(bound) else _BEYOND * max(light, 1e-3 * radius)
+        if np.isinf(bound):
+            bound = surface.semi_diameter or _BEYOND * max(light, 1e-3 * radius)
+        found[surface.name] = bound
     return found
 
 

@@ -76,6 +76,8 @@ _LENS_FILES = {
     ".json": read_optiland_file,
     ".roa": read_rayoptics_file,
 }
+#: Endings of files that a telescope is written to, and their formats.
+WRITTEN = {".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".json": "optiland"}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
 
@@ -201,10 +203,12 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     ConfigError
         If there is no such format.
     PrescriptionError
-        If the file cannot be written, or cannot hold the telescope.
+        If the name does not end in .yaml, .yml, .zmx or .json, or the file cannot be written or cannot hold the telescope.
     """
     target = Path(path)
-    format = format or {".zmx": "zemax", ".json": "optiland"}.get(target.suffix.lower(), "pachon")
+    if target.suffix.lower() not in WRITTEN:
+        raise PrescriptionError(f"expected a name that ends in {', '.join(WRITTEN)}", file=target)
+    format = format or WRITTEN[target.suffix.lower()]
     check_choice("format", format, ("pachon", "batoid", "zemax", "optiland"))
     if format == "zemax":
         lens, glasses = telescope_to_zemax(telescope)

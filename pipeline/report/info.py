@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+from dataclasses import asdict
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.units import ARCSEC
 from ...models.aperture import Annulus, Circle, Complement
+from ...models.design_data import LENGTH_UNITS
 from ...models.first_order import first_order
 from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.apertures import aperture_items
@@ -70,13 +73,19 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "entrance_pupil_z_m": telescope.stop_z,
         "field_radius_deg": math.degrees(telescope.field_radius),
         "field_limit_deg": math.degrees(telescope.field_limit),
+        "object_distance_m": telescope.object_distance if math.isfinite(telescope.object_distance) else None,
         "camera": telescope.camera,
         "groups": {name: list(members) for name, members in telescope.groups.items()},
-        "surfaces": [_row(surface, wavelength) for surface in telescope.surfaces],
+        "length_unit": telescope.design_data.length_unit,
+        "design": asdict(telescope.design_data),
+        "surfaces": [
+            _row(surface, following, wavelength)
+            for surface, following in zip_longest(telescope.surfaces, telescope.surfaces[1:])
+        ],
     }
 
 
-def _row(surface: Surface, wavelength: float) -> dict[str, Any]:
+def _row(surface: Surface, following: Surface | None, wavelength: float) -> dict[str, Any]:
     shape, medium = surface.shape, surface.medium_after
     curvature = shape.curvature
     x, y, z = surface.vertex
@@ -90,6 +99,10 @@ def _row(surface: Surface, wavelength: float) -> dict[str, Any]:
         "x_m": x,
         "y_m": y,
         "z_m": z,
+        # Along the light as it comes in: negative behind an odd number of mirrors, as in lens files.
+        "thickness_m": None if following is None else z - following.vertex[2],
+        "glass": "" if isinstance(medium, ConstantIndex) and medium.n == 1.0 else medium.name,
+        "semi_diameter_m": surface.semi_diameter,
         "tilted": not np.array_equal(surface.matrix, np.eye(3)),
         "index_after": float(medium.index(wavelength)),
         "medium_after": "" if isinstance(medium, ConstantIndex) else "glass",
@@ -115,64 +128,99 @@ def _clear(surface: Surface) -> list[float | None] | None:
     return None
 
 
-def _clear_text(row: dict[str, Any]) -> str:
+def _clear_text(row: dict[str, Any], unit: float) -> str:
     if row["clear_m"] is None:
-        return "another region" if row["aperture"] else ""
+        drawn = "" if row["semi_diameter_m"] is None else f"({row['semi_diameter_m'] / unit:.6g})"
+        return "another region" if row["aperture"] else drawn
     inner, outer = row["clear_m"]
-    return f"from {inner:g}" if outer is None else f"{inner:g} to {outer:g}"
+    return f"from {inner / unit:g}" if outer is None else f"{inner / unit:g} to {outer / unit:g}"
 
 
-SURFACE_COLUMNS = (
-    "surface",
-    "type",
-    "radius [m]",
-    "conic",
-    "r^4, r^6, r^8...",
-    "z [m]",
-    "index after",
-    "clear radius [m]",
-)
+def surface_columns(description: dict[str, Any]) -> list[str]:
+    """Return the headings of the lens table, with the unit that the file counts lengths in."""
+    unit = description["length_unit"]
+    columns = ("surface", "type", f"radius [{unit}]", "conic", f"thickness [{unit}]", "glass", "index after")
+    return [*columns, f"z [{unit}]", f"clear radius [{unit}]"]
 
 
 def surface_rows(description: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return the lens table as text, in the columns of :data:`SURFACE_COLUMNS`."""
+    """Return the lens table as text, in the columns of :func:`surface_columns`."""
+    unit = LENGTH_UNITS[description["length_unit"]]
     return [
         (
             s["name"],
             s["type"] + (" (tilted)" if s["tilted"] else ""),
-            "flat" if s["radius_m"] is None else f"{s['radius_m']:.7g}",
+            "flat" if s["radius_m"] is None else f"{s['radius_m'] / unit:.7g}",
             f"{s['conic']:g}" if s["conic"] else "",
-            ", ".join(f"{c:g}" for c in s["coefficients"]),
-            f"{s['z_m']:.7f}",
+            "" if s["thickness_m"] is None else f"{s['thickness_m'] / unit:.7g}",
+            s["glass"],
             f"{s['index_after']:.6f}" if s["medium_after"] else "",
-            _clear_text(s),
+            f"{s['z_m'] / unit:.7g}",
+            _clear_text(s, unit),
         )
         for s in description["surfaces"]
     ]
 
 
+def coefficient_lines(description: dict[str, Any]) -> list[str]:
+    """Return the coefficients of the aspheres as text, a line each."""
+    unit, found = LENGTH_UNITS[description["length_unit"]], []
+    for s in description["surfaces"]:
+        terms = [(4 + 2 * i, c * unit ** (3 + 2 * i)) for i, c in enumerate(s["coefficients"])]
+        if any(c for _, c in terms):
+            found.append(f"{s['name']}: " + ", ".join(f"{c:.9g} r^{power}" for power, c in terms if c))
+    return found
+
+
 def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the first-order properties as text: name, and value with unit."""
-    d = description
+    d, name = description, description["length_unit"]
+    unit = LENGTH_UNITS[name]
+
+    def length(value: float) -> str:
+        return f"{value / unit:.7g} {name}"
+
     if d["focal_length_m"] is None:
-        lens, image = [("first-order figures", "none: the surfaces do not share one axis")], []
+        lens, image = [("first-order figures", "none: the surfaces do not share one axis, or there is no focus")], []
     else:
         lens = [
-            ("focal length", f"{d['focal_length_m']:.4f} m"),
+            ("focal length", length(d["focal_length_m"])),
             ("focal ratio", f"f/{d['f_number']:.4f}"),
             ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
         ]
         image = [
-            ("exit pupil", f"{d['exit_pupil_diameter_m']:.4f} m at z = {d['exit_pupil_z_m']:.4f} m"),
-            ("paraxial focus", f"z = {d['focus_z_m']:.7f} m"),
+            ("exit pupil", f"{length(d['exit_pupil_diameter_m'])} at z = {length(d['exit_pupil_z_m'])}"),
+            ("paraxial focus", f"z = {length(d['focus_z_m'])}"),
         ]
+    far = d["object_distance_m"]
     return [
         *lens,
-        ("entrance pupil", f"{d['pupil_diameter_m']:g} m at z = {d['entrance_pupil_z_m']:g} m"),
+        ("object", "at infinity" if far is None else f"z = {length(far)}"),
+        ("entrance pupil", f"{length(d['pupil_diameter_m'])} at z = {length(d['entrance_pupil_z_m'])}"),
         ("central obscuration", f"{d['pupil_obscuration']:g} of the diameter"),
-        ("collecting area", f"{d['effective_area_m2']:.2f} m²"),
+        ("collecting area", f"{d['effective_area_m2'] / unit**2:.6g} {name}²"),
         *image,
         ("field of view", f"radius {d['field_radius_deg']:g}°, model good to {d['field_limit_deg']:g}°"),
         ("band", "{:g} to {:g} nm".format(*(round(w, 3) for w in d["band_nm"]))),
         ("camera", d["camera"] or "none"),
+        *_stated_rows(d["design"], unit, name),
     ]
+
+
+def _stated_rows(design: dict[str, Any], unit: float, name: str) -> list[tuple[str, str]]:
+    """Return what the design data state, as text."""
+    rows = []
+    if design["aperture"] is not None:
+        lengths = design["aperture"] in ("entrance_pupil", "stop")
+        value = f"{design['aperture_value'] / unit:.7g} {name}" if lengths else f"{design['aperture_value']:g}"
+        rows.append(("aperture as stated", f"{design['aperture'].replace('_', ' ')} {value}"))
+    if design["stop"] is not None:
+        rows.append(("stop", f"{design['stop']}, ray aiming {design['aiming']}"))
+    if design["fields"]:
+        angles = design["field_type"] == "angle"
+        size, of = (math.radians(1.0), "°") if angles else (unit, f" {name}")
+        points = "; ".join(f"{x / size + 0.0:.6g}, {y / size + 0.0:.6g}{of}" for x, y in design["fields"])
+        rows.append((f"fields, {design['field_type'].replace('_', ' ')}", points))
+    if design["wavelengths"]:
+        rows.append(("wavelengths", ", ".join(f"{w * 1e9:.7g}" for w in design["wavelengths"]) + " nm"))
+    return rows

@@ -20,6 +20,7 @@ from ...models.io.prescription import load_telescope
 from ...models.surface import Surface
 from ...models.telescope import Telescope
 from ...pipeline.report.focal_plane_axes import OBSERVED, RESIDUAL, TRUTH, draw_field_circle, draw_outlines, frame_axes
+from ...raytrace.launch import launch_rays
 from ...wavefront.psf.psf import make_psfs
 from .bench import Bench
 from .figure import EcsvData, Reproduced, figure
@@ -99,7 +100,8 @@ def _ray_paths(telescope: Telescope, angle: float) -> np.ndarray:
     arm = np.linspace(telescope.pupil_obscuration * outer * 1.01, 0.999 * outer, _LAYOUT_RAYS)
     y = np.concatenate([-arm[::-1], arm])
     field = (0.0, float(np.deg2rad(angle)))
-    return ray_paths(telescope, field, telescope.default_wavelength, (np.zeros_like(y), y), _TOP)[..., 1:]
+    rays = launch_rays(telescope, field, telescope.default_wavelength, (np.zeros_like(y), y))
+    return ray_paths(telescope, rays, _TOP)[..., 1:]
 
 
 def _layout_plot(

@@ -342,7 +342,7 @@ def calls(folder):
         "land_on_mesh": (pachon.land_on_mesh, {"detector": tel.surfaces[-1], "mesh": m.cube, "threads": 1,
                          "position": np.array([[0.0, 0.0, -1.0]]), "direction": np.array([[0.0, 0.0, 1.0]])}),
         "launch_rays": (pachon.launch_rays, {"telescope": tel, "field": (0.0, 0.0), "wavelength": w, "pupil": (x, y),
-                        "projection": "zemax"}),
+                        "projection": "zemax", "aiming": "off"}),
         "trace": (pachon.trace, {"telescope": tel, "rays": m.rays, "surfaces": "last", "threads": 1}),
         "read_galaxies": (pachon.read_galaxies, {"path": m.folder / "none.fits", "pointing": (0.0, 0.0)}),
         "write_galaxies": (pachon.write_galaxies, {"path": m.folder / "galaxies.ecsv", "galaxies": m.galaxies}),

@@ -162,7 +162,7 @@ def make_psfs(
         atmosphere or next to no charge diffusion.
     pupil_spacing : float, optional
         Distance of the pupil points [m] (wave). By default the image repeats itself outside the stamp only, and the
-        distance is at most 0.02 m, or 0.04 m without an atmosphere.
+        distance is at most 0.02 m, or 0.04 m without an atmosphere, and a 96th of the diameter.
     projection : {"zemax", "gnomonic", "postel"}
         Meaning of the field angles.
     threads : int, optional

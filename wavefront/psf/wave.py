@@ -52,6 +52,8 @@ LARGEST_SPACING = 0.02
 #: Largest distance of pupil points [m] for the optics alone, which vary over metres: it is limited by the image, which
 #: repeats itself after lambda / spacing (3" at 0.04 m), and by the rim of the pupil.
 LARGEST_SPACING_OPTICS = 0.04
+#: Fewest pupil points across the diameter: the rim of a small telescope is as fine as that of a large one.
+FEWEST_ACROSS = 96
 # Largest transfer function of charge diffusion at longer baselines for a grid without padding.
 _NEGLIGIBLE = 1e-4
 
@@ -74,6 +76,7 @@ class WavePsfEngine(PsfEngine):
     def _lay_grid(self, padding: bool | None, spacing: float | None) -> None:
         if spacing is None:
             largest = LARGEST_SPACING_OPTICS if self._atmosphere is None else LARGEST_SPACING
+            largest = min(largest, self._diameter / FEWEST_ACROSS)
             spacing = min(largest, float(self._wavelengths.min()) * self.focal_length / self._plane.side)
         if not (math.isfinite(spacing) and spacing > 0.0):
             raise DomainError(f"pupil_spacing = {spacing!r}: expected a positive length in metres")

@@ -1,11 +1,12 @@
 """Translate a CODE V lens file (.seq) into the terms of a Zemax file.
 
-Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, before the surfaces or
-after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY THI GLA, STO, SLB, SPH CON
-ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS, HOL) and REX REY with ADX
-ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is right-handed (CODE V reference
-manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name (NBK7_SCHOTT), REFL, or a number
-(517642). Solves are passed over where their solution stands in the file.
+Supported commands: RDM, DIM, TITLE, EPD, FNO, NAO, WL, WTW, REF, XAN YAN, XOB YOB, XIM YIM, XRI YRI, WTF, VUX VLX VUY
+VLY, before the surfaces or after them; the surfaces SO S SI (curvature, or with RDM radius; thickness, glass), RDY CUY
+THI GLA, STO, SLB, SPH CON ASP with K and A to G (r^4 to r^16), XDE YDE ZDE ADE BDE CDE with DAR, BEN and REV, CIR (OBS,
+HOL) and REX REY with ADX ADY, pick-ups PIK, private glasses PRV PWL END. ADE and BDE are left-handed, CDE is
+right-handed (CODE V reference manual, "Decentered surfaces"), Zemax's tilts are all right-handed. A glass is a name
+(NBK7_SCHOTT), REFL, or a number (517642). Solves are passed over where their solution stands in the file. Rays are
+aimed at the stop, as CODE V's chief rays are.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,9 @@ FIELDS = {
 }  # fmt: skip
 #: System apertures; the f-number is that of the image space at the conjugates of the lens, Zemax's FNUM 1.
 APERTURES = {"EPD": ("ENPD",), "FNO": ("FNUM", "1"), "NAO": ("OBNA",)}
-SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "REF", "PRV", *APERTURES, *FIELDS))
+#: Vignetting factors: the parts by which the upper and lower halves of the pupil shrink, along x and y.
+VIGNETTING = ("VUX", "VLX", "VUY", "VLY")
+SYSTEM = frozenset(("RDM", "DIM", "TIT", "WL", "WTW", "WTF", "REF", "PRV", *VIGNETTING, *APERTURES, *FIELDS))
 LONG_NAMES = {"TITLE": "TIT", "STOP": "STO"}
 POWERS = "ABCDEFG"
 #: Surfaces that are not read.
@@ -37,10 +41,10 @@ REFUSED = {
     "DIF": "diffractive surfaces", "GRT": "diffractive surfaces", "XTO": "toroids", "YTO": "toroids",
     "CYL": "cylinders", "RDX": "surfaces of two radii", "NSS": "non-sequential parts", "GRD": "gradient-index media",
 }  # fmt: skip
-#: Commands without effect on rays: names, variables and couplings, weights, vignetting factors of the beams,
-#: solves, whose solution stands in the file, and drawing.
+#: Commands without effect on rays: names, variables and couplings, weights, solves, whose solution stands in the file,
+#: and drawing.
 _IGNORED = """
-LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC WTW WTF VUX VLX VUY VLY CUM
+LEN NEW DER INI GO CA CCY THC KC AC BC CC DC EC FC GC HC IC JC ADC BDC CDC XDC YDC ZDC CUM
 UMY SPH CON ASP RDM WTX WTY VIE DRA COM CUX THM GLC TEM PRE CRA
 POL CLS WID
 """
@@ -86,6 +90,7 @@ class _Translation:
         self.radii = False
         self.field_type = 0.0
         self.waves: list[float] = []
+        self.lists: dict[str, list[float]] = {}
         self.pick_ups: list[Record] = []
         self.private: dict[str, Medium] = {}
         self.private_waves: tuple[float, ...] | None = None
@@ -128,9 +133,25 @@ class _Translation:
         if not any(line.keyword == "STOP" for block in self.surfaces for line in block.lines):
             # Where a file names no stop, it is the first surface.
             self.surfaces[1].lines.append(self._record(1, "STOP"))
+        # Chief rays pass the middle of the stop.
+        self._header_line("RAIM", 0, 1)
+        weights = self.lists.get("WTW", [])
+        for i, wave in enumerate(self.waves):
+            amount = weights[i] if i < len(weights) else 1.0
+            self._header_line("WAVM", i + 1, wave, amount)
+        for axis in "XY":
+            upper, lower = (self.lists.get(f"V{half}{axis}", []) for half in "UL")
+            both = list(zip_longest(upper, lower, fillvalue=0.0))
+            if both:
+                # The pupil reaches from lower - 1 to 1 - upper.
+                self._header_line(f"VD{axis}N", *(0.5 * (low - up) for up, low in both))
+                self._header_line(f"VC{axis}N", *(0.5 * (low + up) for up, low in both))
         words = (repr(self.field_type), "0", "0", str(len(self.waves)))
         self.header.lines.append(Record(str(self.path), 1, "", "FTYP", words, ""))
         return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private)
+
+    def _header_line(self, keyword: str, *values: float) -> None:
+        self.header.lines.append(Record(str(self.path), 1, "", keyword, tuple(map(repr, values)), ""))
 
     def _number(self, command: Record) -> int:
         word = command.words[0][1:].upper()
@@ -162,8 +183,10 @@ class _Translation:
             add(keyword, command.number(0), *flag)
         elif key == "WL":
             self.waves = [command.number(i) / 1e3 for i in range(len(words))]
-            for i, wave in enumerate(self.waves, start=1):
-                add("WAVM", i, repr(wave))
+        elif key in ("WTW", *VIGNETTING):
+            self.lists[key] = [command.number(i) for i in range(len(words))]
+        elif key == "WTF":
+            add("FWGN", *(repr(command.number(i)) for i in range(len(words))))
         elif key == "REF":
             add("PWAV", command.integer(0))
         elif key in FIELDS:

@@ -21,6 +21,7 @@ import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
 from ...design_data import DesignData
+from ...element_groups import element_groups
 from ...media.dispersion import model_glass
 from ...media.medium import Medium, RelativeToAir
 from ...paraxial import ParaxialSurfaces
@@ -130,6 +131,7 @@ class _LensReader:
             band=waves.band(low, high),
             medium_before=self.first_medium,
             object_distance=float(z0 + pupil.image.object_distance),
+            groups=element_groups(surfaces, self.first_medium),
             design_data=data,
         )
 

@@ -7,7 +7,7 @@ import pytest
 
 import pachon
 from pachon.core.errors import PrescriptionError
-from pachon.models.design_data import DesignData
+from pachon.models.design_data import DesignData, vignetted
 from pachon.models.io.prescription import load_telescope, save_telescope
 
 DATA = Path(__file__).parents[2] / "data" / "zmx"
@@ -146,13 +146,18 @@ def test_a_pupil_of_another_origin_is_written_as_a_plane(tmp_path):
 def test_codev_files_keep_fields_and_wavelengths(tmp_path):
     path = tmp_path / "lens.seq"
     path.write_text(
-        "RDM\nDIM M\nEPD 10\nWL 656.3 587.6 486.1\nREF 2\nXAN 0 0\nYAN 0 7\n"
+        "RDM\nDIM M\nEPD 10\nWL 656.3 587.6 486.1\nWTW 1 2 3\nREF 2\nXAN 0 0\nYAN 0 7\n"
+        "WTF 1 4\nVUY 0 0.3\nVLY 0 0.1\n"
         "SO 0 1e20\nS 50 5 NBK7_SCHOTT\nS -50 20\nS 0 30\nSTO\nSI 0 0\n"
     )
     data = load_telescope(path).design_data
     assert (data.length_unit, data.aperture, data.aperture_value, data.stop) == ("mm", "entrance_pupil", 0.01, "S3")
     assert np.rad2deg(data.fields) == pytest.approx(np.array([[0, 0], [0, 7]]), abs=1e-12)
     assert data.wavelengths == pytest.approx((656.3e-9, 587.6e-9, 486.1e-9), rel=1e-15)
+    assert (data.wavelength_weights, data.field_weights) == ((1.0, 2.0, 3.0), (1.0, 4.0))
+    # The rim of the second field: from -1 + 0.1 to 1 - 0.3.
+    rim = vignetted(np.array([[0.0, 1.0], [0.0, -1.0]]), np.array(data.vignetting))
+    assert rim[1, :, 1] == pytest.approx([0.7, -0.9], abs=1e-15)
 
 
 @pytest.mark.parametrize(
