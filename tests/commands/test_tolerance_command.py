@@ -21,7 +21,7 @@ OPTIMIZATION = """
 variables: [S1.radius, S2.thickness, Image.dz]
 fields_deg: [[0, 0], [0, 8]]
 n_pupil: 2
-max_steps: 3
+max_steps: 1
 operands: [{kind: focal_length_mm, target: 25}, {kind: edge_thickness_mm, surface: S1, min: 0.5}]
 """
 
@@ -37,6 +37,7 @@ def written(in_folder):
     return write
 
 
+@pytest.mark.long
 def test_a_study_is_written_shown_and_resumed(capsys, in_folder, written):
     command = ["tolerance", LENS, written("tol.yaml", TOLERANCES)]
     assert main([*command, "--quiet"]) == 0

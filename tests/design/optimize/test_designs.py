@@ -217,14 +217,14 @@ def test_configurations_share_variables_and_have_their_own(zoom):
 
 
 def test_restarts_keep_the_best_and_depend_on_the_seed_alone(doublet):
-    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=3, max_steps=8)
+    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=2, max_steps=4)
     alone = optimize(doublet, ACHROMAT, **how)
     found, again = (optimize(doublet, ACHROMAT, restarts=2, seed=3, spread=0.5, **how) for _ in range(2))
     assert np.array_equal(found.changes, again.changes)
     assert found.history[-1] <= alone.history[-1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_glasses_of_a_catalogue(lens):
     """A doublet of two crowns becomes one of crown and flint, as good as with glasses that do not exist."""
     crowns = lens([(np.inf, 4.0, "N-BK7"), (np.inf, 2.0, "N-BAK4"), (np.inf, 100.0, "")], pupil=5.0, field_deg=0.5)
