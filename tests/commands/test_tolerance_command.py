@@ -21,7 +21,7 @@ OPTIMIZATION = """
 variables: [S1.radius, S2.thickness, Image.dz]
 fields_deg: [[0, 0], [0, 8]]
 n_pupil: 2
-max_steps: 1
+max_steps: 2
 operands: [{kind: focal_length_mm, target: 25}, {kind: edge_thickness_mm, surface: S1, min: 0.5}]
 """
 

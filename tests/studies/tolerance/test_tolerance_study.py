@@ -25,7 +25,7 @@ CONTENT = {
     "tolerances": [
         {"name": "E2.dy_um", "size": 20},
         {"name": "S4.thickness_um", "size": 30, "distribution": "normal"},
-        {"name": "S1.irregularity_nm", "size": 60, "zernikes": [5, 7]},
+        {"name": "S1.irregularity_nm", "size": 60, "zernikes": [5, 6]},
     ],
     "compensators": ["Image.dz_um"],
     "requirement": 5.8,
@@ -137,9 +137,8 @@ def test_processes_give_the_same_bytes(triplet, study, tmp_path):
         assert getattr(found, name).tobytes() == getattr(study, name).tobytes()
 
 
-@pytest.mark.parametrize("method", ["linear", "quadratic"])
-def test_other_methods(triplet, study, method):
-    found = run_tolerances(triplet, file_of(method=method))
+def test_a_method_without_tracing(triplet, study):
+    found = run_tolerances(triplet, file_of(method="quadratic"))
     assert np.array_equal(found.deviations, study.deviations)
     assert np.array_equal(found.lower, study.lower)
     assert np.sqrt(np.mean((found.draws - study.draws) ** 2)) < 0.05 * study.draws.std()
@@ -152,10 +151,14 @@ def shortened(telescope):
 
 def test_a_merit_of_ones_own(triplet):
     content = {"telescope": LENS, "tolerances": [{"name": "S4.thickness_um", "size": 300}], "draws": 5, "rings": 2}
+    content["loss_percent"] = 1
     found = run_tolerances(triplet, ToleranceFile.model_validate(content), merit=shortened)
     length = abs(triplet.surfaces[-1].vertex[2])
     assert [found.lower[0], found.nominal, found.upper[0]] == pytest.approx([length - 3e-4, length, length + 3e-4])
-    assert found.inverse[0] == pytest.approx(0.1 * length * 1e6, rel=1e-3)
+    assert found.inverse[0] == pytest.approx(0.01 * length * 1e6, rel=1e-3)
+    # The space is 754 um long: ten per cent of the length would not fit into it, and no light passes beyond.
+    far = run_tolerances(triplet, ToleranceFile.model_validate({**content, "loss_percent": 10}), merit=shortened)
+    assert far.inverse[0] == pytest.approx(754.469, rel=1e-3)
     assert found.draws == pytest.approx(length + 1e-6 * found.deviations[:, 0])
     with pytest.raises(ConfigError, match="one's own"):
         run_tolerances(triplet, ToleranceFile.model_validate({**content, "method": "linear"}), merit=shortened)
