@@ -72,7 +72,6 @@ def tolerance_command(
             folder / "points.tolerance",
             resume=resume,
             workers=maker,
-            threads=threads,
             reporter=reporter,
         )
     write_tolerances(study, file, folder)

@@ -54,10 +54,16 @@ def with_thicknesses(telescope: Telescope, start: Telescope, changes: Iterable[t
     """Return the telescope with thicknesses behind some surfaces, by their indices, changed by lengths [m].
 
     The surfaces behind each are shifted along its axis in the telescope `start`, before other changes. The pivot of a
-    group goes with the first of its surfaces.
+    group goes with the first of its surfaces. A thickness that becomes negative is a DomainError.
     """
     shifts = np.zeros((len(telescope.surfaces), 3))
     for index, change in changes:
+        before = thickness(start, index)
+        if before >= 0 > before + change:
+            names = start.surface_names[index : index + 2]
+            raise DomainError(
+                f"thickness of {names[0]} = {before + change:.6g} m: expected {names[1]} to stay behind it"
+            )
         shifts[index + 1 :] += change * light_axis(start, index)
     surfaces = tuple(
         replace(s, vertex=_shifted(s.vertex, shift)) if shift.any() else s

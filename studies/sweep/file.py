@@ -78,6 +78,9 @@ class SweepFile(Section):
     parameters: dict[str, SweptParameter] = Field(default_factory=dict, description="varied parameters")
     design: Design = Design()
     metrics: tuple[str, ...] = Field(("fwhm", "rms_e", "xi_raw"), description="groups of metrics of each point")
+    fields_deg: Annotated[tuple[tuple[Real, Real], ...], Field(min_length=1)] | None = Field(
+        None, description="field angles of a telescope without a camera"
+    )
     compensators: tuple[str, ...] = Field((), description="motions solved for the sharpest image before measuring")
     xi_target: Annotated[Real, Field(gt=0)] | None = Field(
         None, description="xi+ that the report shares out between the causes"
@@ -98,7 +101,9 @@ class SweepFile(Section):
         contents = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files}
         if isinstance(telescope, str) and Path(telescope).is_file():
             contents[telescope] = prescription_digest(telescope)
-        return digest({"sweep": self.model_dump(mode="json"), "files": contents})
+        # A key that is not given leaves the digests of older sweeps as they were.
+        left_out = {"fields_deg"} if self.fields_deg is None else set()
+        return digest({"sweep": self.model_dump(mode="json", exclude=left_out), "files": contents})
 
 
 @check_arguments

@@ -7,6 +7,8 @@ A parameter is
 - a value of the prescription with its unit: ``M2.dz_um``, ``Camera.rx_urad``, ``M1.Z5_nm``, ``M1.radius_m``; see
   :mod:`pachon.design.parameters.parameters`.
 
+A telescope without a camera has metrics of the optics alone: see :mod:`pachon.studies.sweep.bare_point`.
+
 Random numbers are common to all points of a replica. Heights keep their pattern when a term grows, stars their
 positions, turbulence and wind their course. A difference between two points is then an effect of their parameters.
 """
@@ -27,8 +29,10 @@ from ...pipeline.config import Configuration, configuration_of
 from ...pipeline.defaults import resolve
 from ...pipeline.experiment import Experiment
 from ...pipeline.kept_screens import with_kept_screens
+from ..metrics.bare_telescope import BARE
 from ..metrics.scene import Scene
 from ..metrics.stars import STARS
+from .bare_point import bare_metrics, check_bare_sweep, is_bare
 from .compensation import compensated
 from .file import SweepFile
 from .store import PointResult, SweepPoint
@@ -54,6 +58,8 @@ class PointMeasurement:
         return PointResult(point.number, metrics, problem, time.perf_counter() - start, worker_name())
 
     def _metrics(self, point: SweepPoint, threads: int) -> dict[str, float]:
+        if is_bare(self.sweep, point.parameters, Path(self.folder)):
+            return bare_metrics(self.sweep, point.parameters, Path(self.folder), threads)
         experiment = with_kept_screens(point_experiment(self.sweep, point, Path(self.folder)))
         experiment, solved = compensated(experiment, self.sweep.compensators, threads)
         scene = Scene(experiment.telescope, experiment, threads=threads)
@@ -101,23 +107,32 @@ def point_experiment(sweep: SweepFile, point: SweepPoint, folder: Path) -> Exper
 
 def check_sweep(sweep: SweepFile, points: list[SweepPoint], folder: Path) -> None:
     """Check names and values, on the first point and the extremes of each parameter."""
-    if not sweep.metrics:
-        raise ConfigError(f"metrics = []: expected some of {', '.join(STARS)}")
-    for name in sweep.metrics:
-        if name not in STARS:
-            raise unknown_name("metric", name, STARS)
     if not points:
         raise ConfigError(f"sweep {sweep.name}: no points to compute")
+    bare = is_bare(sweep, points[0].parameters, folder)
+    if not sweep.metrics:
+        raise ConfigError(f"metrics = []: expected some of {', '.join(BARE if bare else STARS)}")
+    if sweep.fields_deg is not None and not bare:
+        raise ConfigError("fields_deg: expected for a telescope without a camera alone")
+    for name in sweep.metrics:
+        if not bare and name not in STARS:
+            raise unknown_name("metric", name, STARS)
     tried: set[int] = {points[0].number}
-    telescope = point_experiment(sweep, points[0], folder).telescope
-    for name in sweep.compensators:
-        parse_change(telescope, name)
+    if bare:
+        check_bare_sweep(sweep, points[0].parameters, folder)
+    else:
+        telescope = point_experiment(sweep, points[0], folder).telescope
+        for name in sweep.compensators:
+            parse_change(telescope, name)
     for name in points[0].parameters:
         ordered = sorted(points, key=lambda p: (isinstance(p.parameters[name], str), p.parameters[name]))
         for point in (ordered[0], ordered[-1]):
             if point.number not in tried:
                 tried.add(point.number)
-                point_experiment(sweep, point, folder)
+                if bare:
+                    check_bare_sweep(sweep, point.parameters, folder)
+                else:
+                    point_experiment(sweep, point, folder)
 
 
 def _set(content: dict[str, Any], path: list[str], value: Any) -> None:

@@ -88,13 +88,12 @@ def tolerance_merit(
     file: ToleranceFile,
     telescope: Telescope,
     own: Callable[[Telescope], float] | None = None,
-    threads: int | None = None,
 ) -> ToleranceMerit:
-    """Return the merit of a file, or a function of one's own, for a telescope."""
+    """Return the merit of a file, or a function of one's own, for a telescope; it takes one thread."""
     fields = None if file.fields_deg is None else np.deg2rad(file.fields_deg)
     waves = None if file.wavelengths_nm is None else np.array(file.wavelengths_nm) * 1e-9
     weights = None if file.field_weights is None else list(file.field_weights)
-    beams = Beams.of(telescope, fields, waves, field_weights=weights, n_pupil=file.rings, threads=threads)
+    beams = Beams.of(telescope, fields, waves, field_weights=weights, n_pupil=file.rings, threads=1)
     if own is not None:
         return ToleranceMerit("own", "own merit", "", 1.0, False, SpotMerit(telescope, beams), own)
     if file.merit == "wavefront":

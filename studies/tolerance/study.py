@@ -14,7 +14,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError
 from ...core.progress import Reporter
 from ...core.threads import one_blas_thread
-from ...core.workers import MakeWorkers, serial_worker
+from ...core.workers import Compute, MakeWorkers, Workers, serial_worker
 from ...design.optimize.toleranced_merit import TolerancedMerit
 from ...design.optimize.yields import Yield
 from ...design.parameters.tolerances import Tolerance, draw
@@ -117,7 +117,6 @@ def run_tolerances(
     merit: Callable[[Telescope], float] | None = None,
     resume: bool = False,
     workers: MakeWorkers | None = None,
-    threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> ToleranceStudy:
     """Compute sensitivity, inverse sensitivity and Monte Carlo of tolerances.
@@ -139,8 +138,6 @@ def run_tolerances(
         Go on with an existing store.
     workers : callable, optional
         Function that makes workers of the function that computes points; by default this process.
-    threads : int, optional
-        Number of threads of this process.
     reporter : Reporter, optional
         Progress display; silent by default.
 
@@ -152,7 +149,7 @@ def run_tolerances(
     if merit is not None and file.method != "traced":
         raise ConfigError(f"method = {file.method!r}: expected 'traced' for a merit of one's own")
     plan = tolerance_plan(file, telescope)
-    judged = tolerance_merit(file, plan.telescope, merit, threads)
+    judged = tolerance_merit(file, plan.telescope, merit)
     built = TolerancedMerit.of(
         plan.telescope, plan.tolerances, plan.compensators, plan.degrees_of_freedom, judged.judge
     )
@@ -223,7 +220,7 @@ def _results(
         finished = {result.number for result in done}
         missing = [p for p in points if p.number not in finished]
         batches = [_batch(missing[i : i + _BATCH], values) for i in range(0, len(missing), _BATCH)]
-        chosen = (workers or serial_worker)(measured)
+        chosen = (workers or _one_thread)(measured)
         title = f"tolerances: {len(missing)} telescopes, {chosen.description}"
         with reporter.stage(title, len(missing)) as stage:
             for found in chosen.results(batches) if batches else ():
@@ -235,6 +232,10 @@ def _results(
     finally:
         if opened is not None:
             opened.close()
+
+
+def _one_thread(compute: Compute) -> Workers:
+    return serial_worker(compute, 1)
 
 
 def _open(path: Path, file: ToleranceFile, points: Sequence[SweepPoint], resume: bool) -> SweepStore:

@@ -243,7 +243,7 @@ def calls(folder):
                            "merit": "spots", "nearest": 1}),
         "load_optimization": (pachon.load_optimization, {"path": m.optimization}),
         "load_tolerances": (pachon.load_tolerances, {"path": m.tolerances, "telescope": "paul_baker"}),
-        "run_tolerances": (pachon.run_tolerances, {"telescope": tel, "threads": 1,
+        "run_tolerances": (pachon.run_tolerances, {"telescope": tel,
                            "file": pachon.load_tolerances(m.tolerances, "paul_baker")}),
         "sensitivity": (pachon.sensitivity, mono | {"parameters": ["M2.dz"], "n_zernike": 6,
                         "sampling": "gauss", "n_pupil": 6}),

@@ -73,7 +73,8 @@ def test_limits_that_nobody_stated(lens):
     """Curvatures stay below one over the clear radius, thicknesses above zero."""
     start = lens([(20.0, 4.0, "N-BK7"), (-20.0, 15.0, "")], pupil=16.0, field_deg=0.5)
     pull = [pachon.FocalLength(2e-3, weight=100.0)]
-    found = optimize(start, ["S1.radius", "S2.radius", "S1.thickness"], "spots", [[0.0, 0.0]], targets=pull, n_pupil=3)
+    variables = ["S1.radius", "S2.radius", "S1.thickness"]
+    found = optimize(start, variables, "spots", [[0.0, 0.0]], targets=pull, n_pupil=2, max_steps=15)
     assert np.all(np.abs(found.values[:2]) >= 8e-3)
     assert found.values[2] >= 0.0
 
@@ -93,7 +94,7 @@ def ritchey_chretien(conics):
         Surface("Image", Interaction.DETECTOR, Plane(), (0.0, 0.0, apart - to_focus), VACUUM),
     )
     telescope = Telescope(
-        "ritchey_chretien", surfaces, 0.0, 0.2, 0.0, 5.0, 10.0, np.deg2rad(0.2), np.deg2rad(1.0), (3e-7, 1e-6), 5e-7
+        "ritchey_chretien", surfaces, 0.0, 1.0, 0.0, 5.0, 10.0, np.deg2rad(0.2), np.deg2rad(1.0), (3e-7, 1e-6), 5e-7
     )
     # Wilson, Reflecting Telescope Optics I, eqs. 3.109 and 3.114, with m = -magnification there.
     m = magnification
@@ -105,15 +106,16 @@ def ritchey_chretien(conics):
 def test_a_ritchey_chretien_from_spheres():
     """No spherical aberration and no coma: the conics of the closed form."""
     spheres, wanted = ritchey_chretien((0.0, 0.0))
-    fields = np.deg2rad([[0.0, 0.0], [0.0, 0.1], [0.0, 0.2]])
-    found = optimize(spheres, ["M1.conic", "M2.conic", "Image.dz", "Image.rx"], "spots", fields, n_pupil=5)
-    # Fifth order: the square of height over radius, (0.1 / 5)^2, on the primary, ten times that on the secondary.
-    assert found.values[0] == pytest.approx(wanted[0], abs=2e-3)
-    assert found.values[1] == pytest.approx(wanted[1], abs=2e-2)
+    fields = np.deg2rad([[0.0, 0.0], [0.0, 0.05], [0.0, 0.1]])
+    free = ["Image.dz", "Image.rx"]
+    found = optimize(spheres, ["M1.conic", "M2.conic", *free], "spots", fields, n_pupil=5)
+    # A little coma is left, for less astigmatism: square of the field over the focal ratio, (0.1 deg * 10)^2 = 3e-4.
+    assert found.values[0] == pytest.approx(wanted[0], abs=5e-4)
+    assert found.values[1] == pytest.approx(wanted[1], abs=5e-3)
     closed, _ = ritchey_chretien(wanted)
-    best = optimize(closed, ["Image.dz", "Image.rx"], "spots", fields, n_pupil=5)
-    assert found.merits[1] <= best.merits[1]
-    assert found.merits[0] > 100 * found.merits[1]
+    best = optimize(closed, free, "spots", fields, n_pupil=5)
+    assert 0.99 * best.merits[1] < found.merits[1] <= best.merits[1]
+    assert found.merits[0] > 1000 * found.merits[1]
 
 
 TRIPLET = [
@@ -215,14 +217,14 @@ def test_configurations_share_variables_and_have_their_own(zoom):
 
 
 def test_restarts_keep_the_best_and_depend_on_the_seed_alone(doublet):
-    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=3, max_steps=8)
+    how = dict(merit="spots", fields=[[0.0, 0.0]], targets=[pachon.FocalLength(0.1)], n_pupil=2, max_steps=4)
     alone = optimize(doublet, ACHROMAT, **how)
     found, again = (optimize(doublet, ACHROMAT, restarts=2, seed=3, spread=0.5, **how) for _ in range(2))
     assert np.array_equal(found.changes, again.changes)
     assert found.history[-1] <= alone.history[-1]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_glasses_of_a_catalogue(lens):
     """A doublet of two crowns becomes one of crown and flint, as good as with glasses that do not exist."""
     crowns = lens([(np.inf, 4.0, "N-BK7"), (np.inf, 2.0, "N-BAK4"), (np.inf, 100.0, "")], pupil=5.0, field_deg=0.5)

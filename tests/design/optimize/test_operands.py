@@ -98,7 +98,7 @@ def test_transfer_of_a_perfect_pupil(paraboloid):
     assert found == pytest.approx(expected, rel=2e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_transfer_of_a_triplet(triplet):
     """Against the full calculation: close where the contrast is high, too low where it is not, so never flattering."""
     fields = np.deg2rad([[0.0, 0.0], [0.0, 12.0]])

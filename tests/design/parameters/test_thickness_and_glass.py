@@ -118,6 +118,8 @@ def test_wrong_addresses(triplet, address, error, words):
 def test_wrong_groups_and_numbers(lsst_r, triplet):
     with pytest.raises(DomainError, match=r"Camera.thickness.*group of two"):
         Parameter.parse("Camera.thickness", lsst_r)
+    with pytest.raises(DomainError, match=r"thickness of S2 = -0.00136.* m: expected S3 to stay behind it"):
+        apply(triplet, {"S2.thickness": -4e-3})
     with pytest.raises(DomainError, match=r"N-SF2.abbe = -6.*positive Abbe"):
         apply(triplet, {"N-SF2.abbe": -40.0})
     front, *others = triplet.surfaces

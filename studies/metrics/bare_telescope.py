@@ -1,0 +1,81 @@
+"""Metrics of a telescope without a camera: spots, wavefront, encircled energy, modulation transfer, throughput."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...design.images.encircled_energy import encircled_energy
+from ...design.images.mtf import mtf
+from ...design.metrics.spots import spot_diagram
+from ...design.metrics.vignetting import vignetting
+from ...design.optimize.merit import Beams, WavefrontMerit
+from ...models.telescope import Telescope
+from ...wavefront.request import Request
+
+#: Rings of pupil points, pixels of the images of encircled energy, points across the pupil, rays for the throughput.
+_RINGS, _PIXELS, _ACROSS, _RAYS = 6, 96, 192, 4096
+#: Fraction of the light, and contrast.
+_ENERGY, _CONTRAST = 0.8, 0.5
+
+
+@dataclass(frozen=True)
+class BareScene:
+    """A telescope with field points [rad] and wavelengths [m]; None stands for its own."""
+
+    telescope: Telescope
+    fields: np.ndarray | None = None
+    wavelengths: np.ndarray | None = None
+    threads: int | None = None
+
+    @property
+    def request(self) -> Request:
+        """Rays of all fields and wavelengths."""
+        return Request.of(self.telescope, self.fields, self.wavelengths, n_pupil=_RINGS, threads=self.threads)
+
+
+def spots(scene: BareScene) -> dict[str, float]:
+    """Return the rms spot radius over the fields, and the largest."""
+    radii = spot_diagram(scene.request).rms_radius * 1e6
+    return {"spot_rms_um": float(np.sqrt(np.mean(radii**2))), "spot_worst_um": float(radii.max())}
+
+
+def wavefront(scene: BareScene) -> dict[str, float]:
+    """Return the rms wavefront without piston and tilt, over fields and wavelengths."""
+    beams = Beams.of(scene.telescope, scene.fields, scene.wavelengths, n_pupil=_RINGS, threads=scene.threads)
+    residuals = WavefrontMerit(scene.telescope, beams).residuals(scene.telescope)
+    return {"wavefront_rms_nm": float(np.linalg.norm(residuals)) * 1e9}
+
+
+def ee80(scene: BareScene) -> dict[str, float]:
+    """Return the radius of 80 % of the light with diffraction at the middle wavelength, mean and largest."""
+    energy = encircled_energy(
+        scene.telescope, scene.fields, scene.request.middle, pixels=_PIXELS, n_pupil=_ACROSS, threads=scene.threads
+    )
+    radii = energy.radius_holding(_ENERGY) * 1e6
+    return {"ee80_um": float(radii.mean()), "ee80_worst_um": float(radii.max())}
+
+
+def transfer(scene: BareScene) -> dict[str, float]:
+    """Return the frequency at which the contrast falls to a half, mean and least over fields and two directions."""
+    found = mtf(scene.telescope, scene.fields, scene.wavelengths, threads=scene.threads).frequency_at(_CONTRAST) * 1e-3
+    return {"mtf50_per_mm": float(found.mean()), "mtf50_worst_per_mm": float(found.min())}
+
+
+def throughput(scene: BareScene) -> dict[str, float]:
+    """Return mean and minimum of the lit fraction of the pupil over the fields."""
+    request = scene.request
+    lit = vignetting(scene.telescope, request.fields, request.middle, n_pupil=_RAYS, threads=scene.threads).lit_fraction
+    return {"throughput_mean": float(lit.mean()), "throughput_min": float(lit.min())}
+
+
+#: Groups of metrics by name.
+BARE: dict[str, Callable[[BareScene], dict[str, float]]] = {
+    "spots": spots,
+    "wavefront": wavefront,
+    "ee80": ee80,
+    "mtf": transfer,
+    "throughput": throughput,
+}

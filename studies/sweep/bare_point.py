@@ -1,0 +1,98 @@
+"""Points of a sweep over a telescope without a camera: values of the prescription, and metrics of the optics alone.
+
+The configuration may state `telescope`, `wavelengths_nm` and `changes`; a parameter is one of these keys, or a value of
+the prescription with its unit.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import ConfigError, unknown_name
+from ...design.optimize.optimize import optimize
+from ...design.parameters.changes import apply_changes, parse_change
+from ...models.io.prescription import bundled_names, load_telescope
+from ...models.telescope import Telescope
+from ...pipeline.config import Configuration, configuration_of
+from ..metrics.bare_telescope import BARE, BareScene
+from .file import SweepFile
+
+#: Keys of the configuration that a telescope alone has use for.
+KEYS = ("telescope", "wavelengths_nm", "changes", "seed")
+#: Rings of pupil points for compensators, and relative precision of the mean square radius.
+_RINGS, _TOLERANCE = 4, 1e-9
+
+
+def is_bare(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> bool:
+    """Return whether the telescope of a point has no camera."""
+    base = sweep.base if isinstance(sweep.base, dict) else {}
+    name = parameters.get("telescope", base.get("telescope"))
+    return isinstance(name, str) and _without_camera(_path(name, folder))
+
+
+def bare_metrics(sweep: SweepFile, parameters: dict[str, Any], folder: Path, threads: int) -> dict[str, float]:
+    """Return the metrics of one point, compensators solved for the smallest spots."""
+    telescope, config = bare_telescope(sweep, parameters, folder)
+    fields = None if sweep.fields_deg is None else np.deg2rad(sweep.fields_deg)
+    waves = None if config.wavelengths_nm is None else np.array(config.wavelengths_nm) * 1e-9
+    solved = {}
+    if sweep.compensators:
+        chosen = [parse_change(telescope, name, "compensators") for name in sweep.compensators]
+        found = optimize(
+            telescope,
+            [parameter for parameter, _ in chosen],
+            "spots",
+            fields,
+            waves,
+            n_pupil=_RINGS,
+            tolerance=_TOLERANCE,
+            threads=threads,
+        )
+        telescope = found.telescope
+        for name, change, (_, size) in zip(sweep.compensators, found.changes, chosen, strict=True):
+            solved[f"solved {name}"] = float(change / size)
+    scene = BareScene(telescope, fields, waves, threads)
+    metrics: dict[str, float] = {}
+    for name in dict.fromkeys(sweep.metrics):
+        metrics |= BARE[name](scene)
+    return metrics | solved
+
+
+def bare_telescope(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> tuple[Telescope, Configuration]:
+    """Return the telescope and the configuration of one point; an error names the key that has no place there."""
+    content = deepcopy(sweep.base) if isinstance(sweep.base, dict) else {}
+    for name, value in parameters.items():
+        if name in KEYS:
+            content[name] = [value] if name == "wavelengths_nm" else value
+        else:
+            content.setdefault("changes", {})[name] = value
+    for key in content:
+        if key not in KEYS:
+            raise ConfigError(f"base.{key}: expected {', '.join(KEYS)} alone, for a telescope without a camera")
+    config = configuration_of(content, f"sweep {sweep.name}")
+    telescope = load_telescope(_path(config.telescope or "", folder))
+    return apply_changes(telescope, config.changes), config
+
+
+def check_bare_sweep(sweep: SweepFile, parameters: dict[str, Any], folder: Path) -> None:
+    """Check the names of metrics and compensators, and the values of one point."""
+    for name in sweep.metrics:
+        if name not in BARE:
+            raise unknown_name("metric of a telescope without a camera", name, BARE)
+    telescope, _ = bare_telescope(sweep, parameters, folder)
+    for name in sweep.compensators:
+        parse_change(telescope, name, "compensators")
+
+
+def _path(name: str, folder: Path) -> str:
+    return name if name in bundled_names() or not (folder / name).is_file() else str(folder / name)
+
+
+@lru_cache(maxsize=64)
+def _without_camera(path: str) -> bool:
+    return load_telescope(path).camera is None

@@ -1,0 +1,114 @@
+"""`pachon tolerance` and `pachon optimize --config`: products, tables, JSON, one line for bad input."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import pachon
+from pachon.commands.cli import main
+
+LENS = str(Path(__file__).parents[1] / "data" / "zmx" / "lens1.zmx")
+TOLERANCES = """
+fields_deg: [[0, 0], [0, 8]]
+rings: 2
+tolerances: [{name: E2.dy_um, size: 10}, {name: S4.thickness_um, size: 20}]
+compensators: [Image.dz_um]
+requirement: 6
+draws: 12
+"""
+OPTIMIZATION = """
+variables: [S1.radius, S2.thickness, Image.dz]
+fields_deg: [[0, 0], [0, 8]]
+n_pupil: 2
+max_steps: 2
+operands: [{kind: focal_length_mm, target: 25}, {kind: edge_thickness_mm, surface: S1, min: 0.5}]
+"""
+
+
+@pytest.fixture
+def written(in_folder):
+    """``written(name, text)``: a file in the folder."""
+
+    def write(name, text):
+        (in_folder / name).write_text(text)
+        return name
+
+    return write
+
+
+@pytest.mark.long
+def test_a_study_is_written_shown_and_resumed(capsys, in_folder, written):
+    command = ["tolerance", LENS, written("tol.yaml", TOLERANCES)]
+    assert main([*command, "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("tolerances: ")
+    folder = in_folder / "tolerance_lens1"
+    assert {p.name for p in folder.iterdir()} == {
+        "draws.ecsv",
+        "points.tolerance",
+        "sensitivity.ecsv",
+        "sensitivity.png",
+        "summary.json",
+        "yield.png",
+    }
+    before = {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "points.tolerance"}
+    assert main(command) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert main([*command, "--resume"]) == 0
+    out = capsys.readouterr().out
+    for words in ("E2.dy_um", "lower end [um]", "10 % loss at", "12 telescopes, traced", "requirement 6 um: met by"):
+        assert words in out
+    assert {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "points.tolerance"} == before
+
+
+def test_json_and_options(capsys, in_folder, written):
+    command = ["tolerance", LENS, written("tol.yaml", TOLERANCES), "-o", "other", "--json", "--quiet"]
+    assert main([*command, "--method", "linear", "-n", "40", "--seed", "3"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["method"], summary["draws"], summary["folder"]) == ("linear", 40, "other")
+    assert len(summary["worst_offenders"]) == 2
+    assert summary["yield"]["low"] < summary["yield"]["fraction"] + 1e-9 < summary["yield"]["high"] + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("tolerances: [{name: S99.dz_um, size: 1}]", [], "S99"),
+        ("tolerances: []", [], "at least one"),
+        ("merit: beauty", [], "tol.yaml: merit"),
+        (TOLERANCES, ["--method", "guess"], "guess"),
+        (TOLERANCES.replace("Image.dz_um", "Image.dy_um"), [], "Image.dy_um' has no effect"),
+    ],
+)
+def test_bad_input_is_one_line(capsys, written, text, options, words):
+    assert main(["tolerance", LENS, written("tol.yaml", text), "--quiet", *options]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.long
+def test_an_optimization_from_a_file(capsys, in_folder, written):
+    assert main(["optimize", LENS, "--config", written("opt.yaml", OPTIMIZATION), "--out", "better.yaml"]) == 0
+    out = capsys.readouterr().out
+    for words in ("rms of spots: ", "with operands: ", "focal_length: 0.024", "edge_thickness(S1): ", "(>= 0.0005)"):
+        assert words in out
+    assert (in_folder / "optimize_lens1.png").read_bytes().startswith(b"\x89PNG")
+    better = pachon.load_telescope(in_folder / "better.yaml")
+    assert better.surface("S1").shape.radius != pachon.load_telescope(LENS).surface("S1").shape.radius
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "either --variables or --config"),
+        (["--config", "opt.yaml", "--variables", "S1.radius"], "either --variables or --config"),
+        (["--config", "opt.yaml", "--merit", "spots"], "--merit is given beside --config"),
+        (["--config", "opt.yaml", "--field-deg", "0"], "in the file"),
+        (["--config", "none.yaml"], "none.yaml"),
+    ],
+)
+def test_options_that_exclude_each_other(capsys, written, options, words):
+    written("opt.yaml", OPTIMIZATION)
+    assert main(["optimize", LENS, *options]) == 2
+    assert words in capsys.readouterr().err

@@ -1,0 +1,111 @@
+"""Files of optimisations: operands with units, configurations, and what is wrong in one line."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import PachonError
+from pachon.design.optimize.optimize import optimize
+from pachon.design.optimize.optimize_file import load_optimization, optimization_arguments
+
+LENS = "tests/data/zmx/lens1.zmx"
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    return pachon.load_telescope(LENS)
+
+
+@pytest.fixture
+def arguments(tmp_path, triplet):
+    """``arguments(text)``: those of optimize for a file of that text."""
+
+    def read(text):
+        path = tmp_path / "opt.yaml"
+        path.write_text(text)
+        return optimization_arguments(load_optimization(path), triplet, path)
+
+    return read
+
+
+def test_units(arguments):
+    found = arguments(
+        """
+        variables: [S1.radius, S2.thickness]
+        bounds: {S2.thickness_mm: [0.5, 6], S1.radius_mm: [-20, -10]}
+        fields_deg: [[0, 0], [0, 12]]
+        wavelengths_nm: [486.1, 587.6]
+        operands:
+          - {kind: focal_length_mm, target: 25, weight: 2}
+          - {kind: distortion_percent, field_deg: [0, 12], min: -1, max: 1}
+          - {kind: incidence_angle_deg, surface: S3, field_deg: [0, 12], pupil: [0, 1], max: 45, wavelength_nm: 500}
+          - {kind: edge_thickness_um, surface: S1, radius_mm: 4, min: 500}
+          - {kind: mtf, field_deg: [0, 0], frequency_per_mm: 40, angle_deg: 90, min: 0.5}
+          - {kind: rms_spot_um, field_deg: [0, 0], wavelengths_nm: [500], n_pupil: 3, max: 5}
+        """
+    )
+    twelve = float(np.deg2rad(12.0))
+    assert found["bounds"]["S2.thickness"] == pytest.approx((0.5e-3, 6e-3))
+    assert found["bounds"]["S1.radius"] == pytest.approx((-20e-3, -10e-3))
+    assert np.asarray(found["fields"])[1] == pytest.approx([0.0, twelve])
+    assert found["wavelengths"] == pytest.approx([486.1e-9, 587.6e-9])
+    focal, distortion, angle, edge, mtf, spot = found["targets"]
+    assert focal == pachon.FocalLength(0.025, weight=2.0)
+    assert (distortion.field, distortion.minimum, distortion.maximum) == ((0.0, pytest.approx(twelve)), -0.01, 0.01)
+    assert angle.maximum == pytest.approx(np.pi / 4)
+    assert (angle.surface, angle.pupil, angle.wavelength) == ("S3", (0.0, 1.0), pytest.approx(500e-9))
+    assert (edge.radius, edge.minimum) == (pytest.approx(4e-3), pytest.approx(5e-4))
+    assert (mtf.frequency, mtf.angle, mtf.minimum) == (pytest.approx(4e4), pytest.approx(np.pi / 2), 0.5)
+    assert (spot.wavelengths, spot.n_pupil, spot.maximum) == ((pytest.approx(5e-7),), 3, pytest.approx(5e-6))
+    result = optimize(**{**found, "max_steps": 1, "n_pupil": 2})
+    assert len(result.operands) == 6
+
+
+def test_configurations(arguments, tmp_path, triplet):
+    other = pachon.models.telescope.replace(triplet, name="near")
+    pachon.save_telescope(other, tmp_path / "near.yaml")
+    found = arguments(
+        """
+        variables: [S1.curvature, "near:S7.thickness"]
+        bounds: {"near:S7.thickness_mm": [15, 25]}
+        fields_deg: [[0, 0]]
+        configurations:
+          - {telescope: near.yaml, weight: 2, fields_deg: [[0, 5]], operands: [{kind: f_number, target: 3}]}
+        """
+    )
+    first, second = found["telescope"]
+    assert [first.telescope.name, second.telescope.name] == ["lens1", "near"]
+    assert second.weight == 2.0
+    assert np.asarray(second.fields)[0, 1] == pytest.approx(np.deg2rad(5.0))
+    assert found["bounds"] == {"near:S7.thickness": pytest.approx((15e-3, 25e-3))}
+    result = optimize(**{**found, "max_steps": 2, "n_pupil": 2})
+    assert [(o.configuration, o.operand.kind) for o in result.operands] == [("near", "f_number")]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("merit: spots", "variables"),
+        ("variables: []", "variables"),
+        ("{variables: [S1.radius], colour: red}", "unknown key colour"),
+        ("{variables: [S1.radius], merit: beauty}", "merit.*spots"),
+        ("{variables: [S1.radius], operands: [{kind: focal, target: 1}]}", r"operands.0.*focal.*focal_length_mm"),
+        ("{variables: [S1.radius], operands: [{kind: focal_length, target: 1}]}", r"unit at the end, one of m, mm"),
+        ("{variables: [S1.radius], operands: [{kind: focal_length_deg, target: 1}]}", r"unit at the end"),
+        ("{variables: [S1.radius], operands: [{kind: edge_thickness_mm, min: 1}]}", "surface is missing"),
+        (
+            "{variables: [S1.radius], operands: [{kind: f_number, target: 3, surface: S1}]}",
+            "key of operand f_number.*surface",
+        ),
+        ("{variables: [S1.radius], operands: [{kind: f_number}]}", "operands.0.*either a value"),
+        ("{variables: [S1.radius], operands: [{kind: f_number, min: 3, max: 2}]}", "minimum below the maximum"),
+        ("{variables: [S1.radius], bounds: {S1.radius: [1, 2]}}", r"bounds.S1.radius.*unit at the end"),
+        ("{variables: [S1.radius], bounds: {'near:S1.radius_mm': [1, 2]}}", "configuration of bounds.*near"),
+        ("{variables: [S1.radius], configurations: [{telescope: no_such}]}", "configurations.0.*no_such"),
+    ],
+)
+def test_wrong_files(arguments, tmp_path, text, words):
+    with pytest.raises(PachonError, match=words) as caught:
+        arguments(text)
+    assert str(caught.value).startswith(str(tmp_path / "opt.yaml"))
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,110 @@
+"""Toleranced merits: second derivatives and compensators against brute force, methods against each other, yields."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+import pachon
+from pachon.design.optimize.merit import Beams, SpotMerit
+from pachon.design.optimize.monte_carlo import monte_carlo
+from pachon.design.optimize.toleranced_merit import TolerancedMerit
+from pachon.design.optimize.yields import Yield
+from pachon.design.parameters.degrees_of_freedom import DegreesOfFreedom
+from pachon.design.parameters.parameters import apply
+from pachon.design.parameters.tolerances import Tolerance
+
+FIELDS = np.deg2rad([[0.0, 0.0], [0.0, 8.0], [0.0, -11.0]])
+TOLERANCES = (
+    Tolerance("S3.dy", 10e-6),
+    Tolerance("S4.thickness", 20e-6, "normal"),
+    Tolerance("S1.curvature", 0.05),
+    Tolerance("S6.n", 2e-4, "end_point"),
+)
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    return pachon.load_telescope("tests/data/zmx/lens1.zmx")
+
+
+@pytest.fixture(scope="module")
+def built(triplet):
+    dof = DegreesOfFreedom.of_parameters(triplet, [*(t.name for t in TOLERANCES), "Image.dz"])
+    judge = SpotMerit(triplet, Beams.of(triplet, FIELDS, n_pupil=3))
+    return TolerancedMerit.of(triplet, TOLERANCES, ("Image.dz",), dof, judge)
+
+
+def test_second_derivatives(triplet, built):
+    """Central differences of the mean square radius itself."""
+    names = [*(t.name for t in TOLERANCES), "Image.dz"]
+    steps = np.array([5e-6, 1e-5, 0.02, 1e-4, 1e-5])
+
+    def square(values):
+        return np.sum(built.judge.residuals(apply(triplet, dict(zip(names, values, strict=True)))) ** 2)
+
+    start, gradient, hessian = built.second_order
+    assert start == pytest.approx(square(np.zeros(5)), rel=1e-12)
+    scale = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
+    for i in range(5):
+        a = steps[i] * np.eye(5)[i]
+        # Terms of third order in the steps, some 1e-3 of the whole.
+        assert gradient[i] == pytest.approx((square(a) - square(-a)) / (2 * steps[i]), rel=1e-3, abs=1e-13 / steps[i])
+        for j in range(i + 1):
+            b = steps[j] * np.eye(5)[j]
+            mixed = (square(a + b) - square(a - b) - square(b - a) + square(-a - b)) / (4 * steps[i] * steps[j])
+            assert abs(hessian[i, j] - mixed) < 2e-3 * scale[i, j]
+
+
+def test_quadratic_compensation_is_the_best_focus(triplet, built):
+    """The minimum over the compensator is what a search of the focus finds."""
+    deviations = np.array([[1e-5, 2e-5, -0.05, -2e-4]])
+    found = built.quadratic(deviations)[0]
+    moved = apply(triplet, dict(zip([t.name for t in TOLERANCES], deviations[0], strict=True)))
+    best = minimize_scalar(
+        lambda h: np.linalg.norm(built.judge.residuals(apply(moved, {"Image.dz": h}))),
+        bounds=(-1e-4, 1e-4),
+        method="bounded",
+    ).fun
+    assert found == pytest.approx(best, rel=2e-3)
+    assert best > 1.002 * built.nominal
+
+
+def test_methods_and_their_yields_agree(triplet):
+    """Tolerances of good work: merits within 2 per cent of their spread, yields within their binomial errors."""
+    how = dict(merit="spots", n=100, seed=2, compensators=["Image.dz"], fields=FIELDS, n_pupil=3)
+    linear, quadratic, traced = (
+        monte_carlo(triplet, TOLERANCES, method=m, **how) for m in ("linear", "quadratic", "traced")
+    )
+    assert np.array_equal(linear.deviations, traced.deviations)
+    spread = traced.merit.std()
+    assert spread > 0.02 * traced.nominal
+    requirement = float(np.median(traced.merit))
+    exact = traced.yield_at(requirement)
+    assert exact.fraction == pytest.approx(0.5, abs=0.01)
+    for other in (linear, quadratic):
+        assert np.sqrt(np.mean((other.merit - traced.merit) ** 2)) < 0.02 * spread
+        found = other.yield_at(requirement)
+        assert found.low <= exact.fraction <= found.high
+
+
+def test_end_points():
+    tolerance = Tolerance("a", 3.0, "end_point")
+    values = tolerance.draw(1, 10_000)
+    assert set(values) == {-3.0, 3.0}
+    # Five standard errors of the mean.
+    assert abs(values.mean()) < 5 * 3.0 / 100
+    assert tolerance.spread == 3.0
+
+
+def test_yield_and_its_interval():
+    """Wilson's interval holds the fractions p whose own deviation, sqrt(p (1 - p) / n), reaches the one found."""
+    merits = np.concatenate([np.zeros(30), np.ones(9), [np.nan]])
+    found = Yield.of(merits, 0.5)
+    assert found.fraction == 0.75
+    for edge in (found.low, found.high):
+        assert abs(edge - 0.75) == pytest.approx(np.sqrt(edge * (1 - edge) / 40))
+    larger = Yield.of(merits, 0.5, larger=True)
+    assert larger.fraction == pytest.approx(9 / 40)
+    everything = Yield.of(np.zeros(10), 0.5)
+    assert everything.high == pytest.approx(1.0)
+    assert everything.low < 1.0

@@ -1,0 +1,104 @@
+"""Sweeps of a telescope without a camera: metrics against the functions they stand for, compensators, bad input."""
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import PachonError
+from pachon.studies.metrics.bare_telescope import BARE, BareScene
+from pachon.studies.sweep.file import read_sweep
+from pachon.studies.sweep.sweep import run_sweep
+
+LENS = "tests/data/zmx/lens1.zmx"
+FIELDS = [[0.0, 0.0], [0.0, 8.0]]
+CONTENT = {
+    "name": "lens",
+    "base": {"telescope": LENS, "wavelengths_nm": [486.1, 656.3]},
+    "fields_deg": FIELDS,
+    "parameters": {"S3.dy_um": {"nominal": 0, "values": [0, 20]}},
+    "metrics": ["spots", "wavefront"],
+}
+
+
+def table_of(tmp_path, **changes):
+    sweep = read_sweep({**CONTENT, **changes}, "test")
+    run_sweep(sweep, tmp_path / "lens.sweep")
+    return pachon.load_sweep_table(tmp_path / "lens.sweep")
+
+
+def test_points_against_telescopes_made_by_hand(tmp_path):
+    table = table_of(tmp_path)
+    lens = pachon.load_telescope(LENS)
+    waves = [486.1e-9, 656.3e-9]
+    for shift, rms, worst, wavefront in zip(
+        table.parameters["S3.dy_um"],
+        table.metrics["spot_rms_um"],
+        table.metrics["spot_worst_um"],
+        table.metrics["wavefront_rms_nm"],
+        strict=True,
+    ):
+        moved = lens.perturbed("S3", shift=(0.0, 1e-6 * shift, 0.0))
+        radii = 1e6 * pachon.spots(moved, np.deg2rad(FIELDS), waves, n_pupil=6).rms_radius
+        assert rms == pytest.approx(np.sqrt(np.mean(radii**2)), rel=1e-9)
+        assert worst == pytest.approx(radii.max(), rel=1e-9)
+        squares = []
+        for field in np.deg2rad(FIELDS):
+            for wave in waves:
+                opd = pachon.wavefront_opd(moved, field, wave, grid=64)
+                squares.append(np.mean(opd.without_tilt[opd.lit] ** 2))
+        # Quadrature over the pupil against a grid of cells at its rim.
+        assert wavefront == pytest.approx(1e9 * np.sqrt(np.mean(squares)), rel=0.03)
+    assert len(table) == 2
+    assert table.metrics["spot_rms_um"][1] > 1.1 * table.metrics["spot_rms_um"][0]
+
+
+def test_compensators(tmp_path):
+    plain = table_of(tmp_path / "a", metrics=["spots"])
+    solved = table_of(tmp_path / "b", metrics=["spots"], compensators=["Image.dz_um", "Image.rx_arcmin"])
+    assert np.all(solved.metrics["spot_rms_um"] < plain.metrics["spot_rms_um"])
+    lens = pachon.load_telescope(LENS)
+    height, tilt = (solved.metrics[f"solved Image.{name}"][1] for name in ("dz_um", "rx_arcmin"))
+    moved = lens.perturbed("S3", shift=(0.0, 20e-6, 0.0))
+    moved = moved.perturbed("Image", shift=(0.0, 0.0, 1e-6 * height), tilt=(np.deg2rad(tilt / 60.0), 0.0, 0.0))
+    radii = 1e6 * pachon.spots(moved, np.deg2rad(FIELDS), [486.1e-9, 656.3e-9], n_pupil=6).rms_radius
+    assert solved.metrics["spot_rms_um"][1] == pytest.approx(np.sqrt(np.mean(radii**2)), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_metrics_of_images():
+    """The functions that they stand for, at the fields and wavelengths of the sweep."""
+    lens = pachon.load_telescope(LENS)
+    fields, waves = np.deg2rad(FIELDS), np.array([587.6e-9])
+    scene = BareScene(lens, fields, waves)
+    found = {key: value for name in ("ee80", "mtf", "throughput") for key, value in BARE[name](scene).items()}
+    radii = pachon.encircled_energy(lens, fields, waves, pixels=128, n_pupil=256).radius_holding(0.8) * 1e6
+    # Another number of pixels and of pupil points.
+    assert found["ee80_um"] == pytest.approx(radii.mean(), rel=0.01)
+    assert found["ee80_worst_um"] == pytest.approx(radii.max(), rel=0.01)
+    half = pachon.mtf(lens, fields, waves).frequency_at(0.5) * 1e-3
+    assert found["mtf50_worst_per_mm"] == pytest.approx(half.min())
+    # No apertures: all of the light.
+    assert found["throughput_min"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"metrics": ["fwhm"]}, r"without a camera 'fwhm'.*spots"),
+        ({"metrics": []}, r"metrics = \[\].*spots"),
+        ({"base": {"telescope": LENS, "band": "r"}}, r"base.band.*telescope, wavelengths_nm"),
+        ({"parameters": {"S99.dy_um": {"nominal": 0, "values": [0, 1]}}}, "S99"),
+        ({"parameters": {"atmosphere.r0_m": {"nominal": 0, "values": [0, 1]}}}, "atmosphere"),
+        ({"compensators": ["Image.dz"]}, r"compensators.Image.dz.*unit"),
+        ({"base": {"telescope": "lsst_v3.3_r"}, "metrics": ["fwhm"]}, "fields_deg.*without a camera"),
+    ],
+)
+def test_bad_input(tmp_path, changes, words):
+    with pytest.raises(PachonError, match=words):
+        table_of(tmp_path, **changes)
+    assert not (tmp_path / "lens.sweep").exists()
+
+
+def test_a_compensator_without_effect_is_a_problem_of_the_point(tmp_path):
+    table = table_of(tmp_path, metrics=["spots"], compensators=["Image.dx_um"])
+    assert all("Image.dx has no effect" in problem for problem in table.problem)

@@ -1,0 +1,193 @@
+"""Tolerances of files as degrees of freedom: elements, compounds, irregularities, what replaces what."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pachon
+from pachon.core.errors import ConfigError, DomainError, PachonError, UnknownNameError
+from pachon.models.media.medium import abbe_number
+from pachon.studies.tolerance.elements import with_elements
+from pachon.studies.tolerance.file import ToleranceFile, load_tolerances
+from pachon.studies.tolerance.plan import tolerance_plan
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    return pachon.load_telescope("tests/data/zmx/lens1.zmx")
+
+
+def plan_of(triplet, **content):
+    return tolerance_plan(ToleranceFile.model_validate(content), triplet)
+
+
+def moved(plan, **values):
+    names = {name.replace(".", "_").replace(" ", "_"): name for name in plan.degrees_of_freedom.names}
+    return plan.degrees_of_freedom.apply(plan.telescope, {names[k]: v for k, v in values.items()})
+
+
+def test_elements_are_groups(triplet, lsst_r):
+    lens, names = with_elements(triplet)
+    assert names == ("E1", "E2", "E3")
+    assert [lens.groups[n] for n in names] == [("S1", "S2"), ("S3", "S4"), ("S6", "S7")]
+    telescope, known = with_elements(lsst_r)
+    # The camera's own groups are its elements.
+    assert known == ("L1", "L2", "Filter", "L3")
+    assert dict(telescope.groups) == dict(lsst_r.groups)
+    glued = replace(triplet.surface("S2"), medium_after=triplet.surface("S3").medium_after)
+    cemented = replace(triplet, surfaces=tuple(glued if s.name == "S2" else s for s in triplet.surfaces))
+    together, names = with_elements(cemented)
+    assert together.groups["E1"] == ("S1", "S2", "S3", "S4")
+
+
+def test_tolerances_of_all_surfaces_elements_and_gaps(triplet):
+    plan = plan_of(
+        triplet,
+        surfaces={"radius_percent": 0.1},
+        elements={"thickness_um": 10, "tilt_arcmin": 1, "wedge_arcmin": 1, "index": 1e-4, "abbe_percent": 0.5},
+        gaps={"thickness_um": 20},
+    )
+    names = [t.name for t in plan.tolerances]
+    assert names[:6] == [f"S{i}.radius_percent" for i in (1, 2, 3, 4, 6, 7)]
+    assert {n for n in names if n.startswith("E2")} == {
+        "E2.rx_arcmin",
+        "E2.ry_arcmin",
+        "E2.wedge_x_arcmin",
+        "E2.wedge_y_arcmin",
+    }
+    thicknesses = {t.name: t.size for t in plan.tolerances if "thickness" in t.name}
+    assert thicknesses == {f"S{i}.thickness_um": 10 if i in (1, 3, 6) else 20 for i in (1, 2, 3, 4, 6)}
+    assert {n for n in names if n.endswith((".n", "abbe_percent"))} == {
+        f"S{i}.{what}" for i in (1, 3, 6) for what in ("n", "abbe_percent")
+    }
+
+
+def test_what_the_numbers_mean(triplet):
+    plan = plan_of(
+        triplet,
+        surfaces={"radius_percent": 0.1},
+        elements={"wedge_arcmin": 1, "abbe_percent": 0.5, "decentre_um": 5},
+        tolerances=[{"name": "S2.radius_mm", "size": 1}, {"name": "S3.dz_um", "size": 4}],
+    )
+    changed = moved(plan, S1_radius_percent=2.0)
+    assert changed.surface("S1").shape.radius == pytest.approx(1.02 * triplet.surface("S1").shape.radius)
+    arcmin = np.deg2rad(1 / 60)
+    wedge = moved(plan, E2_wedge_x_arcmin=3.0)
+    assert wedge.surface("S3") == triplet.surface("S3")
+    assert wedge.surface("S4").matrix == pytest.approx(
+        triplet.perturbed("S4", tilt=(3 * arcmin, 0, 0)).surface("S4").matrix
+    )
+    glass = moved(plan, S6_abbe_percent=-10.0).surface("S6").medium_after
+    assert abbe_number(glass) == pytest.approx(0.9 * abbe_number(triplet.surface("S6").medium_after))
+    both = moved(plan, E1_dx_um=7.0)
+    assert [both.surface(n).vertex[0] for n in ("S1", "S2", "S3")] == pytest.approx([7e-6, 7e-6, 0.0])
+    assert moved(plan, S2_radius_mm=1.0).surface("S2").shape.radius == pytest.approx(0.1812574754401636 + 1e-3)
+
+
+def test_an_irregularity_has_its_rms(triplet):
+    """Draws of its terms add up to a sag of that rms over the clear aperture, falling with the radial order."""
+    plan = plan_of(triplet, tolerances=[{"name": "S3.irregularity_nm", "size": 50, "zernikes": [5, 15], "power": 3}])
+    sizes = {t.name: t.size for t in plan.tolerances}
+    assert len(sizes) == 11
+    assert np.sqrt(sum(s**2 for s in sizes.values())) == pytest.approx(50)
+    # Noll 5 has the radial order 2, 11 the order 4.
+    ratio = sizes["S3.irregularity_nm Z5"] / sizes["S3.irregularity_nm Z11"]
+    assert ratio == pytest.approx((4 / 2) ** 1.5)
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[-1:1:41j, -1:1:41j]
+    inside = np.hypot(x, y) <= 1
+    radius = pachon.design.optimize.geometry_operands.clear_radius(triplet, "S3")
+    squares = []
+    for _ in range(40):
+        values = {t.name: t.size * rng.normal() for t in plan.tolerances}
+        shape = plan.degrees_of_freedom.apply(plan.telescope, values).surface("S3").shape
+        sag = shape.sag(x[inside] * radius, y[inside] * radius) - triplet.surface("S3").shape.sag(
+            x[inside] * radius, y[inside] * radius
+        )
+        squares.append(np.mean(sag**2))
+    # Forty sums of eleven squares, few of them large: 5 standard errors are 25 per cent.
+    assert np.sqrt(np.mean(squares)) == pytest.approx(50e-9, rel=0.25)
+
+
+def test_single_tolerances_replace_those_of_all(triplet):
+    plan = plan_of(
+        triplet,
+        surfaces={"irregularity_nm": 40, "radius_percent": 0.1},
+        tolerances=[
+            {"name": "S1.irregularity_nm", "size": 10, "zernikes": [5, 6]},
+            {"name": "S1.radius_percent", "size": 0.3, "distribution": "normal"},
+        ],
+        distribution="end_point",
+    )
+    found = {t.name: t for t in plan.tolerances}
+    assert {n for n in found if n.startswith("S1.irr")} == {"S1.irregularity_nm Z5", "S1.irregularity_nm Z6"}
+    assert len([n for n in found if n.startswith("S2.irr")]) == 11
+    assert (found["S1.radius_percent"].size, found["S1.radius_percent"].distribution) == (0.3, "normal")
+    assert found["S2.radius_percent"].distribution == "end_point"
+
+
+def test_named_degrees_of_freedom(lsst_r):
+    content = dict(degrees_of_freedom="lsst", tolerances=[{"name": "M1M3_B3", "size": 0.1}], compensators=["Camera_dz"])
+    plan = plan_of(lsst_r, **content)
+    assert plan.degrees_of_freedom.names == ("M1M3_B3", "Camera_dz")
+    assert plan.degrees_of_freedom.units == ("um", "um")
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "words"),
+    [
+        ({}, ConfigError, "tolerances = \\[\\]"),
+        ({"tolerances": [{"name": "S9.dz_um", "size": 1}]}, UnknownNameError, r"tolerances.0.*S9"),
+        ({"tolerances": [{"name": "S1.dz", "size": 1}]}, ConfigError, r"tolerances.S1.dz.*unit"),
+        ({"tolerances": [{"name": "S1.wedge_arcmin", "size": 1}]}, UnknownNameError, r"wedge.*E1"),
+        ({"tolerances": [{"name": "Image.irregularity_nm", "size": 1}]}, ConfigError, "clear aperture"),
+        ({"tolerances": [{"name": "S1.irregularity_nm", "size": 1, "zernikes": [9, 5]}]}, ConfigError, "rise, from 4"),
+        ({"tolerances": [{"name": "S1.dz_um", "size": 1, "limit": 2}]}, ConfigError, "truncated"),
+        (
+            {"tolerances": [{"name": "S1.dz_um", "size": 1}], "compensators": ["S1.dz_um"]},
+            ConfigError,
+            "either a tolerance or a compensator",
+        ),
+        (
+            {"tolerances": [{"name": "S1.dz_um", "size": 1}], "compensators": ["X.dz_um"]},
+            UnknownNameError,
+            "compensators.*X",
+        ),
+    ],
+)
+def test_wrong_tolerances(triplet, content, error, words):
+    with pytest.raises(error, match=words):
+        plan_of(triplet, **content)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("merit: beauty", "merit.*spots"),
+        ("sirfaces: {}", "unknown key sirfaces.*surfaces"),
+        ("elements: {wedge_arcmin: -1}", "elements.wedge_arcmin"),
+        ("merit: mtf", "frequency_per_mm"),
+        ("{merit: ee80, method: linear}", "method = 'linear'.*ee80"),
+        ("draws: 0", "draws"),
+    ],
+)
+def test_wrong_files(tmp_path, text, words):
+    path = tmp_path / "tol.yaml"
+    path.write_text(text)
+    with pytest.raises(PachonError, match=words) as caught:
+        load_tolerances(path, "paul_baker")
+    assert str(path) in str(caught.value)
+
+
+def test_a_file_without_a_telescope(tmp_path):
+    path = tmp_path / "tol.yaml"
+    path.write_text("draws: 5")
+    with pytest.raises(ConfigError, match="telescope is missing"):
+        load_tolerances(path)
+
+
+def test_a_compensator_without_effect(triplet):
+    content = {"tolerances": [{"name": "S1.dx_um", "size": 1}], "compensators": ["Image.dx_um"], "draws": 2, "rings": 2}
+    with pytest.raises(DomainError, match=r"compensator 'Image.dx_um' has no effect"):
+        pachon.run_tolerances(triplet, ToleranceFile.model_validate(content))
