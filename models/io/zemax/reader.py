@@ -15,6 +15,7 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
+from ..user_glasses import user_catalogues
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
@@ -232,9 +234,10 @@ class _LensReader:
         # up from another surface, a model glass too where it has no name.
         solve = line.number(1, 0.0)
         model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
-        for catalogue in self.catalogues:
+        # The user's own come last and are read only for glasses that no other has.
+        for catalogue in () if model else chain(self.catalogues, user_catalogues()):
             known = catalogue.spelling(name)
-            if known is not None and not model:
+            if known is not None:
                 return False, catalogue[known]
         if not model:
             error = line.problem(f"{line.shown}: the glass is in no catalogue")
