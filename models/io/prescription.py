@@ -91,8 +91,7 @@ def load_telescope(
         Of a batoid, Zemax or CODE V file: warn about keys or lines that are not understood and go on without them.
     glass_catalogues : iterable of GlassCatalogue or path
         AGF catalogues to look up the glasses of a Zemax or CODE V file in, first of all; then comes one beside the
-        file that has its name and ends in .agf, then the bundled one, then the user's own
-        (:mod:`~pachon.models.io.user_glasses`).
+        file that has its name and ends in .agf, then the bundled one.
 
     Returns
     -------

@@ -72,7 +72,7 @@ def test_the_petzval_sum_of_the_triplet():
 
 
 def test_hubble():
-    # 2.4 m, f/24, primary f/2.3, focus 1.4998 m behind it; its numbers as in hubble.len of the user guide of OSLO
+    # 2.4 m, f/24, primary f/2.3, focus 1.4998 m behind it. Its numbers as in hubble.len of OSLO's user guide
     # (Sinclair Optics 1997).
     telescope = pachon.two_mirror("ritchey-chretien", 2.4, 24.0, primary_f_number=2.3, back_focus=1.4998)
     m1, m2, _ = telescope.surfaces

@@ -15,7 +15,6 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,6 @@ from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
-from ..user_glasses import user_catalogues
 from .apertures import read_aperture
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
@@ -234,10 +232,9 @@ class _LensReader:
         # up from another surface, a model glass too where it has no name.
         solve = line.number(1, 0.0)
         model = nd > 1 and (solve == 1 or (solve == 2 and name == NO_NAME))
-        # The user's own come last and are read only for glasses that no other has.
-        for catalogue in () if model else chain(self.catalogues, user_catalogues()):
+        for catalogue in self.catalogues:
             known = catalogue.spelling(name)
-            if known is not None:
+            if known is not None and not model:
                 return False, catalogue[known]
         if not model:
             error = line.problem(f"{line.shown}: the glass is in no catalogue")
