@@ -27,7 +27,7 @@ def test_the_image_may_be_left_out(paraboloid):
 def test_parallel_light_is_refused_in_one_line(afocal):
     telescope, place = afocal(fold=False), [(0.0, 0.0)]
     for analyse in (pachon.field_curvature, pachon.spot_matrix, pachon.strehl):
-        with pytest.raises(DomainError, match="focus|parallel|image"):
+        with pytest.raises(DomainError, match=r"focus|parallel|image"):
             analyse(telescope, place)
     with pytest.raises(DomainError, match="its light is parallel"):
         pachon.target_image(telescope)
