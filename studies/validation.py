@@ -17,6 +17,8 @@ from ..core.errors import ConfigError, HeightWarning, PachonError, PrescriptionE
 from ..core.json_schema import json_schema
 from ..core.schema import problems_of
 from ..core.yaml_reader import line_of, read_mapping
+from ..design.analyses.coatings import Coatings, CoatingsFile
+from ..design.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
 from ..imaging.config import ImagesConfig, load_images_configuration
 from ..models.camera.focal_plane import FocalPlane
 from ..models.io.prescription import ENDINGS, load_telescope
@@ -56,6 +58,8 @@ KINDS = (
     FileKind("visits", VisitsConfig, load_visits_configuration, prepare=with_run),
     FileKind("align", AlignConfig, load_align_configuration),
     FileKind("site", SiteFile, load_site, PrescriptionError),
+    FileKind("coatings", CoatingsFile, Coatings.read),
+    FileKind("degrees_of_freedom", DegreesOfFreedomFile, load_degrees_of_freedom, PrescriptionError),
 )
 
 
@@ -91,8 +95,8 @@ def validate_file(path: str | os.PathLike[str]) -> Validation:
     """Find all problems of a file.
 
     Prescriptions (YAML, Zemax, CODE V), run configurations, sweeps, configurations of images, visits and alignment,
-    sites, and tables of CCD heights; which of them it is, its ending and its keys tell. Values that contradict one
-    another are reported once everything else is in order.
+    sites, coatings, degrees of freedom, and tables of CCD heights; which of them it is, its ending and its keys tell.
+    Values that contradict one another are reported once everything else is in order.
 
     Parameters
     ----------
@@ -121,8 +125,8 @@ def file_schema(kind: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    kind : {"prescription", "run", "sweep", "images", "visits", "align", "site"}
-        Kind of file.
+    kind : str
+        "prescription", "run", "sweep", "images", "visits", "align", "site", "coatings" or "degrees_of_freedom".
 
     Raises
     ------

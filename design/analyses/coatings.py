@@ -123,7 +123,7 @@ class Coatings:
             If it cannot be read or is malformed: one line with file, key, value and what was expected.
         """
         source = Path(path)
-        content = validated_file(_CoatingsFile, read_mapping(source, ConfigError), str(source), ConfigError)
+        content = validated_file(CoatingsFile, read_mapping(source, ConfigError), str(source), ConfigError)
         with error_context(file=source):
             return content.coatings(source.parent)
 
@@ -154,7 +154,7 @@ class _GlassSection(_TableSection):
     thickness_mm: PositiveNumber
 
 
-class _CoatingsFile(Section):
+class CoatingsFile(Section):
     """A file of coatings."""
 
     coatings_: Annotated[dict[str, _TableSection], Field(alias="coatings", default_factory=dict)]

@@ -176,7 +176,7 @@ def lateral_color(
     landing = np.stack([request.bundles(float(w), point).chief_landing() for w in request.wavelengths], axis=1)
     principal = principal_rays_of(request)
     along = np.einsum("fwi,fi->fw", landing, tangential_axes(request)[:, 0])
-    shift = along - along[:, len(request.wavelengths) // 2, None]
+    shift = along - along[:, request.wavelengths == request.middle][:, :1]
     ratio = principal.mean_f_number
     return LateralColor(request, shift, 1.22 * request.middle * np.where(np.isinf(ratio), np.nan, ratio))
 

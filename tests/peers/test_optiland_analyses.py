@@ -128,3 +128,23 @@ def test_fans_curvature_and_distortion(name):
 def chief(telescope, place):
     rays = pachon.launch_rays(telescope, place, WAVELENGTH, ([0.0], [0.0]))
     return pachon.trace(telescope, rays).position[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.filterwarnings("ignore")
+def test_seidel_sums(name):
+    optic, mine = theirs(*SYSTEMS[name]), ours(*SYSTEMS[name])
+    # Theirs are in mm and of the other sign.
+    expected = -1e-3 * np.asarray(optic.aberrations.seidels()).ravel() / np.array([8, 2, 2, 4, 2])
+    assert pachon.seidel_diagram(mine).coefficients[:, :5].sum(axis=0) == pytest.approx(expected, rel=1e-9, abs=1e-18)
+
+
+@pytest.mark.slow
+def test_fringe_zernikes():
+    zernike = pytest.importorskip("optiland.zernike")
+    radius, angle = np.random.default_rng(3).uniform([0.0, -np.pi], [1.0, np.pi], (20, 2)).T
+    mine = pachon.fringe_zernikes(36, radius * np.cos(angle), radius * np.sin(angle))
+    for j in range(36):
+        one = zernike.ZernikeFringe(coeffs=np.eye(36)[j])
+        assert mine[j] == pytest.approx(np.asarray(one.poly(radius, angle)), abs=1e-10), j + 1

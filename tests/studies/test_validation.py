@@ -71,6 +71,7 @@ def test_values_that_contradict_one_another(tmp_path):
         ("stars: {truth: -1, obsrved: 3}\nband: q\n", "run", ["stars.obsrved", "band", "stars.truth"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\ndesign: {kind: grit}\n", "sweep", ["design.kind"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\n", "sweep", [None]),
+        ("coatings: {a: {wavelength_nm: [5, 4]}}\nsurfaces: {M1: a}\n", "coatings", ["coatings.a.efficiency"]),
         ("name: 'a", "YAML", [None]),
     ],
 )
@@ -83,7 +84,12 @@ def test_other_kinds(tmp_path, text, kind, keys):
 
 
 def test_files_of_the_project_have_no_problems():
-    good = ["models/data/paul_baker.yaml", "models/data/cerro_pachon.yaml", "studies/sweep/examples/table1_small.yaml"]
+    good = [
+        "models/data/lsst_degrees_of_freedom.yaml",
+        "models/data/paul_baker.yaml",
+        "models/data/cerro_pachon.yaml",
+        "studies/sweep/examples/table1_small.yaml",
+    ]
     for name in good:
         assert pachon.validate_file(ROOT / name).problems == ()
 
