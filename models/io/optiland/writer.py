@@ -48,8 +48,10 @@ def telescope_to_optiland(telescope: Telescope) -> str:
             _items(_system(-t.stop_z - first), {"type": "Plane", "radius": math.inf}, before, PUPIL_COMMENT, stop=True),
         ]
         for surface in t.surfaces:
-            with error_context(place=f"surface {surface.name}"):
+            try:
                 surfaces.append(_surface_items(surface, first))
+            except PrescriptionError as error:
+                raise PrescriptionError(f"surface {surface.name}: {error}") from None
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
     for surface, here, there in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
         surface["thickness"] = (there - here) / MM

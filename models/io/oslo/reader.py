@@ -126,8 +126,8 @@ class _Translation:
         if len(self.surfaces) < 3:
             problem = f"{len(self.surfaces)} surfaces: expected an object, an image and one between, parted by NXT"
             raise self.found.header.problem(problem)
-        self._resolve()
         self._header()
+        self._resolve()
         self._blocks()
         return self.found.file()
 
