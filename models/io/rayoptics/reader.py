@@ -7,6 +7,7 @@ the profiles of ``shapes``, their decentres, clear apertures, gaps and media, th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -207,5 +208,5 @@ class _Translation:
         return words[-2], words[-1]
 
 
-def _names(table: dict[tuple[str, str], object]) -> str:
+def _names(table: Iterable[tuple[str, str]]) -> str:
     return ", ".join(" ".join(key) for key in table)

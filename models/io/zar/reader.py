@@ -64,7 +64,8 @@ def read_zemax_archive(path: Path, findings: Findings) -> ZemaxFile:
     if len(lenses) != 1:
         found = ", ".join(map(shown, lenses)) or "none"
         raise PrescriptionError(f"expected one lens file (.zmx) in the archive, found {found}", file=path)
-    return replace(parse_zemax_file(*lenses.values(), path, findings), glasses=glasses)
+    (lens,) = lenses.values()
+    return replace(parse_zemax_file(lens, path, findings), glasses=glasses)
 
 
 def _members(data: bytes, path: Path) -> Iterator[tuple[str, bytes]]:

@@ -45,18 +45,18 @@ def test_b270_is_that_of_its_data_sheet():
         assert float(glass.index(wavelength * 1e-6)) == pytest.approx(index, abs=5e-5)
 
 
-# Makers round the coefficients to 1e-6 and more beside the indices; Sumita states Vd to one decimal and takes its figures
-# from melts, not from the formula.
+# Half a unit of the last decimal of nd and Vd, and rounding of the coefficients. Sumita's figures are those of melts
+# and not of its formulas: off by up to 4e-5 in nd and 0.33 % in Vd.
 @pytest.mark.parametrize("maker", MAKERS)
 def test_the_glasses_of_makers_have_the_index_and_abbe_number_that_these_state(maker):
     catalogue = GlassCatalogue.of_maker(maker)
     assert len(catalogue) > 150
-    near_nd, near_vd = (2e-5, 0.1) if maker == "sumita" else (6e-6, 9e-3)
+    near_nd, near_vd = (4e-5, 3.5e-3) if maker == "sumita" else (6e-6, 3.5e-4)
     for name in catalogue:
         entry = catalogue.entry(name)
         d, f, c = (float(v) for v in entry.medium.index(np.array([LINE_D, LINE_F, LINE_C])))
         assert d == pytest.approx(entry.nd, abs=near_nd), name
-        assert (d - 1) / (f - c) == pytest.approx(entry.vd, abs=near_vd), name
+        assert (d - 1) / (f - c) == pytest.approx(entry.vd, rel=near_vd), name
 
 
 def test_common_glasses_are_those_of_their_makers():
@@ -64,10 +64,12 @@ def test_common_glasses_are_those_of_their_makers():
     common = GlassCatalogue.bundled()
     shared = [(name, maker) for maker in MAKERS for name in GlassCatalogue.of_maker(maker) if name in common]
     waves = np.array([LINE_D, LINE_F, LINE_C])
-    same = [np.allclose(common[n].index(waves), GlassCatalogue.of_maker(m)[n].index(waves), atol=1e-9) for n, m in shared]
-    # F2, F5, K7... of Schott have namesakes at others.
-    assert sum(same) > 30
-    assert {n for (n, _), s in zip(shared, same, strict=True) if not s} <= {"F2", "F5", "LLF1", "SF1", "SF11", "SF2", "SF5", "CAF2", "LF5"}
+    owners = {n: [m for name, m in shared if name == n] for n, _ in shared}
+    assert len(owners) > 35
+    for name, makers in owners.items():
+        # Some names of Schott's are Hikari's, Hoya's and CDGM's too.
+        glasses = [GlassCatalogue.of_maker(maker)[name] for maker in makers]
+        assert any(np.allclose(g.index(waves), common[name].index(waves), rtol=0, atol=1e-9) for g in glasses), name
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_a_glass_is_looked_up_at_its_makers(tmp_path):
 @pytest.mark.parametrize("way", ["file", "folder", "variable"])
 def test_a_configured_catalogue_is_searched_after_the_bundled_ones(tmp_path, monkeypatch, catalogue, way):
     path = lens(tmp_path, "MYGLASS")
-    with pytest.raises(PrescriptionError, match="GLAS MYGLASS .* the glass is in no catalogue"):
+    with pytest.raises(PrescriptionError, match=r"GLAS MYGLASS .* the glass is in no catalogue"):
         pachon.load_telescope(path)
     if way == "variable":
         monkeypatch.setenv("PACHON_GLASS_PATH", os.pathsep.join([str(catalogue), str(catalogue.parent)]))
@@ -107,14 +107,14 @@ def test_configured_catalogues_belong_to_the_digest_of_a_lens_file(tmp_path, cat
 def test_wrong_configurations_are_named(tmp_path, monkeypatch, catalogue):
     assert user_catalogues() == ()
     path = configure("glass_catalogues: [nowhere.agf]\n")
-    with pytest.raises(ConfigError, match="config.yaml: glass_catalogues: .*nowhere.agf: expected an AGF file"):
+    with pytest.raises(ConfigError, match=r"config.yaml: glass_catalogues: .*nowhere.agf: expected an AGF file"):
         user_catalogues()
     path.write_text("glass_catalogs: [a.agf]\n")
-    with pytest.raises(ConfigError, match="config.yaml: unknown key glass_catalogs"):
+    with pytest.raises(ConfigError, match=r"config.yaml: unknown key glass_catalogs"):
         user_catalogues()
     path.write_text("glass_catalogues: mine.agf\n")
     with pytest.raises(ConfigError, match="glass_catalogues"):
         user_catalogues()
     monkeypatch.setenv("PACHON_GLASS_PATH", str(tmp_path / "none"))
-    with pytest.raises(ConfigError, match="PACHON_GLASS_PATH: .*none: expected an AGF file, or a folder with some"):
+    with pytest.raises(ConfigError, match=r"PACHON_GLASS_PATH: .*none: expected an AGF file, or a folder with some"):
         user_catalogues()

@@ -117,17 +117,17 @@ OPTICS = ("optical_model", "attributes", "optical_spec", "attributes")
         ("cooke_triplet.json", ("aperture", "type"), "iris", "aperture: type = 'iris': expected one of EPD, imageFNO"),
         ("cooke_triplet.json", ("aperture", "value"), "wide", "aperture: value = 'wide': expected a number"),
         ("cooke_triplet.json", ("surface_group",), None, "expected the JSON file of an optiland Optic"),
-        ("cooke_triplet.json", (*SURFACES, 1, "geometry", "type"), "Nurbs", "surface 1: geometry Nurbs: expected one of"),
-        ("cooke_triplet.json", (*SURFACES, 1, "geometry", "radius"), True, "surface 1: radius = True: expected a number"),
+        ("cooke_triplet.json", (*SURFACES, 1, "geometry", "type"), "Nurbs", "surface 1: geometry Nurbs: expected one"),
+        ("cooke_triplet.json", (*SURFACES, 1, "geometry", "radius"), True, "surface 1: radius = True: expected a numb"),
         ("cooke_triplet.json", (*SURFACES, 1, "material_post", "filename"), "x/schott/GLAS1.yml",
          "surface 1: material GLAS1 of schott: not among the bundled glasses"),
         ("cooke_triplet.json", (*SURFACES, 1, "interaction_model", "type"), "ThinLensInteractionModel",
          "surface 1: interaction_model ThinLensInteractionModel: expected RefractiveReflectiveModel"),
-        ("freeforms.json", (*SURFACES, 9, "geometry", "radius_x"), 30.0, "surface 9: BiconicGeometry with two curvatures"),
-        ("freeforms.json", (*SURFACES, 2, "geometry", "zernike_type"), "mine", "zernike_type = 'mine': expected one of noll"),
-        ("sasian_triplet.roa", (*IFCS, 2, "attributes", "interact_mode"), "diffract", "surface 2: Surface, interact_mode diffr"),
-        ("sasian_triplet.roa", (*IFCS, 2, "attributes", "phase_element"), {"a": 1}, "surface 2: phase_element: diffractive"),
-        ("sasian_triplet.roa", (*IFCS, 2, "attributes", "profile_id"), "0", "surface 2: profile_id = '0': expected a key"),
+        ("freeforms.json", (*SURFACES, 9, "geometry", "radius_x"), 30.0, "surface 9: BiconicGeometry with two curv"),
+        ("freeforms.json", (*SURFACES, 2, "geometry", "zernike_type"), "mine", "zernike_type = 'mine': expected"),
+        ("sasian_triplet.roa", (*IFCS, 2, "attributes", "interact_mode"), "diffract", "surface 2: Surface, interact"),
+        ("sasian_triplet.roa", (*IFCS, 2, "attributes", "phase_element"), {"a": 1}, "surface 2: phase_element: diffr"),
+        ("sasian_triplet.roa", (*IFCS, 2, "attributes", "profile_id"), "0", "surface 2: profile_id = '0': expected"),
         ("sasian_triplet.roa", (*OPTICS, "pupil", "attributes", "_key"), ["aperture", "image", "epd"],
          "pupil image epd: expected one of object epd"),
         ("sasian_triplet.roa", ("optical_model",), None, "expected the file of a ray-optics OpticalModel"),
@@ -143,7 +143,11 @@ def test_what_cannot_be_read_is_named(tmp_path, name, keys, value, expected):
 
 def test_files_that_are_no_json(tmp_path):
     path = tmp_path / "lens.json"
-    for content, expected in (("[1, 2]", "expected a JSON object"), ("{", "not a JSON file"), ("[" * 100000, "not a JSON")):
+    for content, expected in (
+        ("[1, 2]", "expected a JSON object"),
+        ("{", "not a JSON file"),
+        ("[" * 100000, "not a JSON"),
+    ):
         path.write_text(content)
         with pytest.raises(PrescriptionError, match=expected):
             pachon.load_telescope(path)

@@ -240,4 +240,6 @@ def test_lenient_warns_of_what_is_left_out(tmp_path):
     path = lens(tmp_path, "GLA N-BK7\nRD 60\nTH 5\nGIZMO 1", "AIR\nTH 100", after="CFG NEW\nTH 1 2 5.0\nEND\n")
     with pytest.warns(PrescriptionWarning) as caught:
         pachon.load_telescope(path, lenient=True)
-    assert [str(w.message).split(": ", 1)[1][:25] for w in caught] == ["GIZMO 1: this command is ", "CFG: one configuration is"]
+    first, second = (str(w.message).split(": ", 1)[1] for w in caught)
+    assert first.startswith("GIZMO 1: this command is not understood")
+    assert second.startswith("CFG: one configuration is read")
