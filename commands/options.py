@@ -21,7 +21,7 @@ Raft = Annotated[str | None, Option(help="All CCDs of rafts: R22 or R22,R23.")]
 TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
-Lenient = Annotated[bool, Option("--lenient", help="batoid, Zemax or CODE V file: warn about unknown parts and go on.")]
+Lenient = Annotated[bool, Option("--lenient", help="Lens or batoid file: warn about unknown parts and go on.")]
 WavelengthNm = Annotated[float | None, Option("--wavelength-nm", help="Wavelength [nm]; the model's own by default.")]
 FieldsDeg = Annotated[
     list[str] | None,

@@ -208,7 +208,7 @@ def _cases(folder):
 
 
 NAMES = (
-    "zmx", "seq", "agf", "baseline", "site", "images", "visits", "degrees", "heights_ecsv", "heights_fits",
+    "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees", "heights_ecsv", "heights_fits",
     "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image", "psf_model", "stl", "glb", "gltf", "obj",
     "ply", "off", "store",
 )  # fmt: skip
