@@ -75,8 +75,9 @@ def convert_command(
 ) -> None:
     """Write a telescope in another format: any model as ours, batoid's, Zemax's or optiland's.
 
-    Read are files of Zemax (.zmx, .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics (.roa), batoid and ours
-    (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside it.
+    Read are files of Zemax (.zmx, .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics (.roa), and of batoid
+    and ours (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside
+    it.
 
     **Examples**
 

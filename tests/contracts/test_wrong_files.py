@@ -208,9 +208,9 @@ def _cases(folder):
 
 
 NAMES = (
-    "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees", "heights_ecsv", "heights_fits",
-    "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image", "psf_model", "stl", "glb", "gltf", "obj",
-    "ply", "off", "store",
+    "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees",
+    "heights_ecsv", "heights_fits", "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image",
+    "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "store",
 )  # fmt: skip
 TOKENS = [
     b"", b"0", b"-1", b"1e400", b"nan", b"inf", b"-0.0", b"9" * 60, b"null", b"[]", b"{}", b"[" * 50, b'"', b"'", b"\0",
