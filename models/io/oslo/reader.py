@@ -97,7 +97,7 @@ class _Translation:
 
     def __init__(self, path: Path, findings: Findings) -> None:
         self.path, self.findings = path, findings
-        self.found = PlacedSurfaces(path)
+        self.found = PlacedSurfaces(path, "OSLO")
         self.surfaces = [_Surface(0)]
         self.waves: list[float] = list(WAVELENGTHS)
         self.weights: list[float] = []

@@ -44,7 +44,7 @@ class _Translation:
 
     def __init__(self, path: Path, model: JsonObject, findings: Findings) -> None:
         self.model, self.findings = model, findings
-        self.found = PlacedSurfaces(path)
+        self.found = PlacedSurfaces(path, "ray-optics")
         self.sequence = attributes(model, "seq_model")
         self.surfaces = list(self.sequence.children("ifcs", "surface"))
         self.gaps = [attributes(gap) for gap in self.sequence.children("gaps", "gap")]

@@ -23,7 +23,7 @@ from ..zemax.text import decoded
 #: Ending of the names of compressed files.
 _PACKED = ".lzw"
 #: Longest archive, and most bytes of a file in it that is unpacked.
-MAX_BYTES, MAX_UNPACKED = 500_000_000, 50_000_000
+MAX_BYTES, MAX_UNPACKED = 100_000_000, 50_000_000
 
 
 @dataclass(frozen=True)

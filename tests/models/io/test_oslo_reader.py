@@ -68,6 +68,7 @@ def test_the_doublet_of_the_users_guide(tmp_path):
     path.write_text(GUIDE)
     doublet = pachon.load_telescope(path)
     assert doublet.description == "He-ne f/2 doublet focusing lens"
+    assert doublet.source == "OSLO file lasrdb1.len"
     assert doublet.default_wavelength == pytest.approx(632.8e-9, rel=1e-15)
     assert [s.medium_after.name for s in doublet.surfaces] == ["LASF35", "", "LASF35", "", ""]
     # The solve for the slope: 15 / 0.25 mm, the focal length of the title; that for the height puts the image there.
