@@ -268,6 +268,8 @@ class _Translation:
     def distance(self) -> float:
         """Distance of the object from the first surface [lens unit]."""
         value = self.surfaces[0].values.get("TH", math.inf)
+        if value == 0:
+            raise self._problem(self.surfaces[0], "TH 0: expected a distance of the object other than 0")
         return math.inf if abs(value) >= INFINITE else value
 
     def _header(self) -> None:

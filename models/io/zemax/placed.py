@@ -28,7 +28,7 @@ INFINITE = 1e9
 class PlacedSurfaces:
     """Header, glasses and surfaces of a lens file; surfaces are added in the order of the light.
 
-    Lengths are in the unit of the file, which `program` wrote; `glasses` are media by the names that lines ``GLAS`` have.
+    Lengths are in the unit of the file, which `program` wrote; `glasses` are media by their names in lines ``GLAS``.
     """
 
     def __init__(self, path: Path, program: str) -> None:
