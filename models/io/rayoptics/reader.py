@@ -8,6 +8,7 @@ the profiles of ``shapes``, their decentres, clear apertures, gaps and media, th
 from __future__ import annotations
 
 from collections.abc import Iterable
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -164,7 +165,8 @@ class _Translation:
         weights = (weights + [1.0] * len(lengths))[: len(lengths)]
         self._fields(attributes(optics, "field_of_view"), len(lengths))
         for number, (wave, weight) in enumerate(zip(lengths, weights, strict=True), start=1):
-            head("WAVM", str(number), wave / 1e3, weight)
+            # The decimal point is moved: 587.6 is the float 0.5876.
+            head("WAVM", str(number), float(Decimal(repr(wave)).scaleb(-3)), weight)
         head("PWAV", str(waves.whole("reference_wvl") + 1))
 
     def _pupil(self, pupil: JsonObject) -> None:

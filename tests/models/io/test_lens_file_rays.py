@@ -162,7 +162,8 @@ def test_written_for_optiland_and_read_again(tmp_path, name):
     path = tmp_path / "written.json"
     if name == "freeforms.json":
         # The cylinder is read as a biconic, which optiland has not.
-        telescope = replace(telescope, surfaces=(*telescope.surfaces[:8], telescope.surfaces[-1]))
+        surfaces = (*telescope.surfaces[:8], telescope.surfaces[-1])
+        telescope = replace(telescope, surfaces=surfaces, groups={}, group_frames={})
     pachon.save_telescope(telescope, path)
     again = pachon.load_telescope(path)
     angle = 0.5 * telescope.pupil_diameter * np.array([0.2, 0.5, 0.8, 0.95])
@@ -185,3 +186,78 @@ def test_what_optiland_has_not_is_refused(tmp_path):
         with pytest.raises(PrescriptionError, match=expected):
             pachon.save_telescope(pachon.load_telescope(name), tmp_path / "lens.json")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("kind", "terms"),
+    [
+        # r^2 sin 2t, 2 r^2 - 1, r^2 cos 2t, r cos t and (3 r^3 - 2 r) sin t, numbered and normalised as each has it.
+        ("standard", {3: "astigmatism", 4: "defocus", 2: "tilt", 7: "coma"}),
+        ("noll", {5: "astigmatism", 4: "defocus", 2: "tilt", 7: "coma"}),
+        ("fringe", {6: "astigmatism", 4: "defocus", 2: "tilt", 8: "coma"}),
+    ],
+)
+def test_orders_of_zernike_terms(tmp_path, kind, terms):
+    first = 0 if kind == "standard" else 1
+    values = {place: 1e-3 * (i + 1) for i, place in enumerate(terms)}
+    content = json.loads((DATA / "freeforms.json").read_text())
+    geometry = content["surface_group"]["surfaces"][2]["geometry"]
+    coefficients = [values.get(first + i, 0.0) for i in range(9)]
+    geometry |= {"zernike_type": kind, "radius": float("inf"), "conic": 0.0, "coefficients": coefficients}
+    path = tmp_path / "zernikes.json"
+    path.write_text(json.dumps(content))
+    shape = pachon.load_telescope(path).surfaces[1].shape
+    x, y = np.array([3.0, -5.0, 8.0]), np.array([4.0, 1.0, -7.0])
+    r, t = np.hypot(x, y) / 15.0, np.arctan2(y, x)
+    norms = {"astigmatism": 6**0.5, "defocus": 3**0.5, "tilt": 2.0, "coma": 8**0.5}
+    forms = {
+        "astigmatism": r**2 * np.sin(2 * t),
+        "defocus": 2 * r**2 - 1,
+        "tilt": r * np.cos(t),
+        "coma": (3 * r**3 - 2 * r) * np.sin(t),
+    }
+    expected = sum(
+        values[place] * forms[name] * (1 if kind == "fringe" else norms[name]) for place, name in terms.items()
+    )
+    # In the axes of the telescope x and z change their signs.
+    assert np.allclose(shape.sag(-x * 1e-3, y * 1e-3), -expected * 1e-3, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("material", "square"),
+    [
+        ({"kind": "formula", "formula": "formula 1", "coefficients": [0, 1.2, 0.1], "wavelength_range_um": [0.3, 2]},
+         lambda w: 1 + 1.2 * w**2 / (w**2 - 0.01)),
+        ({"kind": "formula", "formula": "formula 2", "coefficients": [0, 1.2, 0.01, 0.3, 90.0]},
+         lambda w: 1 + 1.2 * w**2 / (w**2 - 0.01) + 0.3 * w**2 / (w**2 - 90.0)),
+        ({"kind": "formula", "formula": "formula 3", "coefficients": [2.3, -0.01, 2, 0.02, -2, 1e-4, -12]},
+         lambda w: 2.3 - 0.01 * w**2 + 0.02 / w**2 + 1e-4 / w**12),
+        ({"kind": "tabulated", "wavelengths_um": [0.4, 0.6, 0.7], "indices": [1.6, 1.5, 1.48]},
+         lambda w: (1.6 - 0.5 * (w - 0.4)) ** 2),
+    ],
+)  # fmt: skip
+def test_materials_of_formulas_and_tables(tmp_path, material, square):
+    stated = {"type": "DataMaterial", "name": "mine", "definition": {"dispersion": material}}
+    path = changed(DATA / "cooke_triplet.json", tmp_path / "a.json", *SURFACES, 1, "material_post", value=stated)
+    medium = pachon.load_telescope(path).surfaces[0].medium_after
+    waves = np.array([0.48, 0.55, 0.59])
+    assert np.allclose(medium.index(waves * 1e-6), np.sqrt(square(waves)), rtol=1e-14)
+    assert medium.name == "mine"
+    # And the same once more after writing.
+    pachon.save_telescope(pachon.load_telescope(path), tmp_path / "b.json")
+    assert pachon.load_telescope(tmp_path / "b.json").surfaces[0].medium_after == medium
+
+
+def test_an_abbe_material_is_a_model_glass_with_a_warning(tmp_path):
+    stated = {"type": "AbbeMaterial", "index": 1.62, "abbe": 60.3}
+    path = changed(DATA / "cooke_triplet.json", tmp_path / "a.json", *SURFACES, 1, "material_post", value=stated)
+    with pytest.warns(PrescriptionWarning, match="AbbeMaterial 1.62, 60.3: optiland's dispersion of it is not read"):
+        medium = pachon.load_telescope(path).surfaces[0].medium_after
+    assert float(medium.index(587.5618e-9)) == pytest.approx(1.62, rel=1e-12)
+
+
+def test_a_floating_stop_is_read_with_a_warning(tmp_path):
+    keys = (*IFCS[:-1], "stop_surface")
+    path = changed(DATA / "sasian_triplet.roa", tmp_path / "a.roa", *keys, value=None)
+    with pytest.warns(PrescriptionWarning, match="stop_surface is null.*; the first surface is the stop"):
+        assert pachon.load_telescope(path).stop_z == pytest.approx(0.0, abs=1e-15)
