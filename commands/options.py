@@ -21,10 +21,10 @@ Raft = Annotated[str | None, Option(help="All CCDs of rafts: R22 or R22,R23.")]
 TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
-Lenient = Annotated[bool, Option("--lenient", help="batoid, Zemax or CODE V file: warn about unknown parts and go on.")]
+Lenient = Annotated[bool, Option("--lenient", help="Lens or batoid file: warn about unknown parts and go on.")]
 GlassCatalogues = Annotated[
     list[Path] | None,
-    Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a Zemax or CODE V file, once for each."),
+    Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a lens file, once for each."),
 ]
 Aiming = Annotated[
     str | None, Option(help="Rays fill the entrance pupil (off), or the stop (paraxial, real); as the file says.")

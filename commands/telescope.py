@@ -76,20 +76,25 @@ def info_command(
 @app.command("convert")
 def convert_command(
     model: Model,
-    out: Annotated[Path, Argument(metavar="OUT", help="File to write: .yaml (ours) or .zmx (Zemax).")],
-    format: Annotated[str, Option(help="Format: pachon, batoid or zemax; by default that of the name.")] = "",
+    out: Annotated[
+        Path, Argument(metavar="OUT", help="File to write: .yaml (ours), .zmx (Zemax) or .json (optiland).")
+    ],
+    format: Annotated[str, Option(help="Format: pachon, batoid, zemax or optiland; by default that of the name.")] = "",
     glass_catalogue: GlassCatalogues = None,
     lenient: Lenient = False,
 ) -> None:
-    """Write a telescope in another format: a batoid, Zemax or CODE V file as ours, any model as batoid's or Zemax's.
+    """Write a telescope in another format: any model as ours, batoid's, Zemax's or optiland's.
 
-    Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside it.
+    Read are files of Zemax (.zmx, .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics (.roa), and of batoid
+    and ours (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside
+    it.
 
     **Examples**
 
     - `pachon convert lens.zmx lens.yaml`
     - `pachon convert lens.zmx lens.yaml --glass-catalogue schott.agf --lenient`
     - `pachon convert lsst_v3.3_r lsst.zmx`
+    - `pachon convert doublet.len doublet.json`
     - `pachon convert lsst_v3.3_r LSST_r.yaml --format batoid`
     """
     from ..models.io.prescription import save_telescope

@@ -142,7 +142,8 @@ def load_telescope(
 def prescription_digest(path: str | os.PathLike[str]) -> str:
     """Return the SHA-256 of a prescription file and of the files that it names: grids, meshes, glass catalogues.
 
-    The catalogues that the user has configured belong to those of a lens file. That of a file that names no other is the SHA-256 of its bytes.
+    The catalogues that the user has configured belong to those of a lens file. That of a file that names no
+    other is the SHA-256 of its bytes.
 
     Raises
     ------

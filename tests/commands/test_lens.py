@@ -8,6 +8,7 @@ from pachon.commands.cli import main
 from pachon.models.io.prescription import load_telescope
 
 DATA = Path(__file__).parents[1] / "data" / "zmx"
+LENSES = DATA.parent / "lensfiles"
 
 
 def test_a_zemax_file_becomes_ours_and_back(tmp_path, capsys):
@@ -55,7 +56,23 @@ def test_glass_catalogues_are_looked_at_first(tmp_path):
     assert float(load_telescope(out).surface("S1").medium_after.index(6e-7)) == pytest.approx(1.6, rel=1e-15)
 
 
-@pytest.mark.parametrize("path", sorted(DATA.glob("*.zmx")), ids=lambda p: p.stem)
+def test_a_lens_of_oslo_becomes_one_of_optiland_and_of_zemax(tmp_path, capsys):
+    lens = tmp_path / "lens.len"
+    lens.write_text(
+        'LEN NEW "singlet" 100 2\nEBR 5\nANG 1\nTH 1e20\nNXT\nGLA N-BK7\nRD 50\nTH 3\nNXT\nPY 0\nNXT\nEND 3\n',
+        encoding="utf-8",
+    )
+    for name in ("lens.json", "lens.zmx"):
+        assert main(["convert", str(lens), str(tmp_path / name)]) == 0
+        again, first = load_telescope(tmp_path / name), load_telescope(lens)
+        assert capsys.readouterr().out.startswith("lens: 3 surfaces written")
+        assert [s.vertex[2] for s in again.surfaces] == pytest.approx([s.vertex[2] for s in first.surfaces], abs=1e-16)
+    # Back focus of a plano-convex lens: R / (n - 1) - t / n.
+    n = float(first.surfaces[0].medium_after.index(587.56e-9))
+    assert first.surfaces[-1].vertex[2] == pytest.approx(-(3e-3 + 0.05 / (n - 1) - 3e-3 / n), rel=1e-12)
+
+
+@pytest.mark.parametrize("path", sorted([*DATA.glob("*.zmx"), *LENSES.glob("[!r]*.[jr]*")]), ids=lambda p: p.name)
 def test_info_describes_every_file(path, capsys):
     assert main(["info", str(path)]) == 0
     assert path.name in capsys.readouterr().out

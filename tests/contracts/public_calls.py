@@ -459,6 +459,8 @@ def _methods(m, tel, w, x, y):
         "Silicon": (pachon.Silicon, {"thickness": 1e-4, "temperature": 173.0}),
         "Silicon.absorption_length": (m.silicon.absorption_length, {"wavelength": w}),
         "GlassCatalogue.read": (pachon.GlassCatalogue.read, {"path": m.folder / "none.agf"}),
+        "GlassCatalogue.parse": (pachon.GlassCatalogue.parse, {"text": "NM A 1 0\nCD 2.25\n", "source": "mine"}),
+        "GlassCatalogue.of_maker": (pachon.GlassCatalogue.of_maker, {"maker": "ohara"}),
         "Air": (pachon.Air, {"pressure": 101325.0, "temperature": 288.0, "water_vapour": 0.0, "co2_ppm": 450.0,
                 "formula": "ciddor"}),
         "Air.index": (pachon.Air().index, {"wavelength": [w]}),

@@ -16,9 +16,10 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {path.name: path.read_text(encoding="utf-8") for path in sorted(DOCS.glob("*.md"))}
 BLOCK = re.compile(r"```python\n(.*?)```", flags=re.S)
 LENSES = Path(__file__).parents[1] / "data" / "zmx"
+OPTILAND = Path(__file__).parents[1] / "data" / "lensfiles" / "cooke_triplet.json"
 GLASSES = DATA / "glasses.agf"
 #: Pages whose examples need files of the reader's own, and run with files of ours in other tests.
-WITH_FILES = {"psf_models.md", "zemax.md", "perturbations.md", "focal_plane_psf.md", "piff_files.md"}
+WITH_FILES = {"psf_models.md", "zemax.md", "files.md", "perturbations.md", "focal_plane_psf.md", "piff_files.md"}
 #: Pages whose examples need another package, and of those the ones that take seconds.
 PEERS = {"batoid.md": "batoid", "from_galsim.md": "galsim", "galsim.md": "galsim", "from_piff.md": "piff"}
 SLOW = {"from_piff.md"}
@@ -60,8 +61,21 @@ def test_the_zemax_page_runs_on_a_lens(tmp_path, monkeypatch):
 def test_the_page_of_piff_runs_on_a_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copy(LENSES.parent / "piff" / "moffat.piff", tmp_path / "psf.piff")
-    exec(compile(BLOCK.findall(PAGES["from_piff.md"])[0], "from_piff.md", "exec"), {})
+    exec(compile(BLOCK.findall(PAGES["piff_files.md"])[0], "piff_files.md", "exec"), {})
     assert capsys.readouterr().out.startswith("PiffPsf(1 chips, ")
+
+
+def test_the_page_of_lens_files_runs_on_lenses(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(LENSES / "lens1.zmx", tmp_path / "lens.zmx")
+    shutil.copy(GLASSES, tmp_path / "schott.agf")
+    shutil.copy(OPTILAND, tmp_path / "lens.json")
+    (tmp_path / "lens.len").write_text(
+        'LEN NEW "singlet" 100 2\nEBR 5\nANG 1\nTH 1e20\nNXT\nGLA N-BK7\nRD 50\nTH 3\nNXT\nTH 90\nNXT\nEND 3\n'
+    )
+    for block in BLOCK.findall(PAGES["files.md"]):
+        exec(compile(block, "files.md", "exec"), {})
+    assert (tmp_path / "again.json").stat().st_size > 500
 
 
 @pytest.mark.slow

@@ -154,6 +154,34 @@ S     0.0 60.0
 SI    0.0 0.0
 GO
 """
+LENSES = ROOT / "tests/data/lensfiles"
+LEN = b"""LEN NEW "singlet" 60 2
+EBR 4.0
+ANG 8.5
+AIR
+TH 1e20
+NXT
+GLA 1.5168 1.5224 1.5143
+RD 60.0; TLA 0.5
+TH 5.0
+NXT
+AIR
+RD -60.0
+AST
+PY 0
+NXT
+AIR
+END 3
+"""
+
+
+def _archive():
+    """Return a Zemax archive with one lens file, packed without compression."""
+    header = bytearray(0x288)
+    data, name = LENS.read_bytes(), "lens.zmx".encode("utf-16-le")
+    header[0], header[0x10:0x18] = 0xEC, len(data).to_bytes(8, "little")
+    header[0x30 : 0x30 + len(name)] = name
+    return bytes(header) + data
 
 
 def _cases(folder):
@@ -161,6 +189,11 @@ def _cases(folder):
     return {
         "zmx": (".zmx", LENS.read_bytes(), lambda p: pachon.load_telescope(p, lenient=True)),
         "seq": (".seq", SEQ, lambda p: pachon.load_telescope(p, lenient=True)),
+        "len": (".len", LEN, lambda p: pachon.load_telescope(p, lenient=True)),
+        "json": (".json", (LENSES / "cooke_triplet.json").read_bytes(),
+                 lambda p: pachon.load_telescope(p, lenient=True)),
+        "roa": (".roa", (LENSES / "tilts.roa").read_bytes(), lambda p: pachon.load_telescope(p, lenient=True)),
+        "zar": (".zar", _archive(), lambda p: pachon.load_telescope(p, lenient=True)),
         "agf": (".agf", next(DATA.glob("*.agf")).read_bytes(), pachon.GlassCatalogue.read),
         "baseline": (".json", (ROOT / "studies/baseline/bundled/lsst_v3.3_r.baseline.json").read_bytes(),
                      pachon.read_baseline),
@@ -195,9 +228,9 @@ def _cases(folder):
 
 
 NAMES = (
-    "zmx", "seq", "agf", "baseline", "site", "images", "visits", "degrees", "heights_ecsv", "heights_fits",
-    "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image", "psf_model", "stl", "glb", "gltf", "obj",
-    "ply", "off", "piff", "star_list", "store",
+    "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees",
+    "heights_ecsv", "heights_fits", "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image",
+    "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "store",
 )  # fmt: skip
 TOKENS = [
     b"", b"0", b"-1", b"1e400", b"nan", b"inf", b"-0.0", b"9" * 60, b"null", b"[]", b"{}", b"[" * 50, b'"', b"'", b"\0",

@@ -36,7 +36,7 @@ def read_optiland_file(path: Path, findings: Findings) -> ZemaxFile:
     surfaces = list(root.child("surface_group").children("surfaces", "surface"))
     if len(surfaces) < 3:
         raise root.problem(f"{len(surfaces)} surfaces: expected an object, an image and one between")
-    found = PlacedSurfaces(path)
+    found = PlacedSurfaces(path, "optiland")
     found.head("UNIT", "MM")
     found.head("NAME", root.text("name", ""))
     stop_radius = _system(root, found, findings)

@@ -29,7 +29,7 @@ from ...zernike_polynomials import noll_to_nm
 from ..json_items import JsonObject
 from ..zemax.file import Findings
 from ..zemax.placed import Line, numbered
-from ..zemax.shapes import MOST_ODD, polynomial_powers
+from ..zemax.shapes import MOST_ODD, polynomial_powers, square_term
 
 #: Highest degree of polynomials.
 MOST_DEGREE = 40
@@ -197,9 +197,14 @@ def geometry_items(shape: Shape, unit: float) -> dict[str, Any]:
     parts = list(shape.parts) if isinstance(shape, Sum) else [shape]
     base = next((p for p in parts if not isinstance(p, XYPolynomial | ZernikeSag)), Plane())
     rest = [p for p in parts if p is not base]
-    if not rest:
+    square, rest = square_term(rest)
+    if square and not rest and isinstance(base, Plane | Sphere | Conic | EvenAsphere):
+        head = {"radius": _length(base.curvature, unit), "conic": base.conic}
+        terms = [a * unit ** (2 * i + 1) for i, a in enumerate([square, *base.coefficients])]
+        return {"type": "EvenAsphere", **head, "coefficients": terms}
+    if not (square or rest):
         return _alone(base, unit)
-    if len(rest) > 1 or not isinstance(base, Plane | Sphere | Conic):
+    if square or len(rest) > 1 or not isinstance(base, Plane | Sphere | Conic):
         raise PrescriptionError("a sum of several shapes: optiland has no geometry of this shape")
     head = {"radius": _length(base.curvature, unit), "conic": base.conic}
     part = rest[0]

@@ -48,13 +48,15 @@ def telescope_to_optiland(telescope: Telescope) -> str:
             _items(_system(-t.stop_z - first), {"type": "Plane", "radius": math.inf}, before, PUPIL_COMMENT, stop=True),
         ]
         for surface in t.surfaces:
-            with error_context(place=f"surface {surface.name}"):
+            try:
                 surfaces.append(_surface_items(surface, first))
+            except PrescriptionError as error:
+                raise PrescriptionError(f"surface {surface.name}: {error}") from None
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
-    for surface, here, there in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
-        surface["thickness"] = (there - here) / MM
-    for surface in surfaces:
-        _in_millimetres(surface["geometry"]["cs"])
+    for items, here, there in zip(surfaces[1:], heights[1:], [*heights[2:], heights[-1]], strict=True):
+        items["thickness"] = (there - here) / MM
+    for items in surfaces:
+        _in_millimetres(items["geometry"]["cs"])
     content = {
         "version": 1.0,
         "name": t.description or t.name,

@@ -60,5 +60,5 @@ def _referenced(frames: list[Frame], value: float, number: int, key: str) -> Fra
     """Return the frame of an earlier surface, numbered from the object or, if negative, back from this one."""
     target = int(value) + number if value < 0 else int(value)
     if not 0 < target <= len(frames):
-        raise PrescriptionError(f"{key} {value:g}: expected one of the surfaces 1 to {len(frames)}", place=f"surface {number}")
+        raise PrescriptionError(f"surface {number}: {key} {value:g}: expected one of the surfaces 1 to {len(frames)}")
     return frames[target - 1]

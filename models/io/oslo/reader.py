@@ -1,10 +1,10 @@
 """Translate a lens file of OSLO (.len) into the terms of a Zemax file.
 
-Supported commands: LEN NEW, UNI (mm for each lens unit), EBR, NAO, FNO, NAP, ANG, OBH, GIH, WV, WW and these numbered;
-for surfaces, parted by NXT up to END, RD, CV, CVX, TH, AP (CHK), AIR, RFL, GLA (name, index, indices at the wavelengths,
-MOD), AST, CC, AD AE AF AG, ASP with ASR, ARA and ASX, DCX DCY DCZ TLA TLB TLC with DT, TOX TOY TOZ, GC, RCO and BEN,
-pick-ups PK CV, TH, GLA, AP, and the solves PY and PU of the axial ray. Sources: OSLO Program Reference and Optics
-Reference (Lambda Research), OSLO User's Guide ("Assignment commands"). The first wavelength is the primary one;
+Supported commands: LEN NEW, UNI (mm for each lens unit), EBR, NAO, FNO, NAP, ANG, OBH, GIH, WV, WW and these
+numbered; for surfaces, parted by NXT up to END, RD, CV, CVX, TH, AP (CHK), AIR, RFL, GLA (name, index, indices at the
+wavelengths, MOD), AST, CC, AD AE AF AG, ASP with ASR, ARA and ASX, DCX DCY DCZ TLA TLB TLC with DT, TOX TOY TOZ, GC,
+RCO and BEN, pick-ups PK CV, TH, GLA, AP, and the solves PY and PU of the axial ray. Sources: OSLO Program Reference and
+Optics Reference (Lambda Research), OSLO User's Guide ("Assignment commands"). The first wavelength is the primary one;
 without AST the first surface is the stop.
 """
 
@@ -37,7 +37,8 @@ INFINITE = 1e8
 #: Fields of the header, as fractions of the stated one.
 FRACTIONS = (0.0, 0.7, 1.0)
 #: Commands of a surface with one number.
-NUMBERS = frozenset("""CC AD AE AF AG CVX DCX DCY DCZ TLA TLB TLC DT GC TOX TOY TOZ TH""".split())
+_NUMBERS = "CC AD AE AF AG CVX DCX DCY DCZ TLA TLB TLC DT GC TOX TOY TOZ TH"
+NUMBERS = frozenset(_NUMBERS.split())
 #: Commands of the shape of a surface besides curvature and conic constant.
 SHAPE = r"CVX|A[DEFG]|AS\d+"
 #: Commands without effect on rays: names, notes, drawing, groups, expansion, coatings, printing.
@@ -96,7 +97,7 @@ class _Translation:
 
     def __init__(self, path: Path, findings: Findings) -> None:
         self.path, self.findings = path, findings
-        self.found = PlacedSurfaces(path)
+        self.found = PlacedSurfaces(path, "OSLO")
         self.surfaces = [_Surface(0)]
         self.waves: list[float] = list(WAVELENGTHS)
         self.weights: list[float] = []
@@ -126,8 +127,8 @@ class _Translation:
         if len(self.surfaces) < 3:
             problem = f"{len(self.surfaces)} surfaces: expected an object, an image and one between, parted by NXT"
             raise self.found.header.problem(problem)
-        self._resolve()
         self._header()
+        self._resolve()
         self._blocks()
         return self.found.file()
 
@@ -162,7 +163,8 @@ class _Translation:
         elif key == "AST":
             self.stop = current.number
         elif key == "ASP":
-            current.aspheric = {"0": "ADO", "1": "ASR", "2": "ASX"}.get(command.text, command.text.upper().split(" ")[0])
+            kind = (command.words or ("ADO",))[0].upper()
+            current.aspheric = {"0": "ADO", "1": "ASR", "2": "ASX"}.get(kind, kind)
         elif key == "RCO":
             current.values["RCO"] = command.number(0, float(current.number))
         elif key == "BEN":
@@ -266,6 +268,8 @@ class _Translation:
     def distance(self) -> float:
         """Distance of the object from the first surface [lens unit]."""
         value = self.surfaces[0].values.get("TH", math.inf)
+        if value == 0:
+            raise self._problem(self.surfaces[0], "TH 0: expected a distance of the object other than 0")
         return math.inf if abs(value) >= INFINITE else value
 
     def _header(self) -> None:

@@ -32,3 +32,8 @@ def numbers(items: JsonObject, key: str, size: int | None = None) -> list[float]
     if isinstance(items.get(key), dict):
         return items.child(key).numbers("__ndarray__", size)
     return items.numbers(key, size)
+
+
+def named(items: JsonObject, key: str) -> str:
+    """Return a key as the file has it: attributes of some versions begin with an underscore."""
+    return f"_{key}" if f"_{key}" in items else key

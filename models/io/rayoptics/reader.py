@@ -7,6 +7,8 @@ the profiles of ``shapes``, their decentres, clear apertures, gaps and media, th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from ...telescope import rotation_matrix
 from ..json_items import JsonObject
 from ..zemax.file import Findings, ZemaxFile
 from ..zemax.placed import INFINITE, Line, PlacedSurfaces
-from .items import attributes, class_name, numbers
+from .items import attributes, class_name, named, numbers
 from .media import medium_lines
 from .shapes import profile_lines
 
@@ -43,7 +45,7 @@ class _Translation:
 
     def __init__(self, path: Path, model: JsonObject, findings: Findings) -> None:
         self.model, self.findings = model, findings
-        self.found = PlacedSurfaces(path)
+        self.found = PlacedSurfaces(path, "ray-optics")
         self.sequence = attributes(model, "seq_model")
         self.surfaces = list(self.sequence.children("ifcs", "surface"))
         self.gaps = [attributes(gap) for gap in self.sequence.children("gaps", "gap")]
@@ -132,7 +134,7 @@ class _Translation:
         if "decenter" not in items:
             return unit, none, unit, none
         values = attributes(items, "decenter")
-        kind = values.text("dtype" if "dtype" in values else "_dtype")
+        kind = values.text(named(values, "dtype"))
         if kind not in DECENTERS:
             raise values.problem(f"decenter {kind}: expected one of {', '.join(DECENTERS)}")
         shift, angles = np.array(numbers(values, "dec", 3)), np.radians(numbers(values, "euler", 3))
@@ -150,7 +152,7 @@ class _Translation:
 
     def _header(self) -> None:
         head, system = self.found.head, attributes(self.model, "system_spec")
-        unit = system.text("_dimensions" if "_dimensions" in system else "dimensions", "mm")
+        unit = system.text(named(system, "dimensions"), "mm")
         if unit.lower() not in UNITS:
             raise system.problem(f"dimensions = {unit!r}: expected one of {', '.join(UNITS)}")
         head("UNIT", UNITS[unit.lower()])
@@ -163,18 +165,19 @@ class _Translation:
         weights = (weights + [1.0] * len(lengths))[: len(lengths)]
         self._fields(attributes(optics, "field_of_view"), len(lengths))
         for number, (wave, weight) in enumerate(zip(lengths, weights, strict=True), start=1):
-            head("WAVM", str(number), wave / 1e3, weight)
+            # The decimal point is moved: 587.6 is the float 0.5876.
+            head("WAVM", str(number), float(Decimal(repr(wave)).scaleb(-3)), weight)
         head("PWAV", str(waves.whole("reference_wvl") + 1))
 
     def _pupil(self, pupil: JsonObject) -> None:
         space, kind = self._key(pupil)
         if (space, kind) not in PUPILS:
             raise pupil.problem(f"pupil {space} {kind}: expected one of {_names(PUPILS)}")
-        value = pupil.number("value")
+        value = pupil.number(named(pupil, "value"))
         keyword = PUPILS[space, kind]
         if keyword == "FNUM":
             if not value:
-                pupil.refuse("value", "a number other than 0")
+                pupil.refuse(named(pupil, "value"), "a number other than 0")
             finite = abs(self.distance) < INFINITE
             self.found.head("FNUM", abs(value) if kind == "f/#" else 0.5 / abs(value), str(int(finite)))
         else:
@@ -185,11 +188,11 @@ class _Translation:
         if (space, kind) not in FIELDS:
             raise fields.problem(f"field_of_view {space} {kind}: expected one of {_names(FIELDS)}")
         points = [attributes(point) for point in fields.children("fields", "field")]
-        scale = fields.number("value") if fields.flag("is_relative") else 1.0
+        scale = fields.number(named(fields, "value")) if fields.flag("is_relative") else 1.0
         head = self.found.head
         head("FTYP", str(FIELDS[space, kind]), "0", str(len(points)), str(waves))
-        head("XFLN", *(scale * p.number("x") for p in points))
-        head("YFLN", *(scale * p.number("y") for p in points))
+        head("XFLN", *(scale * p.number(named(p, "x")) for p in points))
+        head("YFLN", *(scale * p.number(named(p, "y")) for p in points))
         head("FWGN", *(p.number("wt", 1.0) for p in points))
         for axis in "xy":
             upper = np.array([p.number(f"vu{axis}", 0.0) for p in points])
@@ -200,12 +203,12 @@ class _Translation:
 
     def _key(self, items: JsonObject) -> tuple[str, str]:
         """Return space and kind of a pupil or of fields: the last two words of their key."""
-        key = "key" if "key" in items else "_key"
+        key = named(items, "key")
         words = items.get(key)
         if not isinstance(words, list) or len(words) < 2 or not all(isinstance(w, str) for w in words):
             items.refuse(key, "a list of words")
         return words[-2], words[-1]
 
 
-def _names(table: dict[tuple[str, str], object]) -> str:
+def _names(table: Iterable[tuple[str, str]]) -> str:
     return ", ".join(" ".join(key) for key in table)

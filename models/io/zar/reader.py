@@ -23,7 +23,7 @@ from ..zemax.text import decoded
 #: Ending of the names of compressed files.
 _PACKED = ".lzw"
 #: Longest archive, and most bytes of a file in it that is unpacked.
-MAX_BYTES, MAX_UNPACKED = 500_000_000, 50_000_000
+MAX_BYTES, MAX_UNPACKED = 100_000_000, 50_000_000
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,12 @@ def read_zemax_archive(path: Path, findings: Findings) -> ZemaxFile:
         ending = name.lower().removesuffix(_PACKED)[-4:]
         if ending not in (".zmx", ".agf"):
             continue
-        # Windows paths; the name is for messages.
-        source = f"{path}: {name}"
-        text = decoded(_unpacked(content, source) if name.lower().endswith(_PACKED) else content, source)
+        text = decoded(_unpacked(content, name) if name.lower().endswith(_PACKED) else content, name)
         if ending == ".zmx":
             lenses[name] = text
             continue
         try:
-            catalogue = GlassCatalogue.parse(text, source)
+            catalogue = GlassCatalogue.parse(text, name)
         except PrescriptionError as error:
             findings.report(error, "this catalogue is left out")
         else:

@@ -28,11 +28,11 @@ INFINITE = 1e9
 class PlacedSurfaces:
     """Header, glasses and surfaces of a lens file; surfaces are added in the order of the light.
 
-    Lengths are in the unit of the file, `glasses` are media by the names that lines ``GLAS`` have.
+    Lengths are in the unit of the file, which `program` wrote; `glasses` are media by their names in lines ``GLAS``.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, program: str) -> None:
+        self.path, self.program = path, program
         self.header = Block(str(path))
         self.glasses: dict[str, Medium] = {}
         self._blocks: list[Block] = []
@@ -91,7 +91,7 @@ class PlacedSurfaces:
             if block.last("COMM") is None:
                 # Names count surfaces and no coordinate breaks; the last is the image.
                 block.lines.append(_record(self.path, block.place, ("COMM", f"S{number}")))
-        return ZemaxFile(self.path, self.header, self._blocks, Block(str(self.path)), self.glasses)
+        return ZemaxFile(self.path, self.header, self._blocks, Block(str(self.path)), self.glasses, self.program)
 
     def _finish(self, place: str, position: np.ndarray) -> None:
         """Give the last surface its thickness: up to the plane across the axis through the next position."""

@@ -114,7 +114,7 @@ class _LensReader:
         limit = min(max(2 * pupil.field_radius, math.radians(5.0)), math.radians(85.0))
         return Telescope(
             name=self.file.path.stem,
-            source=f"Zemax file {self.file.path.name}",
+            source=f"{self.file.program} file {self.file.path.name}",
             version=(header.text("VERS").split() or ["1"])[0],
             description=header.text("NAME"),
             surfaces=surfaces,

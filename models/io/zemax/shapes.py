@@ -191,7 +191,7 @@ def shape_lines(shape: Shape, unit: float) -> list[str]:
         return _special_lines(base, unit)
     if not isinstance(base, Plane | Sphere | Conic | EvenAsphere):
         raise PrescriptionError(f"shape {type(base).__name__}: no type of Zemax surface has this shape")
-    square, rest = _square_term(rest)
+    square, rest = square_term(rest)
     if len(rest) > 1:
         raise PrescriptionError("sum of several shapes: no type of Zemax surface has this shape")
     head = [f"CURV {number_text(base.curvature * unit)}", f"CONI {number_text(base.conic)}"]
@@ -228,7 +228,7 @@ def _special_lines(shape: Biconic | Toroid | OddAsphere, unit: float) -> list[st
     return [*lines, f"PARM 2 {number_text(shape.conic_x)}"] if isinstance(shape, Biconic) else lines
 
 
-def _square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
+def square_term(parts: list[Shape]) -> tuple[float, list[Shape]]:
     """Return the coefficient of r^2 that a part of its own has, and the other parts."""
     for part in parts:
         terms = {(i, j): a for i, j, a in part.terms} if isinstance(part, XYPolynomial) else {}

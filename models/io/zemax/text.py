@@ -100,7 +100,7 @@ def records(text: str, source: str) -> list[Record]:
         if words:
             keyword, *rest = words
             if keyword.upper() == "SURF" and rest:
-                place = f"surface {rest[0]}"
+                place = f"surface {cut_short(rest[0])}"
             after = content.strip()[len(keyword) :].strip()
             found.append(Record(source, line, place, keyword.upper(), tuple(rest), after))
     return found

@@ -45,6 +45,9 @@ def restated(name, w, a):
         return a[0] + a[1] * pole + a[2] * pole**2 + a[3] * w**2 + a[4] * w**4 + a[5] * w**6
     if name == "conrady":
         return a[0] + a[1] / w + a[2] / w**3.5
+    if name == "buchdahl":
+        shift = w - a[3]
+        return a[0] + a[1] * shift / (1 + 2.5 * shift) + a[2] * shift**2 / (1 + 2.5 * shift) ** 2
     assert name == "cauchy"
     return a[0] + a[1] / w**2 + a[2] / w**4 + a[3] / w**6
 

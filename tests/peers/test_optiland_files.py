@@ -1,0 +1,84 @@
+"""Files of optiland, and ours written as such, against optiland's own rays."""
+
+import importlib
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pachon
+
+pytest.importorskip("optiland")
+
+# The tables of materials and the samples take seconds to load.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
+MODULES = ("eyepieces", "infrared", "lithography", "microscopes", "miscellaneous", "objectives", "simple", "telescopes")
+SAMPLES = {
+    "AsphericSinglet", "CementedAchromat", "CookeTriplet", "DoubleGauss", "Edmund_49_847", "EyepieceErfle",
+    "HeliarLens", "HubbleTelescope", "InfraredTriplet", "InfraredTripletF4", "LensWithFieldCorrector",
+    "Microscope20x", "NavarroWideAngleEye", "Objective60x", "ObjectiveUS008879901", "PetzvalLens",
+    "ProjectionLens120FOV", "ProjectionLens160FOV", "ReverseTelephoto", "SingletStopSurf2", "Telephoto",
+    "TelescopeDoublet", "TelescopeObjective48Inch", "TessarLens", "TripletTelescopeObjective", "UVProjectionLens",
+    "UVReflectingMicroscope", "WideAngle100FOV", "WideAngle170FOV",
+}  # fmt: skip
+ZEMAX = sorted((Path(__file__).parents[1] / "data" / "zmx").glob("*.zmx"))
+
+
+def sample(name, path):
+    """Save a sample system of optiland."""
+    from optiland.fileio import save_optiland_file
+
+    for module in map(importlib.import_module, (f"optiland.samples.{m}" for m in MODULES)):
+        if name in dict(inspect.getmembers(module, inspect.isclass)):
+            save_optiland_file(getattr(module, name)(), path)
+            return
+    pytest.skip(f"this optiland has no sample {name}")
+
+
+def assert_same_rays(path, *, near, most_lost=0.0):
+    """Trace rays of the axis and of a field through a file, here and with optiland."""
+    from optiland.fileio import load_optiland_file
+    from optiland.rays import RealRays
+
+    telescope, optic = pachon.load_telescope(path), load_optiland_file(str(path))
+    surfaces = list(optic.surfaces)[1:]
+    # The plane that carries the entrance pupil in files of ours is no surface here.
+    offset = 1 if surfaces[0].comment == "pachon entrance pupil" else 0
+    height = 1e3 * telescope.surfaces[0].vertex[2] + float(np.ravel(surfaces[offset].geometry.cs.z)[0])
+    rng = np.random.default_rng(3)
+    radius, angle = 0.5 * telescope.pupil_diameter * np.sqrt(rng.uniform(size=60)), rng.uniform(0, 2 * np.pi, 60)
+    points = (radius * np.cos(angle), radius * np.sin(angle))
+    compared = 0
+    for fraction in (0.0, 0.5):
+        field = (0.3 * fraction * telescope.field_radius, fraction * telescope.field_radius)
+        wavelength = telescope.default_wavelength
+        rays = pachon.launch_rays(telescope, field, wavelength, points, projection="zemax")
+        traced = pachon.trace(telescope, rays)
+        # Light along +z: half a turn about y.
+        x, y, z = (np.array(rays.position) * [-1e3, 1e3, -1e3]).T
+        along = (np.array(rays.direction) * [-1.0, 1.0, -1.0]).T
+        peer = RealRays(x, y, z + height, *along, np.ones(60), np.full(60, wavelength * 1e6))
+        for surface in surfaces:
+            peer = surface.trace(peer)
+        theirs = np.stack([np.asarray(v) for v in (peer.x, peer.y, peer.z)], axis=-1)
+        ours = np.array(traced.position) * [-1e3, 1e3, -1e3] + [0.0, 0.0, height]
+        good = (np.array(traced.status) <= pachon.RayStatus.VIGNETTED) & np.all(np.isfinite(theirs), axis=1)
+        compared += good.sum()
+        assert np.allclose(ours[good], theirs[good], rtol=0, atol=near * 1e3)
+    assert compared >= (1 - most_lost) * 120
+
+
+@pytest.mark.parametrize("name", sorted(SAMPLES))
+def test_rays_of_a_sample(name, tmp_path):
+    sample(name, str(tmp_path / "sample.json"))
+    # Half of the field of a few wide-angle lenses, and the rim of a mirror objective, pass no rays of the paraxial
+    # pupil. Nearness: 1 nm is what was asked for, 1e-12 m what is found.
+    assert_same_rays(tmp_path / "sample.json", near=1e-12, most_lost=0.5)
+
+
+@pytest.mark.parametrize("name", ["lsst_v3.3_r", "rubin_v3.14_r", "paul_baker", *ZEMAX], ids=str)
+def test_rays_of_ours_written_for_optiland(name, tmp_path):
+    pachon.save_telescope(pachon.load_telescope(name), tmp_path / "ours.json")
+    # Optical paths of 20 m, in millimetres there.
+    assert_same_rays(tmp_path / "ours.json", near=2e-13)
