@@ -204,7 +204,7 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     ConfigError
         If there is no such format.
     PrescriptionError
-        If the name does not end in .yaml, .yml, .zmx or .json, or the file cannot be written or cannot hold the telescope.
+        If the name does not end in .yaml, .yml, .zmx or .json, or the file cannot be written or hold the telescope.
     """
     target = Path(path)
     if target.suffix.lower() not in WRITTEN:
