@@ -117,7 +117,7 @@ def relative_illumination(
     fields : array_like or Quantity, shape [n_field, 2], optional
         Field angles [rad]; a line from the axis along +y to the edge of the field of view by default.
     n_pupil : int
-        Points of the pupil, at equal areas; the error of a vignetted pupil is about the inverse of it times ten.
+        Points of the pupil, at equal areas.
 
     Raises
     ------
