@@ -15,6 +15,7 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.units import ARCSEC
+from ...models.design_data import DesignData
 from ...models.first_order import first_order, seidel_sums
 from ...models.media.medium import ConstantIndex
 from ...models.shapes.shape import Rotational
@@ -34,7 +35,13 @@ _SMALL = 1.0
 
 
 def length_unit(telescope: Telescope) -> tuple[str, float]:
-    """Return the unit of length of a telescope's tables, and its length [m]: mm for pupils under a metre, else m."""
+    """Return the unit of length of a telescope's tables, and its length [m].
+
+    It is that of the lens file; without design data mm for pupils under a metre, else m.
+    """
+    data = telescope.design_data
+    if data != DesignData():
+        return data.length_unit, data.unit
     return ("mm", 1e-3) if telescope.pupil_diameter < _SMALL else ("m", 1.0)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 
 from ..media.medium import Medium
 from .glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
-from .user_glasses import user_catalogues
 
 
 def find_glass(name: str, first: Iterable[GlassCatalogue] = ()) -> Medium | None:
@@ -26,4 +25,7 @@ def _all(first: Iterable[GlassCatalogue]) -> Iterator[GlassCatalogue]:
     yield from first
     yield GlassCatalogue.bundled()
     yield from map(GlassCatalogue.of_maker, (*MAKERS, SUBSTANCES))
+    # The section of the configuration takes time to make, and few glasses are in none of those above.
+    from .user_glasses import user_catalogues
+
     yield from map(GlassCatalogue.read, user_catalogues())

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -42,14 +42,9 @@ from ..telescope import Telescope
 from .batoid import ROOT as BATOID_ROOT
 from .codev.reader import read_codev_file
 from .glass_catalogue import GlassCatalogue
-from .optiland.reader import read_optiland_file
-from .oslo.reader import read_oslo_file
-from .rayoptics.reader import read_rayoptics_file
-from .user_glasses import user_catalogues
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
 from .yaml.writer import telescope_to_yaml
-from .zar.reader import read_zemax_archive
-from .zemax.file import read_zemax_file
+from .zemax.file import Findings, ZemaxFile, read_zemax_file
 from .zemax.reader import read_lens
 from .zemax.writer import catalogue_path, telescope_to_zemax
 
@@ -67,19 +62,34 @@ BUNDLED = (
 )
 
 
-# Readers of the parts of a lens file, by its ending.
-_LENS_FILES = {
-    ".zmx": read_zemax_file,
-    ".zar": read_zemax_archive,
-    ".seq": read_codev_file,
-    ".len": read_oslo_file,
-    ".json": read_optiland_file,
-    ".roa": read_rayoptics_file,
-}
+#: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
+_LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
 #: Endings of files that a telescope is written to, and their formats.
 WRITTEN = {".yaml": "pachon", ".yml": "pachon", ".zmx": "zemax", ".json": "optiland"}
 #: Endings of files that a telescope is read from.
 ENDINGS = (".yaml", ".yml", *_LENS_FILES)
+
+
+def _parts_reader(ending: str) -> Callable[[Path, Findings], ZemaxFile]:
+    """Return the reader of the parts of lens files with an ending."""
+    # Imported where they are needed, like the writers.
+    if ending == ".zar":
+        from .zar.reader import read_zemax_archive
+
+        return read_zemax_archive
+    if ending == ".len":
+        from .oslo.reader import read_oslo_file
+
+        return read_oslo_file
+    if ending == ".json":
+        from .optiland.reader import read_optiland_file
+
+        return read_optiland_file
+    if ending == ".roa":
+        from .rayoptics.reader import read_rayoptics_file
+
+        return read_rayoptics_file
+    return read_codev_file if ending == ".seq" else read_zemax_file
 
 
 def bundled_names() -> tuple[str, ...]:
@@ -132,7 +142,7 @@ def load_telescope(
 
         return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
-        parts = _LENS_FILES[path.suffix.lower()]
+        parts = _parts_reader(path.suffix.lower())
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
         raise PrescriptionError(f"expected a prescription file that ends in {', '.join(ENDINGS)}", file=path)
@@ -153,6 +163,8 @@ def prescription_digest(path: str | os.PathLike[str]) -> str:
     path = Path(path)
     own = hashlib.sha256(read_bytes(path, PrescriptionError)).hexdigest()
     if path.suffix.lower() in _LENS_FILES:
+        from .user_glasses import user_catalogues
+
         named = [path.with_suffix(".agf").name, *(os.path.abspath(p) for p in user_catalogues())]
     else:
         named = sorted(set(_texts(read_mapping(path, max_bytes=MAX_BYTES))))
