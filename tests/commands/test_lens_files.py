@@ -18,6 +18,12 @@ WIDE, LENS, FINITE = (
 FEW = ["--sampling", "rings", "--rays", "3"]
 
 
+@pytest.fixture(autouse=True)
+def without_pictures(monkeypatch):
+    """Pictures are not what these tests are about, and drawing them takes longer than all else."""
+    monkeypatch.setattr("pachon.core.plotting.picture_bytes", lambda figure, kind: b"")
+
+
 def metrics(capsys, *arguments):
     assert main([*arguments, "--json", "-o", "picture.png"]) == 0
     return json.loads(capsys.readouterr().out)

@@ -13,8 +13,8 @@ from ...core.launch import launch
 from ...core.units import require_count
 from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
+from ...raytrace.launch import launch_bundles
 from ...raytrace.pack.surfaces import clear_ring, pack_surfaces
-from ...raytrace.rays import parallel_rays
 from ...raytrace.trace import trace_packets
 from .clear_pupil_kernels import find_edges
 
@@ -90,7 +90,7 @@ def clear_edges(
     radius = np.linspace(telescope.pupil_obscuration * outer, outer, _EDGE_RINGS)
     points = (radius[:, None, None] * unit).reshape(-1, 2)
     n_surface = len(telescope.surfaces)
-    rays = parallel_rays(telescope, direction, wavelength, points)
+    rays = launch_bundles(telescope, direction, wavelength, points)
     places = trace_packets(telescope, rays, n_surface, threads=threads).end.position
     surfaces = pack_surfaces(telescope)
     edges = np.empty((n_star, n_spoke, 2))

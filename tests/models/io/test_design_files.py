@@ -160,6 +160,21 @@ def test_codev_files_keep_fields_and_wavelengths(tmp_path):
     assert rim[1, :, 1] == pytest.approx([0.7, -0.9], abs=1e-15)
 
 
+def test_rays_of_codev_files_are_aimed_at_the_stop(tmp_path):
+    """A stop that is decentred and returns: chief rays pass its middle, and not that of its paraxial image."""
+    path = tmp_path / "lens.seq"
+    path.write_text(
+        "RDM\nDIM M\nEPD 10\nWL 587.6\nREF 1\nXAN 0\nYAN 3\n"
+        "SO 0 1e20\nS 50 5 NBK7_SCHOTT\nS -50 20\nS 0 30\nSTO\nDAR\nYDE 2\nSI 0 0\n"
+    )
+    lens = load_telescope(path)
+    rays = pachon.Request.of(lens).launch(lens.default_wavelength, np.zeros((1, 2)))
+    assert lens.design_data.stop == "S3"
+    met = pachon.trace(lens, rays, "all")[2].position
+    assert lens.surface("S3").to_local(met)[0] == pytest.approx(np.zeros(3), abs=1e-14)
+    assert met[0, 1] == pytest.approx(2e-3, abs=1e-14)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
