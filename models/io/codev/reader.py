@@ -148,7 +148,7 @@ class _Translation:
                 self._header_line(f"VC{axis}N", *(0.5 * (low + up) for up, low in both))
         words = (repr(self.field_type), "0", "0", str(len(self.waves)))
         self.header.lines.append(Record(str(self.path), 1, "", "FTYP", words, ""))
-        return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private)
+        return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private, program="CODE V")
 
     def _header_line(self, keyword: str, *values: float) -> None:
         self.header.lines.append(Record(str(self.path), 1, "", keyword, tuple(map(repr, values)), ""))
