@@ -40,6 +40,7 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
+from .simulate.screen_cover import check_samples
 
 
 @dataclass(frozen=True)
@@ -97,9 +98,9 @@ class Experiment:
         if config.active_optics.residual_um > 0.0:
             rms = config.active_optics.residual_um * 1e-6
             aberration = ResidualWavefront.draw(telescope, rms, config.seed, config.atmosphere.epoch)
-        return cls(
-            config, telescope, _focal_plane(config, resolved.camera), _atmosphere(config, site), aberration, site
-        )
+        focal_plane, atmosphere = _focal_plane(config, resolved.camera), _atmosphere(config, site)
+        check_samples(config, telescope)
+        return cls(config, telescope, focal_plane, atmosphere, aberration, site)
 
     @property
     def camera(self) -> Camera:
