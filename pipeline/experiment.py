@@ -42,6 +42,7 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
+from .simulate.screen_cover import check_samples
 from .star_list import StarList, listed_stars, pointing_of
 
 #: Keys of the stars that a configuration without a catalogue did not have once.
@@ -106,15 +107,10 @@ class Experiment:
         if config.active_optics.residual_um > 0.0:
             rms = config.active_optics.residual_um * 1e-6
             aberration = ResidualWavefront.draw(telescope, rms, config.seed, config.atmosphere.epoch)
-        return cls(
-            config,
-            telescope,
-            _focal_plane(config, resolved.camera),
-            _atmosphere(config, site),
-            aberration,
-            site,
-            star_list=listed_stars(config, telescope, resolved.camera),
-        )
+        focal_plane, atmosphere = _focal_plane(config, resolved.camera), _atmosphere(config, site)
+        check_samples(config, telescope)
+        listed = listed_stars(config, telescope, resolved.camera)
+        return cls(config, telescope, focal_plane, atmosphere, aberration, site, star_list=listed)
 
     @property
     def camera(self) -> Camera:

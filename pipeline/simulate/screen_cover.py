@@ -57,17 +57,10 @@ def _corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) -
 
 
 def check_screens(config: Configuration, telescope: Telescope, camera: Camera, site: Site) -> None:
-    """Raise ConfigError if the screens are too coarse for the pupil, or repeat within the light to the chosen CCDs."""
+    """Raise ConfigError, with layer and length, if a periodic screen repeats within the light to the chosen CCDs."""
     air = config.atmosphere
     if not air.enabled or not ENGINES[config.psf.engine].screens:
         return
-    sample, widest = air.screen_length_m / air.screen_size, telescope.pupil_diameter / _LEAST_SAMPLES
-    if sample > widest:
-        raise ConfigError(
-            f"atmosphere.screen_size = {air.screen_size}: expected at least {math.ceil(air.screen_length_m / widest)}, "
-            f"so that a pupil of {telescope.pupil_diameter:g} m has {_LEAST_SAMPLES} samples across, or a shorter "
-            f"atmosphere.screen_length_m than {air.screen_length_m:g}"
-        )
     swept = swept_lengths(config, telescope, camera, site)
     layer = int(np.argmax(swept))
     if swept[layer] <= air.screen_length_m:
@@ -79,3 +72,17 @@ def check_screens(config: Configuration, telescope: Telescope, camera: Camera, s
         f" {site.altitudes[layer]:g} m, whose periodic screen comes round after {air.screen_length_m:g} m: expected"
         f" atmosphere.screen_length_m of at least {least} (and atmosphere.screen_size = {size} to keep its pixel)"
     )
+
+
+def check_samples(config: Configuration, telescope: Telescope) -> None:
+    """Raise ConfigError if screens are too coarse for the pupil of a telescope."""
+    air = config.atmosphere
+    if not air.enabled or not ENGINES[config.psf.engine].screens:
+        return
+    sample, widest = air.screen_length_m / air.screen_size, telescope.pupil_diameter / _LEAST_SAMPLES
+    if sample > widest:
+        raise ConfigError(
+            f"atmosphere.screen_size = {air.screen_size}: expected at least {math.ceil(air.screen_length_m / widest)}, "
+            f"so that a pupil of {telescope.pupil_diameter:g} m has {_LEAST_SAMPLES} samples across, or a shorter "
+            f"atmosphere.screen_length_m than {air.screen_length_m:g}"
+        )

@@ -99,7 +99,7 @@ def test_columns_of_other_names_are_mapped(tmp_path, telescope, places, magnitud
 
 
 def test_stars_that_are_left_out_are_counted(tmp_path, telescope):
-    center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], CAMERA.half_size
+    center, half = CAMERA.centers[CAMERA.ccd_index("R22_S11")], CAMERA.half_sizes[0, 0]
     rim = half - (RIM - 0.5) * CAMERA.pixel_size
     inside = half - (RIM + 0.5) * CAMERA.pixel_size
     offsets = np.array([[0, 0], [0, 0], [0, 0], [np.nan, 0], [rim, 0], [inside, 0], [0.0211, 0], [0, 0]])
@@ -280,7 +280,7 @@ def world_coordinates(experiment):
 
 def pixels(table):
     """Pixels of the central CCD."""
-    return (np.stack([table["X"], table["Y"]], axis=1) * 1e-3 + CAMERA.half_size) / CAMERA.pixel_size - 0.5
+    return (np.stack([table["X"], table["Y"]], axis=1) * 1e-3 + CAMERA.half_sizes[0, 0]) / CAMERA.pixel_size - 0.5
 
 
 @pytest.mark.slow
