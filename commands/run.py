@@ -41,7 +41,7 @@ def run_command(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Follow starlight from the sky to a PSF model: optics, CCD heights, atmosphere, noisy stars, PCA, correlations.
+    """Follow starlight from the sky to a PSF model: optics, CCD heights, atmosphere, noisy stars, correlations.
 
     Without a configuration: r band of the LSST, nine CCDs from the centre of the field to its edge.
 

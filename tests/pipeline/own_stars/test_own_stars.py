@@ -77,6 +77,7 @@ def test_residuals_of_held_out_stars_are_their_noise(own):
     assert abs(np.nanmean(rho.rho1.xi_plus)) < 0.2 * own.summary()["rms_e"] ** 2
 
 
+@pytest.mark.long
 def test_the_parts_held_out_are_those_of_the_seed(stars, own):
     options = {"basis": "pixels", "interpolation": "polynomial", "order": 1, "weights": "noise"}
     one, again, other = (fit_own_stars(*stars, PIXEL, seed=seed, **options) for seed in (1, 1, 2))
