@@ -53,6 +53,12 @@ class Request:
     projection: str
     threads: int | None
 
+    def __repr__(self) -> str:
+        waves = ", ".join(f"{1e9 * w:.5g}" for w in self.wavelengths[:3]) + ", ..." * (len(self.wavelengths) > 3)
+        return (
+            f"<Request: {self.telescope.name}, {len(self.fields)} fields, {waves} nm, {len(self.pupil)} pupil points>"
+        )
+
     @classmethod
     @check_arguments
     def of(

@@ -34,6 +34,9 @@ class Camera:
     pixel_size: float  #: side of a pixel [m]
     vendors: tuple[str, ...] = ()  #: maker of each CCD; empty where they are not told apart
 
+    def __repr__(self) -> str:
+        return f"<Camera {self.name}: {len(self)} CCDs of {self.pixels} pixels of {self.pixel_size * 1e6:g} um>"
+
     def __post_init__(self) -> None:
         for array in (self.raft_index, self.centers):
             array.flags.writeable = False
