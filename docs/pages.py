@@ -10,6 +10,7 @@ import io
 import os
 import re
 from pathlib import Path
+from textwrap import dedent
 
 ROOT = Path(__file__).parents[1]
 STUB = ROOT / "pachon" / "__init__.pyi"
@@ -80,6 +81,8 @@ def command_page() -> str:
     ]
     for name, command in sorted(_commands(typer.main.get_command(app), "pachon")):
         text = inspect.cleandoc(command.help or "").replace("\b\n", "").replace("**Examples**", "*Examples*")
+        # Indented blocks stand behind items of lists, which would take them for text.
+        text = re.sub(r"\n\n((?: {4}.*\n?)+)", lambda m: f"\n\n```text\n{dedent(m[1]).rstrip()}\n```\n", text)
         parts += [f"## {name}\n", text + "\n"]
         rows = [row for parameter in command.params if (row := _option_row(parameter))]
         if rows:
@@ -137,6 +140,7 @@ def setup(app: object) -> dict[str, bool]:
     """Connect the pages to a build of Sphinx."""
     app.connect("builder-inited", _write_references)
     app.connect("source-read", _run_example)
+    app.connect("autodoc-process-docstring", _attributes_as_parameters, priority=400)
     return {"parallel_read_safe": False}
 
 
@@ -146,6 +150,13 @@ def _write_references(app: object) -> None:
     for layer in LAYERS:
         (folder / f"api_{layer or 'galsim'}.md").write_text(api_page(layer), encoding="utf-8")
     (folder / "commands.md").write_text(command_page(), encoding="utf-8")
+
+
+def _attributes_as_parameters(*event: object) -> None:
+    """Rename lists of attributes, arguments of dataclasses: napoleon splits "x, y : float" in parameters alone."""
+    lines = event[-1]
+    assert isinstance(lines, list)
+    lines[:] = ["Parameters" if line == "Attributes" else line for line in lines]
 
 
 def _run_example(app: object, name: str, source: list[str]) -> None:

@@ -66,6 +66,12 @@ class CcdWcs:
     inverse: np.ndarray
     error: float
 
+    def __repr__(self) -> str:
+        ra, dec = np.rad2deg(self.pointing)
+        ny, nx = self.shape
+        where = f"pointing ({ra:g}, {dec:g}) deg, error {self.error:.2g} rad"
+        return f"<CcdWcs: {nx} x {ny} pixels, order {self.order}, {where}>"
+
     @property
     def order(self) -> int:
         """Order of the polynomials: 1 is TAN without SIP."""

@@ -49,6 +49,9 @@ class Obstruction(ContentEquality):
     triangles: np.ndarray
     before: tuple[str, ...] | None = None
 
+    def __repr__(self) -> str:
+        return f"<Obstruction {self.name}: {len(self.triangles)} triangles>"
+
     def __post_init__(self) -> None:
         self._freeze(triangles=np.float32)
         triangles = self.triangles

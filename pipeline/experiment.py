@@ -83,6 +83,9 @@ class Experiment:
     atmosphere_only: bool = False
     star_list: StarList | None = None
 
+    def __repr__(self) -> str:
+        return f"<Experiment: {self.telescope!r}, {self.focal_plane!r}, {self.config.psf.engine} engine>"
+
     @classmethod
     @check_arguments
     def from_config(cls, config: Configuration, folder: Path | None = None) -> Experiment:

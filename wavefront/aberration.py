@@ -58,6 +58,9 @@ class ResidualWavefront:
     pupil_obscuration: float
     field_gradient: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
+    def __repr__(self) -> str:
+        return f"<ResidualWavefront: {len(self.coefficients)} Noll terms, pupil {self.pupil_diameter:g} m>"
+
     def __post_init__(self) -> None:
         values = metres(self.coefficients, "coefficients")
         gradient = np.asarray(self.field_gradient, dtype=np.float64)

@@ -36,6 +36,9 @@ class PupilSampling:
     points: np.ndarray
     weights: np.ndarray
 
+    def __repr__(self) -> str:
+        return f"<PupilSampling: {len(self)} points>"
+
     def __post_init__(self) -> None:
         points, weights = (np.asarray(v, dtype=np.float64) for v in (self.points, self.weights))
         if points.ndim != 2 or points.shape[1] != 2 or weights.shape != points.shape[:1] or not len(weights):

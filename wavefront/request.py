@@ -62,6 +62,12 @@ class Request:
     primary: float | None = None
     vignetting: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        waves = ", ".join(f"{1e9 * w:.5g}" for w in self.wavelengths[:3]) + ", ..." * (len(self.wavelengths) > 3)
+        return (
+            f"<Request: {self.telescope.name}, {len(self.fields)} fields, {waves} nm, {len(self.pupil)} pupil points>"
+        )
+
     @classmethod
     @check_arguments
     def of(

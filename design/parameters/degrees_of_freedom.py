@@ -102,6 +102,10 @@ class DegreesOfFreedom:
     description: str = ""
     source: str = ""
 
+    def __repr__(self) -> str:
+        few = ", ".join(self.names[:4]) + ", ..." * (len(self) > 4)
+        return f"<DegreesOfFreedom{' ' * bool(self.name)}{self.name}: {len(self)}: {few}>"
+
     def __post_init__(self) -> None:
         if not self.members:
             raise ConfigError("degrees_of_freedom = []: expected at least one")

@@ -71,6 +71,9 @@ class Baseline(Section):
     reasons: dict[str, str] = Field(description="reasons of the tolerances")
     figures: Annotated[dict[str, BaselineMetric], Field(min_length=1)] = Field(description="the metrics by name")
 
+    def __repr__(self) -> str:
+        return f"<Baseline of {self.model}: {len(self.figures)} metrics>"
+
 
 @check_arguments
 def read_baseline(path: str | os.PathLike[str]) -> Baseline:

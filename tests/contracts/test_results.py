@@ -78,6 +78,16 @@ def test_representations_are_short(results):
         assert "array(" not in repr(result)
 
 
+def test_no_public_object_prints_walls_of_digits(results, tmp_path):
+    made = public_calls._Made(tmp_path)
+    several = [getattr(made, name.removeprefix("make_")) for name in dir(made) if name.startswith("make_")]
+    own = [one for one in several if type(one).__module__.startswith("pachon") and type(one).__name__ in PUBLIC]
+    own += [made.spots.request, made.spots.request.pupil, made.lsst.obstructions, made.aberration, made.baseline]
+    # A configuration is its text, key by key.
+    walls = {type(one).__name__: len(repr(one)) for one in own if len(repr(one)) > 220}
+    assert set(walls) <= {"Configuration"}
+
+
 def test_summaries_are_json(results):
     for name, result in results.items():
         summary = result.summary()
