@@ -69,11 +69,11 @@ class Surface:
     def __post_init__(self) -> None:
         if len(self.vertex) != 3 or not np.all(np.isfinite(self.vertex)):
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
-        if self.rotation == IDENTITY:
-            return
         axes = np.array(self.rotation, dtype=np.float64)
         # 1e-9 admits what many rotations accumulate in rounding, and no scaling or reflection.
-        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-9) or np.linalg.det(axes) < 0:
+        if self.rotation != IDENTITY and (
+            axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-9) or np.linalg.det(axes) < 0
+        ):
             raise PrescriptionError(f"rotation = {self.rotation!r}: expected a 3 x 3 rotation matrix")
 
     @cached_property
