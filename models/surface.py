@@ -74,11 +74,11 @@ class Surface:
             raise PrescriptionError(f"vertex = {self.vertex!r}: expected three finite numbers")
         if self.semi_diameter is not None and not 0 < self.semi_diameter < np.inf:
             raise PrescriptionError(f"semi_diameter = {self.semi_diameter!r}: expected a positive number")
-        if self.rotation is IDENTITY:
-            return
         axes = np.array(self.rotation, dtype=np.float64)
         # 1e-9 admits what many rotations accumulate in rounding, and no scaling or reflection.
-        if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-9) or np.linalg.det(axes) < 0:
+        if self.rotation != IDENTITY and (
+            axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-9) or np.linalg.det(axes) < 0
+        ):
             raise PrescriptionError(f"rotation = {self.rotation!r}: expected a 3 x 3 rotation matrix")
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Picture of a telescope before and after an optimisation: sections and spots, each pair on one scale."""
+"""Picture of a telescope before and after an optimisation: sections, and spots on a scale of their own each."""
 
 from __future__ import annotations
 

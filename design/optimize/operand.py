@@ -17,10 +17,10 @@ from ...raytrace.rays import field_direction
 from .jacobian import ParameterColumns
 
 #: Classes of operands by their kinds, as in files.
-OPERANDS: dict[str, type[Operand]] = {}
+OPERANDS: dict[str, type[GoalOperand]] = {}
 #: Fields of the goal, and of how it is computed; the others say which number it is.
 _GOAL = ("value", "minimum", "maximum", "weight", "step")
-_Kind = TypeVar("_Kind", bound="type[Operand]")
+_Kind = TypeVar("_Kind", bound="type[GoalOperand]")
 
 
 def operand_kind(kind: str, unit: str) -> Callable[[_Kind], _Kind]:

@@ -39,7 +39,7 @@ from ...models.telescope import Telescope
 from ..parameters.changes import ANGLES, LENGTHS, parse_change
 from . import geometry_operands, ray_operands, targets
 from .configuration import DesignConfiguration
-from .operand import OPERANDS, Operand
+from .operand import OPERANDS, GoalOperand, Operand
 
 _DEGREE = ANGLES["deg"]
 #: Keys of files for the fields of operands, and their units in SI; other fields have their own names.
@@ -85,7 +85,7 @@ class OperandSection(Section):
     def operand(self) -> Operand:
         """Return the operand; ConfigError or DomainError where its numbers do not fit together."""
         cls, size = _kind(self.kind)
-        names = [f.name for f in dataclasses.fields(cls) if f.repr]  # type: ignore[arg-type]
+        names = [f.name for f in dataclasses.fields(cls) if f.repr]
         own = {n: _KEYS.get(n, (n, None)) for n in names if n not in ("value", "minimum", "maximum", "weight")}
         keys = [key for key, _ in own.values()]
         for key in self.model_fields_set - {"kind", "target", "min", "max", "weight"}:
@@ -98,14 +98,14 @@ class OperandSection(Section):
         for name, number in (("value", self.target), ("minimum", self.min), ("maximum", self.max)):
             if number is not None:
                 values[name] = number * size
-        needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING]  # type: ignore[arg-type]
+        needed = [f for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING]
         for one in needed:
             if one.name not in values:
                 raise ConfigError(f"operand {self.kind}: {own[one.name][0]} is missing")
         return cls(**values)
 
 
-def _kind(text: str) -> tuple[type[Operand], float]:
+def _kind(text: str) -> tuple[type[GoalOperand], float]:
     """Return the class of a kind with its unit, and the size of the unit in SI."""
     for kind, cls in OPERANDS.items():
         units = _UNITS[cls.unit]

@@ -158,7 +158,8 @@ def _given(variable: Variable, pair: tuple[float, float]) -> tuple[float, float]
         raise DomainError(
             f"bounds of {variable.address} = ({low:g}, {high:g}): expected radii of one sign; a curvature can have both"
         )
-    return tuple(sorted((1.0 / high if high else -np.inf, 1.0 / low if low else np.inf)))  # type: ignore[return-value]
+    ends = 1.0 / high if high else -np.inf, 1.0 / low if low else np.inf
+    return min(ends), max(ends)
 
 
 def _usual(telescopes: Sequence[Telescope], variable: Variable) -> tuple[float, float]:

@@ -127,6 +127,19 @@ def test_single_tolerances_replace_those_of_all(triplet):
     assert found["S2.radius_percent"].distribution == "end_point"
 
 
+def test_groups_and_mirrors(lsst_r):
+    """A group of the telescope tilts about its own pivot; mirrors have radii and irregularities as lenses do."""
+    content = {"surfaces": {"irregularity_nm": 20}, "tolerances": [{"name": "Camera.tilt_arcmin", "size": 1}]}
+    plan = plan_of(lsst_r, **content)
+    assert {"M1.irregularity_nm Z5", "M3.irregularity_nm Z15", "L3_exit.irregularity_nm Z9"} <= {
+        t.name for t in plan.tolerances
+    }
+    tilted = moved(plan, Camera_rx_arcmin=2.0)
+    expected = lsst_r.perturbed("Camera", tilt=(np.deg2rad(2.0 / 60.0), 0.0, 0.0))
+    for name in ("L1_entrance", "Detector"):
+        assert tilted.surface(name).vertex == pytest.approx(expected.surface(name).vertex, abs=1e-12)
+
+
 def test_named_degrees_of_freedom(lsst_r):
     content = dict(degrees_of_freedom="lsst", tolerances=[{"name": "M1M3_B3", "size": 0.1}], compensators=["Camera_dz"])
     plan = plan_of(lsst_r, **content)
