@@ -11,6 +11,9 @@ from public_calls import calls
 import pachon
 from pachon.core.docstrings import described
 
+# What is tested is made once for the file, in seconds.
+pytestmark = pytest.mark.long
+
 #: Units in which quantities are handed over, by what the docstrings say.
 OTHER = {"m": u.um, "rad": u.arcmin}
 #: Names of arguments that are lengths or angles, whatever the docstring says.

@@ -18,6 +18,9 @@ from pachon.pipeline.focal_plane_psf.mosaic import PsfShapes
 from pachon.studies.baseline.check import Deviation
 from pachon.studies.shimming.shim import Motion
 
+# What is tested is made once for the file, in seconds.
+pytestmark = pytest.mark.long
+
 PUBLIC = {name: getattr(pachon, name) for name in pachon.__all__}
 #: A focal plane has a table of its own, which :meth:`from_heights` reads back.
 OWN_TABLES = {"FocalPlane"}
