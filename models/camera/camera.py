@@ -98,9 +98,6 @@ class Camera:
     placement: np.ndarray | None = None
     """Nominal height [m] and rotations about x and y of the focal plane [rad] of each CCD, [n_ccd, 3]; zero if None."""
 
-    def __repr__(self) -> str:
-        return f"<Camera {self.name}: {len(self)} CCDs of {self.pixels} pixels of {self.pixel_size * 1e6:g} um>"
-
     def __post_init__(self) -> None:
         n = len(self.ccd_names)
         if not n:
