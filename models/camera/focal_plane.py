@@ -360,8 +360,7 @@ class FocalPlane(HeightMap):
         """Return an upper bound of the distance between mesh and surface.
 
         On a right triangle with two sides of one cell, linear interpolation is off by at most the largest second
-        derivative in any direction times the square of the cell's diagonal over 8 (the circumscribed circle's radius
-        squared over 2).
+        derivative in any direction times the square of the cell's diagonal over 8.
 
         Parameters
         ----------
