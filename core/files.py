@@ -209,17 +209,21 @@ def json_text(content: Any) -> str:
     return json.dumps(plain_values(content), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
 
 
-def plain_values(value: Any) -> Any:
-    """Return a value as JSON holds it: lists for arrays, None for numbers that are not finite, nine digits."""
+def plain_values(value: Any, digits: int | None = 9) -> Any:
+    """Return a value as JSON holds it: lists for arrays, None for numbers that are not finite, so many digits or all.
+
+    Nine digits are enough, and equal on machines whose sums differ in the last bits.
+    """
     if isinstance(value, dict):
-        return {str(k): plain_values(v) for k, v in value.items()}
+        return {str(k): plain_values(v, digits) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain_values(v) for v in value]
+        return [plain_values(v, digits) for v in value]
     if isinstance(value, np.ndarray):
-        return plain_values(value.tolist())
+        return plain_values(value.tolist(), digits)
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
-        # Nine digits are enough, and equal on machines whose sums differ in the last bits.
-        return float(f"{value:.9g}") if np.isfinite(value) else None
+        if not np.isfinite(value):
+            return None
+        return value if digits is None else float(f"{value:.{digits}g}")
     return value

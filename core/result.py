@@ -82,7 +82,7 @@ class Result:
 
     def summary(self) -> dict[str, Any]:
         """Return the results by name as plain numbers, texts and lists for JSON; None where there is no number."""
-        plain: dict[str, Any] = plain_values(self._summary())
+        plain: dict[str, Any] = plain_values(self._summary(), digits=None)
         return plain
 
     def to_table(self) -> QTable:

@@ -227,8 +227,10 @@ def chromatic_sums(
 
     Parameters
     ----------
-    telescope, field
-        As for :func:`seidel_sums`.
+    telescope : Telescope
+        Prescription; its surfaces must share one axis.
+    field : float, optional
+        Field angle of the chief ray [rad]; the radius of the field by default.
     wavelengths : array_like or Quantity, shape [2], optional
         Shortest and longest vacuum wavelength [m]; the edges of the band where not given. Rays are those of the
         telescope's default wavelength.

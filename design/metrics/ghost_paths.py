@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...core.errors import DomainError, unknown_name
+from ...models.design_data import DesignData
 from ...models.media.medium import Medium
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
@@ -178,6 +179,7 @@ class GhostTrace:
             groups={},
             group_frames={},
             obstructions=tuple(obstructions),
+            design_data=DesignData(),
         )
 
     def _landing(self, first: str, second: str, beam: _Beam) -> GhostLight:

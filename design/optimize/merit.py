@@ -6,6 +6,7 @@ The rays of a merit are those that are lit at the start; otherwise a merit could
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
-from ...raytrace.rays import Rays, RayStatus, parallel_rays
+from ...raytrace.rays import Rays, RayStatus, straight_bundles
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request, relative_weights
@@ -52,9 +53,16 @@ class Beams:
         return cls(request, relative_weights(field_weights, len(request.fields), "field_weights"))
 
     def rays(self, telescope: Telescope, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
-        """Return the rays of one wavelength, field by field; through other pupil points [m] if these are given."""
-        points = self.request.pupil.points if pupil is None else pupil
-        return parallel_rays(telescope, self.request.directions, wavelength, points)
+        """Return the rays of one wavelength, field by field; through other pupil points [m] if these are given.
+
+        Where they cross the entrance pupil does not change with the telescope: they are aimed at the stop of the one
+        that the request is of.
+        """
+        if pupil is None:
+            points = _entrance_points(self.request, wavelength)
+        else:
+            points = self.request.entrance_points(wavelength, pupil)
+        return straight_bundles(telescope, self.request.directions, wavelength, points)
 
     def weights(self, telescope: Telescope) -> np.ndarray:
         """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit."""
@@ -68,6 +76,11 @@ class Beams:
                 raise DomainError(f"{field_label(dark)}: no ray reaches the image of {telescope.name}")
             found.append(lit / total * self.field_weights[:, None])
         return np.array(found) * self.request.weights[:, None, None]
+
+
+@lru_cache(maxsize=32)
+def _entrance_points(request: Request, wavelength: float) -> np.ndarray:
+    return request.entrance_points(wavelength, request.pupil.points)
 
 
 class Merit(Protocol):

@@ -13,7 +13,8 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError
 from ...core.units import field_label
 from ...models.telescope import Telescope
-from ...raytrace.rays import RayStatus, parallel_rays
+from ...raytrace.launch import launch_bundles
+from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import image_jacobians
 from ...wavefront.opd import wavefront_opd
@@ -56,7 +57,7 @@ class IncidenceAngle(GoalOperand):
         surface = telescope.surface(self.surface)
         point = 0.5 * telescope.pupil_diameter * np.array([self.pupil], dtype=np.float64)
         light = direction_of(self.field, telescope)
-        rays = parallel_rays(telescope, light, wavelength_of(self.wavelength, telescope), point)
+        rays = launch_bundles(telescope, light, wavelength_of(self.wavelength, telescope), point)
         results = trace(telescope, rays, surfaces="all", threads=1)
         i = telescope.surface_names.index(surface.name)
         here = results[i]
@@ -138,7 +139,15 @@ class RmsSpot(_RmsOperand):
 @check_arguments
 @dataclass(frozen=True)
 class RmsWavefront(_RmsOperand):
-    """Rms wavefront [m] of one field point without piston and tilt; arguments as those of :class:`RmsSpot`."""
+    """Rms wavefront [m] of one field point without piston and tilt.
+
+    Parameters
+    ----------
+    field : tuple of float, shape (2,)
+        Field angles [rad].
+    wavelengths, n_pupil, value, minimum, maximum, weight
+        As of :class:`RmsSpot`.
+    """
 
     _merits: ClassVar[type[SpotMerit] | type[WavefrontMerit]] = WavefrontMerit
 

@@ -18,7 +18,7 @@
     draws: 1000
 
 `surfaces`, `elements` and `gaps` are the tolerances of all of them; those of the list replace what they name again.
-Sizes are in the unit at the end of the name. An element is a piece of glass or a cemented group. It is named E1, E2...
+Sizes are in the unit at the end of the name. An element is a piece of glass or a cemented group. It is named L1, L2...
 or, where it is a group of the telescope, as that.
 """
 
@@ -44,7 +44,7 @@ Pair = tuple[Real, Real]
 class ToleranceSection(Section):
     """Tolerance of one parameter, motion, compound or degree of freedom."""
 
-    name: str = Field(description="address and unit, such as S1.radius_mm, E2.tilt_arcmin, S1.irregularity_nm")
+    name: str = Field(description="address and unit, such as S1.radius_mm, L2.tilt_arcmin, S1.irregularity_nm")
     size: Positive = Field(description="largest deviation, or standard deviation, in the unit of the name")
     distribution: Distribution | None = Field(None, description="that of the file by default")
     limit: Positive | None = Field(None, description="largest deviation of a truncated distribution")

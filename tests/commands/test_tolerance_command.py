@@ -12,7 +12,7 @@ LENS = str(Path(__file__).parents[1] / "data" / "zmx" / "lens1.zmx")
 TOLERANCES = """
 fields_deg: [[0, 0], [0, 8]]
 rings: 2
-tolerances: [{name: E2.dy_um, size: 10}, {name: S4.thickness_um, size: 20}]
+tolerances: [{name: L2.dy_um, size: 10}, {name: S4.thickness_um, size: 20}]
 compensators: [Image.dz_um]
 requirement: 6
 draws: 12
@@ -56,7 +56,7 @@ def test_a_study_is_written_shown_and_resumed(capsys, in_folder, written):
     assert "--resume" in capsys.readouterr().err
     assert main([*command, "--resume"]) == 0
     out = capsys.readouterr().out
-    for words in ("E2.dy_um", "lower end [um]", "10 % loss at", "12 telescopes, traced", "requirement 6 um: met by"):
+    for words in ("L2.dy_um", "lower end [um]", "10 % loss at", "12 telescopes, traced", "requirement 6 um: met by"):
         assert words in out
     assert {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "points.tolerance"} == before
 

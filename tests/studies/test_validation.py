@@ -95,9 +95,11 @@ def test_files_of_the_project_have_no_problems():
 
 
 def test_lens_files_and_heights(tmp_path):
-    found = pachon.validate_file(ROOT / "tests/data/zmx/US05831776-1.zmx")
+    lens = (ROOT / "tests/data/zmx/lens1.zmx").read_text()
+    (tmp_path / "lens.zmx").write_text(lens.replace("TYPE STANDARD", "TYPE BINARY_2"))
+    found = pachon.validate_file(tmp_path / "lens.zmx")
     assert found.kind == "lens file"
-    assert "telecentric" in str(found.problems[0])
+    assert "BINARY_2" in str(found.problems[0])
     (tmp_path / "heights.csv").write_text("ccd,x\n1,2\n")
     assert pachon.validate_file(tmp_path / "heights.csv").problems
 

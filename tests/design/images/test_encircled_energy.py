@@ -74,11 +74,11 @@ def test_over_the_field_of_the_lsst():
     fields = np.deg2rad([[0.0, 0.0], [0.0, 0.7], [0.0, 1.0], [0.0, 1.4], [0.0, 1.75]])
     energy = encircled_energy(telescope, fields, 750e-9, pixels=160)
     summary = energy.summary()
-    radius = summary["ee80_radius_arcsec"]
+    radius = np.array(summary["ee80_radius_arcsec"])
     assert radius == pytest.approx(np.rad2deg(energy.radius_holding(0.8) * energy.plate_scale) * 3600.0)
     # FFT PSFs of batoid for this design gave 0.091, 0.088, 0.078 and 0.091; they hold the wings to about 40 um.
     assert radius[[0, 2, 3, 4]] == pytest.approx([0.091, 0.088, 0.078, 0.091], rel=0.035)
-    assert summary["ee50_radius_um"].max() < summary["ee80_radius_um"].min()
+    assert max(summary["ee50_radius_um"]) < min(summary["ee80_radius_um"])
     assert energy.plot().get_size_inches()[0] > 5
 
 

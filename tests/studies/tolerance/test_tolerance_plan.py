@@ -29,7 +29,7 @@ def moved(plan, **values):
 
 def test_elements_are_groups(triplet, lsst_r):
     lens, names = with_elements(triplet)
-    assert names == ("E1", "E2", "E3")
+    assert names == ("L1", "L2", "L3")
     assert [lens.groups[n] for n in names] == [("S1", "S2"), ("S3", "S4"), ("S6", "S7")]
     telescope, known = with_elements(lsst_r)
     # The camera's own groups are its elements.
@@ -38,7 +38,7 @@ def test_elements_are_groups(triplet, lsst_r):
     glued = replace(triplet.surface("S2"), medium_after=triplet.surface("S3").medium_after)
     cemented = replace(triplet, surfaces=tuple(glued if s.name == "S2" else s for s in triplet.surfaces))
     together, names = with_elements(cemented)
-    assert together.groups["E1"] == ("S1", "S2", "S3", "S4")
+    assert together.groups[names[0]] == ("S1", "S2", "S3", "S4")
 
 
 def test_tolerances_of_all_surfaces_elements_and_gaps(triplet):
@@ -50,11 +50,11 @@ def test_tolerances_of_all_surfaces_elements_and_gaps(triplet):
     )
     names = [t.name for t in plan.tolerances]
     assert names[:6] == [f"S{i}.radius_percent" for i in (1, 2, 3, 4, 6, 7)]
-    assert {n for n in names if n.startswith("E2")} == {
-        "E2.rx_arcmin",
-        "E2.ry_arcmin",
-        "E2.wedge_x_arcmin",
-        "E2.wedge_y_arcmin",
+    assert {n for n in names if n.startswith("L2")} == {
+        "L2.rx_arcmin",
+        "L2.ry_arcmin",
+        "L2.wedge_x_arcmin",
+        "L2.wedge_y_arcmin",
     }
     thicknesses = {t.name: t.size for t in plan.tolerances if "thickness" in t.name}
     assert thicknesses == {f"S{i}.thickness_um": 10 if i in (1, 3, 6) else 20 for i in (1, 2, 3, 4, 6)}
@@ -73,14 +73,14 @@ def test_what_the_numbers_mean(triplet):
     changed = moved(plan, S1_radius_percent=2.0)
     assert changed.surface("S1").shape.radius == pytest.approx(1.02 * triplet.surface("S1").shape.radius)
     arcmin = np.deg2rad(1 / 60)
-    wedge = moved(plan, E2_wedge_x_arcmin=3.0)
+    wedge = moved(plan, L2_wedge_x_arcmin=3.0)
     assert wedge.surface("S3") == triplet.surface("S3")
     assert wedge.surface("S4").matrix == pytest.approx(
         triplet.perturbed("S4", tilt=(3 * arcmin, 0, 0)).surface("S4").matrix
     )
     glass = moved(plan, S6_abbe_percent=-10.0).surface("S6").medium_after
     assert abbe_number(glass) == pytest.approx(0.9 * abbe_number(triplet.surface("S6").medium_after))
-    both = moved(plan, E1_dx_um=7.0)
+    both = moved(plan, L1_dx_um=7.0)
     assert [both.surface(n).vertex[0] for n in ("S1", "S2", "S3")] == pytest.approx([7e-6, 7e-6, 0.0])
     assert moved(plan, S2_radius_mm=1.0).surface("S2").shape.radius == pytest.approx(0.1812574754401636 + 1e-3)
 
@@ -153,7 +153,7 @@ def test_named_degrees_of_freedom(lsst_r):
         ({}, ConfigError, "tolerances = \\[\\]"),
         ({"tolerances": [{"name": "S9.dz_um", "size": 1}]}, UnknownNameError, r"tolerances.0.*S9"),
         ({"tolerances": [{"name": "S1.dz", "size": 1}]}, ConfigError, r"tolerances.S1.dz.*unit"),
-        ({"tolerances": [{"name": "S1.wedge_arcmin", "size": 1}]}, UnknownNameError, r"wedge.*E1"),
+        ({"tolerances": [{"name": "S1.wedge_arcmin", "size": 1}]}, UnknownNameError, r"wedge.*L1"),
         ({"tolerances": [{"name": "Image.irregularity_nm", "size": 1}]}, ConfigError, "clear aperture"),
         ({"tolerances": [{"name": "S1.irregularity_nm", "size": 1, "zernikes": [9, 5]}]}, ConfigError, "rise, from 4"),
         ({"tolerances": [{"name": "S1.dz_um", "size": 1, "limit": 2}]}, ConfigError, "truncated"),
