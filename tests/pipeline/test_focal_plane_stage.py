@@ -145,7 +145,7 @@ def test_a_finished_run_resumed_on_two_threads_has_the_same_bytes(whole_run, foc
     assert contents(tmp_path / "copy") == contents(whole_run)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_run_stopped_while_products_are_rewritten_goes_on_to_the_same_bytes(
     focal_plane_config, tmp_path, plane_model, no_report, monkeypatch
 ):
@@ -170,7 +170,7 @@ def test_a_run_stopped_while_products_are_rewritten_goes_on_to_the_same_bytes(
     assert contents(out) == contents(tmp_path / "at_once")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_run_that_grows_models_all_ccds_again(focal_plane_config, tmp_path, plane_model, no_report):
     options = {"stars__observed": 32}
     run(focal_plane_config(ccds=CCDS[:1], **options), tmp_path / "grows")
@@ -353,7 +353,7 @@ def test_too_few_stars_are_one_line(focal_plane_config, tmp_path, capsys):
     assert "30" in error
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_who_wants_no_progress_reads_the_warnings(focal_plane_config, tmp_path, plane_model, no_report, capsys):
     path = tmp_path / "small.yaml"
     path.write_text(to_yaml(focal_plane_config()))

@@ -118,7 +118,7 @@ def test_the_angle_is_a_parameter_of_sweeps(lsst_r, tmp_path):
     assert experiment.rotator == pytest.approx(np.pi / 6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_run_with_a_rotated_camera(tiny, tmp_path, monkeypatch):
     # Drawing the report takes longest, and others test it.
     monkeypatch.setattr(run_module, "draw_pictures", lambda *_: [])

@@ -46,7 +46,7 @@ def test_rays_end_on_the_surface_and_on_their_own_line(lsst_r, focal_plane, bund
         assert np.array_equal(end.ccd, focal_plane.ccd_at(x, y))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mesh_agrees_to_the_facet_error(lsst_r, focal_plane, bundles):
     cells = 24
     mesh = focal_plane.to_mesh(cells)

@@ -137,7 +137,7 @@ def _penalty_at(packed, problem, here, noise, blocks, spread):
 LAGS = 0.6 / 210.0 * np.array([3.0, 8.0, 16.0])  # 3, 8 and 16 arcmin of 210 over the field [m]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_variance_and_correlation_of_a_known_field_are_found():
     # One anisotropic component of 0.10 by 0.02 m; shapes of 1 % rms, noise of half that.
     angle = 0.5

@@ -209,7 +209,7 @@ def test_same_bytes_and_splitting():
     assert one.at(elsewhere[3]).tobytes() == whole[3].tobytes()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_blas_threads():
     code = (
         "import numpy as np, zlib; from pachon.pipeline.psf_model.model import PsfModel; g = np.random.default_rng(0);"

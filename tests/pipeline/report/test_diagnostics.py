@@ -118,6 +118,7 @@ def test_files_hold_what_was_returned(diagnosed):
         assert (diagnosed.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_same_bytes_again(finished_run, diagnosed, tmp_path):
     again = diagnose(finished_run, tmp_path / "again")
     for name in diagnosed.files:

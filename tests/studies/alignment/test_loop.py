@@ -67,7 +67,7 @@ def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
     assert again.visits == aligned.visits[:2]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_files_have_the_loop_and_states_go_into_runs(aligned, tmp_path):
     names = write_alignment(aligned, tmp_path)
     assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())

@@ -166,6 +166,7 @@ def test_a_dask_cluster_that_loses_a_worker_its_driver_and_its_scheduler(folder,
     assert figures("small.sweep") == reference
 
 
+@pytest.mark.slow
 def test_a_changed_sweep_is_refused_with_what_differs(folder, capsys):
     (folder / "small.yaml").write_text(SWEEP.replace("points: 14", "points: 1"))
     assert main(["sweep", "small.yaml", "--quiet"]) == 0
