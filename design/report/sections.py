@@ -49,6 +49,8 @@ class Where:
     @property
     def colors(self) -> Any:
         """Wavelengths [m] across the band where none are given."""
+        if self.telescope.design_data.wavelengths:
+            return self.wavelengths
         return band_wavelengths(self.telescope, self.wavelengths, 3)
 
 
