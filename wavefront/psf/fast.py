@@ -45,6 +45,8 @@ PUPIL_POINTS, PUPIL_POINTS_STILL = 334, 5000
 #: 1.25 they would make the edge of a stamp of 6 arcsec 1.5 times and its corners 2.2 times as bright as they are,
 #: at 1e-4 of the peak; with 2 they leave 1.1 and 1.2 times.
 GRID_MARGIN, GRID_MARGIN_STILL = 2.0, 1.25
+#: Fewest samples of a screen across the pupil, on which its points lie.
+LEAST_SAMPLES = 4
 #: Cells per pixel by default, with and without an atmosphere. A ray counts as spread over its cell, which is right on
 #: the mean over many rays; an undisturbed spot may be no larger than one cell of a quarter of a pixel.
 OVERSAMPLING, OVERSAMPLING_STILL = 2, 12
@@ -114,6 +116,12 @@ class FastPsfEngine(PsfEngine):
                 raise DomainError(
                     f"screen_length = {self._atmosphere.screen_length!r}: expected screens wider than the pupil,"
                     f" {diameter} m"
+                )
+            if pixel * LEAST_SAMPLES > diameter:
+                raise DomainError(
+                    f"screen_size = {self._atmosphere.screen_size}: expected at least"
+                    f" {math.ceil(self._atmosphere.screen_length * LEAST_SAMPLES / diameter)}, so that a pupil of"
+                    f" {diameter:g} m has {LEAST_SAMPLES} samples across"
                 )
         self._lattice = PupilLattice.fill(diameter, obscuration, spacing / self._finer)
         self._points = self._lattice.points

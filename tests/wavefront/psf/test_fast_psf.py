@@ -7,6 +7,7 @@ from scipy.optimize import brentq
 from scipy.special import j0
 
 from pachon.core.errors import DomainError
+from pachon.models.io.prescription import load_telescope
 from pachon.wavefront.atmosphere.atmosphere import Atmosphere
 from pachon.wavefront.atmosphere.layer_screens import SLOPE_LAG
 from pachon.wavefront.atmosphere.turbulence import (
@@ -352,3 +353,11 @@ def test_refuses_screens_narrower_than_the_pupil(polynomial_pupil):
     atmosphere = Atmosphere.from_site("cerro_pachon", 5, screen_size=64, screen_length=8.0, exposure=0.1)
     with pytest.raises(DomainError, match="wider than the pupil"):
         FastPsfEngine(polynomial_pupil().inputs(ONE_WAVE, PLANE, atmosphere=atmosphere))
+
+
+def test_screens_too_coarse_for_a_small_pupil_are_refused():
+    telescope = load_telescope("auxtel")  # of 1.2 m
+    coarse = {"screen_size": 256, "screen_length": 128.0, "exposure": 0.1}
+    air = Atmosphere.from_site("cerro_pachon", seed=2, **coarse)
+    with pytest.raises(DomainError, match=r"screen_size = 256: expected at least 427, .* 1\.2 m has 4 samples across"):
+        make_psfs(telescope, [(0.0, 0.0)], [620e-9], atmosphere=air)
