@@ -62,6 +62,7 @@ def converted(optic):
     ), wavelength, largest  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore:Material")  # glasses that two makers have
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SAMPLES)
 def test_aimed_rays_land_where_those_of_optiland_do(name):

@@ -22,7 +22,8 @@ SAMPLES = {
     "TelescopeDoublet", "TelescopeObjective48Inch", "TessarLens", "TripletTelescopeObjective", "UVProjectionLens",
     "UVReflectingMicroscope", "WideAngle100FOV", "WideAngle170FOV",
 }  # fmt: skip
-ZEMAX = sorted((Path(__file__).parents[1] / "data" / "zmx").glob("*.zmx"))
+TELECENTRIC = Path(__file__).parents[1] / "data" / "zmx" / "US05831776-1.zmx"
+ZEMAX = sorted(set(TELECENTRIC.parent.glob("*.zmx")) - {TELECENTRIC})
 
 
 def sample(name, path):
@@ -82,3 +83,9 @@ def test_rays_of_ours_written_for_optiland(name, tmp_path):
     pachon.save_telescope(pachon.load_telescope(name), tmp_path / "ours.json")
     # Optical paths of 20 m, in millimetres there.
     assert_same_rays(tmp_path / "ours.json", near=2e-13)
+
+
+def test_a_telecentric_object_space_is_refused(tmp_path):
+    with pytest.raises(pachon.PrescriptionError, match="telecentric object space cannot be written"):
+        pachon.save_telescope(pachon.load_telescope(TELECENTRIC), tmp_path / "ours.json")
+    assert not list(tmp_path.iterdir())

@@ -39,6 +39,9 @@ def test_rays_of_a_file(name):
     sequence.gaps[0].thi = 1.0
     sequence.update_model()
     wavelength = telescope.default_wavelength
+    # It looks for wavelengths of its own by their exact numbers.
+    nm = min(model["optical_spec"].spectral_region.wavelengths, key=lambda w: abs(w - wavelength * 1e9))
+    assert nm == pytest.approx(wavelength * 1e9, rel=1e-12)
     rng = np.random.default_rng(4)
     radius, angle = 0.5 * telescope.pupil_diameter * np.sqrt(rng.uniform(size=8)), rng.uniform(0, 2 * np.pi, 8)
     points = (radius * np.cos(angle), radius * np.sin(angle))
@@ -53,6 +56,6 @@ def test_rays_of_a_file(name):
             direction = along * [-1.0, 1.0, -1.0]
             start = np.array([x, y, z]) - direction * (z + 1.0) / direction[2]
             start[2] = 0.0
-            ray = trace.trace(sequence, start, direction, wavelength * 1e9)[0]
+            ray = trace.trace(sequence, start, direction, nm)[0]
             # 1 nm is what was asked for, 4e-14 m what is found.
             assert np.allclose(ours, ray[-1][0], rtol=0, atol=1e-12 * unit)

@@ -36,6 +36,8 @@ def telescope_to_optiland(telescope: Telescope) -> str:
             raise PrescriptionError("a file of optiland needs a detector as its last surface")
         if t.obstructions:
             raise PrescriptionError(f"obstruction {t.obstructions[0].name}: a file of optiland cannot hold meshes")
+        if t.design_data.telecentric:
+            raise PrescriptionError("a telecentric object space cannot be written")
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)
         surfaces = [
