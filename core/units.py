@@ -100,6 +100,12 @@ def require_positive(value: Any, name: str, unit: str = "") -> float:
     return number
 
 
+def require_all_positive(**values: Any) -> None:
+    """Raise :class:`DomainError` that names the first of the arguments that is no finite, positive number."""
+    for name, value in values.items():
+        require_positive(value, name)
+
+
 def radians(value: Any, name: str) -> np.ndarray:
     """Return an angle in radians as a float64 array; plain numbers are radians already."""
     return in_unit(value, u.rad, name)

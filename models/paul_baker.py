@@ -21,7 +21,7 @@ from dataclasses import replace
 
 from ..core.arguments import check_arguments
 from ..core.errors import DomainError
-from ..core.units import require_positive
+from ..core.units import require_all_positive
 from .aperture import Annulus, Circle
 from .first_order import footprints
 from .shapes.shape import Conic, Plane, Sphere
@@ -67,8 +67,7 @@ def paul_baker(
     DomainError
         If an argument is out of range, or the mirrors leave nothing of the primary.
     """
-    for name, value in (("diameter", diameter), ("focal_ratio", focal_ratio), ("field_radius", field_radius)):
-        require_positive(value, name)
+    require_all_positive(diameter=diameter, focal_ratio=focal_ratio, field_radius=field_radius)
     if not 0 < beam_compression < 0.5:
         raise DomainError(f"beam_compression = {beam_compression!r}: expected between 0 and 0.5")
     m = beam_compression

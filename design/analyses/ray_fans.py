@@ -203,7 +203,7 @@ def ray_fans(
     """
     request, pupil, axes, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
     n = len(request.fields)
-    (chief, *_) = (b.chief_landing() for b in bundles if b.wavelength == request.middle)
+    chief = bundles[request.middle_index].chief_landing()
     landing = np.stack([b.landing() - chief[:, None] for b in bundles], axis=1).reshape(n, len(bundles), 2, -1, 2)
     return RayFans(request, pupil, _lit(bundles), np.einsum("fwkpi,fji->fwkpj", landing, axes))
 

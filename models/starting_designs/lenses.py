@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...core.arguments import check_arguments
-from ...core.units import require_positive
+from ...core.units import require_all_positive
 from ..aperture import Circle
 from ..first_order import chromatic_sums, first_order, footprints, seidel_sums
 from ..io.glass_catalogue import GlassCatalogue
@@ -107,8 +107,7 @@ def singlet(diameter: float = 0.02, f_number: float = 10.0, *, field_radius: flo
     DomainError
         If a number is out of range, or there is no such lens.
     """
-    for name, value in (("diameter", diameter), ("f_number", f_number), ("field_radius", field_radius)):
-        require_positive(value, name)
+    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
     f = f_number * diameter
     glass = GlassCatalogue.bundled()["N-BK7"]
     n = float(glass.index(LINES[1]))
@@ -147,8 +146,7 @@ def doublet(diameter: float = 0.05, f_number: float = 8.0, *, field_radius: floa
     DomainError
         If a number is out of range, or there is no such lens.
     """
-    for name, value in (("diameter", diameter), ("f_number", f_number), ("field_radius", field_radius)):
-        require_positive(value, name)
+    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
     f = f_number * diameter
     glasses = [GlassCatalogue.bundled()[name] for name in ("N-BK7", "F2")]
     gaps = [0.08 * diameter + 0.35 * diameter**2 / f, 0.06 * diameter]
@@ -190,8 +188,7 @@ def triplet(diameter: float = 0.01, f_number: float = 5.0, *, field_radius: floa
     DomainError
         If a number is out of range.
     """
-    for name, value in (("diameter", diameter), ("f_number", f_number), ("field_radius", field_radius)):
-        require_positive(value, name)
+    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
     f = f_number * diameter
     crown, flint = (GlassCatalogue.bundled()[name] for name in ("N-SK16", "F2"))
     media = [crown, VACUUM, flint, VACUUM, crown, VACUUM]

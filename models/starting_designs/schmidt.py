@@ -12,7 +12,7 @@ import math
 from dataclasses import replace
 
 from ...core.arguments import check_arguments
-from ...core.units import require_positive
+from ...core.units import require_all_positive
 from ..aperture import Circle
 from ..first_order import seidel_sums
 from ..io.glass_catalogue import GlassCatalogue
@@ -48,8 +48,7 @@ def schmidt(diameter: float = 0.5, f_number: float = 2.5, *, field_radius: float
     DomainError
         If a number is out of range.
     """
-    for name, value in (("diameter", diameter), ("f_number", f_number), ("field_radius", field_radius)):
-        require_positive(value, name)
+    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
     f, rim = f_number * diameter, 0.5 * diameter
     thickness, center = _THICKNESS * diameter, 2.0 * f
     glass = GlassCatalogue.bundled()["N-BK7"]

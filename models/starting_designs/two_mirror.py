@@ -20,7 +20,7 @@ from typing import Literal
 
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError
-from ...core.units import require_positive
+from ...core.units import require_all_positive
 from ..aperture import Annulus, Circle, Complement
 from ..first_order import footprints
 from ..shapes.shape import Conic, Plane
@@ -74,9 +74,9 @@ def two_mirror(
     DomainError
         If a number is out of range, or the mirrors leave nothing of the primary.
     """
-    values = {"diameter": diameter, "f_number": f_number, "field_radius": field_radius}
-    for name, value in (*values.items(), ("primary_f_number", primary_f_number)):
-        require_positive(value, name)
+    require_all_positive(
+        diameter=diameter, f_number=f_number, field_radius=field_radius, primary_f_number=primary_f_number
+    )
     if not primary_f_number < f_number:
         raise DomainError(f"primary_f_number = {primary_f_number!r}: expected below f_number = {f_number:g}")
     f1, radius = primary_f_number * diameter, 0.5 * diameter
@@ -134,8 +134,7 @@ def newtonian(diameter: float = 0.2, f_number: float = 5.0, *, field_radius: flo
     DomainError
         If a number is out of range, or the flat covers the primary.
     """
-    for name, value in (("diameter", diameter), ("f_number", f_number), ("field_radius", field_radius)):
-        require_positive(value, name)
+    require_all_positive(diameter=diameter, f_number=f_number, field_radius=field_radius)
     f, radius = f_number * diameter, 0.5 * diameter
     # The focus stands a tenth of the diameter outside the tube.
     before = 0.6 * diameter

@@ -15,7 +15,7 @@ from ...models.telescope import Telescope
 from ...wavefront.atmosphere.layers import line_of_sight
 from ...wavefront.chief_rays import fields_at
 from ...wavefront.psf.engines import ENGINES
-from ...wavefront.psf.fast import LEAST_SAMPLES
+from ...wavefront.psf.fast import LEAST_SAMPLES, least_screen_size
 from ..config import Configuration
 
 
@@ -77,10 +77,10 @@ def check_samples(config: Configuration, telescope: Telescope) -> None:
     air = config.atmosphere
     if not air.enabled or not ENGINES[config.psf.engine].screens:
         return
-    sample, widest = air.screen_length_m / air.screen_size, telescope.pupil_diameter / LEAST_SAMPLES
-    if sample > widest:
+    least = least_screen_size(telescope.pupil_diameter, air.screen_length_m)
+    if air.screen_size < least:
         raise ConfigError(
-            f"atmosphere.screen_size = {air.screen_size}: expected at least {math.ceil(air.screen_length_m / widest)}, "
+            f"atmosphere.screen_size = {air.screen_size}: expected at least {least}, "
             f"so that a pupil of {telescope.pupil_diameter:g} m has {LEAST_SAMPLES} samples across, or a shorter "
             f"atmosphere.screen_length_m than {air.screen_length_m:g}"
         )

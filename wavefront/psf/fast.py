@@ -69,6 +69,11 @@ def rest_structure_function(separation: np.ndarray, r0: float, outer_scale: floa
     return np.maximum.accumulate(np.maximum(rest, 0.0))
 
 
+def least_screen_size(diameter: float, screen_length: float) -> int:
+    """Return the fewest samples of a screen [m] of which a pupil [m] has :data:`LEAST_SAMPLES` across."""
+    return math.ceil(LEAST_SAMPLES * screen_length / diameter)
+
+
 class FastPsfEngine(PsfEngine):
     """Geometric optics with filters.
 
@@ -117,10 +122,10 @@ class FastPsfEngine(PsfEngine):
                     f"screen_length = {self._atmosphere.screen_length!r}: expected screens wider than the pupil,"
                     f" {diameter} m"
                 )
-            if pixel * LEAST_SAMPLES > diameter:
+            least = least_screen_size(diameter, self._atmosphere.screen_length)
+            if self._atmosphere.screen_size < least:
                 raise DomainError(
-                    f"screen_size = {self._atmosphere.screen_size}: expected at least"
-                    f" {math.ceil(self._atmosphere.screen_length * LEAST_SAMPLES / diameter)}, so that a pupil of"
+                    f"screen_size = {self._atmosphere.screen_size}: expected at least {least}, so that a pupil of"
                     f" {diameter:g} m has {LEAST_SAMPLES} samples across"
                 )
         self._lattice = PupilLattice.fill(diameter, obscuration, spacing / self._finer)
