@@ -20,8 +20,8 @@ from .clear_pupil_kernels import find_edges
 
 # Spokes per ring: the phase of a blur varies some three times faster around the pupil than across its ring.
 _SPOKES_PER_RING = 3.2
-# More rings, of polynomials of a higher degree, add nothing.
-_MOST_RINGS = 12
+#: Most rings; more, of polynomials of a higher degree, add nothing.
+MOST_RINGS = 12
 # Rays on a spoke that determine the rims of apertures, by parabolas.
 _EDGE_RINGS = 3
 
@@ -44,7 +44,7 @@ class SpokePupil:
     def fill(cls, diameter: float, obscuration: float, count: int) -> SpokePupil:
         """Return approximately ``count`` points of an annulus of given diameter [m] and linear obscuration."""
         require_count(count, "n_pupil", 10)
-        n_ring = min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), _MOST_RINGS)
+        n_ring = min(math.ceil(math.sqrt(count / _SPOKES_PER_RING)), MOST_RINGS)
         n_spoke = 4 * max(1, round(count / (4 * n_ring)))
         legendre = np.polynomial.legendre.Legendre.basis(n_ring - 1)
         node = np.concatenate([[-1.0], np.sort(legendre.deriv().roots().real), [1.0]])

@@ -156,7 +156,7 @@ class FastPsfEngine(PsfEngine):
         rest = self._rest(baseline)
         if rest is not None:
             table *= coherence(rest, self._wavelengths[:, None])
-        return float(baseline[1]), table[self._channels.wave].astype(np.float32)
+        return float(baseline[1]), table.astype(np.float32)
 
     def _rest(self, baseline: np.ndarray) -> np.ndarray | None:
         """Return the structure function of the air beside that of the rays [m^2] at baselines [m], if any."""
@@ -279,7 +279,7 @@ class FastPsfEngine(PsfEngine):
                 warp_array(spectra, wp.vec2f),
                 float(self._kx[1]),
                 warp_array(metric_of(optics.jacobian), wp.float32),
-                warp_array((self._wavelengths[wave] / (2.0 * math.pi)).astype(np.float32), wp.float32),
+                warp_array((self._wavelengths / (2.0 * math.pi)).astype(np.float32), wp.float32),
                 warp_array(self._filter, wp.float32),
                 self._filter_step,
                 warp_array(self._detector, wp.float32),

@@ -162,13 +162,16 @@ def combine_wavelengths(
 ):
     """Filter the transforms of one star's channels and add them up, one row of frequencies an item.
 
+    Channels are the depths of each wavelength, as many of each.
+
     Arguments: spectra [star, channel, ky, kx]; frequency: step of the frequencies [rad/m]; metric [star, 3]: xx, xy, yy
-    of jacobian @ jacobian.T [m^2/rad^2]; baseline [channel]: wavelength / 2 pi [m]; table [channel, sample]: filter
+    of jacobian @ jacobian.T [m^2/rad^2]; baseline [wave]: wavelength / 2 pi [m]; table [wave, sample]: filter
     against the baseline in the pupil, at steps of table_step [m]; detector [ky, kx]: real filter of all channels;
     ramp_x [star, channel, kx], ramp_y [star, channel, ky]: phase factors and weights; combined [star, ky, kx]: the sum.
     """
     item = first + wp.tid()
     n_row = spectra.shape[2]
+    n_depth = spectra.shape[1] // table.shape[0]
     star = item // n_row
     row = item % n_row
     ky = wp.float32(wp.where(2 * row > n_row, row - n_row, row)) * frequency
@@ -176,12 +179,13 @@ def combine_wavelengths(
         kx = wp.float32(column) * frequency
         separation = wp.sqrt(squared_baseline(metric, star, kx, ky)) / table_step
         total = wp.vec2f(0.0, 0.0)
-        for wave in range(spectra.shape[1]):
+        for wave in range(table.shape[0]):
             value = tabulated(table, wave, separation * baseline[wave])
-            px = ramp_x[star, wave, column]
-            py = ramp_y[star, wave, row]
-            re = px[0] * py[0] - px[1] * py[1]
-            im = px[0] * py[1] + px[1] * py[0]
-            s = spectra[star, wave, row, column]
-            total = total + wp.vec2f(s[0] * re - s[1] * im, s[0] * im + s[1] * re) * value
+            for part in range(wave * n_depth, (wave + 1) * n_depth):
+                px = ramp_x[star, part, column]
+                py = ramp_y[star, part, row]
+                re = px[0] * py[0] - px[1] * py[1]
+                im = px[0] * py[1] + px[1] * py[0]
+                s = spectra[star, part, row, column]
+                total = total + wp.vec2f(s[0] * re - s[1] * im, s[0] * im + s[1] * re) * value
         combined[star, row, column] = total * detector[row, column]

@@ -51,7 +51,7 @@ _NEGLIGIBLE = 1e-5
 # Largest coherence at a baseline as long as the pupil's ring is wide, where the strips along its rims would meet.
 _LARGEST_LEFT = 1e-3
 # Stars of one batch, fewer where the room for their waves would fill more than this many bytes.
-_BATCH, _BATCH_BYTES = 256, 1 << 24
+_BATCH, _BATCH_BYTES = 256, 1 << 25
 # Samples of the filter against the baseline: linear interpolation is then good to 1e-6.
 _TABLE_SIZE = 2048
 
@@ -187,9 +187,10 @@ class LongExposureEngine(PsfEngine):
         n_star, _, n_point = optics.lit.shape
         n_row, n_packet = self._detector.shape[1:3]
         landed = np.isfinite(optics.displacement).all(axis=(1, 3)).astype(np.float64)
-        wave = self._channels.wave
+        channels = self._channels
+        n_wave, depths = len(self._wavelengths), channels.depths
         # Place and light of the points, cut and lean of the strips along the rims.
-        shapes = (len(wave), 2, n_point), (n_point,), (2 * pupil.n_spoke, 2), (len(wave), 2 * pupil.n_spoke, 2)
+        shapes = (n_wave * depths, 2, n_point), (n_point,), (2 * pupil.n_spoke, 2), (n_wave, 2 * pupil.n_spoke, 2)
         points = [wp.empty((n_star, *shape), dtype=wp.float32, device="cpu") for shape in shapes]
         launch(
             place_points,
@@ -198,21 +199,21 @@ class LongExposureEngine(PsfEngine):
                 *(warp_array(rule) for rule in (pupil.radius, pupil.inverse, pupil.fraction, pupil.quadrature)),
                 warp_array(pupil.unit, wp.vec2d),
                 warp_array(edges, wp.float64),
-                warp_array(self._channels.displacement(optics), wp.float32),
+                warp_array(optics.displacement, wp.float32),
                 warp_array(landed, wp.float64),
                 warp_array(optics.jacobian, wp.mat22d),
-                warp_array(self._dispersion[wave], wp.vec2d),
+                warp_array(optics.reference_cosines, wp.vec2d),
+                warp_array(self._dispersion, wp.vec2d),
+                warp_array(channels.shift.reshape(n_wave, depths), wp.float64),
+                warp_array(channels.of_wavelength(channels.shift), wp.float64),
                 self.period,
                 warp_array(area, wp.float64),
                 *points,
             ],
             threads=self._threads,
         )
-        *points, lean = points
-        depths = self._channels.depths
-        lean = np.moveaxis(self._channels.of_wavelength(np.moveaxis(lean.numpy(), 1, 0)), 0, 1).astype(np.float32)
-        room = (n_star, depths * n_point, n_packet, 2, LANES)
-        along_x, along_y = np.empty(room, dtype=np.float32), np.empty(room, dtype=np.float32)
+        along_x = np.empty((n_star, n_packet, depths * n_point, 2, LANES), dtype=np.float32)
+        along_y = np.empty((n_star, n_packet * LANES, depths * n_point, 2), dtype=np.float32)
         spectrum = np.empty((n_star, 4, n_row, n_packet, LANES), dtype=np.float32)
         launch(
             transform_pupils,
@@ -221,7 +222,6 @@ class LongExposureEngine(PsfEngine):
                 pupil.n_spoke,
                 depths,
                 *points,
-                warp_array(lean, wp.float32),
                 warp_array(self._fade_x, samples),
                 warp_array(self._fade_y, samples),
                 warp_array(self._wavelengths.astype(np.float32), wp.float32),
@@ -230,8 +230,7 @@ class LongExposureEngine(PsfEngine):
                 warp_array(self._filter, wp.float32),
                 warp_array(self._filter_steps, wp.float32),
                 warp_array(along_x, samples),
-                warp_array(along_y, samples),
-                warp_array(along_y.reshape(n_star, -1), wp.float32),
+                warp_array(along_y, wp.float32),
                 warp_array(spectrum, samples),
             ],
             threads=self._threads,

@@ -5,10 +5,13 @@ from __future__ import annotations
 import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
+from .clear_pupil import MOST_RINGS
 from .packet_functions import squared_baseline, tabulated, unit_circle
 from .sample_packets import LANES, samples
 
 wp.set_module_options(FORWARD_OPTIONS)
+
+ring_values = wp.types.vector(MOST_RINGS, wp.float64)
 
 
 @wp.func
@@ -59,7 +62,10 @@ def place_points(
     displacement: wp.array4d(dtype=wp.float32),
     landed: wp.array2d(dtype=wp.float64),
     jacobian: wp.array(dtype=wp.mat22d),
+    cosines: wp.array(dtype=wp.vec2d),
     dispersion: wp.array(dtype=wp.vec2d),
+    shift: wp.array2d(dtype=wp.float64),
+    mean_shift: wp.array(dtype=wp.float64),
     period: wp.float64,
     area: wp.array(dtype=wp.float64),
     place: wp.array4d(dtype=wp.float32),
@@ -71,12 +77,14 @@ def place_points(
 
     Arguments: radius [ring] of the traced points [m]; inverse [ring, ring] of the differences of radii [1/m]; fraction
     [ring] of the clear area of the spoke within a point; quadrature [ring]: weights, of sum 1; unit [spoke]: direction;
-    edges [star, spoke, 2] [m]; displacement [star, channel, ring * n_spoke + spoke, 2] of the traced points [m]; landed
-    [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; dispersion [channel]
-    [rad]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the order of the traced
-    ones and rims as [2, n_spoke]: place [star, channel, 2, point] [periods]; light [star, point]: part of the pupil;
-    cut [star, rim, 2]: part of the pupil per metre of wavelength and step of frequency; lean [star, channel, rim, 2]:
-    phase half-way through the part cut off, against the rim, over that part, per step of frequency [rad].
+    edges [star, spoke, 2] [m]; displacement [star, wave, ring * n_spoke + spoke, 2] of the traced points [m]; landed
+    [star, ring * n_spoke + spoke]: 1, or 0 for a ray that was lost; jacobian [star] [m/rad]; cosines [star] of the
+    chief ray along the detector; dispersion [wave] [rad]; shift [wave, depth]: path in silicon over its index, and its
+    mean_shift [wave] [m]; period of the images [m]; area [star]: the clear pupil [m^2]. Results, with points in the
+    order of the traced ones and rims as [2, n_spoke]: place [star, wave * n_depth + depth, 2, point] [periods]; light
+    [star, point]: part of the pupil; cut [star, rim, 2]: part of the pupil per metre of wavelength and step of
+    frequency; lean [star, wave, rim, 2]: phase half-way through the part cut off, against the rim, over that part, per
+    step of frequency [rad].
     """
     item = first + wp.tid()
     n_spoke = unit.shape[0]
@@ -93,6 +101,10 @@ def place_points(
     for ring in range(n_ring):
         known = known + landed[star, ring * n_spoke + spoke]
     clear = span > zero and known > zero
+    # Direction cosines of the light at the image change along the spoke by this per metre.
+    turn = -wp.transpose(wp.inverse(jacobian[star])) * unit[spoke]
+    values = ring_values()
+    slopes = ring_values()
     for ring in range(n_ring):
         point = ring * n_spoke + spoke
         light[star, point] = wp.float32(0.0)
@@ -112,21 +124,29 @@ def place_points(
             across = across * (half / (period * area[star]))
             if at > zero:
                 depth = wp.where(end == 0, -half, half) * area[star] / (at * angle)
-        for part in range(displacement.shape[1]):
-            landing = jacobian[star] * dispersion[part]
+        for k in range(n_ring):
+            value, rate = basis(radius, inverse, landed, star, spoke, n_spoke, k, at)
+            values[k] = value
+            slopes[k] = rate
+        steepness = cosines[star] + at * turn
+        for wave in range(displacement.shape[1]):
+            landing = jacobian[star] * dispersion[wave]
             slope = wp.vec2d(zero, zero)
             for k in range(n_ring):
                 if landed[star, k * n_spoke + spoke] > zero:
-                    value, rate = basis(radius, inverse, landed, star, spoke, n_spoke, k, at)
-                    x = wp.float64(displacement[star, part, k * n_spoke + spoke, 0])
-                    y = wp.float64(displacement[star, part, k * n_spoke + spoke, 1])
-                    landing = landing + wp.vec2d(value * x, value * y)
-                    slope = slope + wp.vec2d(rate * x, rate * y)
-            place[star, part, 0, point] = wp.float32(landing[0] / period)
-            place[star, part, 1, point] = wp.float32(landing[1] / period)
+                    x = wp.float64(displacement[star, wave, k * n_spoke + spoke, 0])
+                    y = wp.float64(displacement[star, wave, k * n_spoke + spoke, 1])
+                    landing = landing + wp.vec2d(values[k] * x, values[k] * y)
+                    slope = slope + wp.vec2d(slopes[k] * x, slopes[k] * y)
+            for d in range(shift.shape[1]):
+                deep = landing + shift[wave, d] * steepness
+                part = wave * shift.shape[1] + d
+                place[star, part, 0, point] = wp.float32(deep[0] / period)
+                place[star, part, 1, point] = wp.float32(deep[1] / period)
             if outermost:
-                lean[star, part, rim, 0] = wp.float32(depth * tau / period * slope[0])
-                lean[star, part, rim, 1] = wp.float32(depth * tau / period * slope[1])
+                slope = slope + mean_shift[wave] * turn
+                lean[star, wave, rim, 0] = wp.float32(depth * tau / period * slope[0])
+                lean[star, wave, rim, 1] = wp.float32(depth * tau / period * slope[1])
         if outermost:
             cut[star, rim, 0] = wp.float32(across[0])
             cut[star, rim, 1] = wp.float32(across[1])
@@ -184,21 +204,19 @@ def transform_pupils(
     table: wp.array2d(dtype=wp.float32),
     per_step: wp.array(dtype=wp.float32),
     along_x: wp.array4d(dtype=samples),
-    along_y: wp.array4d(dtype=samples),
-    at_y: wp.array2d(dtype=wp.float32),
+    along_y: wp.array4d(dtype=wp.float32),
     spectrum: wp.array4d(dtype=samples),
 ):
     """Add up the transfer functions of one star's wavelengths, over columns m and rows +n and -n of frequencies.
 
     A wavelength has ``n_depth`` channels, with the light of the same points at other places.
 
-    Arguments: place, light, cut as ``place_points`` leaves them; lean [star, wave, rim, 2] of the channels of a
-    wavelength together; fade_x, fade_y [channel, packet]: their filters along x, with their weights, and along y;
+    Arguments: place, light, cut as ``place_points`` leaves them; fade_x, fade_y [channel, packet]: their filters along x, with their weights, and along y;
     wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @
     jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of the table per step of
-    frequency, for a unit Jacobian; along_x, along_y [star, depth * n_point + point, packet, 2]: room for cosines and
-    sines; at_y: along_y as plain numbers [star, ...]; spectrum [star, 4, row, packet]: real and imaginary parts at +n,
-    and at -n.
+    frequency, for a unit Jacobian; along_x [star, packet, depth * n_point + point, 2] and along_y [star, row, depth *
+    n_point + point, 2]: room for cosines and sines, side by side as the sums over points read them; spectrum [star, 4,
+    row, packet]: real and imaginary parts at +n, and at -n.
     """
     star = first + wp.tid()
     n_wave = wavelength.shape[0]
@@ -224,30 +242,30 @@ def transform_pupils(
                     number = lane_numbers(packet)
                     cosine, sine = unit_circle(-x * number)
                     fade = scale * fade_x[part, packet]
-                    along_x[star, here, packet, 0] = wp.cw_mul(fade, cosine)
-                    along_x[star, here, packet, 1] = wp.cw_mul(fade, sine)
-                for packet in range(along_y.shape[2]):
+                    along_x[star, packet, here, 0] = wp.cw_mul(fade, cosine)
+                    along_x[star, packet, here, 1] = wp.cw_mul(fade, sine)
+                for packet in range(n_packet):
                     number = lane_numbers(packet)
                     cosine, sine = unit_circle(-y * number)
-                    fade = fade_y[part, packet]
-                    along_y[star, here, packet, 0] = wp.cw_mul(fade, cosine)
-                    along_y[star, here, packet, 1] = wp.cw_mul(fade, sine)
-        stride = 2 * LANES * along_y.shape[2]
+                    cosine = wp.cw_mul(fade_y[part, packet], cosine)
+                    sine = wp.cw_mul(fade_y[part, packet], sine)
+                    for i in range(LANES):
+                        along_y[star, packet * LANES + i, here, 0] = cosine[i]
+                        along_y[star, packet * LANES + i, here, 1] = sine[i]
         for packet in range(n_packet):
             number = lane_numbers(packet)
             for row in range(rows[packet]):
                 ky = wp.float32(row)
-                here = (row // LANES) * 2 * LANES + row % LANES
                 cc = samples()
                 ss = samples()
                 cs = samples()
                 sc = samples()
                 for depth in range(n_depth):
                     for point in range(depth * n_point + inner_end, depth * n_point + outer_start):
-                        a = along_x[star, point, packet, 0]
-                        b = along_x[star, point, packet, 1]
-                        c = at_y[star, point * stride + here]
-                        d = at_y[star, point * stride + here + LANES]
+                        a = along_x[star, packet, point, 0]
+                        b = along_x[star, packet, point, 1]
+                        c = along_y[star, row, point, 0]
+                        d = along_y[star, row, point, 1]
                         cc = cc + c * a
                         ss = ss + d * b
                         cs = cs + d * a
@@ -261,20 +279,20 @@ def transform_pupils(
                     point = rim
                     if rim >= n_spoke:
                         point = rim + outer_start - n_spoke
-                    a = along_x[star, point, packet, 0]
-                    b = along_x[star, point, packet, 1]
-                    c = at_y[star, point * stride + here]
-                    d = at_y[star, point * stride + here + LANES]
+                    a = along_x[star, packet, point, 0]
+                    b = along_x[star, packet, point, 1]
+                    c = along_y[star, row, point, 0]
+                    d = along_y[star, row, point, 1]
                     cc = c * a
                     ss = d * b
                     cs = d * a
                     sc = c * b
                     for depth in range(1, n_depth):
                         deeper = depth * n_point + point
-                        a = along_x[star, deeper, packet, 0]
-                        b = along_x[star, deeper, packet, 1]
-                        c = at_y[star, deeper * stride + here]
-                        d = at_y[star, deeper * stride + here + LANES]
+                        a = along_x[star, packet, deeper, 0]
+                        b = along_x[star, packet, deeper, 1]
+                        c = along_y[star, row, deeper, 0]
+                        d = along_y[star, row, deeper, 1]
                         cc = cc + c * a
                         ss = ss + d * b
                         cs = cs + d * a
