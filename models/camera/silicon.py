@@ -13,6 +13,7 @@ drifted, :math:`t` the thickness and :math:`\sigma` the spread from the surface,
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -77,22 +78,7 @@ class Silicon:
         It integrates polynomials of the path up to the order ``2 count - 1`` (Golub & Welsch 1969, Math. Comp. 23,
         221).
         """
-        from scipy.linalg import eigh_tridiagonal
-
-        length = self.absorption_length(wavelength)
-        path = 0.5 * min(self.thickness / length, _ALL_ABSORBED) * (_NODE + 1.0)
-        density = _WEIGHT * np.exp(-path)
-        density /= density.sum()
-        # Recurrence of the orthonormal polynomials of the distribution, by Stieltjes' procedure.
-        diagonal, beside = np.empty(count), np.zeros(count)
-        before, now = np.zeros_like(path), np.ones_like(path)
-        for k in range(count):
-            diagonal[k] = density @ (path * now**2)
-            after = (path - diagonal[k]) * now - beside[k - 1] * before
-            beside[k] = math.sqrt(density @ after**2)
-            before, now = now, after / beside[k]
-        roots, vectors = eigh_tridiagonal(diagonal, beside[: count - 1])
-        return ConversionPaths(length * roots, self.absorbed(wavelength) * vectors[0] ** 2)
+        return _gauss_rule(self, length(wavelength, "wavelength"), count)
 
     def defocus(self, wavelength: ArrayLike) -> tuple[float, float]:
         """Return mean and rms about it of the equivalent defocus [m], behind the surface, at a vacuum wavelength [m].
@@ -111,3 +97,27 @@ class Silicon:
         ``from_surface`` [m] is that of charge which drifts through the whole thickness.
         """
         return from_surface * np.sqrt(np.clip(1.0 - path / self.thickness, 0.0, 1.0))
+
+
+@functools.lru_cache(maxsize=256)
+def _gauss_rule(silicon: Silicon, wavelength: float, count: int) -> ConversionPaths:
+    """Return the rule of :meth:`Silicon.paths`; maps of many fields ask for the same one again and again."""
+    from scipy.linalg import eigh_tridiagonal
+
+    length = silicon.absorption_length(wavelength)
+    path = 0.5 * min(silicon.thickness / length, _ALL_ABSORBED) * (_NODE + 1.0)
+    density = _WEIGHT * np.exp(-path)
+    density /= density.sum()
+    # Recurrence of the orthonormal polynomials of the distribution, by Stieltjes' procedure.
+    diagonal, beside = np.empty(count), np.zeros(count)
+    before, now = np.zeros_like(path), np.ones_like(path)
+    for k in range(count):
+        diagonal[k] = density @ (path * now**2)
+        after = (path - diagonal[k]) * now - beside[k - 1] * before
+        beside[k] = math.sqrt(density @ after**2)
+        before, now = now, after / beside[k]
+    roots, vectors = eigh_tridiagonal(diagonal, beside[: count - 1])
+    rule = ConversionPaths(length * roots, silicon.absorbed(wavelength) * vectors[0] ** 2)
+    # Shared by all callers.
+    rule.length.flags.writeable = rule.weight.flags.writeable = False
+    return rule

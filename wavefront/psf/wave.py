@@ -220,11 +220,14 @@ class WavePsfEngine(PsfEngine):
         # the wavenumber on the focal plane of a baseline of one step in x and in y, by the sign of the transform
         per_step = -2.0 * math.pi * self._lattice.spacing * np.linalg.inv(jacobian)
         spectra = np.zeros((len(self._wavelengths), len(step), len(step)), dtype=np.complex128)
-        for wave, variance, square in zip(self._channels.wave, self._channels.variance, intensity, strict=True):
-            along = per_step[0, :, None, None] * step + per_step[1, :, None, None] * step[:, None]
-            k = along / self._wavelengths[wave]
-            spread = np.exp(-0.5 * variance * (k * k).sum(axis=0)) if variance else 1.0
-            spectra[wave] += scipy.fft.ifft2(square)[np.ix_(step, step)] * (self._plane.transfer(*k) * spread)
+        channels, depths = self._channels, self._channels.depths
+        for wave, wavelength in enumerate(self._wavelengths):
+            k = (per_step[0, :, None, None] * step + per_step[1, :, None, None] * step[:, None]) / wavelength
+            transfer, square = self._plane.transfer(*k), (k * k).sum(axis=0)
+            for channel in range(wave * depths, (wave + 1) * depths):
+                variance = channels.variance[channel]
+                filters = transfer * np.exp(-0.5 * variance * square) if variance else transfer
+                spectra[wave] += scipy.fft.ifft2(intensity[channel])[np.ix_(step, step)] * filters
         return spectra
 
     def _sample(self, spectra: np.ndarray, jacobian: np.ndarray, offset: np.ndarray) -> np.ndarray:
