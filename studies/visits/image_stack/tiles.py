@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,8 @@ NO_DATA = 1
 STACK_MASK_BITS = {NO_DATA: "NO_DATA"}
 #: Bytes of a pixel of a tile: sums of data and variance, number of visits.
 BYTES = 10
+#: Nodes along a side of a CCD that tell which part of it touches tiles.
+_NODES = 65
 #: Visits, and points along a side of a tile, that tell how much of it visits see.
 _VISITS, _POINTS = 10, 5
 
@@ -174,23 +176,24 @@ class TileSums:
         return cls(hdus[0].header[VISITS_CARD], data, variance, np.array(hdus["COUNT"].data, dtype=np.int16))
 
 
-def window_on(tiles: Sequence[Tile], pixels: int, frame_at: np.ndarray, nodes: np.ndarray) -> Window | None:
-    """Return the part of a CCD of `pixels` x `pixels` that touches tiles; None if none does.
+def window_on(tiles: Sequence[Tile], wcs: CcdWcs, to_frame: Callable[[np.ndarray], np.ndarray]) -> Window | None:
+    """Return the part of a CCD that touches tiles; None if none does.
 
-    `frame_at` [n, n, 2] are the places in the frame of the pixels `nodes` [n] along x and y of the CCD.
+    `to_frame` gives the places in the frame, shape [n, 2], of pixels (x, y) of the CCD, shape [n, 2].
     """
-    step = float(nodes[1] - nodes[0])
-    places = frame_at.reshape(-1, 2)
+    height, width = wcs.shape
+    nodes = [np.linspace(0.0, n - 1.0, _NODES) for n in (width, height)]
+    steps = [float(line[1]) for line in nodes]
+    places = to_frame(np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 2))
     # Nodes are less than a step and a half from any pixel between them, along each axis of a rolled frame.
-    near = np.any([tile.inside.contains(places - tile.first, 1.5 * step) for tile in tiles], axis=0).reshape(
-        frame_at.shape[:2]
-    )
+    near = np.any([tile.inside.contains(places - tile.first, 1.5 * max(steps)) for tile in tiles], axis=0)
+    near = near.reshape(_NODES, _NODES)
     if not near.any():
         return None
     ends = []
-    for axis in (0, 1):
+    for axis, (line, step, pixels) in enumerate(zip(nodes, steps, (width, height), strict=True)):
         own = np.flatnonzero(near.any(axis=axis))
-        low, high = nodes[own[0]] - step, nodes[own[-1]] + step
+        low, high = line[own[0]] - step, line[own[-1]] + step
         ends.append((max(0, int(low)), min(pixels, int(np.ceil(high)) + 1)))
     (x0, x1), (y0, y1) = ends
     return Window(x0, y0, x1 - x0, y1 - y0)
