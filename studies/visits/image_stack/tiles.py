@@ -61,6 +61,7 @@ class Tile:
         nothing = np.zeros((2, 2, 2))
         return CcdWcs(
             pointing=(0.0, 0.0),
+            reference=(0.0, 0.0),
             shape=(self.side, self.side),
             reference_pixel=-self.first,
             cd=np.linalg.inv(frame.matrix),
