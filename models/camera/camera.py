@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, check_unique, unknown_name
+from ...core.errors import DomainError, check_unique, unknown_name
 from ...core.units import plane_points
 
 if TYPE_CHECKING:
@@ -197,12 +197,6 @@ class Camera:
         quarters = round(float(self.rotation_deg[ccd]) / 90.0)
         a, b = (b - rim, a - rim) if quarters % 2 else (a - rim, b - rim)
         return (x - a, x + a, y - b, y + b), float(np.deg2rad(self.rotation_deg[ccd] - 90.0 * quarters))
-
-    def square_pixels(self) -> int:
-        """Return the pixels along a side of equal square CCDs; ConfigError where they are not `alike`."""
-        if not self.alike:
-            raise ConfigError(f"camera = {self.name}: expected equal square CCDs along the axes of the focal plane")
-        return int(self.pixels[0, 0])
 
     def turned(self, angle_deg: float) -> Camera:
         """Return the camera in axes of the focal plane that are turned from +x towards +y [deg]; quarters are exact."""
