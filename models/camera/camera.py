@@ -200,6 +200,8 @@ class Camera:
 
     def turned(self, angle_deg: float) -> Camera:
         """Return the camera in axes of the focal plane that are turned from +x towards +y [deg]; quarters are exact."""
+        if not np.isfinite(angle_deg):
+            raise DomainError(f"angle_deg = {angle_deg}: expected a finite number of degrees")
         cosine, sine = _directions(np.array(angle_deg))
 
         def along(vectors: np.ndarray) -> np.ndarray:

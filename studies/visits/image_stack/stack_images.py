@@ -227,8 +227,7 @@ def _add_visit(
     """Draw the CCDs of a visit that touch tiles, and add them to the sums."""
     exposure, windows = stack.exposure(), {}
     for name, own in wcs.items():
-        to_sky = VisitWcs(own, visit).to_sky
-        window = window_on(list(due), own, lambda pixels, to_sky=to_sky: to_sky(pixels) @ stack.frame.matrix.T)
+        window = window_on(list(due), stack.frame, VisitWcs(own, visit))
         if window is not None:
             windows[name] = window
     experiment = visit_experiment(stack.experiment, visit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from astropy.io import fits
 
 from ....core.errors import DomainError, ProductError
 from ....core.products import Stamp, image_hdu, read_fits, write_fits
-from ....imaging.draw import Window
+from ....imaging.draw import SkyPixels, Window
 from ....imaging.wcs import CcdWcs
 from ....pipeline.experiment import Experiment
 from ..plan import plan_visits
@@ -177,15 +177,12 @@ class TileSums:
         return cls(hdus[0].header[VISITS_CARD], data, variance, np.array(hdus["COUNT"].data, dtype=np.int16))
 
 
-def window_on(tiles: Sequence[Tile], wcs: CcdWcs, to_frame: Callable[[np.ndarray], np.ndarray]) -> Window | None:
-    """Return the part of a CCD that touches tiles; None if none does.
-
-    `to_frame` gives the places in the frame, shape [n, 2], of pixels (x, y) of the CCD, shape [n, 2].
-    """
+def window_on(tiles: Sequence[Tile], frame: StackFrame, wcs: SkyPixels) -> Window | None:
+    """Return the part of a CCD that touches tiles; None if none does."""
     height, width = wcs.shape
     nodes = [np.linspace(0.0, n - 1.0, _NODES) for n in (width, height)]
     steps = [float(line[1]) for line in nodes]
-    places = to_frame(np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 2))
+    places = wcs.to_sky(np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 2)) @ frame.matrix.T
     # Nodes are less than a step and a half from any pixel between them, along each axis of a rolled frame.
     near = np.any([tile.inside.contains(places - tile.first, 1.5 * max(steps)) for tile in tiles], axis=0)
     near = near.reshape(_NODES, _NODES)
