@@ -77,7 +77,9 @@ class PachonError(Exception):
         if file is not None and self.file == os.fspath(file):
             return self
         if file is None and not key:
-            both = ": ".join(part for part in (subject, self.subject) if part)
+            # A subject that an inner context has stated is not repeated.
+            stated = subject is not None and f"{self.subject}:".startswith(f"{subject}:")
+            both = ": ".join(part for part in (None if stated else subject, self.subject) if part)
             return type(self)(self.problem, subject=both or None, file=self.file, place=self.place, key=self.key)
         inner = self.file is None and self.subject is None
         problem = (f"{key}." if key else "") + self.problem if inner else ": ".join(filter(None, (key, str(self))))

@@ -105,7 +105,7 @@ class PsfField:
         """
         config, camera = experiment.config, experiment.camera
         positions = holdout_positions(experiment, ccd)
-        psfs = expose_positions(experiment, positions, threads, progress=progress)
+        psfs = expose_positions(experiment, positions, threads, progress=progress, along=ccd)
         return cls.fit(
             psfs.image.astype(np.float64),
             to_pixel(experiment, ccd, positions),

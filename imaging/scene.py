@@ -13,7 +13,6 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
-from ..models.camera.camera import Camera
 from ..pipeline.defaults import pixel_angle
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
@@ -125,8 +124,8 @@ def draw_ccd(
     Raises
     ------
     ConfigError
-        If the run has no atmosphere, without which PSFs are finer than pixels, its pixels are not those of the
-        camera, or the CCD is turned.
+        If the run has no atmosphere, without which PSFs are finer than pixels, or its pixels are not those of the
+        camera.
     DomainError
         If no light reaches the CCD, or the galaxies bury the sky.
     """
@@ -150,7 +149,6 @@ def draw_ccd(
         wavelength=experiment.wavelengths[len(experiment.wavelengths) // 2],
         threads=threads,
     )
-    check_upright(camera, ccd)
     part = Window(0, 0, *camera.pixels[camera.ccd_index(ccd)].tolist()) if window is None else window
     psf = PsfField.of_run(experiment, ccd, interpolation=interpolation, threads=threads, progress=progress)
     galaxies = galaxies_near(galaxies, wcs, part)
@@ -200,14 +198,6 @@ def draw_ccd(
         config.seed,
         config.atmosphere.epoch,
     )
-
-
-def check_upright(camera: Camera, ccd: str) -> None:
-    """Raise ConfigError if a CCD is turned: stamps of stars are drawn along the axes of the focal plane."""
-    turn = camera.rotation_deg[camera.ccd_index(ccd)]
-    if turn:
-        text = f"{ccd} of {camera.name} is turned by {turn:g} deg"
-        raise ConfigError(f"ccds: {text}: images expect CCDs along the axes of the focal plane")
 
 
 def nominal_scale(experiment: Experiment) -> float:
@@ -263,7 +253,7 @@ def _add_stars(
         return {"PIXEL": pixels, "MAG": magnitude, "FLUX": magnitude}
     nearest = np.rint(pixels).astype(np.int64)
     stars = expose_positions(
-        experiment, provisional.observed[near], threads, progress, room=STAR_ROOM, offsets=pixels - nearest
+        experiment, provisional.observed[near], threads, progress, room=STAR_ROOM, offsets=pixels - nearest, along=ccd
     )
     electrons = exposure.electrons(magnitude) * stars.lit_fraction
     corners = nearest - stars.image.shape[1] // 2 - (window.x, window.y)

@@ -29,7 +29,7 @@ from .draw import Window
 from .exposure import Exposure
 from .image_file import is_whole
 from .preview import cutouts_png, preview_png
-from .scene import check_density, check_upright, draw_ccd, nominal_scale, stamped
+from .scene import check_density, draw_ccd, nominal_scale, stamped
 
 #: Limits of the bins over which the light of a population is summed.
 _MAGNITUDES = 200
@@ -163,7 +163,6 @@ def _image(
 def _window(config: ImagesConfig, experiment: Experiment, name: str) -> Window:
     """Return the part of a CCD that is drawn."""
     camera, side = experiment.camera, config.image.side
-    check_upright(camera, name)
     nx, ny = camera.pixels[camera.ccd_index(name)].tolist()
     if side is None:
         return Window(0, 0, nx, ny)

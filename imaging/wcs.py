@@ -1,7 +1,8 @@
 """World coordinates of a CCD: pixels, tangent plane and celestial coordinates, fitted to traced chief rays.
 
-The tangent plane is that of a :class:`~pachon.Pointing`, whose module has the formulas.
-Headers are TAN, or TAN-SIP (Shupe et al. 2005, ASP Conf. 347, 491) with the pointing as reference point of all CCDs.
+The tangent plane (xi, eta) is that of a :class:`~pachon.Pointing`, whose module has the formulas.
+Headers are TAN, or TAN-SIP (Shupe et al. 2005, ASP Conf. 347, 491), about the middle of each CCD. About the pointing,
+the polynomials of a distant CCD of a camera with much distortion, such as Hyper Suprime-Cam, would have no inverse.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from ..wavefront.chief_rays import fields_at
 #: Largest error of the fit at pixels between those of the fit [rad]. Catalogues are good to a few milliarcseconds.
 TOLERANCE = 3e-4 * ARCSEC
 #: Largest order that is tried.
-_MOST = 6
+_MOST = 9
 #: Points along a side of the CCD at which chief rays are traced for the fit, and for its check.
-_FIT_POINTS, _CHECK_POINTS = 9, 14
+_FIT_POINTS, _CHECK_POINTS = 12, 15
 #: Steps of Newton's method from the inverse polynomial, which is good to a thousandth of a pixel.
 _NEWTON_STEPS = 3
 
@@ -40,18 +41,21 @@ class CcdWcs:
     """World coordinates of a CCD.
 
     Pixels (x, y) are those of arrays, ``image[y, x]``, the first pixel's centre at (0, 0); FITS headers count from 1.
-    With u = pixel - reference_pixel, (xi, eta) = cd (u + distortion(u)).
+    With u = pixel - reference_pixel, ``cd (u + distortion(u))`` is the place on the tangent plane about the reference
+    point; (xi, eta) is that about the pointing.
 
     Attributes
     ----------
     pointing : tuple of float
         Right ascension and declination of the optical axis [rad].
+    reference : tuple of float
+        Right ascension and declination of the reference point, in the middle of the CCD [rad].
     shape : tuple of int
         Rows and columns of the CCD.
     reference_pixel : ndarray, shape [2]
-        Pixel of the pointing, mostly far outside the CCD.
+        Pixel of the reference point.
     cd : ndarray, shape [2, 2]
-        d(xi, eta)/d(pixel) there [rad/pixel].
+        d(place on its tangent plane)/d(pixel) there [rad/pixel].
     distortion, inverse : ndarray, shape [2, order + 1, order + 1]
         SIP polynomials A, B and AP, BP; [axis, i, j] is the coefficient of u^i v^j.
     error : float
@@ -59,6 +63,7 @@ class CcdWcs:
     """
 
     pointing: tuple[float, float]
+    reference: tuple[float, float]
     shape: tuple[int, int]
     reference_pixel: np.ndarray
     cd: np.ndarray
@@ -80,13 +85,13 @@ class CcdWcs:
     @check_arguments
     def to_sky(self, pixels: ArrayLike) -> np.ndarray:
         """Return (xi, eta) [rad], shape [n, 2], of pixels (x, y), shape [n, 2]."""
-        u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
-        return (u + _values(self.distortion, u)) @ self.cd.T
+        return _projected(self._on_plane(pixels), self._turn)[0]
 
     @check_arguments
     def to_pixel(self, sky: ArrayLike) -> np.ndarray:
         """Return pixels (x, y), shape [n, 2], of (xi, eta) [rad], shape [n, 2]."""
-        target = np.atleast_2d(np.asarray(sky, dtype=np.float64)) @ np.linalg.inv(self.cd).T
+        plane = np.atleast_2d(np.asarray(sky, dtype=np.float64))
+        target = _projected(plane, self._turn.T)[0] @ np.linalg.inv(self.cd).T
         u = target + _values(self.inverse, target)
         for _ in range(_NEWTON_STEPS):
             miss = target - u - _values(self.distortion, u)
@@ -97,7 +102,7 @@ class CcdWcs:
     def jacobians(self, pixels: ArrayLike) -> np.ndarray:
         """Return d(x, y)/d(xi, eta) [pixel/rad] at pixels, shape [n, 2, 2]."""
         u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
-        return np.linalg.inv(self.cd @ self._derivative(u))
+        return np.linalg.inv(_projected(self._on_plane(pixels), self._turn)[1] @ self.cd @ self._derivative(u))
 
     @check_arguments
     def to_celestial(self, sky: ArrayLike) -> np.ndarray:
@@ -114,7 +119,7 @@ class CcdWcs:
         header["CUNIT1"] = header["CUNIT2"] = "deg"
         header["RADESYS"] = "ICRS"
         for i, key in enumerate("12"):
-            header[f"CRVAL{key}"] = (float(np.rad2deg(self.pointing[i])), "[deg] optical axis of the telescope")
+            header[f"CRVAL{key}"] = float(np.rad2deg(self.reference[i]))
             header[f"CRPIX{key}"] = float(self.reference_pixel[i] - corner[i] + 1.0)
             for j in range(2):
                 header[f"CD{key}_{j + 1}"] = float(np.rad2deg(self.cd[i, j]))
@@ -133,6 +138,16 @@ class CcdWcs:
         wcs = WCS(self.to_header(corner))
         wcs.pixel_shape = (self.shape[1] - corner[0], self.shape[0] - corner[1])
         return wcs
+
+    def _on_plane(self, pixels: ArrayLike) -> np.ndarray:
+        """Return the places of pixels on the tangent plane about the reference point, shape [n, 2]."""
+        u = np.atleast_2d(np.asarray(pixels, dtype=np.float64)) - self.reference_pixel
+        return (u + _values(self.distortion, u)) @ self.cd.T
+
+    @property
+    def _turn(self) -> np.ndarray:
+        """Rotation of vectors (east, north, outwards) at the reference point into those at the pointing, [3, 3]."""
+        return _axes(*self.pointing) @ _axes(*self.reference).T
 
     def _derivative(self, u: np.ndarray) -> np.ndarray:
         """Return d(u + distortion)/du, shape [n, 2, 2]."""
@@ -187,17 +202,26 @@ def ccd_wcs(
     pixels = camera.pixels[index]
     middle, half = 0.5 * (pixels - 1), 0.5 * pixels
 
+    def to_sky(places: np.ndarray) -> np.ndarray:
+        """Return (xi, eta) of places on the CCD, from -1 to 1 along both axes, shape [n, 2]."""
+        with error_context(subject=f"CCD {ccd}"):
+            slopes = fields_at(
+                telescope, camera.from_uv(index, places), wavelength, projection="gnomonic", threads=threads
+            )
+            telescope.check_field(*np.arctan(slopes.T))
+        return aim.to_sky(slopes)
+
+    # Equal skies have equal headers: angles are taken modulo a turn.
+    center = (aim.ra % (2.0 * np.pi), aim.dec)
+    ra, dec = aim.to_celestial(to_sky(np.zeros((1, 2))))[0].tolist()
+    to_reference = _axes(ra, dec) @ _axes(*center).T
+
     def traced(points: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return places on the CCD, from -1 to 1 along both axes, and their (xi, eta)."""
+        """Return places on the CCD, from -1 to 1 along both axes, and on the tangent plane about its middle."""
         # Chebyshev points: a polynomial through them errs about equally everywhere.
         line = np.cos(np.pi * (np.arange(points) + 0.5) / points) / np.cos(0.5 * np.pi / points)
         places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        offset = half * camera.pixel_size * places
-        positions = np.stack(camera.from_local(index, offset[:, 0], offset[:, 1]), axis=1)
-        with error_context(subject=f"CCD {ccd}"):
-            slopes = fields_at(telescope, positions, wavelength, projection="gnomonic", threads=threads)
-            telescope.check_field(*np.arctan(slopes.T))
-        return places, aim.to_sky(slopes)
+        return places, _projected(to_sky(places), to_reference)[0]
 
     fit, check = traced(_FIT_POINTS), traced(_CHECK_POINTS)
     for order in range(1, _MOST + 1):
@@ -208,15 +232,16 @@ def ccd_wcs(
             break
     else:
         raise DomainError(
-            f"CCD {ccd}: polynomials of order {_MOST} leave {error / ARCSEC:.2g} arcsec between pixels and sky; "
-            "expected a telescope whose images move smoothly with the field angle"
+            f"polynomials of order {_MOST} leave {error / ARCSEC:.2g} arcsec between pixels and sky; expected a "
+            "telescope whose images move smoothly with the field angle",
+            subject=f"CCD {ccd}",
         )
     target = fit[1] @ np.linalg.inv(linear).T
     offset = half * fit[0] - reference - target
     inverse = _fitted(target, offset, order)
-    # Zero point and angles of the pointing modulo a turn: equal skies have equal headers.
     return CcdWcs(
-        pointing=(aim.ra % (2.0 * np.pi), aim.dec),
+        pointing=center,
+        reference=(ra, dec),
         shape=(int(pixels[1]), int(pixels[0])),
         reference_pixel=reference + middle,
         cd=linear,
@@ -297,6 +322,19 @@ def _forward(
     distortion = np.einsum("ab,bij->aij", np.linalg.inv(linear), tables)
     distortion[:, [0, 0, 1], [0, 1, 0]] = 0.0
     return linear, reference, distortion
+
+
+def _axes(ra: float, dec: float) -> np.ndarray:
+    """Return the unit vectors towards east, north and outwards at a place of the sky [rad], as rows."""
+    (sa, sd), (ca, cd) = np.sin([ra, dec]), np.cos([ra, dec])
+    return np.array([[-sa, ca, 0.0], [-sd * ca, -sd * sa, cd], [cd * ca, cd * sa, sd]])
+
+
+def _projected(plane: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return places [n, 2] of a tangent plane on another, by the rotation of its axes, and derivatives [n, 2, 2]."""
+    vectors = np.column_stack([plane, np.ones(len(plane))]) @ turn.T
+    found, ahead = vectors[:, :2] / vectors[:, 2:], vectors[:, 2, None, None]
+    return found, (turn[:2, :2] - found[:, :, None] * turn[2, :2]) / ahead
 
 
 def _linear(tables: np.ndarray) -> np.ndarray:

@@ -72,6 +72,9 @@ class Experiment:
         the CCD heights and the active optics.
     star_list : StarList or None
         Stars of the catalogue of the configuration; None where stars are drawn.
+    axes_deg : float
+        Angle by which the axes of positions and stamps are turned from those of the configuration's focal plane
+        [deg], see :meth:`along`.
     """
 
     config: Configuration
@@ -82,6 +85,7 @@ class Experiment:
     site: Site
     atmosphere_only: bool = False
     star_list: StarList | None = None
+    axes_deg: float = 0.0
 
     def __repr__(self) -> str:
         return f"<Experiment: {self.telescope!r}, {self.focal_plane!r}, {self.config.psf.engine} engine>"
@@ -168,8 +172,25 @@ class Experiment:
 
     @property
     def rotator(self) -> float:
-        """Angle of the camera from +x towards +y of the telescope frame [rad]."""
-        return math.radians(self.config.rotator_deg)
+        """Angle of the axes of the focal plane from +x towards +y of the telescope frame [rad]."""
+        return math.radians(self.config.rotator_deg + self.axes_deg)
+
+    @check_arguments
+    def along(self, ccd: str) -> Experiment:
+        """Return the same experiment with the axes of the focal plane turned, so that they are those of a CCD.
+
+        A position (x, y) is then ``camera.frame(index).along_ccd(x, y)`` of the position before; light, screens and
+        heights are the same. The experiment itself where the CCD is not turned.
+        """
+        angle = float(self.camera.rotation_deg[self.camera.ccd_index(ccd)])
+        if not angle:
+            return self
+        return replace(
+            self,
+            telescope=self.telescope.with_rotator(math.radians(angle)),
+            focal_plane=replace(self.focal_plane, camera=self.camera.turned(angle)),
+            axes_deg=self.axes_deg + angle,
+        )
 
     @check_arguments
     def displacements(self, name: str) -> tuple[Displacement, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, DomainError, check_unique, unknown_name
+from ...core.errors import DomainError, check_unique, unknown_name
 from ...core.units import plane_points
 
 if TYPE_CHECKING:
@@ -198,11 +198,19 @@ class Camera:
         a, b = (b - rim, a - rim) if quarters % 2 else (a - rim, b - rim)
         return (x - a, x + a, y - b, y + b), float(np.deg2rad(self.rotation_deg[ccd] - 90.0 * quarters))
 
-    def square_pixels(self) -> int:
-        """Return the pixels along a side of equal square CCDs; ConfigError where they are not `alike`."""
-        if not self.alike:
-            raise ConfigError(f"camera = {self.name}: expected equal square CCDs along the axes of the focal plane")
-        return int(self.pixels[0, 0])
+    def turned(self, angle_deg: float) -> Camera:
+        """Return the camera in axes of the focal plane that are turned from +x towards +y [deg]; quarters are exact."""
+        if not np.isfinite(angle_deg):
+            raise DomainError(f"angle_deg = {angle_deg}: expected a finite number of degrees")
+        cosine, sine = _directions(np.array(angle_deg))
+
+        def along(vectors: np.ndarray) -> np.ndarray:
+            x, y = vectors[:, -2], vectors[:, -1]
+            return np.column_stack([vectors[:, :-2], cosine * x + sine * y, cosine * y - sine * x])
+
+        placement = None if self.placement is None else along(self.placement)
+        rotation = self.rotation_deg - angle_deg
+        return replace(self, centers=along(self.centers), rotation_deg=rotation, placement=placement)
 
     # ---- names
 
@@ -329,10 +337,7 @@ class Camera:
     @cached_property
     def _direction(self) -> np.ndarray:
         """Cosine and sine of the angle of each CCD, [2, n_ccd]; exact for quarter turns."""
-        quarters = np.round(self.rotation_deg / 90.0).astype(np.int64)
-        rest = np.deg2rad(self.rotation_deg - 90.0 * quarters)
-        cosine, sine = _QUARTER_COSINES[quarters % 4], _QUARTER_COSINES[(quarters - 1) % 4]
-        return np.stack([cosine * np.cos(rest) - sine * np.sin(rest), sine * np.cos(rest) + cosine * np.sin(rest)])
+        return _directions(self.rotation_deg)
 
     @cached_property
     def _kinds(self) -> list[_Kind]:
@@ -368,3 +373,11 @@ class Camera:
             i = int(np.flatnonzero(~apart)[0])
             one, two = self.ccd_names[first[i]], self.ccd_names[second[i]]
             raise DomainError(f"camera {self.name}: CCDs {one} and {two} overlap: expected them beside each other")
+
+
+def _directions(angles_deg: np.ndarray) -> np.ndarray:
+    """Return cosine and sine of angles [deg], shape [2, ...]; exact for quarter turns."""
+    quarters = np.round(angles_deg / 90.0).astype(np.int64)
+    rest = np.deg2rad(angles_deg - 90.0 * quarters)
+    cosine, sine = _QUARTER_COSINES[quarters % 4], _QUARTER_COSINES[(quarters - 1) % 4]
+    return np.stack([cosine * np.cos(rest) - sine * np.sin(rest), sine * np.cos(rest) + cosine * np.sin(rest)])

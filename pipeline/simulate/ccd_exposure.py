@@ -66,14 +66,15 @@ def expose_positions(
     *,
     room: int = 0,
     offsets: np.ndarray | None = None,
+    along: str | None = None,
 ) -> NoiseFreeStars:
     """Make noise-free PSFs at positions on the detector [m], shape [n, 2], of any CCDs.
 
     The position of a star is that of the chief ray of the middle wavelength, at the centre of a pixel, or `offsets`
-    [pixel] from it; stamps are larger than those of the run by `room` pixels. DomainError if no light reaches one of
-    them.
+    [pixel] from it; stamps are larger than those of the run by `room` pixels, and lie along the axes of the focal plane
+    or, with `along`, those of a CCD. DomainError if no light reaches one of them.
     """
-    return _lit(_expose(experiment, positions, threads, progress, room=room, offsets=offsets))
+    return _lit(_expose(experiment, positions, threads, progress, room=room, offsets=offsets, along=along))
 
 
 def expose_ccd(
@@ -102,8 +103,10 @@ def expose_centered(
     positions: np.ndarray,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
+    *,
+    along: str | None = None,
 ) -> NoiseFreeStars:
-    """Make noise-free PSFs at positions on the detector [m], shape [n, 2], their centroids at the centre of a pixel."""
+    """Make noise-free PSFs as :func:`expose_positions` does, their centroids at the centre of a pixel."""
 
     def centroid(images: np.ndarray, pixel_scale: float) -> np.ndarray:
         shapes = measure_shapes(images, pixel_scale, experiment.weight_fwhm)
@@ -111,7 +114,7 @@ def expose_centered(
 
     # The engine draws them at the position that compensates their shift by the atmosphere. Resampling, as of observed
     # stars, would leave ringing along rows and columns where an image is not quite band-limited.
-    return _expose(experiment, positions, threads, progress, recenter=centroid)
+    return _expose(experiment, positions, threads, progress, recenter=centroid, along=along)
 
 
 def _lit(stars: NoiseFreeStars) -> NoiseFreeStars:
@@ -130,10 +133,15 @@ def _expose(
     room: int = 0,
     offsets: np.ndarray | None = None,
     recenter: Callable[[np.ndarray, float], np.ndarray] | None = None,
+    along: str | None = None,
 ) -> NoiseFreeStars:
     """Make PSFs at positions on the detector, `offsets` [pixel] from the centre of a pixel, on stamps with `room`."""
-    config, wavelengths, telescope = experiment.config, experiment.wavelengths, experiment.telescope
-    fields = fields_at(telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    config, wavelengths = experiment.config, experiment.wavelengths
+    fields = fields_at(experiment.telescope, positions, wavelengths[len(wavelengths) // 2], threads=threads)
+    if along is not None:
+        frame = experiment.camera.frame(experiment.camera.ccd_index(along))
+        positions, experiment = np.stack(frame.along_ccd(*positions.T), axis=1), experiment.along(along)
+    telescope = experiment.telescope
     optical, magnification = not experiment.atmosphere_only, 1.0
     if not optical:
         ideal = without_aberration(telescope, _IDEAL_RATIO).with_rotator(experiment.rotator)

@@ -443,6 +443,7 @@ def _methods(m, tel, w, x, y):
         "Union": (pachon.Union, {"parts": (pachon.Circle(1.0), pachon.Circle(2.0))}),
         "Complement": (pachon.Complement, {"part": pachon.Circle(1.0)}),
         "Camera.ccd_at": (m.camera.ccd_at, {"x": [0.0, 0.1], "y": [0.0, 0.1], "margin": 0.0}),
+        "Camera.turned": (m.camera.turned, {"angle_deg": 30.0}),
         "Camera.ccd_index": (m.camera.ccd_index, {"name": "R22_S11"}),
         "FocalPlane.from_budget": (pachon.FocalPlane.from_budget, {"camera": "lsst", "seed": 1, "terms": ["raft"],
                                    "budget": "simulated"}),

@@ -80,7 +80,11 @@ def test_the_inverse_polynomials_of_the_header_are_good_to_a_milliarcsecond(tele
     wcs = ccd_wcs(telescope, CAMERA, "R41_S20", pointing=(RA, DEC), position_angle=ROLL)
     header = wcs.to_header()
     cd = np.array([[header[f"CD{i}_{j}"] for j in (1, 2)] for i in (1, 2)])
-    u, v = np.linalg.solve(cd, np.rad2deg(wcs.to_sky(PIXELS)).T)
+    # Gnomonic projection about CRVAL (Calabretta & Greisen 2002, sec. 5.1.3).
+    (ra, dec), (ra0, dec0) = traced(telescope, "R41_S20").T, np.deg2rad([header["CRVAL1"], header["CRVAL2"]])
+    depth = np.sin(dec0) * np.sin(dec) + np.cos(dec0) * np.cos(dec) * np.cos(ra - ra0)
+    north = np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)
+    u, v = np.linalg.solve(cd, np.rad2deg([np.cos(dec) * np.sin(ra - ra0) / depth, north / depth]))
     powers = [(i, j) for i in range(wcs.order + 1) for j in range(wcs.order + 1)]
     for axis, (name, linear) in enumerate((("AP", u), ("BP", v))):
         distortion = sum(header.get(f"{name}_{i}_{j}", 0.0) * u**i * v**j for i, j in powers)

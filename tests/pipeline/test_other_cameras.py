@@ -9,7 +9,6 @@ from astropy.table import Table
 import pachon
 from pachon import PachonError, load_camera
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError
 from pachon.pipeline.ccd_product import read_product
 from pachon.pipeline.config import Configuration, configuration_of, with_options
 from pachon.pipeline.experiment import Experiment
@@ -199,15 +198,6 @@ def test_what_does_not_fit_is_one_line(tmp_path, changes, words):
     with pytest.raises(PachonError, match=words) as caught:
         small(tmp_path, **changes)
     assert "\n" not in str(caught.value)
-
-
-def test_images_refuse_turned_ccds(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "images.yaml").write_text(json.dumps({"run": {**SMALL, "ccds": ["hsc049", "hsc000"]}}))
-    assert main(["images", "images.yaml", "--quiet"]) == 2
-    assert "hsc000 of hsc is turned by 180 deg: images expect" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="square CCDs"):
-        load_camera("decam").square_pixels()
 
 
 @pytest.mark.slow

@@ -13,9 +13,10 @@ from ..psf_visit import StackFrame
 from .resample_kernels import add_rows
 from .tiles import Tile, TileSums
 
-#: Pixels between nodes of the mapping. It is linear between them to 1e-4 pixel, as the scale of the LSST changes by
-#: 1e-7 of itself from pixel to pixel.
-_STEP = 64
+#: Pixels between nodes of the mapping: the first that leaves less than the tolerance [pixel] halfway between them. For
+#: the LSST, whose scale changes by 1e-7 of itself from pixel to pixel, that is 64, and leaves 1e-4.
+_STEPS = (64, 32, 16, 8)
+_TOLERANCE = 1e-3
 
 
 def add_resampled(
@@ -50,13 +51,13 @@ def add_resampled(
     part = _touched(tile, frame, window, wcs)
     if part is None:
         return
-    nodes = _nodes(tile, frame, part, window, wcs)
+    step, nodes = _nodes(tile, frame, part, window, wcs)
     inputs = [
         warp_array(exposed.image, wp.float32),
         warp_array(exposed.variance, wp.float32),
         warp_array(exposed.mask, wp.int16),
         warp_array(nodes),
-        _STEP,
+        step,
         part.x,
         part.y,
         part.width,
@@ -80,12 +81,21 @@ def _touched(tile: Tile, frame: StackFrame, window: Window, wcs: SkyPixels) -> W
     return Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
-def _nodes(tile: Tile, frame: StackFrame, part: Window, window: Window, wcs: SkyPixels) -> np.ndarray:
-    """Return x, y in the window, and area of a pixel of the tile, at nodes of a part of it, [ny, nx, 3]."""
-    x, y = (_STEP * np.arange(-(-n // _STEP) + 1) + start for n, start in ((part.width, part.x), (part.height, part.y)))
-    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) + tile.first
+def _nodes(tile: Tile, frame: StackFrame, part: Window, window: Window, wcs: SkyPixels) -> tuple[int, np.ndarray]:
+    """Return the pixels between nodes of a part of a tile, and x, y in the window and area of a pixel at them."""
     to_sky = np.linalg.inv(frame.matrix)
-    pixels = wcs.to_pixel(places @ to_sky.T)
-    area = np.abs(np.linalg.det(wcs.jacobians(pixels) @ to_sky))
-    found = np.column_stack([pixels - (window.x, window.y), area])
-    return found.reshape(len(y), len(x), 3)
+    inside = Window(0, 0, window.width, window.height)
+    for step in _STEPS:
+        # Nodes and, between them, places where the mapping is checked.
+        counts = [2 * -(-n // step) + 1 for n in (part.width, part.height)]
+        x, y = (0.5 * step * np.arange(n) + start for n, start in zip(counts, (part.x, part.y), strict=True))
+        pixels = wcs.to_pixel((np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) + tile.first) @ to_sky.T)
+        area = np.abs(np.linalg.det(wcs.jacobians(pixels) @ to_sky))
+        found = np.column_stack([pixels - (window.x, window.y), area]).reshape(len(y), len(x), 3)
+        nodes, between = found[::2, ::2].copy(), found[1::2, 1::2, :2]
+        linear = 0.25 * (nodes[:-1, :-1] + nodes[:-1, 1:] + nodes[1:, :-1] + nodes[1:, 1:])[..., :2]
+        # Polynomials hold on the CCD only.
+        on_ccd = inside.contains(between.reshape(-1, 2)).reshape(between.shape[:2])
+        if not on_ccd.any() or np.abs(linear - between)[on_ccd].max() < _TOLERANCE:
+            break
+    return step, nodes

@@ -20,6 +20,7 @@ from ....imaging.image_file import CcdImage, is_whole
 from ....imaging.scene import ellipticities, object_columns, sky_ranges
 from ....imaging.simulate import BYTES_PER_PIXEL
 from ....imaging.wcs import CcdWcs, ccd_wcs
+from ....models.camera.camera import Camera
 from ....pipeline.config import differences, digest
 from ....pipeline.defaults import given
 from ....pipeline.experiment import Experiment
@@ -42,8 +43,6 @@ FOLDER_NAME, SETTINGS_NAME = "images", "images.yaml"
 #: S/N of a star as faint as the faintest galaxies in the stack of all visits, and its FWHM: fainter ones are not
 #: detected, and all of those below together are 3 % of its noise in a pixel.
 _FAINTEST_SNR = 4.0
-#: Nodes along a side of a CCD that tell which part of it touches tiles.
-_NODES = 65
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,13 +225,9 @@ def _add_visit(
     reporter: Reporter,
 ) -> None:
     """Draw the CCDs of a visit that touch tiles, and add them to the sums."""
-    pixels, exposure = stack.experiment.camera.square_pixels(), stack.exposure()
-    nodes = np.linspace(0.0, pixels - 1.0, _NODES)
-    grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
-    windows = {}
+    exposure, windows = stack.exposure(), {}
     for name, own in wcs.items():
-        frame_at = (VisitWcs(own, visit).to_sky(grid) @ stack.frame.matrix.T).reshape(_NODES, _NODES, 2)
-        window = window_on(list(due), pixels, frame_at, nodes)
+        window = window_on(list(due), stack.frame, VisitWcs(own, visit))
         if window is not None:
             windows[name] = window
     experiment = visit_experiment(stack.experiment, visit)
@@ -331,7 +326,7 @@ def _resolved(
     if before is not None:
         side, faintest = side or before.side, faintest or before.faintest
     if side is None:
-        side = experiment.camera.square_pixels()
+        side = _side(experiment.camera)
     if faintest is None:
         faintest = round(stack_limit(experiment, _FAINTEST_SNR, visits.visits.count), 2)
     camera, config = experiment.camera, experiment.config
@@ -341,6 +336,11 @@ def _resolved(
             f"expect pixels of {camera.pixel_size * 1e6:g} um and an atmosphere"
         )
     return settings.model_copy(update={"side": side, "faintest": float(faintest)})
+
+
+def _side(camera: Camera) -> int:
+    """Return the pixels along a side of a square as large as the largest CCD."""
+    return int(np.ceil(np.sqrt(camera.pixels.prod(axis=1).max())))
 
 
 def _claim(stack: ImageStack, resume: bool) -> None:
@@ -369,8 +369,8 @@ def _check_room(stack: ImageStack, threads: int | None) -> None:
     """Raise DomainError where memory or disk cannot hold the tiles."""
     tile, tiles = BYTES * stack.tiles[0].side ** 2, len(stack.tiles)
     # Beside the sums: a CCD that is drawn, and a tile that is stacked and written.
-    pixels = stack.experiment.camera.square_pixels()
-    ccd = BYTES_PER_PIXEL * max(pixels, stack.tiles[0].side) ** 2
+    largest = max(_side(stack.experiment.camera), stack.tiles[0].side)
+    ccd = BYTES_PER_PIXEL * largest**2
     require_bytes(needed_bytes(stack.experiment, threads) + ccd + tiles * tile, "images")
     # Sums, one of them twice while it is replaced, and the stacks that are kept.
     needed = tile * (tiles + 1 + tiles * len(stack.visits.kept))

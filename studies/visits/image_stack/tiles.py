@@ -11,7 +11,7 @@ from astropy.io import fits
 
 from ....core.errors import DomainError, ProductError
 from ....core.products import Stamp, image_hdu, read_fits, write_fits
-from ....imaging.draw import Window
+from ....imaging.draw import SkyPixels, Window
 from ....imaging.wcs import CcdWcs
 from ....pipeline.experiment import Experiment
 from ..plan import plan_visits
@@ -24,6 +24,8 @@ NO_DATA = 1
 STACK_MASK_BITS = {NO_DATA: "NO_DATA"}
 #: Bytes of a pixel of a tile: sums of data and variance, number of visits.
 BYTES = 10
+#: Nodes along a side of a CCD that tell which part of it touches tiles.
+_NODES = 65
 #: Visits, and points along a side of a tile, that tell how much of it visits see.
 _VISITS, _POINTS = 10, 5
 
@@ -59,6 +61,7 @@ class Tile:
         nothing = np.zeros((2, 2, 2))
         return CcdWcs(
             pointing=(0.0, 0.0),
+            reference=(0.0, 0.0),
             shape=(self.side, self.side),
             reference_pixel=-self.first,
             cd=np.linalg.inv(frame.matrix),
@@ -174,23 +177,21 @@ class TileSums:
         return cls(hdus[0].header[VISITS_CARD], data, variance, np.array(hdus["COUNT"].data, dtype=np.int16))
 
 
-def window_on(tiles: Sequence[Tile], pixels: int, frame_at: np.ndarray, nodes: np.ndarray) -> Window | None:
-    """Return the part of a CCD of `pixels` x `pixels` that touches tiles; None if none does.
-
-    `frame_at` [n, n, 2] are the places in the frame of the pixels `nodes` [n] along x and y of the CCD.
-    """
-    step = float(nodes[1] - nodes[0])
-    places = frame_at.reshape(-1, 2)
+def window_on(tiles: Sequence[Tile], frame: StackFrame, wcs: SkyPixels) -> Window | None:
+    """Return the part of a CCD that touches tiles; None if none does."""
+    height, width = wcs.shape
+    nodes = [np.linspace(0.0, n - 1.0, _NODES) for n in (width, height)]
+    steps = [float(line[1]) for line in nodes]
+    places = wcs.to_sky(np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 2)) @ frame.matrix.T
     # Nodes are less than a step and a half from any pixel between them, along each axis of a rolled frame.
-    near = np.any([tile.inside.contains(places - tile.first, 1.5 * step) for tile in tiles], axis=0).reshape(
-        frame_at.shape[:2]
-    )
+    near = np.any([tile.inside.contains(places - tile.first, 1.5 * max(steps)) for tile in tiles], axis=0)
+    near = near.reshape(_NODES, _NODES)
     if not near.any():
         return None
     ends = []
-    for axis in (0, 1):
+    for axis, (line, step, pixels) in enumerate(zip(nodes, steps, (width, height), strict=True)):
         own = np.flatnonzero(near.any(axis=axis))
-        low, high = nodes[own[0]] - step, nodes[own[-1]] + step
+        low, high = line[own[0]] - step, line[own[-1]] + step
         ends.append((max(0, int(low)), min(pixels, int(np.ceil(high)) + 1)))
     (x0, x1), (y0, y1) = ends
     return Window(x0, y0, x1 - x0, y1 - y0)

@@ -90,12 +90,13 @@ def visit_image(
     PachonError
         If the PSF of the CCD cannot be fitted, or no light reaches a star.
     """
-    config, points, pixels = experiment.config, sky.points, experiment.camera.square_pixels()
+    config, points, camera = experiment.config, sky.points, experiment.camera
+    pixels = camera.pixels[camera.ccd_index(name)]
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
     at = to_pixel(experiment, name, xy)
     inside = (np.abs(at - 0.5 * (pixels - 1)) <= 0.5 * pixels - _LEAST_DEPTH).all(axis=1)
     rows = np.flatnonzero(inside & (np.hypot(xy[:, 0], xy[:, 1]) <= experiment.field_radius_on_detector))
-    psfs = expose_centered(experiment, xy[rows], threads)
+    psfs = expose_centered(experiment, xy[rows], threads, along=name)
     field = PsfField.fit(
         psfs.image.astype(np.float64),
         at[rows],
@@ -114,7 +115,7 @@ def visit_image(
     if len(own):
         nearest = np.rint(at[rows[own]])
         offsets = at[rows[own]] - nearest + psfs.offset[own]
-        stars = expose_positions(experiment, xy[rows[own]], threads, room=STAR_ROOM, offsets=offsets)
+        stars = expose_positions(experiment, xy[rows[own]], threads, room=STAR_ROOM, offsets=offsets, along=name)
         magnitude = magnitudes_at(points.quantile[rows[own]], *magnitude_limits(experiment))
         light = (exposure.electrons(magnitude) * stars.lit_fraction).astype(np.float32)
         corners = nearest.astype(np.int64) - stars.image.shape[1] // 2 - (window.x, window.y)
@@ -124,8 +125,8 @@ def visit_image(
     return exposed
 
 
-def _rim(window: Window, pixels: int) -> np.ndarray:
-    """Return whether pixels of a window are on the rim of the CCD, shape [ny, nx]."""
+def _rim(window: Window, pixels: np.ndarray) -> np.ndarray:
+    """Return whether pixels of a window are on the rim of the CCD of `pixels` along x and y, shape [ny, nx]."""
     x, y = (start + np.arange(n) for start, n in ((window.x, window.width), (window.y, window.height)))
-    inner = [(v >= RIM) & (v < pixels - RIM) for v in (x, y)]
+    inner = [(v >= RIM) & (v < n - RIM) for v, n in zip((x, y), pixels, strict=True)]
     return ~(inner[1][:, None] & inner[0])

@@ -116,7 +116,6 @@ def test_a_square_camera_is_as_it_was():
     assert np.array_equal(lsst.to_pixel(ccd, xy), (xy - lsst.centers[ccd]) / 10e-6 + 2047.5)
     assert lsst.alike
     assert not camera_of().alike
-    assert lsst.square_pixels() == 4096
 
 
 def test_members_are_rafts_or_ccds():
@@ -157,5 +156,16 @@ def test_neighbours_may_touch():
 def test_unknown_cameras_are_listed():
     with pytest.raises(PachonError, match="unknown camera 'hcs': did you mean hsc"):
         load_camera("hcs")
-    with pytest.raises(PachonError, match="square CCDs along the axes"):
-        camera_of().square_pixels()
+
+
+@pytest.mark.parametrize("angle", [90.0, -30.0, 123.0])
+def test_a_turned_camera_has_the_same_ccds_in_other_axes(angle):
+    camera, rng = camera_of(), np.random.default_rng(7)
+    ccd, uv = rng.integers(0, len(camera), 200), rng.uniform(-1, 1, (200, 2))
+    turned = camera.turned(angle)
+    x, y = camera.from_uv(ccd, uv).T
+    expected = (x + 1j * y) * np.exp(-1j * np.deg2rad(angle))
+    assert np.allclose(turned.from_uv(ccd, uv), np.stack([expected.real, expected.imag], axis=1), rtol=0, atol=1e-15)
+    assert (turned.ccd_at(expected.real, expected.imag) == camera.ccd_at(x, y)).mean() > 0.99
+    assert turned.ccd_names == camera.ccd_names
+    assert np.array_equal(camera.turned(0.0).centers, camera.centers)

@@ -24,6 +24,11 @@ class RoundGalaxies:
         return self.all.take(np.flatnonzero(own))
 
 
+@pytest.fixture(scope="session")
+def round_galaxies():
+    return RoundGalaxies
+
+
 @pytest.fixture(scope="package")
 def small_visits(tiny):
     """Configuration of visits of one CCD with 450 stars, in the mean over all turbulence."""
