@@ -63,12 +63,18 @@ def launch_rays(
     return launch_bundles(telescope, field_direction(tx, ty, projection)[None], wavelength, points)
 
 
+def aimed_points(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> np.ndarray:
+    """Return :func:`~pachon.raytrace.aiming.entrance_points`; DomainError if no ray of a direction can be aimed."""
+    points = entrance_points(telescope, directions, wavelength, pupil)
+    require_aimed(telescope, directions, points)
+    return points
+
+
 def launch_bundles(telescope: Telescope, directions: np.ndarray, wavelength: float, pupil: np.ndarray) -> Rays:
     """Launch the light of several field points, at any distance, through points of the entrance pupil.
 
     As :func:`~pachon.raytrace.rays.straight_bundles`, but aimed at the stop where the design data of the telescope say
     so, and with parallel chief rays in a telecentric object space. DomainError if a chief ray cannot be aimed.
     """
-    points = entrance_points(telescope, directions, wavelength, pupil)
-    require_aimed(telescope, directions, points)
+    points = aimed_points(telescope, directions, wavelength, pupil)
     return straight_bundles(telescope, directions, wavelength, points)

@@ -9,10 +9,10 @@ import warp as wp
 
 from ..core.launch import FORWARD_OPTIONS
 from ..raytrace.kernels.kernel_pair import kernel_pair
-from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes, lanes_sqrt
-from ..raytrace.kernels.pupil import launched
+from ..raytrace.kernels.packet import LANES, RayPackets, lane_flags, lanes
+from ..raytrace.kernels.pupil import directed, launched
 from ..raytrace.kernels.sphere import sphere_distance
-from ..raytrace.kernels.surface import OK, ONE, ZERO
+from ..raytrace.kernels.surface import OK, ZERO
 from ..raytrace.kernels.trace import LOOPS, PackedSurfaces
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -62,15 +62,7 @@ def trace_opds(special: bool, module: wp.Module) -> wp.Kernel:
             x = lanes(start[b, 0])
             y = lanes(start[b, 1])
             z = lanes(start[b, 2])
-            du = px - x
-            dv = py - y
-            dw = lanes(pupil_z) - z
-            # The plane of the pupil may lie behind the object; the light still travels downwards.
-            scale = -wp.sign(pupil_z - start[b, 2]) * lanes(ONE)
-            scale = wp.cw_div(scale, lanes_sqrt(wp.cw_mul(du, du) + wp.cw_mul(dv, dv) + wp.cw_mul(dw, dw)))
-            du = wp.cw_mul(scale, du)
-            dv = wp.cw_mul(scale, dv)
-            dw = wp.cw_mul(scale, dw)
+            du, dv, dw = directed(px, py, pupil_z, start[b, 0], start[b, 1], start[b, 2])
         x, y, z, u, v, w, path, status = through_telescope(
             surfaces, indices, 0, x, y, z, du, dv, dw, lanes(ZERO), p, no_rays
         )

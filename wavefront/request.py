@@ -14,7 +14,7 @@ from ..core.errors import DomainError, shown
 from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import vignetted
 from ..models.telescope import Telescope
-from ..raytrace.aiming import entrance_points, require_aimed
+from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
 from ..raytrace.trace import trace
@@ -194,9 +194,18 @@ class Request:
         Their shape is [n_pupil, 2], or [n_field, n_pupil, 2] where each field has its own. DomainError if the chief ray
         of a field cannot be aimed.
         """
-        points = entrance_points(self.telescope, self.directions, wavelength, self.vignetted(pupil))
-        require_aimed(self.telescope, self.directions, points)
-        return points
+        return aimed_points(self.telescope, self.directions, wavelength, self.vignetted(pupil))
+
+    def own_entrance_points(self, wavelength: float) -> np.ndarray:
+        """Return :meth:`entrance_points` of the pupil points of the request, found once for each wavelength [m]."""
+        known = self._found_points
+        if wavelength not in known:
+            known[wavelength] = self.entrance_points(wavelength, self.pupil.points)
+        return known[wavelength]
+
+    @cached_property
+    def _found_points(self) -> dict[float, np.ndarray]:
+        return {}
 
     def vignetted(self, pupil: np.ndarray) -> np.ndarray:
         """Return pupil points [m] with the vignetting factors of each field, [n_field, n_pupil, 2].

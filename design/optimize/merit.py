@@ -5,8 +5,7 @@ The rays of a merit are those that are lit at the start; otherwise a merit could
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -52,6 +51,10 @@ class Beams:
         request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
         return cls(request, relative_weights(field_weights, len(request.fields), "field_weights"))
 
+    def aimed_at(self, telescope: Telescope) -> Beams:
+        """Return the rays of the same pupil points, aimed at the stop of another telescope."""
+        return replace(self, request=replace(self.request, telescope=telescope))
+
     def rays(self, telescope: Telescope, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
         """Return the rays of one wavelength, field by field; through other pupil points [m] if these are given.
 
@@ -59,7 +62,7 @@ class Beams:
         that the request is of.
         """
         if pupil is None:
-            points = _entrance_points(self.request, wavelength)
+            points = self.request.own_entrance_points(wavelength)
         else:
             points = self.request.entrance_points(wavelength, pupil)
         return straight_bundles(telescope, self.request.directions, wavelength, points)
@@ -76,11 +79,6 @@ class Beams:
                 raise DomainError(f"{field_label(dark)}: no ray reaches the image of {telescope.name}")
             found.append(lit / total * self.field_weights[:, None])
         return np.array(found) * self.request.weights[:, None, None]
-
-
-@lru_cache(maxsize=32)
-def _entrance_points(request: Request, wavelength: float) -> np.ndarray:
-    return request.entrance_points(wavelength, request.pupil.points)
 
 
 class Merit(Protocol):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -13,18 +14,13 @@ from ...core.errors import DomainError, check_choice
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
-from ...raytrace.rays import field_direction, parallel_rays
+from ...raytrace.launch import aimed_points
+from ...raytrace.rays import field_direction, straight_bundles
 from .jacobian import ParameterColumns
 from .operand import GoalOperand, Operand, direction_of, operand_kind, wavelength_of
 
 #: Angle [rad] between the two chief rays of the focal length; distortion enters as its square.
 _SMALL_FIELD = 1e-4
-
-
-def _landing(columns: ParameterColumns, light: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return landing points of chief rays of some directions [m], shape [2, n], and derivatives [2, n, n_parameter]."""
-    forward = forward_pass(columns.telescope, parallel_rays(columns.telescope, light, wavelength, np.zeros((1, 2))))
-    return forward.landing[:2], columns.derivatives(forward, landing_gradient(forward))
 
 
 def _near_axis() -> np.ndarray:
@@ -42,14 +38,30 @@ def _scale(landing: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray]:
 
 @dataclass(frozen=True)
 class _ExactOperand(GoalOperand):
-    """Operand whose number and derivatives are computed together."""
+    """Operand whose number and derivatives are computed together, from chief rays.
+
+    Once bound, chief rays are those that go through the stop of the telescope they are bound to.
+    """
+
+    aimed: Telescope | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
 
     @property
     def exact(self) -> bool:
         return True
 
+    def bound(self, telescope: Telescope) -> Self:
+        return replace(self, aimed=telescope)
+
     def measure(self, telescope: Telescope) -> float:
         return self.gradient(ParameterColumns.at(telescope, ()))[0]
+
+    def landing(
+        self, columns: ParameterColumns, light: np.ndarray, wavelength: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return landing points of chief rays of some directions [m], [2, n], and derivatives [2, n, n_parameter]."""
+        points = aimed_points(self.aimed or columns.telescope, light, wavelength, np.zeros((1, 2)))
+        forward = forward_pass(columns.telescope, straight_bundles(columns.telescope, light, wavelength, points))
+        return forward.landing[:2], columns.derivatives(forward, landing_gradient(forward))
 
 
 @operand_kind("focal_length", "m")
@@ -79,7 +91,7 @@ class FocalLength(_ExactOperand):
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         wavelength = wavelength_of(self.wavelength, columns.telescope)
-        return _scale(*_landing(columns, _near_axis(), wavelength))
+        return _scale(*self.landing(columns, _near_axis(), wavelength))
 
 
 @operand_kind("f_number", "1")
@@ -121,7 +133,7 @@ class ChiefRay(_ExactOperand):
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         light = direction_of(self.field, columns.telescope)
-        landing, change = _landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
+        landing, change = self.landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
         row = "xy".index(self.axis)
         return float(landing[row, 0]), change[row, 0]
 
@@ -152,7 +164,7 @@ class RelativeDistortion(_ExactOperand):
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         light = np.concatenate([_near_axis(), direction_of(self.field, columns.telescope)])
-        landing, change = _landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
+        landing, change = self.landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
         focal, by_focal = _scale(landing[:, :2], change[:, :2])
         away = landing[:, 2] - landing[:, :2].mean(axis=1)
         by_away = change[:, 2] - change[:, :2].mean(axis=1)
@@ -188,8 +200,8 @@ class Target(Operand):
     value: float | None = None
     weight: float = 1.0
     step: float = 1e-5
-    minimum: float | None = field(default=None, kw_only=True)
-    maximum: float | None = field(default=None, kw_only=True)
+    minimum: float | None = dataclasses.field(default=None, kw_only=True)
+    maximum: float | None = dataclasses.field(default=None, kw_only=True)
 
     def measure(self, telescope: Telescope) -> float:  # noqa: D102
         return float(self.function(telescope))

@@ -16,7 +16,7 @@ from ...core.units import field_label
 from ...raytrace.adjoint.backward_pass import OutputGradient, position_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.adjoint.sphere_adjoint import SphereAdjoint
-from ...raytrace.rays import RayStatus, parallel_rays
+from ...raytrace.rays import RayStatus, straight_bundles
 from ...wavefront.request import Request
 from .jacobian import ParameterColumns, sphere_gradient
 
@@ -80,7 +80,9 @@ class FieldWavefronts:
         telescope, fields, light = columns.telescope, request.fields, request.directions
         self._columns, self._threads = columns, thread_count(request.threads)
         self._size = (len(fields), len(request.pupil))
-        chief = forward_pass(telescope, parallel_rays(telescope, light, wavelength, np.zeros((1, 2))), threads=1)
+        # Rays go where those of the request go, also of a telescope that has changed.
+        chief_points = request.entrance_points(wavelength, np.zeros((1, 2)))
+        chief = forward_pass(telescope, straight_bundles(telescope, light, wavelength, chief_points), threads=1)
         if not chief.arrived.all():
             raise DomainError(f"{field_label(fields[~chief.arrived][0])}: the chief ray does not reach the image")
         gradient, path = sphere_gradient(chief, chief.position, telescope.reference_sphere_radius)
@@ -88,7 +90,7 @@ class FieldWavefronts:
             telescope,
             light,
             chief.indices,
-            request.pupil.points,
+            request.own_entrance_points(wavelength),
             chief.position,
             path,
             telescope.reference_sphere_radius,

@@ -11,6 +11,7 @@ from ...core.warp_arrays import warp_array
 from ...models.telescope import Telescope
 from ..kernels.packet import LANES, lane_flags, lanes, ray_packets, to_packets
 from ..pack.surfaces import pack_surfaces
+from ..rays import object_points
 from .adjoint_matrix import AdjointMatrix, Polynomials, column_count, polynomial_tables
 from .forward_pass import check_differentiable
 from .sphere_kernels import SPHERE_COLUMNS, sphere_paths
@@ -23,8 +24,8 @@ class SphereAdjoint:
     :func:`~pachon.raytrace.adjoint.backward_pass.backward_pass`, but the rays stay in the processor's cache.
 
     ``directions`` [n_field, 3] are unit vectors of the light's travel, ``indices`` [n_surface + 1] the refractive index
-    before the first surface and after each, ``pupil`` [n_pupil, 2] entrance-pupil coordinates [m]. The spheres have one
-    ``radius`` [m] and a ``center`` each [m], [3, n_field], telescope frame; ``path`` [n_field] is the optical path [m]
+    before the first surface and after each, ``pupil`` entrance-pupil coordinates [m], [n_pupil, 2] or by field point,
+    [n_field, n_pupil, 2]. The spheres have one ``radius`` [m] and a ``center`` each [m], [3, n_field], telescope frame; ``path`` [n_field] is the optical path [m]
     of the chief ray to the sphere, which is subtracted. ``columns`` and ``polynomials`` are as in `backward_pass`, with
     four columns left free from ``sphere_column`` on: the path less ``path`` [m], and its derivatives with respect to
     the landing point, which are opposite to those with respect to the centre. With ``lit_only`` all is zero for
@@ -47,15 +48,17 @@ class SphereAdjoint:
         lit_only: bool = False,
     ) -> None:
         check_differentiable(telescope)
-        self._columns, self._n_surface, self._n_pupil = columns, len(telescope.surfaces), len(pupil)
+        self._columns, self._n_surface, self._n_pupil = columns, len(telescope.surfaces), pupil.shape[-2]
         self._n_columns = max(sphere_column + SPHERE_COLUMNS, column_count(columns, polynomials))
-        points = to_packets(pupil.T)
-        self._n_packets = points.shape[1]
+        points = np.stack([to_packets(own.T) for own in (pupil if pupil.ndim == 3 else pupil[None])])
+        self._n_packets = points.shape[2]
+        distant = not np.isfinite(telescope.object_distance)
         self._inputs = [
             pack_surfaces(telescope),
             warp_array(indices[None]),
             warp_array(indices),
             warp_array(np.column_stack([directions, center.T, path])),
+            warp_array(np.empty((0, 3)) if distant else object_points(telescope, directions)),
             warp_array(points, lanes),
             float(telescope.stop_z),
             float(telescope.launch_distance),

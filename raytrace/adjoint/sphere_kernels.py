@@ -10,7 +10,7 @@ import warp as wp
 from ...core.launch import FORWARD_OPTIONS
 from ..kernels.kernel_pair import kernel_pair
 from ..kernels.packet import LANES, RayPackets, lane_flags, lanes
-from ..kernels.pupil import launched
+from ..kernels.pupil import directed, launched
 from ..kernels.sphere import sphere_distance
 from ..kernels.surface import OK, ONE, ZERO
 from ..kernels.trace import LOOPS, PackedSurfaces, statuses
@@ -36,7 +36,8 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
         indices: wp.array2d(dtype=wp.float64),
         media: wp.array(dtype=wp.float64),
         fields: wp.array2d(dtype=wp.float64),
-        pupil: wp.array2d(dtype=lanes),
+        objects: wp.array2d(dtype=wp.float64),
+        pupil: wp.array3d(dtype=lanes),
         pupil_z: wp.float64,
         distance: wp.float64,
         radius: wp.float64,
@@ -55,29 +56,39 @@ def sphere_paths(special: bool, module: wp.Module) -> wp.Kernel:
         """Trace one of ``n_items`` equal parts of the packets; a packet's rays overwrite those of the one before.
 
         The packets are those of the pupil, field point by field point. ``fields`` holds for each of these the direction
-        of its light, the centre of its sphere and the path of its chief ray to that [m]. ``sphere_column`` is the first
-        column of the sphere. With ``lit_only`` all is zero for rays that are vignetted.
+        of its light, the centre of its sphere and the path of its chief ray to that [m]; ``objects`` the point that the
+        light comes from, where it is not empty. ``pupil`` [set, 2, packet] has one set for all field points, or one for
+        each. ``sphere_column`` is the first column of the sphere. With ``lit_only`` all is zero for rays that are
+        vignetted.
         """
         item = first + wp.tid()
         count = status_out.shape[0]
-        n_packets = pupil.shape[1]
+        n_packets = pupil.shape[2]
         n_surfaces = surfaces.kinds.shape[0]
         n = media[n_surfaces - 1]
         for p in range(count * item / n_items, count * (item + 1) / n_items):
             f = first_field + p / n_packets
             q = p % n_packets
-            du = fields[f, 0]
-            dv = fields[f, 1]
-            dw = fields[f, 2]
-            px, py, pz = launched(pupil[0, q], pupil[1, q], pupil_z, du, dv, dw, distance)
+            own = f % pupil.shape[0]
+            du = lanes(fields[f, 0])
+            dv = lanes(fields[f, 1])
+            dw = lanes(fields[f, 2])
+            at_x = pupil[own, 0, q]
+            at_y = pupil[own, 1, q]
+            px, py, pz = launched(at_x, at_y, pupil_z, fields[f, 0], fields[f, 1], fields[f, 2], distance)
+            if objects.shape[0] > 0:
+                px = lanes(objects[f, 0])
+                py = lanes(objects[f, 1])
+                pz = lanes(objects[f, 2])
+                du, dv, dw = directed(at_x, at_y, pupil_z, objects[f, 0], objects[f, 1], objects[f, 2])
             start.position[0, 0, item] = px
             start.position[0, 1, item] = py
             start.position[0, 2, item] = pz
-            start.direction[0, 0, item] = lanes(du)
-            start.direction[0, 1, item] = lanes(dv)
-            start.direction[0, 2, item] = lanes(dw)
+            start.direction[0, 0, item] = du
+            start.direction[0, 1, item] = dv
+            start.direction[0, 2, item] = dw
             x, y, z, u, v, w, path, status = through_telescope(
-                surfaces, indices, 0, px, py, pz, lanes(du), lanes(dv), lanes(dw), lanes(ZERO), item, rays
+                surfaces, indices, 0, px, py, pz, du, dv, dw, lanes(ZERO), item, rays
             )
             status_out[p] = statuses(status)
             weight = lanes(ONE)

@@ -10,9 +10,9 @@ import warp as wp
 
 from ...core.launch import FORWARD_OPTIONS
 from .kernel_pair import kernel_pair
-from .packet import RayPackets, lane_flags, lanes
+from .packet import RayPackets, lane_flags, lanes, lanes_sqrt
 from .sphere import sphere_distance
-from .surface import ZERO
+from .surface import ONE, ZERO
 from .trace import LOOPS, PackedSurfaces, statuses
 
 wp.set_module_options(FORWARD_OPTIONS)
@@ -23,6 +23,18 @@ def launched(px: lanes, py: lanes, pz: wp.float64, u: wp.float64, v: wp.float64,
     """Start parallel rays through (px, py, pz) on the plane at -distance along the direction of the light."""
     back = u * px + v * py + lanes(w * pz + distance)
     return px - u * back, py - v * back, lanes(pz) - w * back
+
+
+@wp.func
+def directed(px: lanes, py: lanes, pz: wp.float64, x: wp.float64, y: wp.float64, z: wp.float64):
+    """Return the directions of light from the point (x, y, z) of an object through (px, py, pz)."""
+    du = px - lanes(x)
+    dv = py - lanes(y)
+    dw = lanes(pz - z)
+    # The plane of the pupil may lie behind the object; the light still travels downwards.
+    scale = -wp.sign(pz - z) * lanes(ONE)
+    scale = wp.cw_div(scale, lanes_sqrt(wp.cw_mul(du, du) + wp.cw_mul(dv, dv) + wp.cw_mul(dw, dw)))
+    return wp.cw_mul(scale, du), wp.cw_mul(scale, dv), wp.cw_mul(scale, dw)
 
 
 @kernel_pair
