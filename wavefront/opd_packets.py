@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from ..core.buffers import empty
 from ..core.launch import launch
 from ..core.warp_arrays import warp_array
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
@@ -14,6 +15,7 @@ from ..raytrace.pack.surfaces import leading_surfaces, pack_surfaces, refractive
 from ..raytrace.rays import object_points
 from .opd_kernels import trace_opds
 from .request import Request
+from .straight_light import passing_packets
 
 #: Rays in one batch: enough that starting a batch does not count, and 0.2 s between two reports of progress.
 _RAYS_AT_ONCE = 1 << 22
@@ -31,7 +33,8 @@ def traced_opds(
 
     ``spheres`` [n_field, 4] holds the centres of the reference spheres of a radius [m] and the optical paths of the
     chief rays to them [m]. ``progress`` is called with the number of fields of each batch. Light that the first
-    aperture stops is traced no further: a first stage, up to that aperture, selects the packets of the second.
+    apertures stop is traced no further: geometry selects the packets where they are discs or rings, and elsewhere a
+    first stage, up to the first aperture, selects those of the second.
     """
     telescope, directions = request.telescope, request.directions
     whole = pack_surfaces(telescope)
@@ -44,18 +47,21 @@ def traced_opds(
     # From the centre outwards, so that a central obscuration or a rim stops whole packets.
     order = np.argsort(np.hypot(x, y), kind="stable")
     points = request.entrance_points(request.wavelength, np.stack([x, y], axis=-1)[order])
-    pupil = warp_array(to_packets(points.T), lanes) if points.ndim == 2 else None
+    shared = to_packets(points.T) if points.ndim == 2 else None
     place = np.full(packet_count(len(order)) * LANES, -1, dtype=np.int32)
     place[: len(order)] = order
     packed_place = warp_array(place.reshape(-1, LANES), lane_flags)
-    value = np.full((len(directions), x.size), np.nan)
+    value = empty((len(directions), x.size))
+    value.fill(np.nan)
     # Fields with pupil points of their own are traced one by one.
-    step = 1 if pupil is None else max(1, _RAYS_AT_ONCE // max(1, x.size))
+    step = 1 if shared is None else max(1, _RAYS_AT_ONCE // max(1, x.size))
     for first in range(0, len(value), step):
         part = slice(first, min(first + step, len(value)))
-        own = warp_array(to_packets(points[first].T), lanes) if pupil is None else pupil
-        lit = np.ones((part.stop - first) * len(packed_place), dtype=np.int32)
-        for surfaces in stages:
+        pupil = to_packets(points[first].T) if shared is None else shared
+        passing = passing_packets(telescope, pupil, directions[part], start[part])
+        lit = np.ones((part.stop - first) * len(packed_place)) if passing is None else passing.ravel()
+        lit = lit.astype(np.int32)
+        for surfaces in stages if passing is None else stages[-1:]:
             work = np.flatnonzero(lit).astype(np.int32)
             # A stage before the last counts the lit lanes only.
             filled = value[part] if surfaces is whole else value[:0]
@@ -66,7 +72,7 @@ def traced_opds(
                     surfaces,
                     indices,
                     warp_array(work, wp.int32),
-                    own,
+                    warp_array(pupil, lanes),
                     packed_place,
                     float(telescope.stop_z),
                     float(telescope.launch_distance),
