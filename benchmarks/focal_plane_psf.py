@@ -1,22 +1,22 @@
-"""The focal-plane PSF model beside the CCDs' own polynomials and Piff's Gaussian process over the whole field.
+"""The focal-plane PSF model beside the CCDs' own models: errors, uncertainties, correlations, time and memory.
 
-Run: python benchmarks/focal_plane_psf.py RUN [--heights STATIC.fits] [--no-piff]
+Run: python benchmarks/focal_plane_psf.py RUN [--heights STATIC.fits]
 
 RUN is the folder of `pachon run --all`: its observed stars and its noise-free PSFs at holdout positions. Errors are
 those of e1, e2 and ln size at the holdout positions:
 
 - the models of the CCDs in the products (the paper's cubic by default), and linear polynomials of all pixels with
   softened weights, the best of docs/psf_study.md;
-- Piff's GPInterp (treegp) over the whole field, on the same measured shapes with the same noise: isotropic and
-  anisotropic von Karman kernels, hyperparameters by Piff's two-point function;
 - pachon without telescope, and with the telescope but without heights; with those of other exposures if they are given.
 
 With the times of the fits, which run one after the other on all threads.
 """
 
 import argparse
+import json
 import resource
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from astropy.io import fits
 
 import pachon
 from pachon.core.units import ARCMIN
-from pachon.pipeline.ccd_product import read_product
+from pachon.pipeline.ccd_product import CcdProduct, read_product
 from pachon.pipeline.config import configuration_of
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_psf.stars import FocalPlaneStars
@@ -37,24 +37,30 @@ from pachon.pipeline.psf_model.model import PsfModel
 from pachon.pipeline.run_folder import SUMMARY_NAME
 
 
-def piff_gp(stars: FocalPlaneStars, x: np.ndarray, y: np.ndarray, kernel: str, optimizer: str) -> np.ndarray:
-    """Return e1, e2 and ln size at places by Piff's Gaussian process over the field."""
-    import piff
+@dataclass(frozen=True, eq=False)
+class RunStars:
+    """Stars and holdout positions of a run."""
 
-    def star(u: float, v: float) -> piff.Star:
-        return piff.Star.makeTarget(u=u, v=v, x=u, y=v, stamp_size=8, scale=1.0)
+    experiment: Experiment
+    products: list[CcdProduct]
+    stars: FocalPlaneStars
+    names: list[str]  #: CCD of each holdout position
+    x: np.ndarray  #: holdout positions on the detector [m]
+    y: np.ndarray
+    truth: np.ndarray  #: e1, e2 and ln size of the noise-free PSFs there, [n, 3]
 
-    # Piff's own units: arcmin of the field.
-    per_metre = 1.0 / 3.0e-3
-    fitted = [
-        piff.Star(star(u, v).data, piff.StarFit(params=p, params_var=n**2))
-        for u, v, p, n in zip(stars.x * per_metre, stars.y * per_metre, stars.values, stars.noise, strict=True)
-    ]
-    gp = piff.GPInterp(kernel=kernel, optimizer=optimizer, normalize=True, max_sep=60.0, nbins=21)
-    fitted = gp.initialize(fitted)
-    gp.solve(fitted)
-    at = gp.interpolateList([star(u, v) for u, v in zip(x * per_metre, y * per_metre, strict=True)])
-    return np.array([s.fit.params for s in at])
+    @classmethod
+    def read(cls, folder: Path) -> "RunStars":
+        """Read the products of a run."""
+        summary = json.loads((folder / SUMMARY_NAME).read_text())
+        experiment = Experiment.from_config(configuration_of(summary["configuration"], str(folder)))
+        products = [read_product(path, holdout_images=False) for path in sorted(folder.glob("ccd_*.fits"))]
+        stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
+        x, y, e1, e2, size = (
+            np.concatenate([getattr(p.holdout, key) for p in products]) for key in ("x", "y", "e1", "e2", "size")
+        )
+        names = [p.name for p in products for _ in range(len(p.holdout))]
+        return cls(experiment, products, stars, names, x, y, np.stack([e1, e2, np.log(size)], axis=1))
 
 
 def linear(products, experiment) -> np.ndarray:
@@ -76,21 +82,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--heights", type=Path, help="heights learnt from other exposures, of StaticHeights.write")
-    parser.add_argument("--no-piff", action="store_true")
     options = parser.parse_args()
-    import json
-
-    summary = json.loads((options.run / SUMMARY_NAME).read_text())
-    experiment = Experiment.from_config(configuration_of(summary["configuration"], str(options.run)))
-    products = [read_product(path, holdout_images=False) for path in sorted(options.run.glob("ccd_*.fits"))]
-    stars = FocalPlaneStars.from_products(products, experiment.weight_fwhm)
-    holdout = {
-        key: np.concatenate([getattr(p.holdout, key) for p in products]) for key in ("x", "y", "e1", "e2", "size")
-    }
+    run = RunStars.read(options.run)
+    experiment, products, stars, names, truth = run.experiment, run.products, run.stars, run.names, run.truth
     field = np.concatenate([np.stack([p.holdout.field_x, p.holdout.field_y]) for p in products], axis=1)
-    names = [p.name for p in products for _ in range(len(p.holdout))]
     patch = np.repeat(np.arange(len(products)), [len(p.holdout) for p in products])
-    truth = np.stack([holdout["e1"], holdout["e2"], np.log(holdout["size"])], axis=1)
     print(f"pachon {pachon.__version__}, {len(products)} CCDs, {len(stars)} stars, {len(names)} holdout positions")
     print(
         f"{'':44s} {'e1':>8s} {'e2':>8s} {'ln size':>8s}  chi2 e1, e2, ln size     xi+ 5.5', 10'-20', 30'-180'      fit"
@@ -124,17 +120,6 @@ def main() -> None:
     show("each CCD, as in the run", np.column_stack([values[:, :2], np.log(values[:, 2])]))
     start = time.perf_counter()
     show("each CCD, linear, all pixels, softened", linear(products, experiment), time.perf_counter() - start)
-    if not options.no_piff:
-        import piff
-
-        print(f"Piff {piff.__version__}")
-        for kernel, optimizer in (
-            ("1.e-5 * VonKarman(20.)", "isotropic"),
-            ("1.e-5 * AnisotropicVonKarman(invLam=np.array([[1./400., 0.], [0., 1./400.]]))", "anisotropic"),
-        ):
-            start = time.perf_counter()
-            found = piff_gp(stars, holdout["x"], holdout["y"], kernel, optimizer)
-            show(f"Piff GPInterp, {optimizer}", found, time.perf_counter() - start)
     cases: list[tuple[str, bool, Any]] = [
         ("without telescope", False, None),
         ("telescope, heights unknown", True, None),
@@ -147,7 +132,7 @@ def main() -> None:
         start = time.perf_counter()
         model = fit_focal_plane_model(experiment, stars, heights, telescope=telescope, components=0)
         seconds = time.perf_counter() - start
-        shapes, sigma = model.predict(names, holdout["x"], holdout["y"])
+        shapes, sigma = model.predict(names, run.x, run.y)
         found = np.stack([shapes.e1, shapes.e2, np.log(shapes.size)], axis=1)
         show(f"pachon, {label}", found, seconds, np.stack([sigma.e1, sigma.e2, sigma.size / shapes.size], axis=1))
         for remark in model.warnings:
