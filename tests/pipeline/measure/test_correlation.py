@@ -265,5 +265,5 @@ def test_whole_weights_are_stars_that_many_times():
     expected = shear_correlation(*many, subtract_mean=True, **BINS)
     np.testing.assert_allclose(shifted.xi_plus[filled], expected.xi_plus[filled], rtol=1e-6, atol=1e-10)
     for wrong in (count[1:], -count - 1.0, np.full(80, np.nan)):
-        with pytest.raises(DomainError, match="^weight: expected 80 finite numbers from 0, one for each star$"):
+        with pytest.raises(DomainError, match=r"^weight: expected 80 finite numbers from 0, one for each star$"):
             shear_correlation(x, y, e1, e2, weight=wrong, **BINS)
