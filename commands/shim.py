@@ -16,7 +16,7 @@ from .tables import Rows, print_json
 app = typer.Typer()
 _CAPTION = (
     "Mean over the area of the CCDs of the long-exposure PSF, at places that the fit did not use. Focused: moved as a "
-    "whole, which needs no shims. Plane: CCDs without heights, focused."
+    "whole, which needs no shims. Plane: CCDs without heights, focused. xi+: rms over logarithmic bins of separation."
 )
 
 
@@ -28,14 +28,16 @@ def shim_command(
     heights: Annotated[
         str | None, Option(help="Measured heights: lsstcam, or an ECSV or FITS file; those of the configuration.")
     ] = None,
-    merit: Annotated[str, Option(help="fwhm (mean FWHM) or ellipticity (rms).")] = "fwhm",
+    merit: Annotated[
+        str, Option("--minimise", "--merit", help="fwhm (mean), ellipticity (rms) or xi (its correlation, rms).")
+    ] = "fwhm",
     parts: Annotated[str, Option(help="rafts or ccds.")] = "rafts",
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_shims"),
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Find by how much rafts or CCDs should move for the sharpest or roundest images, and what that gains.
+    """Find by how much rafts or CCDs should move for the sharpest, roundest or least correlated images.
 
     Telescope, band, heights and seeing are those of the configuration; all CCDs are used unless some are named. Motions
     (shims.ecsv), gains (shims.json), a plot, and the configuration with the shims go into one folder.
@@ -43,7 +45,8 @@ def shim_command(
     **Examples**
 
     - `pachon shim --heights lsstcam`: rafts of LSSTCam as built, half a minute
-    - `pachon shim my_config.yaml --parts ccds --merit ellipticity`
+    - `pachon shim my_config.yaml --parts ccds --minimise ellipticity`
+    - `pachon shim --heights lsstcam --minimise xi`: a smaller correlation of ellipticities over the focal plane
     - `pachon run pachon_shims/config.yaml`: the run with the shims
     """
     from ..core.files import make_folder
@@ -62,8 +65,18 @@ def shim_command(
     if not quiet:
         reference = shims.checked["focused"].fwhm
         rows = [
-            (state, f"{m.fwhm:.4f}", f"{1e3 * (m.fwhm - reference):+.2f}", f"{1e3 * m.rms_e:.2f}")
+            (
+                state,
+                f"{m.fwhm:.4f}",
+                f"{1e3 * (m.fwhm - reference):+.2f}",
+                f"{1e3 * m.rms_e:.2f}",
+                f"{1e6 * m.rms_xi:.2f}",
+            )
             for state, m in ((state, shims.checked[state]) for state in STATES)
         ]
-        Rows(("focal plane", "mean FWHM [arcsec]", "less focused [mas]", "rms e [1e-3]"), rows, _CAPTION).show()
+        Rows(
+            ("focal plane", "mean FWHM [arcsec]", "less focused [mas]", "rms e [1e-3]", "rms xi+ [1e-6]"),
+            rows,
+            _CAPTION,
+        ).show()
     print(f"shims: {out.resolve()}")

@@ -156,13 +156,14 @@ def shear_correlation(
     exact: bool | None = None,
     patch: Any = None,
     other: tuple[Any, Any] | None = None,
+    weight: ArrayLike | None = None,
 ) -> Correlation:
     r"""Correlate ellipticities of star pairs (Jee & Tyson 2011, eq. 7).
 
     xi+ is the mean of ``Re(e e'*)`` over the pairs of a bin and xi- that of Re(e e' exp(-4 i phi)), phi being the
-    direction of the pair from x towards y; equal weights, flat sky. TreeCorr runs on one thread, since several would
-    add the pairs in another order: the same stars give the same bytes. It keeps ellipticities in single precision, so
-    a correlation is good to about 1e-7 of the mean of e squared.
+    direction of the pair from x towards y; flat sky. TreeCorr runs on one thread, since several would add the pairs in
+    another order: the same stars give the same bytes. It keeps ellipticities in single precision, so a correlation is
+    good to about 1e-7 of the mean of e squared.
 
     With patches, such as the CCDs, the error bars are those of the delete-one jackknife (Efron 1982; Norberg et
     al. 2009):
@@ -195,12 +196,14 @@ def shear_correlation(
     other : pair of arrays, optional
         A second ellipticity (f1, f2) of the same stars: xi+ becomes the mean of ``Re(e f'* + f e'*) / 2`` over the
         pairs, and xi- that of Re((e f' + f e') exp(-4 i phi)) / 2.
+    weight : array, optional
+        Weight of each star, not negative; a pair has the product of two. Equal by default.
 
     Raises
     ------
     DomainError
-        If shapes differ, separations are not positive and rising, fewer than two stars are usable, or these are all of
-        one patch.
+        If shapes differ, a weight is negative or not finite, separations are not positive and rising, fewer than two
+        stars are usable, or these are all of one patch.
     """
     columns = [radians(v, n) for v, n in ((x, "x"), (y, "y"))]
     if other is not None and len(other) != 2:
@@ -209,6 +212,10 @@ def shear_correlation(
     columns += [real_array(v, "e1, e2: expected arrays of real numbers") for v in ellipticities]
     if columns[0].ndim != 1 or any(c.shape != columns[0].shape for c in columns):
         raise DomainError(f"x, y, e1, e2 have shapes {[c.shape for c in columns]}: expected [n] four times")
+    if weight is not None:
+        weights = real_array(weight, "weight: expected an array of real numbers")
+        if weights.shape != columns[0].shape or not (np.isfinite(weights) & (weights >= 0.0)).all():
+            raise DomainError(f"weight: expected {len(columns[0])} finite numbers from 0, one for each star")
     try:
         labels = None if patch is None else np.asarray(patch)
     except ValueError:
@@ -226,17 +233,17 @@ def shear_correlation(
     if n_stars < 2:
         raise DomainError(f"e1, e2: {n_stars} of {len(usable)} stars are usable, expected at least 2")
     px, py, *g = (c[usable] for c in columns)
+    of_stars: dict[str, Any] = {} if weight is None else {"w": weights[usable]}
     if subtract_mean:
-        g = [c - c.mean() for c in g]
+        g = [c - np.average(c, weights=of_stars.get("w")) for c in g]
     if exact is None:
         exact = n_stars <= EXACT_LIMIT
-    patches: dict[str, Any] = {}
     if labels is not None:
         found, number = np.unique(labels[usable], return_inverse=True)
         if len(found) < 2:
             raise DomainError(f"patch: all usable stars are of patch {found[0]}, expected at least 2 patches")
-        patches = {"patch": number, "npatch": len(found)}
-    catalogs = [treecorr.Catalog(x=px, y=py, g1=g[i], g2=g[i + 1], **patches) for i in range(0, len(g), 2)]
+        of_stars |= {"patch": number, "npatch": len(found)}
+    catalogs = [treecorr.Catalog(x=px, y=py, g1=g[i], g2=g[i + 1], **of_stars) for i in range(0, len(g), 2)]
     pairs = treecorr.GGCorrelation(min_sep=low, max_sep=high, nbins=n_bins, bin_slop=0.1, brute=exact, verbose=0)
     pairs.process(*catalogs, num_threads=1)
     empty = pairs.npairs == 0

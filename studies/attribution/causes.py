@@ -70,29 +70,44 @@ def _no_diffusion(config: Configuration) -> str | None:
     return "psf.diffusion_pixels = 0" if config.psf.diffusion_pixels == 0.0 else None
 
 
+def _no_silicon(config: Configuration) -> str | None:
+    return None if config.detector.silicon else "detector.silicon = false"
+
+
+def _no_effect(key: str, config: Configuration) -> str | None:
+    value = getattr(config.sensor, key)
+    return None if value else f"sensor.{key} = {'null' if value is None else f'{value:g}'}"
+
+
 #: All causes by name: terms of the CCD heights and all of them, residual aberration, the whole telescope, turbulence
-#: with refraction, the ground layer in common to all stars, charge diffusion, and noise.
+#: with refraction, the ground layer in common to all stars, charge diffusion, the depth at which silicon absorbs light,
+#: sensor effects, and noise.
 CAUSES: dict[str, Cause] = {
     **{
         term: Cause({f"focal_plane__{term}": False}, partial(_no_term, term))
         for term in ("global", "raft", "ccd", "tilt", "potato_chip")
     },
-    "heights": Cause({"focal_plane__budget": "flat"}, _no_heights),
+    "heights": Cause({"focal_plane__heights": None, "focal_plane__budget": "flat"}, _no_heights),
     "active_optics": Cause({"active_optics__residual_um": 0.0}, _no_aberration),
     OPTICS: Cause({}, _nothing_left),
     "atmosphere": Cause({"atmosphere__enabled": False}, _no_atmosphere),
     "ground_layer": Cause({"atmosphere__ground_lift_m": GROUND_LIFT}, _no_ground_layer),
     "diffusion": Cause({"psf__diffusion_pixels": 0.0}, _no_diffusion),
+    "absorption_depth": Cause({"detector__silicon": False}, _no_silicon),
+    "brighter_fatter": Cause({"sensor__brighter_fatter": None}, partial(_no_effect, "brighter_fatter")),
+    "tree_rings": Cause({"sensor__tree_rings_um": 0.0}, partial(_no_effect, "tree_rings_um")),
+    "edge_rolloff": Cause({"sensor__edge_rolloff_um": 0.0}, partial(_no_effect, "edge_rolloff_um")),
     NOISE: Cause({}, lambda _: None),
 }
 
 
 def without(config: Configuration, cause: str) -> Configuration:
     """Return the configuration with a cause switched off."""
-    if cause == "heights":
-        plane = config.focal_plane.model_copy(update={"heights": None})
-        config = config.model_copy(update={"focal_plane": plane})
-    return with_options(config, **CAUSES[cause].options)
+    options = CAUSES[cause].options
+    for dotted in (dotted for dotted, value in options.items() if value is None):
+        name, key = dotted.split("__")
+        config = config.model_copy(update={name: getattr(config, name).model_copy(update={key: None})})
+    return with_options(config, **options)
 
 
 def checked_causes(config: Configuration, causes: Sequence[str] | None = None) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from ...core.plotting import new_figure, png_bytes, styled
 from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.experiment import Experiment
+from ...pipeline.report.diagnostics import correlation_columns
 from ...pipeline.report.focal_plane_axes import draw_outlines, frame_axes
 from ...pipeline.report.focal_plane_plots import draw_heights
 from ...pipeline.run_folder import stamp_of
@@ -24,7 +25,9 @@ def shim_metrics(shims: Shims) -> dict[str, Any]:
     named = {name: dict(zip(("dz_um", "rx_urad", "ry_urad"), values, strict=True)) for name, values in motions.items()}
 
     def states(of: Any) -> dict[str, dict[str, float]]:
-        return {state: {"mean_fwhm_arcsec": m.fwhm, "rms_e": m.rms_e} for state, m in of.items()}
+        return {
+            state: {"mean_fwhm_arcsec": m.fwhm, "rms_e": m.rms_e, "rms_xi_plus": m.rms_xi} for state, m in of.items()
+        }
 
     focus = asdict(shims.focus)
     return {
@@ -38,7 +41,7 @@ def shim_metrics(shims: Shims) -> dict[str, Any]:
 
 
 def write_shims(shims: Shims, folder: Path, experiment: Experiment) -> tuple[str, ...]:
-    """Write motions, gains, plot and the configuration with the shims; return the names of the files."""
+    """Write motions, gains, correlations, plot and the configuration with the shims; return the names of the files."""
     motions = shims.motions.values()
     columns = {
         "part": (np.array(list(shims.motions)), "", "raft or CCD"),
@@ -48,7 +51,10 @@ def write_shims(shims: Shims, folder: Path, experiment: Experiment) -> tuple[str
     }
     return write_products(
         folder,
-        {"shims.ecsv": ("motions beside the focus of the whole focal plane", columns)},
+        {
+            "shims.ecsv": ("motions beside the focus of the whole focal plane", columns),
+            "correlations.ecsv": ("xi of the ellipticities of each state", correlation_columns(shims.correlations)),
+        },
         {"shims.png": shims_plot(shims)},
         {"shims.json": shim_metrics(shims)},
         stamp_of(experiment).meta(),

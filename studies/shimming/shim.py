@@ -1,9 +1,10 @@
-"""Motions of rafts or CCDs that make the images of a focal plane sharpest or roundest.
+"""Motions of rafts or CCDs that make the images of a focal plane sharpest, roundest or least correlated.
 
 At Gauss-Legendre nodes of each CCD the long-exposure engine gives the width and the ellipticity of the PSF as functions
 of the height. Piston, tip and tilt of each part then follow from a minimum of the mean over its nodes, with exact
-derivatives; parts do not influence each other. First the focal plane as a whole is focused, which the camera's hexapod
-does without any shim: gains are counted from there. Results are checked with the engine at other places.
+derivatives; parts do not influence each other, but for the correlation of ellipticities, of which all are found
+together. First the focal plane as a whole is focused, which the camera's hexapod does without any shim: gains are
+counted from there. Results are checked with the engine at other places, and correlated there by TreeCorr.
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ from ...models.camera.focal_plane import FocalPlane
 from ...pipeline.config import Configuration, MotionConfig
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.height_series import HeightSeries
+from ...pipeline.measure.correlation import Correlation, shear_correlation
+from ...wavefront.chief_rays import fields_at
 from .curves import Places, focus_curves, measured
+from .pairs import PairSum, separation_edges
 
-MERITS = ("fwhm", "ellipticity")
+MERITS = ("fwhm", "ellipticity", "xi")
 PARTS = ("rafts", "ccds")
 #: States of the focal plane: as it is, focused as a whole, shimmed, and an ideal plane in focus.
 STATES = ("as built", "focused", "shimmed", "plane")
@@ -33,6 +37,8 @@ STATES = ("as built", "focused", "shimmed", "plane")
 _FIT, _CHECK = 3, 4
 # Room for motions beyond the largest height [m].
 _ROOM = 10e-6
+#: Merit at each place and its derivative with respect to the height there, of values and slopes [n, 3].
+Value = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 # Lengths of which motions are multiples in the fit [m]: of the piston, and of a tilt at the rim of a part.
 _UNIT = 1e-6
 
@@ -60,6 +66,7 @@ class StateMetrics:
 
     fwhm: float  #: mean FWHM [arcsec]
     rms_e: float  #: rms of the ellipticity, both components together
+    rms_xi: float  #: rms over logarithmic bins of separation of xi+ of the ellipticity; 0 where there are no pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +83,8 @@ class Shims(Result):
         Of each part, beside the focus.
     fitted, checked : dict of str to StateMetrics
         By state, from the curves at the nodes of the fit, and from the engine at other places.
+    correlations : dict of str to Correlation
+        By state, of the ellipticities at these other places, weighted by their shares of the area.
     focused, focal_plane : FocalPlane
         Focused as a whole, and shimmed.
     """
@@ -88,6 +97,7 @@ class Shims(Result):
     motions: dict[str, Motion]
     fitted: dict[str, StateMetrics]
     checked: dict[str, StateMetrics]
+    correlations: dict[str, Correlation]
     focused: FocalPlane
     focal_plane: FocalPlane
 
@@ -105,14 +115,15 @@ def shim(
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> Shims:
-    """Find the motions of rafts or CCDs that minimise the mean FWHM or the rms ellipticity.
+    """Find motions of rafts or CCDs that minimise FWHM, ellipticity or xi+.
 
     Parameters
     ----------
     experiment : Experiment
         Telescope, atmosphere and heights, with the long_exposure engine; the CCDs of its configuration are used.
     merit : str
-        "fwhm" (mean FWHM over the area) or "ellipticity" (rms).
+        "fwhm" (mean FWHM over the area), "ellipticity" (rms) or "xi" (rms over logarithmic bins of separation of xi+ of
+        the ellipticity; from the motions of the smallest rms ellipticity to the next minimum).
     parts : str
         "rafts" or "ccds".
     threads : int, optional
@@ -125,7 +136,7 @@ def shim(
     ConfigError
         If merit or parts are unknown, or the engine is another one.
     DomainError
-        If a PSF has no width within the range of the heights.
+        If a PSF has no width within the range of the heights, or places are too many for the pairs of "xi".
     """
     check_choice("merit", merit, MERITS)
     check_choice("parts", parts, PARTS)
@@ -143,15 +154,20 @@ def shim(
             lost = ~np.isfinite(curves.coefficients).all(axis=(0, 2))
             some = plane.names[fit.ccd[np.flatnonzero(lost)[0]]]
             raise DomainError(f"{some}: the PSF has no width or shape within {1e6 * curves.reach:.0f} um of focus")
-    whole = np.zeros(2), np.arange(len(fit.ccd))
-    focus = _best(curves, fit, heights, *whole, merit)
-    level = _best(curves, fit, np.zeros_like(heights), *whole, merit)
-    focused = heights + _lift(focus, fit.position)
-    motions: dict[str, Motion] = {}
+    sky, sky_checked = (_sky(experiment, places, threads) for places in (fit, check))
+    edges = _edges(plane, np.concatenate([fit.position, check.position]), np.concatenate([sky, sky_checked]))
+    pairs = PairSum.of(sky, fit.weight, edges) if merit == "xi" else None
+    whole = [(np.zeros(2), np.arange(len(fit.ccd)))]
+    with reporter.stage("motions"):
+        (focus,) = _best(curves, fit, heights, whole, merit, pairs)
+        (level,) = _best(curves, fit, np.zeros_like(heights), whole, merit, pairs)
+        focused = heights + _lift(focus, fit.position)
+        named = _parts(plane, fit, parts)
+        best = _best(curves, fit, focused, [part[1:] for part in named], merit, pairs)
+    motions = {part[0]: motion for part, motion in zip(named, best, strict=True)}
     shimmed = focused.copy()
-    for part, center, rows in _parts(plane, fit, parts):
-        motions[part] = _best(curves, fit, focused, center, rows, merit)
-        shimmed[rows] += _lift(motions[part], fit.position[rows] - center)
+    for name, center, rows in named:
+        shimmed[rows] += _lift(motions[name], fit.position[rows] - center)
     planes = {
         "as built": plane,
         "focused": moved_whole(plane, focus),
@@ -159,10 +175,26 @@ def shim(
         "plane": moved_whole(FocalPlane.flat(plane.camera), level),
     }
     by_state = (heights, focused, shimmed, _lift(level, fit.position))
-    fitted = {state: _metrics(fit, curves.at(h)) for state, h in zip(STATES, by_state, strict=True)}
+    fitted, checked, correlations = {}, {}, {}
     with reporter.stage("check with the engine at other places"):
-        checked = {state: _metrics(check, measured(experiment, planes[state], check, threads)) for state in STATES}
-    return Shims(merit, parts, focus, motions, fitted, checked, planes["focused"], planes["shimmed"])
+        for state, at in zip(STATES, by_state, strict=True):
+            fitted[state], _ = _metrics(fit, curves.at(at), sky, edges)
+            values = measured(experiment, planes[state], check, threads)
+            checked[state], correlations[state] = _metrics(check, values, sky_checked, edges)
+    return Shims(merit, parts, focus, motions, fitted, checked, correlations, planes["focused"], planes["shimmed"])
+
+
+def _sky(experiment: Experiment, places: Places, threads: int | None) -> np.ndarray:
+    """Return the field angles of places [rad], shape [n, 2]."""
+    middle = experiment.wavelengths[len(experiment.wavelengths) // 2]
+    return fields_at(experiment.telescope, places.position, middle, threads=threads)
+
+
+def _edges(plane: FocalPlane, positions: np.ndarray, sky: np.ndarray) -> np.ndarray:
+    """Return the edges of the bins of separation of places at positions [m] and field angles [rad]."""
+    longest = float(np.hypot(*np.ptp(sky, axis=0)))
+    scale = longest / float(np.hypot(*np.ptp(positions, axis=0)))
+    return separation_edges(0.25 * plane.camera.shortest_side * scale, longest)
 
 
 def moved_whole(plane: FocalPlane, motion: Motion) -> FocalPlane:
@@ -217,27 +249,71 @@ def _lift(motion: Motion, position: np.ndarray) -> np.ndarray:
 
 
 def _best(
-    curves: HeightSeries, places: Places, heights: np.ndarray, center: np.ndarray, rows: np.ndarray, merit: str
-) -> Motion:
-    """Return the motion of a part, given by its places, that minimises the merit function."""
-    some, weight, start = curves.chosen(rows), places.weight[rows], heights[rows]
-    x, y = (places.position[rows] - center).T
-    arm = float(np.abs([x, y]).max())
-    design = np.stack([np.ones_like(x), y / arm, -x / arm], axis=1) * _UNIT
-    value = _VALUES[merit]
+    curves: HeightSeries,
+    places: Places,
+    heights: np.ndarray,
+    parts: Sequence[tuple[np.ndarray, np.ndarray]],
+    merit: str,
+    pairs: PairSum | None,
+) -> list[Motion]:
+    """Return the motions of parts, given by centre and rows of their places, that minimise the merit function."""
+    separate = merit if pairs is None else "ellipticity"
+    found = np.concatenate(
+        [_minimum(curves, places, heights, [part], _VALUES[separate], np.zeros(3)) for part in parts]
+    )
+    if pairs is not None:
+
+        def value(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            # All places in the order of the pairs; in units of 1e-6, of order one for the minimiser.
+            total, change = pairs.mean_square(1e3 * values[order, 1:])
+            slope = np.einsum("nk,nk->n", change[rows], 1e3 * slopes[:, 1:]) / places.weight[rows]
+            return np.full(len(rows), total), slope
+
+        rows = np.concatenate([rows for _, rows in parts])
+        order = np.argsort(rows)
+        found = _minimum(curves, places, heights, parts, value, found)
+    return [_motion(x, places.position[rows] - center) for x, (center, rows) in zip(found, parts, strict=True)]
+
+
+def _minimum(
+    curves: HeightSeries,
+    places: Places,
+    heights: np.ndarray,
+    parts: Sequence[tuple[np.ndarray, np.ndarray]],
+    value: Value,
+    start: np.ndarray,
+) -> np.ndarray:
+    """Return piston and tilts of parts [n_part, 3], in units of 1 um of lift, at the minimum next to a start."""
+    rows = np.concatenate([rows for _, rows in parts])
+    part = np.repeat(np.arange(len(parts)), [len(rows) for _, rows in parts])
+    some, weight, before = curves.chosen(rows), places.weight[rows], heights[rows]
+    design = np.concatenate([_design(places.position[rows] - center) for center, rows in parts]) * _UNIT
 
     def merit_function(motion: np.ndarray) -> tuple[float, np.ndarray]:
-        new = start + np.einsum("nk,k->n", design, motion)
+        new = before + np.einsum("nk,nk->n", design, motion.reshape(-1, 3)[part])
         # Heights beyond the curves are penalised: the minimum lies within.
         inside = np.clip(new, -some.reach, some.reach)
         merits, slope = value(some.at(inside), some.slope(inside))
         beyond = (new - inside) / _UNIT
         total = merits + beyond**2
-        slope = np.where(beyond == 0.0, slope, 0.0) + 2.0 * beyond / _UNIT
-        return float(np.einsum("n,n->", weight, total)), np.einsum("n,nk->k", weight * slope, design)
+        slope = weight * (np.where(beyond == 0.0, slope, 0.0) + 2.0 * beyond / _UNIT)
+        change = np.stack([np.bincount(part, slope * along) for along in design.T], axis=1)
+        return float(np.einsum("n,n->", weight, total)), change.ravel()
 
-    found = scipy.optimize.minimize(merit_function, np.zeros(3), jac=True, method="BFGS", options={"gtol": 1e-9})
-    dz, rx, ry = found.x * _UNIT
+    found = scipy.optimize.minimize(merit_function, start.ravel(), jac=True, method="BFGS", options={"gtol": 1e-9})
+    return np.asarray(found.x).reshape(-1, 3)
+
+
+def _design(position: np.ndarray) -> np.ndarray:
+    """Return the lift of places at positions about the centre of a part [n, 2] by piston and two tilts, [n, 3]."""
+    x, y = position.T / np.abs(position).max()
+    return np.stack([np.ones_like(x), y, -x], axis=1)
+
+
+def _motion(lifts: np.ndarray, position: np.ndarray) -> Motion:
+    """Return the motion of piston and tilts as :func:`_minimum` has them, of a part with places at these positions."""
+    dz, rx, ry = lifts * _UNIT
+    arm = np.abs(position).max()
     return Motion(float(dz), float(np.arctan(rx / arm)), float(np.arctan(ry / arm)))
 
 
@@ -251,12 +327,25 @@ def _square_ellipticity(values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndar
     return (e**2).sum(axis=1), 2.0 * (e * change).sum(axis=1)
 
 
-#: Merit of a place and its derivative with respect to the height, of values and slopes [n, 3].
-_VALUES: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
+#: Merits that are means over places.
+_VALUES: dict[str, Value] = {
     "fwhm": _width,
     "ellipticity": _square_ellipticity,
 }
 
 
-def _metrics(places: Places, values: np.ndarray) -> StateMetrics:
-    return StateMetrics(places.mean(values[:, 0]), places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5)
+def _metrics(
+    places: Places, values: np.ndarray, sky: np.ndarray, edges: np.ndarray
+) -> tuple[StateMetrics, Correlation]:
+    """Return means of values [n, 3] at places, and the correlation of their ellipticities."""
+    found = shear_correlation(
+        *sky.T,
+        *values[:, 1:].T,
+        min_sep=edges[0],
+        max_sep=edges[-1],
+        n_bins=len(edges) - 1,
+        weight=places.weight,
+    )
+    rms_xi = float(np.sqrt(np.nanmean(found.xi_plus**2)))
+    rms_e = places.mean((values[:, 1:] ** 2).sum(axis=1)) ** 0.5
+    return StateMetrics(places.mean(values[:, 0]), rms_e, rms_xi), found

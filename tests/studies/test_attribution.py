@@ -19,7 +19,7 @@ from pachon.pipeline.simulate.ccd_exposure import expose_ccd
 from pachon.pipeline.simulate.ccd_model import model_ccd
 from pachon.pipeline.simulate.stamps import center_stamps
 from pachon.studies.attribution.attribution import attribute, changes, without_cause
-from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes
+from pachon.studies.attribution.causes import CAUSES, FULL, GROUND_LIFT, NOISE, OPTICS, checked_causes, without
 from pachon.studies.attribution.product import write_attribution
 from pachon.wavefront.atmosphere.turbulence import structure_function
 
@@ -168,7 +168,7 @@ def test_a_lifted_ground_layer_is_the_same_air(tiny):
 
 def test_causes_that_are_off_are_no_causes(tiny):
     config = tiny()
-    assert checked_causes(config) == tuple(c for c in CAUSES if c != "active_optics")
+    assert checked_causes(config) == tuple(c for c in CAUSES if c not in ("active_optics", *OFF))
     config = tiny(focal_plane__tilt=False, psf__diffusion_pixels=0.0, active_optics__residual_um=0.2)
     assert not {"tilt", "diffusion"} & set(checked_causes(config))
     assert "active_optics" in checked_causes(config)
@@ -267,3 +267,49 @@ def test_cases_have_the_focal_plane_model_that_a_run_has(focal_plane_config, pla
     table = Table.read(tmp_path / "attribution.ecsv")
     assert table[key].description == "mean xi+ of away of the CCDs' own models, 0 to 10 arcmin"
     assert table["xi_plus_away_short"].description == "mean xi+ of away, 0 to 10 arcmin"
+
+
+SENSORS = {
+    "detector__silicon": True,
+    "sensor__brighter_fatter": "e2v",
+    "sensor__tree_rings_um": 2.0,
+    "sensor__edge_rolloff_um": 40.0,
+    "sensor__edge_rolloff_length_um": 5000.0,
+}
+
+
+OFF = {
+    "absorption_depth": {"detector__silicon": False},
+    "brighter_fatter": {"sensor__brighter_fatter": None},
+    "tree_rings": {"sensor__tree_rings_um": 0.0},
+    "edge_rolloff": {"sensor__edge_rolloff_um": 0.0},
+}
+
+
+def test_silicon_and_sensor_effects_are_causes_where_they_are_on(tiny):
+    names = ("absorption_depth", "brighter_fatter", "tree_rings", "edge_rolloff")
+    assert not set(names) & set(checked_causes(Experiment.from_config(tiny()).config))
+    on = Experiment.from_config(tiny(**SENSORS)).config
+    assert set(names) < set(checked_causes(on))
+    reasons = ("detector.silicon = false", "sensor.brighter_fatter = null", "sensor.tree_rings_um = 0")
+    for name, reason in zip(names, (*reasons, "sensor.edge_rolloff_um = 0"), strict=True):
+        with pytest.raises(ConfigError, match=f"^{name} cannot be switched off: {reason}$"):
+            checked_causes(tiny(), [name])
+        # One key, and nothing else, is another one.
+        assert without(on, name) == Experiment.from_config(tiny(**(SENSORS | OFF[name]))).config
+
+
+def test_a_case_without_a_sensor_effect_is_the_run_without_it(tiny):
+    """On each CCD the stars of every case are those of an experiment whose configuration never had the effect."""
+    on = tiny(ccds=("R22_S11",), psf__engine="long_exposure", wavelengths_nm=(690.0,), **SENSORS)
+    result = attribute(on, list(OFF), threads=1)
+    for name, options in OFF.items():
+        plain = tiny(ccds=("R22_S11",), psf__engine="long_exposure", wavelengths_nm=(690.0,), **(SENSORS | options))
+        experiment = Experiment.from_config(plain)
+        product = model_ccd(experiment, expose_ccd(experiment, "R22_S11", threads=1))
+        e = np.array([product.holdout.e1, product.holdout.e2])
+        assert result.metrics[name]["rms_e_truth"] == np.sqrt(np.mean(e**2))
+        changed = result.metrics[name]["change_rms_e_truth"] != 0.0
+        # The noise-free PSF is that of a faint star, without the brighter-fatter effect.
+        assert changed == (name != "brighter_fatter")
+        assert result.metrics[name]["change_rms_residual_at_stars"] != 0.0

@@ -12,9 +12,12 @@ from pachon.core.files import json_text
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.pipeline.config import Configuration, load_configuration, with_options
 from pachon.pipeline.experiment import Experiment
+from pachon.pipeline.measure.correlation import shear_correlation
 from pachon.studies.shimming.curves import Places, focus_curves, measured
+from pachon.studies.shimming.pairs import PairSum, separation_edges
 from pachon.studies.shimming.product import shim_metrics
 from pachon.studies.shimming.shim import STATES, Motion, moved_parts, shim, shimmed_configuration
+from pachon.wavefront.chief_rays import fields_at
 
 # Three CCDs that are not in a row hold a raft.
 OPTIONS = {"ccds": ("R34_S00", "R34_S11", "R34_S20"), "psf__engine": "long_exposure", "wavelengths_nm": (620.0,)}
@@ -91,6 +94,62 @@ def test_a_shimmed_raft_is_sharpest(built, shims):
         assert abs(plus - minus) < 0.2 * (plus + minus - 2 * best)
 
 
+def pair_by_pair(sky, weight, e, edges):
+    """xi+ of each bin with pairs, by all pairs at once."""
+    i, j = np.triu_indices(len(sky), 1)
+    which = np.searchsorted(edges, np.hypot(*(sky[i] - sky[j]).T), side="right") - 1
+    chosen = [np.flatnonzero(which == b) for b in range(len(edges) - 1)]
+    share = weight[i] * weight[j]
+    return np.array([share[c] @ (e[i[c]] * e[j[c]]).sum(axis=1) / share[c].sum() for c in chosen if len(c)])
+
+
+def test_pair_sums_are_those_of_treecorr_and_their_derivatives_finite_differences():
+    rng = np.random.default_rng(5)
+    sky, weight, e = rng.uniform(0, 0.01, (60, 2)), rng.uniform(0.5, 2.0, 60), rng.normal(0, 1e-2, (60, 2))
+    edges = separation_edges(0.5e-3, 9e-3)
+    assert len(edges) == 9
+    assert np.allclose(np.diff(np.log(edges)), np.log(18) / 8)
+    pairs = PairSum.of(sky, weight, edges)
+    expected = pair_by_pair(sky, weight, e, edges)
+    assert pairs.xi_plus(e) == pytest.approx(expected, rel=1e-12)
+    found = shear_correlation(*sky.T, *e.T, min_sep=edges[0], max_sep=edges[-1], n_bins=8, weight=weight)
+    # TreeCorr keeps ellipticities in single precision.
+    assert found.xi_plus[found.n_pairs > 0] == pytest.approx(expected, abs=1e-7 * (e**2).sum(axis=1).mean())
+    value, slope = pairs.mean_square(e)
+    assert value == pytest.approx((expected**2).mean(), rel=1e-12)
+    for i, k in ((0, 0), (17, 1), (59, 0)):
+        step = np.zeros_like(e)
+        step[i, k] = 1e-6
+        difference = (pairs.mean_square(e + step)[0] - pairs.mean_square(e - step)[0]) / 2e-6
+        assert slope[i, k] == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.long
+def test_no_motion_of_a_grid_has_a_smaller_correlation(built):
+    """Brute force over piston and tilts of a raft of three CCDs, with the correlation pair by pair."""
+    found = shim(built, merit="xi", threads=1)
+    fit, check = (Places.gauss(built.focal_plane, built.config.ccds, order) for order in (3, 4))
+    curves = focus_curves(built, fit, 40e-6)
+    sky, other = (fields_at(built.telescope, places.position, 620e-9) for places in (fit, check))
+    positions, both = np.concatenate([fit.position, check.position]), np.concatenate([sky, other])
+    longest, on_detector = (np.hypot(*np.ptp(values, axis=0)) for values in (both, positions))
+    edges = separation_edges(0.25 * 40.96e-3 * longest / on_detector, longest)
+
+    def correlation(heights):
+        return float(np.sqrt((pair_by_pair(sky, fit.weight, curves.at(heights)[:, 1:], edges) ** 2).mean()))
+
+    heights = fit.heights(found.focal_plane)
+    best = correlation(heights)
+    # Single precision of TreeCorr, and a series that spans other heights.
+    assert found.fitted["shimmed"].rms_xi == pytest.approx(best, rel=2e-3)
+    assert best < 0.95 * shim(built, merit="ellipticity", threads=1).fitted["shimmed"].rms_xi
+    x, y = (fit.position - fit.position.mean(axis=0)).T
+    steps = np.array([-6.0, -2.0, 0.0, 2.0, 6.0]) * 1e-6
+    others = [correlation(heights + dz + rx * y / 0.04 + ry * x / 0.04) for dz in steps for rx in steps for ry in steps]
+    assert len(others) == 125
+    assert min(others) >= best * (1 - 1e-9)
+
+
 @pytest.mark.long
 def test_gains_are_in_order_and_checked_elsewhere(built, shims):
     for states in (shims.fitted, shims.checked):
@@ -120,7 +179,13 @@ def test_the_command_writes_motions_gains_and_a_configuration(tmp_path, capsys):
     assert main([*arguments, "--json", "--threads", "2"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert list(found["motions"]) == ["R22_S11"]
-    assert {p.name for p in out.iterdir()} == {"shims.ecsv", "shims.json", "shims.png", "config.yaml"}
+    assert {p.name for p in out.iterdir()} == {
+        "shims.ecsv",
+        "correlations.ecsv",
+        "shims.json",
+        "shims.png",
+        "config.yaml",
+    }
     moved = load_configuration(out / "config.yaml").focal_plane.moved
     assert "R22_S11" in moved
     # One thread, the same numbers.
@@ -131,7 +196,7 @@ def test_the_command_writes_motions_gains_and_a_configuration(tmp_path, capsys):
 
 def test_bad_arguments_are_one_line(capsys):
     experiment = experiment_of(focal_plane__heights="lsstcam")
-    with pytest.raises(ConfigError, match="merit = 'size': expected one of fwhm, ellipticity"):
+    with pytest.raises(ConfigError, match="merit = 'size': expected one of fwhm, ellipticity, xi"):
         shim(experiment, merit="size")
     with pytest.raises(ConfigError, match="parts = 'raft': expected one of rafts, ccds"):
         shim(experiment, parts="raft")

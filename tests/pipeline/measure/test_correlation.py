@@ -247,3 +247,23 @@ def test_bad_arguments():
             shear_correlation(x, y, e1, e2, min_sep=low, max_sep=high)
     with pytest.raises(DomainError, match="n_bins"):
         shear_correlation(x, y, e1, e2, min_sep=0.1, max_sep=1.0, n_bins=0)
+
+
+def test_whole_weights_are_stars_that_many_times():
+    rng = np.random.default_rng(8)
+    x, y = rng.uniform(0, 60 * ARCMIN, (2, 80))
+    e1, e2 = rng.normal(0, 0.02, (2, 80))
+    count = rng.integers(0, 4, 80)
+    # Copies of a star are apart by less than the first bin.
+    many = [np.repeat(v, count) for v in (x, y, e1, e2)]
+    one, other = shear_correlation(x, y, e1, e2, weight=count, **BINS), shear_correlation(*many, **BINS)
+    filled = other.n_pairs > 0
+    assert filled.sum() > 3
+    for key in ("xi_plus", "xi_minus"):
+        np.testing.assert_allclose(getattr(one, key)[filled], getattr(other, key)[filled], rtol=1e-6, atol=1e-10)
+    shifted = shear_correlation(x, y, e1, e2, weight=count, subtract_mean=True, **BINS)
+    expected = shear_correlation(*many, subtract_mean=True, **BINS)
+    np.testing.assert_allclose(shifted.xi_plus[filled], expected.xi_plus[filled], rtol=1e-6, atol=1e-10)
+    for wrong in (count[1:], -count - 1.0, np.full(80, np.nan)):
+        with pytest.raises(DomainError, match=r"^weight: expected 80 finite numbers from 0, one for each star$"):
+            shear_correlation(x, y, e1, e2, weight=wrong, **BINS)
