@@ -163,7 +163,7 @@ def test_sweeps_find_a_camera_beside_them(cameras):
 @pytest.mark.parametrize(
     ("telescope", "ccds", "pixel", "scale"),
     # Scales that observatories state ["].
-    [("hsc", ("hsc002", "hsc058"), 15.0, 0.168), ("decam", ("S4", "N30"), 15.0, 0.263),
+    [("hsc", ("hsc042", "hsc098"), 15.0, 0.168), ("decam", ("S4", "N30"), 15.0, 0.263),
      ("comcam_r", ("R22_S00", "R22_S22"), 10.0, 0.2), ("auxtel", ("RXX_S00", "RXX_S00"), 10.0, 0.0955)],
 )  # fmt: skip
 def test_defaults_follow_the_camera(telescope, ccds, pixel, scale):

@@ -62,17 +62,47 @@ def test_hsc_covers_the_field_of_90_arcmin():
 
 
 def test_hsc_ccds_stand_where_the_published_picture_has_them():
-    # DET-ID 49 next below the axis, 0 to 3 the column at +x, 100 to 103 turned by a quarter at the corners.
+    # DET-ID 49 next below the axis, 0 to 3 the column at one side, 100 to 103 turned by a quarter at the corners.
     at = {name: 1e3 * HSC.centers[HSC.ccd_index(name)] for name in ("hsc049", "hsc000", "hsc099", "hsc103", "hsc022")}
     assert np.allclose(at["hsc049"], [0.0, -33.9], atol=0.1)
-    assert np.allclose(at["hsc000"], [222.9, -104.2], atol=0.1)
-    assert np.allclose(at["hsc099"], [-222.9, 100.2], atol=0.1)
-    assert np.allclose(at["hsc103"], [-143.3, 215.0], atol=0.1)
-    assert np.allclose(at["hsc022"], [95.5, -235.0], atol=0.1)
+    assert np.allclose(at["hsc000"], [-222.9, -104.2], atol=0.1)
+    assert np.allclose(at["hsc099"], [222.9, 100.2], atol=0.1)
+    assert np.allclose(at["hsc103"], [143.3, 215.0], atol=0.1)
+    assert np.allclose(at["hsc022"], [-95.5, -235.0], atol=0.1)
     odd = [name for name, angle in zip(HSC.ccd_names, HSC.rotation_deg, strict=True) if angle % 180]
     assert odd == ["hsc100", "hsc101", "hsc102", "hsc103"]
     # Halves are turned towards each other.
     assert set(HSC.rotation_deg) == {0.0, 90.0, 180.0, 270.0}
+
+
+def test_hsc_is_on_the_sky_as_obs_subaru_has_it():
+    """In obs_subaru +x of the focal plane is along west where +y is along north (wcsFlipX is False)."""
+    telescope = load_telescope("hsc")
+    # Offsets x, y in pixels of CCDs of DET-ID 0, 49 and 103 (hsc_geom.paf), and their sky.
+    offsets = {"hsc000": (14858.70, -6944.16), "hsc049": (0.0, -2259.16), "hsc103": (-9550.2, 14334.6)}
+    sky = []
+    for name in offsets:
+        wcs = pachon.ccd_wcs(telescope, HSC, name)
+        sky.append(wcs.to_sky([[1023.5, 2087.5]])[0] / ARCSEC / 0.17)
+    offset, sky = np.array(list(offsets.values())), np.array(sky)
+    # A rotation, no reflection, carries (-x, y) to (xi, eta); the distortion at the edge of the field is 4 per cent.
+    ratio = (sky[:, 0] + 1j * sky[:, 1]) / (-offset[:, 0] + 1j * offset[:, 1])
+    assert np.allclose(np.angle(ratio / ratio[1]), 0.0, rtol=0, atol=1e-3)
+    assert np.allclose(np.abs(ratio), 0.98, rtol=0, atol=0.025)
+    # The other sense would not do.
+    mirrored = (sky[:, 0] + 1j * sky[:, 1]) / (offset[:, 0] + 1j * offset[:, 1])
+    assert np.ptp(np.angle(mirrored / mirrored[1])) > 0.5
+
+
+@pytest.mark.parametrize(("ccd", "crpix"), [("S4", 2151.2), ("N4", 2049.0 - 2151.2)])
+def test_decam_is_on_the_sky_as_its_headers_have_it(ccd, crpix):
+    """CRPIX1 and the CD matrix of S4 in a raw image (CCDNUM 28); those of N4 follow by symmetry."""
+    header = np.array([[8.8e-9, 7.28611e-5], [-7.28567e-5, 1.04e-8]])
+    wcs = pachon.wcs(load_telescope("decam"), ccd, (1.0, 0.0), np.deg2rad(-90.0))
+    # The linear terms of their distortion (TPV: PV1_1, PV2_1) are 1.0056.
+    assert np.allclose(wcs.wcs.cd, 1.0056 * header, rtol=0, atol=2e-3 * 7.3e-5)
+    center = wcs.all_pix2world([[1024.5, 2048.5]], 1)[0] - np.rad2deg([1.0, 0.0])
+    assert np.allclose(center, 1.0056 * header @ [1024.5 - crpix, 0.0], rtol=0, atol=2e-3 * 0.083)
 
 
 def test_decam_is_the_published_hexagon():
