@@ -73,6 +73,18 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     return found.reshape(n, -1, 2)
 
 
+def pupil_coordinates(telescope: Telescope, direction: np.ndarray, wavelength: float, points: np.ndarray) -> np.ndarray:
+    """Return the pupil points [m] whose rays cross the plane of the entrance pupil in given points [n, 2] [m].
+
+    The inverse of :func:`entrance_points` for one direction [3]; NaN where a ray does not reach the stop.
+    """
+    if telescope.design_data.aiming == "off":
+        return points
+    stop = stop_of(telescope)
+    landing = stop.landing(telescope, direction[None], wavelength)(points, np.zeros(len(points), dtype=int))
+    return landing @ stop.axes * (0.5 * telescope.pupil_diameter / stop.radius)
+
+
 def require_aimed(telescope: Telescope, directions: np.ndarray, points: np.ndarray) -> None:
     """Raise a DomainError that names the first of the fields, by their directions, of which no ray was aimed."""
     lost = np.isnan(points).all(axis=(-2, -1)) if points.ndim == 3 else np.zeros(len(directions), dtype=bool)

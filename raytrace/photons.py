@@ -15,6 +15,7 @@ from ..models.telescope import Telescope
 from .detector import land_bundle
 from .kernels.packet import from_packets, lane_flags, lanes, packet_count, ray_packets, to_packets
 from .kernels.photons import trace_photons
+from .launch import aimed_points
 from .pack.surfaces import distinct_media, pack_surfaces
 from .rays import RayStatus, require_distant_object
 
@@ -68,6 +69,8 @@ def land_photons(
 ) -> LandedPhotons:
     """Trace photons to the last surface of a telescope, or to the CCDs of a focal plane.
 
+    Where the design data ask for ray aiming, pupil coordinates are those of the stop: photons cross the plane of the
+    entrance pupil where rays from the point of the sky do so at the default wavelength, to the same points of the stop.
     The result does not depend on the number of threads, all processors by default.
 
     Raises
@@ -80,7 +83,9 @@ def land_photons(
     packed, count = pack_surfaces(telescope), packet_count(n)
     landing = wp.empty((6, count), dtype=lanes, device="cpu")
     statuses = wp.empty(count, dtype=lane_flags, device="cpu")
-    packets = [warp_array(to_packets(a), lanes) for a in (*beam.offset, *beam.pupil)]
+    light = -beam.source[:1] / np.linalg.norm(beam.source[0])
+    points = aimed_points(telescope, light, telescope.default_wavelength, np.stack(beam.pupil, axis=-1))
+    packets = [warp_array(to_packets(a), lanes) for a in (*beam.offset, *points.reshape(n, 2).T)]
     start = [warp_array(beam.source.ravel()), telescope.stop_z, telescope.launch_distance]
     indices = warp_array(to_packets(_indices(telescope, beam.wavelength)), lanes)
     inputs = [packed, indices, *packets, *start, ray_packets(), landing, statuses]

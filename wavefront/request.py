@@ -50,6 +50,8 @@ class Request:
         Wavelength that reference points belong to [m], where it is one of `wavelengths`; else the one in their middle.
     vignetting : ndarray, shape [n_field, 5], optional
         Vignetting factors of the fields, which change their pupil points, see :class:`~pachon.DesignData`.
+    stated_weights : ndarray, shape [n_field], optional
+        Weights of the fields that the design data state.
     """
 
     telescope: Telescope
@@ -61,6 +63,7 @@ class Request:
     threads: int | None
     primary: float | None = None
     vignetting: np.ndarray | None = None
+    stated_weights: np.ndarray | None = None
 
     def __repr__(self) -> str:
         waves = ", ".join(f"{1e9 * w:.5g}" for w in self.wavelengths[:3]) + ", ..." * (len(self.wavelengths) > 3)
@@ -92,8 +95,8 @@ class Request:
             The telescope.
         fields : array_like or Quantity, shape [n_field, 2] or [2], optional
             Field angles [rad]: slopes of the light's own travel, in the stated projection. By default those that the
-            design data of the telescope state, with their vignetting factors; where they state none, five points from
-            the axis to the edge of the field along +y.
+            design data of the telescope state, with their vignetting factors and weights; where they state none, five
+            points from the axis to the edge of the field along +y.
         wavelengths : array_like or Quantity, shape [n_wave] or scalar, optional
             Vacuum wavelengths [m]. By default those that the design data state, with their weights; where they state
             none, the telescope's default.
@@ -135,16 +138,17 @@ class Request:
         pupil = pupil_sampling(telescope, sampling, n_pupil)
         primary = telescope.default_wavelength if own_waves else None
         vignetting = np.array(data.vignetting) if fields is None and data.vignetting else None
-        request = cls(telescope, points, waves, weights, pupil, projection, threads, primary, vignetting)
+        stated = np.array(data.field_weights) if fields is None and data.field_weights else None
+        request = cls(telescope, points, waves, weights, pupil, projection, threads, primary, vignetting, stated)
         _ = request.directions  # an unknown projection is an error of the request, not of its first use
         return request
 
     def at_fields(self, fields: np.ndarray | slice) -> Request:
         """Return the request for a part of its fields, or for other field angles [rad], without vignetting factors."""
         if not isinstance(fields, slice):
-            return replace(self, fields=fields, vignetting=None)
-        factors = None if self.vignetting is None else self.vignetting[fields]
-        return replace(self, fields=self.fields[fields], vignetting=factors)
+            return replace(self, fields=fields, vignetting=None, stated_weights=None)
+        factors, stated = (None if v is None else v[fields] for v in (self.vignetting, self.stated_weights))
+        return replace(self, fields=self.fields[fields], vignetting=factors, stated_weights=stated)
 
     @cached_property
     def directions(self) -> np.ndarray:
@@ -155,6 +159,11 @@ class Request:
     def slopes(self) -> np.ndarray:
         """Slopes (vx, vy) / abs(vz) of the light of each field point, shape [n_field, 2]."""
         return self.directions[:, :2] / -self.directions[:, 2:]
+
+    @property
+    def field_weights(self) -> np.ndarray:
+        """Weights of a mean over the fields, shape [n_field]: those that the design data state, or equal ones."""
+        return relative_weights(self.stated_weights, len(self.fields), "field_weights")
 
     @property
     def middle(self) -> float:

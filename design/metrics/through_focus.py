@@ -53,7 +53,7 @@ class ThroughFocus(FieldResult):
     best_wavefront : ndarray, shape [n_field]
         Height of the smallest rms wavefront of each field [m]; NaN where it lies outside the heights.
     best_common : float
-        Height of the smallest mean square radius of all fields [m].
+        Height of the smallest mean square radius of all fields [m], with the weights that the design data state.
     smallest_radius : ndarray, shape [n_field]
         Root mean square radius at `best_spot` [m].
     """
@@ -150,7 +150,7 @@ def through_focus(
     if parallel.any():
         raise DomainError(f"{field_label(request.fields[parallel][0])}: the light is parallel; expected a focus")
     best = -square[:, 1] / (2.0 * square[:, 2])
-    total = square.sum(axis=0)
+    total = request.field_weights @ square
     common = float(-total[1] / (2.0 * total[2]))
     smallest = np.sqrt(np.maximum(np.polynomial.polynomial.polyval(best, square.T, tensor=False), 0.0))
     if defocus is None:

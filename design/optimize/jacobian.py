@@ -103,6 +103,36 @@ class ParameterColumns:
         other_terms = tuple((s, name) for _, s, name in others)
         return cls(moved, parameters, table, listed, other_terms, count, total[first:], numbers)
 
+    def leading(self, front: Telescope, wavelength: float) -> ParameterColumns:
+        """Return the columns of the first surfaces alone, those of a telescope `front`, for one wavelength [m].
+
+        Derivatives are those of landing points in the frame of its last surface.
+        """
+        count, first = len(front.surfaces), self.intermediate + SPHERE_COLUMNS
+        table = self.table[: count + 1].copy()
+        table[count] = -1
+        polynomials = [block for block in self.polynomials if block[0] < count]
+        kept = np.unique(np.concatenate([table.ravel(), *(columns for *_, columns in polynomials)]))
+        early, late = kept[(kept >= 0) & (kept < self.intermediate)], kept[kept >= first]
+        # Numbers -1, for none, stand at the end.
+        number = np.full(max(int(kept[-1]), 0) + 2, -1, dtype=np.int32)
+        number[early] = np.arange(len(early))
+        number[late] = len(early) + SPHERE_COLUMNS + np.arange(len(late))
+        others = [i for i, (s, _) in enumerate(self.other_terms) if s < count]
+        direct = len(self.weights) - len(self.other_terms)
+        rows = [*(late - first), *(direct + i for i in others)]
+        shaped = tuple(p for p in self.parameters if p.kind == "shape" and p.target in front.surface_names)
+        return ParameterColumns(
+            front,
+            shaped,
+            number[table],
+            tuple((s, scale, degree, number[columns]) for s, scale, degree, columns in polynomials),
+            tuple(self.other_terms[i] for i in others),
+            len(early),
+            self.weights_at(wavelength)[rows],
+            {},
+        )
+
     def weights_at(self, wavelength: float) -> np.ndarray:
         """Return the weights of the columns at a wavelength [m]; dispersion changes indices by amounts of its own."""
         if not self.abbe_numbers:

@@ -20,6 +20,7 @@ from ...raytrace.rays import Rays, RayStatus, straight_bundles
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request, relative_weights
+from .aimed_rays import AimedRays
 from .jacobian import ParameterColumns
 from .wavefront_derivatives import FieldWavefronts, WavefrontBlock
 
@@ -46,26 +47,26 @@ class Beams:
         n_pupil: int | None = None,
         **options: Any,
     ) -> Beams:
-        """Return the rays of a request, by default in 6 rings; further options are those of :meth:`Request.of`."""
+        """Return the rays of a request, by default in 6 rings; further options are those of :meth:`Request.of`.
+
+        Weights of the fields are those that the design data state, where neither fields nor weights are given.
+        """
         count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil
         request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
-        return cls(request, relative_weights(field_weights, len(request.fields), "field_weights"))
-
-    def aimed_at(self, telescope: Telescope) -> Beams:
-        """Return the rays of the same pupil points, aimed at the stop of another telescope."""
-        return replace(self, request=replace(self.request, telescope=telescope))
+        weights = request.stated_weights if field_weights is None else field_weights
+        return cls(request, relative_weights(weights, len(request.fields), "field_weights"))
 
     def rays(self, telescope: Telescope, wavelength: float, pupil: np.ndarray | None = None) -> Rays:
-        """Return the rays of one wavelength, field by field; through other pupil points [m] if these are given.
+        """Return the rays of one wavelength, field by field, through other pupil points [m] if these are given.
 
-        Where they cross the entrance pupil does not change with the telescope: they are aimed at the stop of the one
-        that the request is of.
+        Where rays are aimed, they are aimed at the stop of that telescope.
         """
-        if pupil is None:
-            points = self.request.own_entrance_points(wavelength)
+        if telescope is self.request.telescope or telescope.design_data.aiming == "off":
+            here = self.request
         else:
-            points = self.request.entrance_points(wavelength, pupil)
-        return straight_bundles(telescope, self.request.directions, wavelength, points)
+            here = replace(self.request, telescope=telescope)
+        points = here.own_entrance_points(wavelength) if pupil is None else here.entrance_points(wavelength, pupil)
+        return straight_bundles(telescope, here.directions, wavelength, points)
 
     def weights(self, telescope: Telescope) -> np.ndarray:
         """Return the weight of each ray in the mean square, [n_wave, n_field, n_pupil]; zero where it is not lit."""
@@ -130,14 +131,15 @@ class SpotMerit:
     def derivatives(self, columns: ParameterColumns) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         stacked = []
         for wavelength in self._beams.request.wavelengths:
-            rays = self._beams.rays(columns.telescope, wavelength)
-            stacked.append(self._landing(columns, rays))
+            aimed = AimedRays(columns, self._beams.request, float(wavelength), self._beams.request.pupil.points)
+            stacked.append(self._landing(aimed))
             if self._heights.any():
-                end = trace(columns.telescope, rays, threads=self._beams.request.threads)
+                end = trace(columns.telescope, aimed.rays, threads=self._beams.request.threads)
                 stacked[-1][..., 0] += self._beyond(columns.telescope, end.direction)
         chief = None
         if self._reference == "chief":
-            chief = self._landing(columns, self._chief_rays(columns.telescope))
+            first = float(self._beams.request.wavelengths[0])
+            chief = self._landing(AimedRays(columns, self._beams.request, first, np.zeros((1, 2))))
         reduced = self._reduced(np.array(stacked), chief)
         return reduced[..., 0].ravel(), reduced[..., 1:].reshape(-1, reduced.shape[-1] - 1)
 
@@ -155,10 +157,10 @@ class SpotMerit:
         along = direction @ telescope.surfaces[-1].matrix
         return (along[:, :2] / along[:, 2:]).T * self._heights
 
-    def _landing(self, columns: ParameterColumns, rays: Rays) -> np.ndarray:
+    def _landing(self, aimed: AimedRays) -> np.ndarray:
         """Return landing points and, behind them, their derivatives, shape [2, n, 1 + n_parameter]."""
-        forward = forward_pass(columns.telescope, rays, threads=self._beams.request.threads)
-        change = columns.derivatives(forward, landing_gradient(forward), threads=self._beams.request.threads)
+        forward = aimed.forward(self._beams.request.threads)
+        change = aimed.derivatives(forward, landing_gradient(forward), self._beams.request.threads)
         return np.concatenate([forward.landing[:2, :, None], change], axis=2)
 
     def _reduced(self, landing: np.ndarray, chief: np.ndarray | None) -> np.ndarray:
@@ -168,7 +170,9 @@ class SpotMerit:
         # Rays that are not lit have no weight and may be NaN.
         values = np.where((weights > 0)[:, None, ..., None], values, 0.0)
         if chief is None:
-            mean = np.einsum("wfp,wxfpk->xfk", weights, values) / weights.sum(axis=(0, 2))[:, None]
+            total = weights.sum(axis=(0, 2))
+            # Fields of no weight have no centroid, and count for nothing.
+            mean = np.einsum("wfp,wxfpk->xfk", weights, values) / np.where(total > 0.0, total, 1.0)[:, None]
         else:
             mean = chief
         return np.sqrt(weights)[:, None, ..., None] * (values - mean[:, :, None])
@@ -214,8 +218,7 @@ class WavefrontMerit:
                 value = block.value - self._goal[i, block.fields]
                 # NaN for a lost ray makes the solver take a shorter step.
                 value = np.where((block.status > RayStatus.VIGNETTED) & (roots > 0), np.nan, value)
-                change = block.by_center @ block.moved - block.columns @ weights
-                both = roots[..., None] * np.concatenate([value[..., None], change], axis=2)
+                both = roots[..., None] * np.concatenate([value[..., None], block.change(weights)], axis=2)
                 return (both - basis @ (basis.transpose(0, 2, 1) @ both)).reshape(-1, both.shape[-1])
 
             parts += FieldWavefronts(columns, beams.request, float(wavelength)).map(reduced)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,8 +32,6 @@ NO_EFFECT = 1e-11
 _FIRST_STEP = 100.0
 #: Singular value, relative to the largest, below which variables scaled to equal effects are collinear.
 _COLLINEAR = 1e-6
-#: Times that rays are aimed again, and change of the merit by it, relative, below which they are not.
-_AIMED_AGAIN, _SETTLED = 10, 1e-6
 
 
 @check_arguments
@@ -85,7 +82,7 @@ def optimize(
     targets : sequence of Operand
         Further numbers to be reached or held within limits, of each configuration.
     field_weights : array_like, shape [n_field], optional
-        Weights in the mean square; equal by default.
+        Weights in the mean square; by default those of the design data with their fields, else equal.
     reference : {"centroid", "chief"}
         Origin of the landing points.
     goal : array_like, shape [n_field, n_wave, n_pupil], optional
@@ -110,10 +107,6 @@ def optimize(
         If a merit or variable does not exist, or an operand is given twice.
     """
     require_count(restarts, "restarts", 0)
-
-    def rebuilt(telescope: Telescope, rays: Beams) -> Merit:
-        return _merit(merit, telescope, rays, reference, goal) if isinstance(merit, str) else merit
-
     states, beams = _states(
         configurations(
             telescope,
@@ -124,8 +117,8 @@ def optimize(
         ),
         merit,
         tuple(targets),
+        reference,
         goal,
-        rebuilt,
         dict(sampling=sampling, n_pupil=n_pupil, projection=projection, threads=threads),
     )
     telescopes = [state.telescope for state in states]
@@ -148,14 +141,6 @@ def optimize(
             found, course = _solve(problem, box, other, residuals, scale, tolerance, max_steps)
             if found.cost < done.cost:
                 done, history = found, course
-    for _ in range(_AIMED_AGAIN if any(t.design_data.aiming != "off" for t in telescopes) else 0):
-        # The stop of the telescope as it is now: light goes through the middle of that, not of the one at the start.
-        problem = DesignProblem(_aimed_again(states, beams, problem.telescopes(done.x * scale), rebuilt), chosen)
-        residuals = problem.linear(done.x * scale)[0]
-        if abs(float(np.linalg.norm(residuals)) - history[-1]) <= _SETTLED * history[-1]:
-            break
-        done, course = _solve(problem, box, done.x * scale, residuals, scale, tolerance, max_steps)
-        history += course
     solved = done.x * scale
     values, slopes = problem.linear(solved)
     end = float(np.linalg.norm(values))
@@ -245,8 +230,8 @@ def _states(
     found: tuple[DesignConfiguration, ...],
     merit: str | Merit,
     targets: tuple[Operand, ...],
+    reference: str,
     goal: Any,
-    rebuilt: Callable[[Telescope, Beams], Merit],
     options: dict[str, Any],
 ) -> tuple[tuple[DesignState, ...], tuple[Beams, ...]]:
     """Return merit and operands of each configuration, and their rays."""
@@ -258,7 +243,7 @@ def _states(
     for one in found:
         weights: dict[str, Any] = dict(field_weights=one.field_weights, wavelength_weights=one.wavelength_weights)
         rays = Beams.of(one.telescope, one.fields, one.wavelengths, **weights, **options)
-        wanted = rebuilt(one.telescope, rays)
+        wanted = merit if not isinstance(merit, str) else _merit(merit, one.telescope, rays, reference, goal)
         operands = (*targets, *one.operands)
         check_operands(operands)
         bound = []
@@ -269,22 +254,6 @@ def _states(
         states.append(DesignState(one.telescope, wanted, tuple(bound), one.weight / total))
         beams.append(rays)
     return tuple(states), tuple(beams)
-
-
-def _aimed_again(
-    states: Sequence[DesignState],
-    beams: Sequence[Beams],
-    telescopes: Sequence[Telescope],
-    rebuilt: Callable[[Telescope, Beams], Merit],
-) -> list[DesignState]:
-    """Return the states with their rays aimed at the stops of other telescopes, where rays are aimed."""
-    found = []
-    for state, rays, telescope in zip(states, beams, telescopes, strict=True):
-        if telescope.design_data.aiming != "off":
-            operands = tuple(operand.bound(telescope) for operand in state.operands)
-            state = replace(state, merit=rebuilt(telescope, rays.aimed_at(telescope)), operands=operands)
-        found.append(state)
-    return found
 
 
 def _check_start(operand: Operand, telescope: Telescope) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,19 +13,28 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
-from ...raytrace.adjoint.forward_pass import forward_pass
-from ...raytrace.launch import aimed_points
-from ...raytrace.rays import field_direction, straight_bundles
+from ...wavefront.pupil_sampling import CHIEF_RAY
+from ...wavefront.request import Request
+from .aimed_rays import AimedRays
 from .jacobian import ParameterColumns
-from .operand import GoalOperand, Operand, direction_of, operand_kind, wavelength_of
+from .operand import GoalOperand, Operand, angles_of, operand_kind, wavelength_of
 
 #: Angle [rad] between the two chief rays of the focal length; distortion enters as its square.
 _SMALL_FIELD = 1e-4
 
 
+def _landing(columns: ParameterColumns, fields: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return landing points of chief rays of some fields [rad] [m], [2, n], and derivatives [2, n, n_parameter]."""
+    columns.telescope.check_field(*fields.T)
+    request = Request.of(columns.telescope, fields, wavelength, sampling=CHIEF_RAY)
+    aimed = AimedRays(columns, request, wavelength, CHIEF_RAY.points)
+    forward = aimed.forward()
+    return forward.landing[:2], aimed.derivatives(forward, landing_gradient(forward))
+
+
 def _near_axis() -> np.ndarray:
-    """Return the directions of two chief rays near the axis, shape [2, 3]."""
-    return field_direction(np.array([-0.5, 0.5]) * _SMALL_FIELD, np.zeros(2))
+    """Return two field points near the axis [rad], shape [2, 2]."""
+    return _SMALL_FIELD * np.array([[-0.5, 0.0], [0.5, 0.0]])
 
 
 def _scale(landing: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray]:
@@ -38,30 +47,14 @@ def _scale(landing: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray]:
 
 @dataclass(frozen=True)
 class _ExactOperand(GoalOperand):
-    """Operand whose number and derivatives are computed together, from chief rays.
-
-    Once bound, chief rays are those that go through the stop of the telescope they are bound to.
-    """
-
-    aimed: Telescope | None = dataclasses.field(default=None, repr=False, compare=False, kw_only=True)
+    """Operand whose number and derivatives are computed together, from chief rays."""
 
     @property
     def exact(self) -> bool:
         return True
 
-    def bound(self, telescope: Telescope) -> Self:
-        return replace(self, aimed=telescope)
-
     def measure(self, telescope: Telescope) -> float:
         return self.gradient(ParameterColumns.at(telescope, ()))[0]
-
-    def landing(
-        self, columns: ParameterColumns, light: np.ndarray, wavelength: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return landing points of chief rays of some directions [m], [2, n], and derivatives [2, n, n_parameter]."""
-        points = aimed_points(self.aimed or columns.telescope, light, wavelength, np.zeros((1, 2)))
-        forward = forward_pass(columns.telescope, straight_bundles(columns.telescope, light, wavelength, points))
-        return forward.landing[:2], columns.derivatives(forward, landing_gradient(forward))
 
 
 @operand_kind("focal_length", "m")
@@ -91,7 +84,7 @@ class FocalLength(_ExactOperand):
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
         wavelength = wavelength_of(self.wavelength, columns.telescope)
-        return _scale(*self.landing(columns, _near_axis(), wavelength))
+        return _scale(*_landing(columns, _near_axis(), wavelength))
 
 
 @operand_kind("f_number", "1")
@@ -132,8 +125,8 @@ class ChiefRay(_ExactOperand):
         check_choice("axis", self.axis, ("x", "y"))
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
-        light = direction_of(self.field, columns.telescope)
-        landing, change = self.landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
+        field = np.array([angles_of(self.field)])
+        landing, change = _landing(columns, field, wavelength_of(self.wavelength, columns.telescope))
         row = "xy".index(self.axis)
         return float(landing[row, 0]), change[row, 0]
 
@@ -163,13 +156,13 @@ class RelativeDistortion(_ExactOperand):
             raise DomainError(f"operand {self.label}: expected a field off the axis")
 
     def gradient(self, columns: ParameterColumns) -> tuple[float, np.ndarray]:  # noqa: D102
-        light = np.concatenate([_near_axis(), direction_of(self.field, columns.telescope)])
-        landing, change = self.landing(columns, light, wavelength_of(self.wavelength, columns.telescope))
+        fields = np.array([*_near_axis(), angles_of(self.field)])
+        landing, change = _landing(columns, fields, wavelength_of(self.wavelength, columns.telescope))
         focal, by_focal = _scale(landing[:, :2], change[:, :2])
         away = landing[:, 2] - landing[:, :2].mean(axis=1)
         by_away = change[:, 2] - change[:, :2].mean(axis=1)
         distance = float(np.hypot(*away))
-        perfect = float(np.hypot(*light[2, :2]) / -light[2, 2])
+        perfect = float(np.hypot(*np.tan(fields[2])))
         ratio = distance / (focal * perfect)
         return ratio - 1.0, ratio * (away / distance**2 @ by_away - by_focal / focal)
 

@@ -14,10 +14,10 @@ from ...core.errors import DomainError
 from ...core.threads import thread_count
 from ...core.units import field_label
 from ...raytrace.adjoint.backward_pass import OutputGradient, position_gradient
-from ...raytrace.adjoint.forward_pass import forward_pass
 from ...raytrace.adjoint.sphere_adjoint import SphereAdjoint
-from ...raytrace.rays import RayStatus, straight_bundles
+from ...raytrace.rays import RayStatus
 from ...wavefront.request import Request
+from .aimed_rays import AimedRays
 from .jacobian import ParameterColumns, sphere_gradient
 
 Result = TypeVar("Result")
@@ -31,11 +31,12 @@ class WavefrontBlock:
 
     The wavefront is the path of the chief ray minus that of the ray, to a sphere about the landing point of the chief
     ray. That point moves with the parameters, so a derivative of the wavefront is
-    ``by_center @ moved - columns @ weights + piston``, summed over three components of the point and over columns.
+    ``by_center @ moved - columns @ weights + aimed + piston``, summed over three components of the point and columns.
 
     In `table` stand paths minus those of the chief rays [m], their derivatives with respect to the landing point (3),
     and the columns with weights; 0 where a ray is lost, and with `lit_only` where it is vignetted. `moved` holds the
-    derivatives of the centres, `piston` those of the paths of the chief rays.
+    derivatives of the centres, `piston` those of the paths of the chief rays, `aimed` what rays change that are aimed
+    again at the stop.
     """
 
     fields: slice
@@ -43,6 +44,7 @@ class WavefrontBlock:
     status: np.ndarray  #: [n_field, n_pupil] RayStatus
     moved: np.ndarray  #: [n_field, 3, n_parameter]
     piston: np.ndarray  #: [n_field, n_parameter]
+    aimed: np.ndarray | None  #: [n_field, n_pupil, n_parameter]; None without ray aiming
 
     @property
     def value(self) -> np.ndarray:
@@ -59,6 +61,11 @@ class WavefrontBlock:
         """Derivatives of the paths, shape [n_field, n_pupil, n_column]."""
         return self.table[4:].transpose(1, 2, 0)
 
+    def change(self, weights: np.ndarray) -> np.ndarray:
+        """Return the derivatives without piston, [n_field, n_pupil, n_parameter], from the weights of the columns."""
+        change: np.ndarray = self.by_center @ self.moved - self.columns @ weights
+        return change if self.aimed is None else change + self.aimed
+
     def project(self, terms: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sums over the rays of terms times wavefront and derivatives, these without piston.
 
@@ -68,7 +75,8 @@ class WavefrontBlock:
         # Sums over the rays first, as there are fewer columns than rays; all columns and field points in one product.
         count, n_field, n_pupil = self.table.shape
         sums = (terms @ self.table.reshape(-1, n_pupil).T).reshape(len(terms), count, n_field).transpose(2, 0, 1)
-        return -sums[..., 0], sums[..., 1:4] @ self.moved - sums[..., 4:] @ weights
+        change = sums[..., 1:4] @ self.moved - sums[..., 4:] @ weights
+        return -sums[..., 0], change if self.aimed is None else change + terms @ self.aimed
 
 
 class FieldWavefronts:
@@ -77,20 +85,21 @@ class FieldWavefronts:
     def __init__(
         self, columns: ParameterColumns, request: Request, wavelength: float, *, lit_only: bool = False
     ) -> None:
-        telescope, fields, light = columns.telescope, request.fields, request.directions
+        telescope, fields = columns.telescope, request.fields
         self._columns, self._threads = columns, thread_count(request.threads)
         self._size = (len(fields), len(request.pupil))
-        # Rays go where those of the request go, also of a telescope that has changed.
-        chief_points = request.entrance_points(wavelength, np.zeros((1, 2)))
-        chief = forward_pass(telescope, straight_bundles(telescope, light, wavelength, chief_points), threads=1)
+        aimed = AimedRays(columns, request, wavelength, np.zeros((1, 2)))
+        chief = aimed.forward(threads=1)
         if not chief.arrived.all():
             raise DomainError(f"{field_label(fields[~chief.arrived][0])}: the chief ray does not reach the image")
         gradient, path = sphere_gradient(chief, chief.position, telescope.reference_sphere_radius)
+        self._aimed = AimedRays(columns, request, wavelength, request.pupil.points)
+        self._centers, self._lit_only = chief.position, lit_only
         self._rays = SphereAdjoint(
             telescope,
-            light,
+            request.directions,
             chief.indices,
-            request.own_entrance_points(wavelength),
+            self._aimed.points,
             chief.position,
             path,
             telescope.reference_sphere_radius,
@@ -107,7 +116,7 @@ class FieldWavefronts:
             np.append(axes.path, gradient.path),
             index=np.concatenate([zero, gradient.index]),
         )
-        derivatives = columns.derivatives(chief, both, threads=1)
+        derivatives = aimed.derivatives(chief, both, threads=1)
         self._moved = derivatives[:3].transpose(1, 0, 2)
         self._piston = derivatives[3] - np.einsum("in,nip->np", gradient.position[0], self._moved)
 
@@ -130,4 +139,17 @@ class FieldWavefronts:
         lost = status > RayStatus.VIGNETTED
         if lost.any():
             table = np.where(lost, 0.0, table)
-        return WavefrontBlock(part, table, status, self._moved[part], self._piston[part])
+        return WavefrontBlock(part, table, status, self._moved[part], self._piston[part], self._by_aim(part, status))
+
+    def _by_aim(self, part: slice, status: np.ndarray) -> np.ndarray | None:
+        """Return the change of wavefronts by the motion of aimed rays, [n_field, n_pupil, n_parameter]."""
+        aimed = self._aimed.part(slice(part.start * self._size[1], part.stop * self._size[1]))
+        if aimed.motion is None:
+            return None
+        forward = aimed.forward(threads=1)
+        centers = np.repeat(self._centers[:, part], self._size[1], axis=1)
+        gradient, _ = sphere_gradient(forward, centers, self._columns.telescope.reference_sphere_radius)
+        by_points = aimed.by_points(forward, gradient, threads=1)[0]
+        change = -np.einsum("na,nap->np", by_points, aimed.motion).reshape(*status.shape, -1)
+        dark = status > (RayStatus.OK if self._lit_only else RayStatus.VIGNETTED)
+        return np.where(dark[..., None], 0.0, change)

@@ -19,8 +19,9 @@ from ...design.parameters.tolerances import Tolerance
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
+from ...raytrace.launch import aimed_points
 from ...raytrace.rays import parallel_rays
-from .donut_rays import chief_landing, landing_of, spread_of
+from .donut_rays import landing_of, spread_of
 from .pupil_cells import PupilCells
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ class FreedomRays:
         self._cells, self._footprint = cells, footprint
         self.weights = np.outer(wavelength_weights, cells.weights).ravel()
         middle = float(wavelengths[len(wavelengths) // 2])
+        #: Where the chief ray crosses the plane of the entrance pupil: that of the telescope as it is believed to be.
+        self._chief = np.reshape(aimed_points(telescope, direction[None], middle, np.zeros((1, 2))), (1, 2))
         columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ at)
 
         def derivatives(wavelength: float, points: np.ndarray) -> np.ndarray:
@@ -72,7 +75,7 @@ class FreedomRays:
             return columns.derivatives(forward, landing_gradient(forward), threads=1) @ self._matrix
 
         landing = [derivatives(float(w), cells.points) for w in wavelengths]
-        self._response = np.concatenate(landing, axis=1) - derivatives(middle, np.zeros((1, 2)))
+        self._response = np.concatenate(landing, axis=1) - derivatives(middle, self._chief)
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], of the telescope with its degrees of freedom."""
@@ -82,7 +85,10 @@ class FreedomRays:
             for w in self._wavelengths
         ]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
-        return np.concatenate(places) - chief_landing(changed, self._direction, middle)
+        chief = landing_of(changed, parallel_rays(changed, self._direction[None], middle, self._chief))
+        if not np.isfinite(chief).all():
+            raise DomainError("the chief ray does not reach the image")
+        return np.concatenate(places) - chief
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point."""

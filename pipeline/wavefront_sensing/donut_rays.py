@@ -1,10 +1,10 @@
 r"""Landing points of the light of one donut, and their response to the unknown wavefront.
 
-Rays pass given points p of the entrance pupil. A wavefront W(p) [m] beside the telescope's own, positive where it
-leads, is an optical delay of -W: it turns the light at p by :math:`-\nabla W`, and the ray lands elsewhere by
+Rays pass given points p of the plane of the entrance pupil. A wavefront W(p) [m] beside the telescope's own, positive
+where it leads, is an optical delay of -W: it turns the light at p by :math:`-\nabla W`, and the ray lands elsewhere by
 :math:`-J(p) \nabla W`, with J(p) the derivative of the landing point with respect to the direction cosines of the
 incoming light at a fixed point of the pupil. Rays are traced with their own changed directions, so landing points
-are exact for a wavefront of any size.
+are exact for a wavefront of any size. Where rays are aimed, Zernikes are functions of the stop's coordinates.
 """
 
 from __future__ import annotations
@@ -16,10 +16,15 @@ import numpy as np
 from ...core.errors import DomainError
 from ...models.telescope import Telescope
 from ...models.zernike_polynomials import annular_zernike_gradients
+from ...raytrace.aiming import pupil_coordinates
+from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import Rays, RayStatus, parallel_rays
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import JACOBIAN_STEP
 from .pupil_cells import PupilCells
+
+#: Step of the differences by which aimed pupil points follow those of the entrance pupil, in units of its radius.
+_DIFFERENCE = 1e-4
 
 
 class LightRays(Protocol):
@@ -68,11 +73,8 @@ class ZernikeRays:
         self.weights = np.outer(wavelength_weights, cells.weights).ravel()
         middle = float(wavelengths[len(wavelengths) // 2])
         self._chief = chief_landing(telescope, direction, middle)
-        radius = 0.5 * telescope.pupil_diameter
-        x, y = cells.points.T / radius
-        terms = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)
-        #: Derivatives of the terms along x and y of the pupil [1/m], [n_term, 2, n_point].
-        self._gradients = terms[noll - 1] / radius
+        #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
+        self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
         #: Sides of the image of a cell [m], columns of a matrix.
         self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 2))))
@@ -107,6 +109,26 @@ class ZernikeRays:
         return self._response
 
 
+def _gradients(
+    telescope: Telescope, direction: np.ndarray, wavelength: float, points: np.ndarray, noll: np.ndarray
+) -> np.ndarray:
+    """Return the derivatives of Zernike terms of the pupil by points of its plane [1/m], [n_term, 2, n_point]."""
+    radius = 0.5 * telescope.pupil_diameter
+    x, y = pupil_coordinates(telescope, direction, wavelength, points).T / radius
+    terms: np.ndarray = annular_zernike_gradients(int(noll.max()), x, y, telescope.pupil_obscuration)[noll - 1] / radius
+    if telescope.design_data.aiming == "off":
+        return terms
+    step = _DIFFERENCE * radius
+    sides = [
+        pupil_coordinates(telescope, direction, wavelength, points + axis)
+        - pupil_coordinates(telescope, direction, wavelength, points - axis)
+        for axis in step * np.eye(2)
+    ]
+    # [n_point, pupil axis, axis of the plane]: the terms are functions of the pupil, which the front of a lens deforms.
+    change = np.stack(sides, axis=-1) / (2.0 * step)
+    return np.einsum("tip,pij->tjp", terms, change)
+
+
 def spread_of(cells: PupilCells, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Return the spreads [m^2] of the landing points of one or more wavelengths, one after the other."""
     each = landing.reshape(-1, len(cells), 2)
@@ -120,7 +142,7 @@ def landing_of(telescope: Telescope, rays: Rays) -> np.ndarray:
 
 def chief_landing(telescope: Telescope, direction: np.ndarray, wavelength: float) -> np.ndarray:
     """Return the landing point x, y [m] of the chief ray, vignetting ignored; a lost ray is a DomainError."""
-    end = trace(telescope, parallel_rays(telescope, direction[None], wavelength, np.zeros((1, 2))), threads=1)
+    end = trace(telescope, launch_bundles(telescope, direction[None], wavelength, np.zeros((1, 2))), threads=1)
     if end.status[0] > RayStatus.VIGNETTED:
         raise DomainError("the chief ray does not reach the image")
     return telescope.surfaces[-1].to_local(end.position)[0, :2]

@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
+from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import parallel_rays
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import image_jacobians
@@ -96,7 +97,7 @@ class Instrument:
         height, tilt = defocus, (0.0, 0.0, 0.0)
         place = chief_landing(telescope, direction, self.middle)
         if self.focal_plane is not None:
-            rays = parallel_rays(telescope, direction[None], self.middle, np.zeros((1, 2)))
+            rays = launch_bundles(telescope, direction[None], self.middle, np.zeros((1, 2)))
             chief = trace(telescope, rays, focal_plane=self.focal_plane, threads=1)
             if chief.ccd is None or chief.ccd[0] < 0:
                 raise DomainError("the chief ray lands between the CCDs")

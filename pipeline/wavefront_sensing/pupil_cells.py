@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from ...models.telescope import Telescope
+from ...raytrace.launch import aimed_points
 from ...raytrace.rays import RayStatus, parallel_rays
 from ...raytrace.trace import trace
 
@@ -23,6 +24,8 @@ from ...raytrace.trace import trace
 _MARGIN = 1.02
 #: Chords of a cell on a rim, nodes along each, and halvings of a piece with a rim: to a 500th of a cell.
 _CHORDS, _NODES, _BISECTIONS = 8, 5, 6
+#: Points of the rim that the width of an aimed beam is taken from.
+_RIM = 48
 #: Degree of the polynomials that landing points are differentiated by.
 _DEGREE = 8
 
@@ -34,19 +37,22 @@ class PupilCells:
     Attributes
     ----------
     points : ndarray, shape [n, 2]
-        Centroids of the lit parts [m], entrance-pupil coordinates.
+        Centroids of the lit parts [m], in the plane of the entrance pupil.
     weights : ndarray, shape [n]
         Fractions of the light; they sum to 1. Empty where no light passes.
     moments : ndarray, shape [n, 2, 2]
         Second moments of the lit parts about their centroids [m^2].
     side : float
         Side of a cell [m].
+    center : ndarray, shape [2]
+        Middle of the lattice [m].
     """
 
     points: np.ndarray
     weights: np.ndarray
     moments: np.ndarray
     side: float
+    center: np.ndarray
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -54,8 +60,9 @@ class PupilCells:
     @cached_property
     def _smooth(self) -> tuple[np.ndarray, np.ndarray]:
         """Orthonormal polynomials at the points, [n, m], and their derivatives along x and y [1/m], [2, n, m]."""
-        radius = max(float(np.abs(self.points).max()), self.side)
-        x, y = self.points.T / radius
+        away = self.points - self.center
+        radius = max(float(np.abs(away).max()), self.side)
+        x, y = away.T / radius
         p, q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
         powers_x, powers_y = (v[:, None] ** np.arange(_DEGREE + 1) for v in (x, y))
         basis, triangle = np.linalg.qr(powers_x[:, p] * powers_y[:, q])
@@ -82,8 +89,13 @@ class PupilCells:
 
 
 def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, across: int) -> PupilCells:
-    """Return the lit cells of a lattice with so many cells across the pupil, for light of one direction [3]."""
-    side = _MARGIN * telescope.pupil_diameter / across
+    """Return the lit cells of a lattice with so many cells across the beam, for light of one direction [3].
+
+    They are cells of the plane of the entrance pupil, on which the light of a star is even; where rays are aimed at the
+    stop the lattice covers the light that fills it.
+    """
+    center, width = _beam(telescope, direction, wavelength)
+    side = _MARGIN * width / across
     middle = (np.arange(across) - 0.5 * (across - 1)) * side
 
     def lit(points: np.ndarray) -> np.ndarray:
@@ -91,7 +103,7 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
         rays = parallel_rays(telescope, direction[None], wavelength, points.reshape(-1, 2))
         return (trace(telescope, rays, threads=1).status == RayStatus.OK).reshape(points.shape[:-1])
 
-    centers = np.stack(np.meshgrid(middle, middle), axis=-1)
+    centers = np.stack(np.meshgrid(middle, middle), axis=-1) + center
     quarter = 0.25 * side * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
     area = lit(centers[:, :, None] + quarter).mean(axis=2)
     moments = np.tile(side**2 / 12.0 * np.eye(2), (across, across, 1, 1))
@@ -102,7 +114,18 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
         area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, np.abs(along[:, 1]) > np.abs(along[:, 0]))
         centers[rim] += offset
     some = area > 0.0
-    return PupilCells(centers[some], area[some] / max(area.sum(), 1e-300), moments[some], side)
+    return PupilCells(centers[some], area[some] / max(area.sum(), 1e-300), moments[some], side, center)
+
+
+def _beam(telescope: Telescope, direction: np.ndarray, wavelength: float) -> tuple[np.ndarray, float]:
+    """Return middle [2] and width [m] of the light of one direction in the plane of the entrance pupil."""
+    angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    rim = 0.5 * telescope.pupil_diameter * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points = aimed_points(telescope, direction[None], wavelength, rim)
+    if points.ndim == 2:
+        return np.zeros(2), telescope.pupil_diameter
+    low, high = np.nanmin(points[0], axis=0), np.nanmax(points[0], axis=0)
+    return 0.5 * (low + high), float((high - low).max())
 
 
 def _lit_parts(

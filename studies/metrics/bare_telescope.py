@@ -1,4 +1,7 @@
-"""Metrics of a telescope without a camera: spots, wavefront, encircled energy, modulation transfer, throughput."""
+"""Metrics of a telescope without a camera: spots, wavefront, encircled energy, modulation transfer, throughput.
+
+Means over the fields have the weights that the design data state, where the fields are those of the design.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +41,9 @@ class BareScene:
 
 def spots(scene: BareScene) -> dict[str, float]:
     """Return the rms spot radius over the fields, and the largest."""
-    radii = spot_diagram(scene.request).rms_radius * 1e6
-    return {"spot_rms_um": float(np.sqrt(np.mean(radii**2))), "spot_worst_um": float(radii.max())}
+    request = scene.request
+    radii = spot_diagram(request).rms_radius * 1e6
+    return {"spot_rms_um": float(np.sqrt(request.field_weights @ radii**2)), "spot_worst_um": float(radii.max())}
 
 
 def wavefront(scene: BareScene) -> dict[str, float]:
@@ -55,20 +59,21 @@ def ee80(scene: BareScene) -> dict[str, float]:
         scene.telescope, scene.fields, scene.request.middle, pixels=_PIXELS, n_pupil=_ACROSS, threads=scene.threads
     )
     radii = energy.radius_holding(_ENERGY) * 1e6
-    return {"ee80_um": float(radii.mean()), "ee80_worst_um": float(radii.max())}
+    return {"ee80_um": float(scene.request.field_weights @ radii), "ee80_worst_um": float(radii.max())}
 
 
 def transfer(scene: BareScene) -> dict[str, float]:
     """Return the frequency at which the contrast falls to a half, mean and least over fields and two directions."""
     found = mtf(scene.telescope, scene.fields, scene.wavelengths, threads=scene.threads).frequency_at(_CONTRAST) * 1e-3
-    return {"mtf50_per_mm": float(found.mean()), "mtf50_worst_per_mm": float(found.min())}
+    mean = float(scene.request.field_weights @ found.reshape(len(found), -1).mean(axis=1))
+    return {"mtf50_per_mm": mean, "mtf50_worst_per_mm": float(found.min())}
 
 
 def throughput(scene: BareScene) -> dict[str, float]:
     """Return mean and minimum of the lit fraction of the pupil over the fields."""
     request = scene.request
     lit = vignetting(scene.telescope, request.fields, request.middle, n_pupil=_RAYS, threads=scene.threads).lit_fraction
-    return {"throughput_mean": float(lit.mean()), "throughput_min": float(lit.min())}
+    return {"throughput_mean": float(request.field_weights @ lit), "throughput_min": float(lit.min())}
 
 
 #: Groups of metrics by name.
