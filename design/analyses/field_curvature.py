@@ -137,13 +137,16 @@ def field_curvature(
     request = line_request(telescope, fields, wavelengths, projection, threads)
     axes = tangential_axes(request)
     steps = _CLOSE * 0.5 * telescope.pupil_diameter * np.concatenate([axes, -axes], axis=1)
-    axis = replace(request, fields=_NEAR_AXIS * np.array([[0, 0], [0, 1.0], [0, -1.0]]), projection="gnomonic")
+    slopes = _NEAR_AXIS * np.array([0.0, 1.0, -1.0, 2.0, -2.0])
+    axis = replace(request, fields=np.stack([0.0 * slopes, slopes], axis=-1), projection="gnomonic")
     foci, distortion, scales = [], [], []
     for wavelength in map(float, request.wavelengths):
         bundles = request.bundles(wavelength, steps)
         foci.append(close_foci(request, bundles))
-        origin, up, down = axis.bundles(wavelength, np.zeros((1, 2))).chief_landing()
-        scale = float(np.linalg.norm(up - down)) / (2.0 * _NEAR_AXIS)
+        origin, *ends = axis.bundles(wavelength, np.zeros((1, 2))).chief_landing()
+        near, far = (float(np.linalg.norm(ends[2 * i] - ends[2 * i + 1])) / (i + 1) for i in (0, 1))
+        # Distortion of third order adds to the scale with the square of the slope, which two slopes remove.
+        scale = (4.0 * near - far) / (6.0 * _NEAR_AXIS)
         slope = np.linalg.norm(request.slopes, axis=-1)
         height = np.linalg.norm(bundles.chief_landing() - origin, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,4 +1,4 @@
-"""File of a sweep: SQLite in WAL mode, a row a point, each written once and whole.
+"""File of a sweep or another study of many points: SQLite in WAL mode, a row a point, each written once and whole.
 
 Metrics are JSON with all digits of a double, in a column apart from times and workers. Two stores of one sweep hold the
 same metrics, byte for byte, whatever the workers and interruptions.
@@ -72,17 +72,34 @@ class StoredStudy(Protocol):
         """Return the content as plain mappings."""
 
 
+@dataclass(frozen=True)
+class StoreKind:
+    """Words of messages about the store of a study."""
+
+    name: str  #: "sweep"
+    maker: str  #: what makes such a store
+    rescue: str  #: what to do about a damaged one
+
+    @property
+    def article(self) -> str:
+        """The name with its article."""
+        return f"a {self.name}"
+
+
+SWEEP = StoreKind("sweep", "pachon sweep makes", "pachon sweep export saves what it can")
+
+
 class DamagedStoreError(ProductError):
     """Store that SQLite cannot read."""
 
 
 class SweepStore:
-    """Open file of a sweep, which must exist; a ProductError where it is no store, of another format, or damaged."""
+    """Open file of a study, which must exist; a ProductError where it is no store, of another format, or damaged."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kind: StoreKind = SWEEP) -> None:
         if not path.is_file():
-            raise ProductError("no such file; expected the store of a sweep, such as pachon sweep makes", file=path)
-        self.path = path
+            raise ProductError(f"no such file; expected the store of {kind.article}, such as {kind.maker}", file=path)
+        self.path, self.kind = path, kind
         with self.guarded():
             self._connection = sqlite3.connect(path, timeout=30.0)
             about = dict(self._connection.execute("SELECT key, value FROM about"))
@@ -150,13 +167,15 @@ class SweepStore:
         try:
             yield
         except sqlite3.Error as error:
-            raise _problem(self.path, error) from None
+            raise _problem(self.path, error, self.kind) from None
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            raise _damaged(self.path, error) from None
+            raise _damaged(self.path, error, self.kind) from None
 
 
-def create_store(path: Path, sweep: StoredStudy, points: Iterable[SweepPoint], extra: dict[str, str]) -> None:
-    """Create the file of a sweep with all its points and no results, whole or not at all."""
+def create_store(
+    path: Path, sweep: StoredStudy, points: Iterable[SweepPoint], extra: dict[str, str], kind: StoreKind = SWEEP
+) -> None:
+    """Create the file of a study with all its points and no results, whole or not at all."""
     partial = partial_path(path)
     make_folder(path.parent)
     try:
@@ -187,7 +206,7 @@ def create_store(path: Path, sweep: StoredStudy, points: Iterable[SweepPoint], e
     except FileExistsError:
         raise store_exists(path) from None
     except sqlite3.Error as error:
-        raise _problem(path, error) from None
+        raise _problem(path, error, kind) from None
     except OSError as error:
         raise ProductError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
@@ -197,7 +216,7 @@ def create_store(path: Path, sweep: StoredStudy, points: Iterable[SweepPoint], e
 
 
 def store_exists(path: Path) -> ConfigError:
-    """Return the error for a new sweep whose store is there already."""
+    """Return the error for a new study whose store is there already."""
     return ConfigError(f"{path} exists: go on with it by --resume, or give another -o")
 
 
@@ -221,12 +240,14 @@ def readable_rows(path: Path) -> Iterator[tuple[int, str, str | None]]:
 
 
 def check_same_sweep(store: SweepStore, sweep: StoredStudy) -> None:
-    """Refuse another sweep than that of the store, in one line with the differences."""
+    """Refuse another study than that of the store, in one line with the differences."""
     if store.about.get("digest") == sweep.digest:
         return
     changed = differences(json.loads(store.about["sweep"]), sweep.model_dump(mode="json"))
     shown = "; ".join(changed[:4]) + (f"; and {len(changed) - 4} more" if len(changed) > 4 else "")
-    raise ConfigError(f"{store.path}: store of another sweep ({shown or 'other file contents'}); give another -o")
+    raise ConfigError(
+        f"{store.path}: store of another {store.kind.name} ({shown or 'other file contents'}); give another -o"
+    )
 
 
 def exact_json(value: Any) -> str:
@@ -254,7 +275,7 @@ def _beside(path: Path) -> Sequence[Path]:
     return [path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal")]
 
 
-def _problem(path: Path, error: sqlite3.Error) -> ProductError:
+def _problem(path: Path, error: sqlite3.Error, kind: StoreKind) -> ProductError:
     """Return an error of SQLite as one line with the remedy."""
     text = str(error)
     if "full" in text or "disk I/O" in text:
@@ -262,14 +283,12 @@ def _problem(path: Path, error: sqlite3.Error) -> ProductError:
     if "readonly" in text or "unable to open" in text:
         return ProductError(f"cannot write {path}: {text}; expected a file and a folder that can be written")
     if "locked" in text:
-        return ProductError(f"cannot write {path}: {text}; is another sweep writing to it?")
+        return ProductError(f"cannot write {path}: {text}; is another {kind.name} writing to it?")
     if "malformed" in text or "not a database" in text or "no such table" in text:
-        return _damaged(path, error)
+        return _damaged(path, error, kind)
     return ProductError(text, file=path)
 
 
-def _damaged(path: Path, error: Exception) -> DamagedStoreError:
+def _damaged(path: Path, error: Exception, kind: StoreKind) -> DamagedStoreError:
     text = cut_short(" ".join(str(error).split()), 120)
-    return DamagedStoreError(
-        f"damaged, or no store of a sweep ({text}); pachon sweep export saves what it can", file=path
-    )
+    return DamagedStoreError(f"damaged, or no store of {kind.article} ({text}); {kind.rescue}", file=path)

@@ -1,23 +1,28 @@
-"""Plots of a tolerance study: costs of single tolerances, and the yield curve."""
+"""Plots of a tolerance study: costs and limits of single tolerances, the drawn merits, and the yield curve."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...core.plotting import BLUE, GREY, ORANGE, RED, new_figure, plain_text, png_bytes, styled
 from .study import ToleranceStudy
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 #: Tolerances in the picture, the costliest.
 _SHOWN = 25
 
 
 def sensitivity_plot(study: ToleranceStudy) -> bytes:
-    """Draw the change of the merit at either end of the costliest tolerances."""
+    """Draw the change of the merit at the ends of the costliest tolerances, and in the draws, with its error."""
     shown = study.offenders[:_SHOWN][::-1]
     scale = study.merit.scale
     with styled():
-        figure = new_figure(8.4, 1.4 + 0.24 * len(shown))
-        axes = figure.subplots()
+        figure = new_figure(9.6, 1.5 + 0.24 * len(shown))
+        axes, drawn = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
         rows = np.arange(len(shown))
         for values, color, name, height in (
             (study.lower, BLUE, "lower end", 0.7),
@@ -27,16 +32,73 @@ def sensitivity_plot(study: ToleranceStudy) -> bytes:
             axes.barh(rows, change, height=height, color=color, alpha=0.8, label=name)
             for row in rows[np.isnan(change)]:
                 axes.text(0.0, row, " light is lost", va="center", fontsize=7)
-        labels = [
-            f"{plain_text(t.name)} ± {t.size:.3g}{'' if u == '1' else f' {u}'}"
-            for t, u in ((study.tolerances[i], study.units[i]) for i in shown)
-        ]
-        axes.set_yticks(rows, labels)
+        _name_rows(axes, study, shown)
         axes.axvline(0.0, color=GREY, linewidth=0.8)
-        axes.set_xlabel(f"change of the {study.merit.title}{_unit(study)}, compensated")
-        axes.set_title(_title(study, f"{len(shown)} of {len(study.tolerances)} tolerances, the costliest on top"))
+        axes.set_xlabel(f"change of the {study.merit.title}{_unit(study)},\nthe tolerance alone")
         axes.legend(loc="lower right")
+        effect, error = (scale * v[:, shown] for v in study.effects)
+        for end, color, name in ((0, BLUE, "lowest third"), (1, RED, "highest third")):
+            bars = {"markersize": 3.5, "elinewidth": 1.0, "capsize": 2.0, "color": color, "label": name}
+            drawn.errorbar(effect[end], rows + (0.15 if end else -0.15), xerr=error[end], fmt="o", **bars)
+        drawn.axvline(0.0, color=GREY, linewidth=0.8)
+        drawn.set_xlabel(f"less the mean of the other draws{_unit(study)},\nall tolerances at once")
+        drawn.legend(loc="lower right")
+        title = f"{len(shown)} of {len(study.tolerances)} tolerances, the costliest on top"
+        figure.suptitle(_title(study, title), fontsize="medium")
         return png_bytes(figure)
+
+
+def inverse_plot(study: ToleranceStudy) -> bytes:
+    """Draw the size that costs the stated loss over the size of each of the costliest tolerances."""
+    shown = study.offenders[:_SHOWN][::-1]
+    ratio = study.inverse[shown] / np.array([study.tolerances[i].size for i in shown])
+    known = np.isfinite(ratio)
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    with styled():
+        figure = new_figure(8.4, 1.4 + 0.24 * len(shown))
+        axes = figure.subplots()
+        rows = np.arange(len(shown))
+        colors = np.where(ratio < 1.0, RED, BLUE)
+        axes.barh(rows[known], ratio[known] - 1.0, left=1.0, height=0.6, color=colors[known], alpha=0.8)
+        for row in rows[~known]:
+            axes.text(1.0, row, " no size costs as much", va="center", fontsize=7)
+        _name_rows(axes, study, shown)
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.axvline(1.0, color=GREY, linewidth=0.8)
+        axes.grid(True, axis="x", color="0.93", linewidth=0.5)
+        axes.set_xlabel(f"size that costs {100 * study.loss:g} % of the {study.merit.title}, over the tolerance")
+        axes.set_title(_title(study, "inverse sensitivity; red: the tolerance costs more"))
+        return png_bytes(figure)
+
+
+def draws_plot(study: ToleranceStudy) -> bytes:
+    """Draw the histogram of the merit over the drawn telescopes, with the requirement."""
+    scale = study.merit.scale
+    finite = scale * study.draws[np.isfinite(study.draws)]
+    with styled():
+        figure = new_figure(6.4, 4.2)
+        axes = figure.subplots()
+        bins = max(5, min(60, round(len(finite) ** 0.5)))
+        axes.hist(finite, bins=bins, color=BLUE, alpha=0.7, label=f"{len(study.draws)} telescopes, {study.method}")
+        axes.axvline(scale * study.nominal, color=GREY, linestyle=(0, (4, 2)), linewidth=0.9, label="as designed")
+        if study.requirement is not None:
+            axes.axvline(scale * study.requirement, color=ORANGE, linewidth=1.2, label="requirement")
+        axes.set(xlabel=f"{study.merit.title}{_unit(study)}", ylabel="telescopes")
+        axes.legend(loc="best")
+        axes.set_title(_title(study, "Monte Carlo"))
+        return png_bytes(figure)
+
+
+def _name_rows(axes: Axes, study: ToleranceStudy, shown: np.ndarray) -> None:
+    labels = [
+        f"{plain_text(t.name)} ± {t.size:.3g}{'' if u == '1' else f' {u}'}"
+        for t, u in ((study.tolerances[i], study.units[i]) for i in shown)
+    ]
+    axes.set_yticks(np.arange(len(shown)), labels)
 
 
 def yield_plot(study: ToleranceStudy) -> bytes:

@@ -11,7 +11,8 @@ from ...core.files import write_bytes, write_json
 from ...core.products import Columns, write_ecsv
 from ...core.version import VERSION
 from .file import ToleranceFile
-from .plots import sensitivity_plot, yield_plot
+from .plots import draws_plot, inverse_plot, sensitivity_plot, yield_plot
+from .report import tolerance_page
 from .study import ToleranceStudy
 
 _PERCENT = (50, 80, 90, 95, 98)
@@ -62,7 +63,7 @@ def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -
     """Write the files of a study into an existing folder, and return their names."""
     unit, scale = study.merit.unit, study.merit.scale
     meta = {"pachon": VERSION, "telescope": study.telescope, "merit": study.merit.title, "seed": file.seed}
-    about = "merit, compensated"
+    about, (effect, effect_error) = "merit, compensated", study.effects
     sensitivity: Columns = {
         "name": (np.array([t.name for t in study.tolerances]), "", "tolerance"),
         "size": (np.array([t.size for t in study.tolerances]), "", "largest or standard deviation, in its unit"),
@@ -72,6 +73,14 @@ def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -
         "upper_end": (scale * study.upper, unit, f"{about}, at plus the size"),
         "cost": (scale * study.cost, unit, "loss at the worse end"),
         "size_for_the_loss": (study.inverse, "", f"size that costs {100 * study.loss:g} per cent of the merit"),
+        **{
+            name: (scale * values[end], unit, about_draws)
+            for end, third in enumerate(("lowest", "highest"))
+            for name, values, about_draws in (
+                (f"{third}_third", effect, f"mean merit of draws with the {third} third of it less that of the others"),
+                (f"{third}_third_error", effect_error, "standard error of that difference"),
+            )
+        },
     }
     draws: Columns = {"merit": (scale * study.draws, unit, about)}
     for i, name in enumerate(study.compensators):
@@ -80,11 +89,18 @@ def write_tolerances(study: ToleranceStudy, file: ToleranceFile, folder: Path) -
         draws[tolerance.name] = (study.deviations[:, i], _fits(study.units[i]), "")
     write_ecsv(folder / "sensitivity.ecsv", sensitivity, {"what": "sensitivity to tolerances", **meta})
     write_ecsv(folder / "draws.ecsv", draws, {"what": f"telescopes within tolerances, {study.method}", **meta})
-    pictures = {"sensitivity.png": sensitivity_plot(study), "yield.png": yield_plot(study)}
+    pictures = {
+        "sensitivity.png": sensitivity_plot(study),
+        "inverse.png": inverse_plot(study),
+        "draws.png": draws_plot(study),
+        "yield.png": yield_plot(study),
+    }
     for name, png in pictures.items():
         write_bytes(folder / name, png)
-    write_json(folder / "summary.json", {**tolerance_summary(study), "pachon": VERSION, "digest": file.digest})
-    return "sensitivity.ecsv", "draws.ecsv", "summary.json", *pictures
+    summary = tolerance_summary(study)
+    write_json(folder / "summary.json", {**summary, "pachon": VERSION, "digest": file.digest})
+    write_bytes(folder / "report.html", tolerance_page(study, file, summary, tuple(pictures.values())).encode())
+    return "report.html", "sensitivity.ecsv", "draws.ecsv", "summary.json", *pictures
 
 
 def _fits(unit: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ...design.optimize.toleranced_merit import TolerancedMerit
 from ...design.optimize.yields import Yield
 from ...design.parameters.tolerances import Tolerance, draw
 from ...models.telescope import Telescope
-from ..sweep.store import PointResult, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
+from ..sweep.store import PointResult, StoreKind, SweepPoint, SweepStore, check_same_sweep, create_store, store_exists
 from .file import ToleranceFile
 from .measurement import DRAW, INVERSE, LOWER, NOMINAL, UPPER, Batch, ToleranceMeasurement
 from .merits import ToleranceMerit, tolerance_merit
@@ -27,6 +28,7 @@ from .plan import tolerance_plan
 
 #: Points that a worker computes at once.
 _BATCH = 25
+_STORE = StoreKind("tolerance study", "pachon tolerance makes", "remove it, and begin again")
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,24 @@ class ToleranceStudy:
     def offenders(self) -> np.ndarray:
         """Indices of the tolerances, the costliest first."""
         return np.argsort(-self.cost, kind="stable")
+
+    @cached_property
+    def effects(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean merit of the draws with the lowest and the highest third of each deviation less that of the others.
+
+        Both arrays are [2, n_tolerance], lowest third first: the difference, and its standard error; NaN where a group
+        has less than two telescopes with light.
+        """
+        known = np.isfinite(self.draws)
+        effect, error = np.full((2, 2, self.deviations.shape[1]), np.nan)
+        for i, column in enumerate(self.deviations.T):
+            low, high = np.quantile(column, (1 / 3, 2 / 3))
+            for end, third in enumerate((column <= low, column >= high)):
+                inner, outer = self.draws[known & third], self.draws[known & ~third]
+                if min(len(inner), len(outer)) >= 2:
+                    effect[end, i] = inner.mean() - outer.mean()
+                    error[end, i] = np.sqrt(inner.var(ddof=1) / len(inner) + outer.var(ddof=1) / len(outer))
+        return effect, error
 
     @check_arguments
     def at_most(self, fraction: float) -> float:
@@ -242,8 +262,8 @@ def _open(path: Path, file: ToleranceFile, points: Sequence[SweepPoint], resume:
     if path.exists() and not resume:
         raise store_exists(path)
     if not path.exists():
-        create_store(path, file, points, {})
-    store = SweepStore(path)
+        create_store(path, file, points, {}, _STORE)
+    store = SweepStore(path, _STORE)
     check_same_sweep(store, file)
     return store
 

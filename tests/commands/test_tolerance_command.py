@@ -45,13 +45,26 @@ def test_a_study_is_written_shown_and_resumed(capsys, in_folder, written):
     folder = in_folder / "tolerance_lens1"
     assert {p.name for p in folder.iterdir()} == {
         "draws.ecsv",
+        "draws.png",
+        "inverse.png",
         "points.tolerance",
+        "report.html",
         "sensitivity.ecsv",
         "sensitivity.png",
         "summary.json",
         "yield.png",
     }
+    page = (folder / "report.html").read_text()
+    for words in ("L2.dy_um", "size for 10 %", "yield: fraction that meets it", "Image.dz_um"):
+        assert words in page
+    assert page.count('<img src="data:image/png;base64,') == 4
+    # Nothing of another file or site.
+    assert "http" not in page.replace("http-equiv", "")
     before = {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "points.tolerance"}
+    written("tol.yaml", TOLERANCES.replace("draws: 12", "draws: 13"))
+    assert main([*command, "--resume"]) == 2
+    assert "store of another tolerance study (draws: 12 -> 13)" in capsys.readouterr().err
+    written("tol.yaml", TOLERANCES)
     assert main(command) == 2
     assert "--resume" in capsys.readouterr().err
     assert main([*command, "--resume"]) == 0

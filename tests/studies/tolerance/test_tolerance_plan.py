@@ -1,6 +1,7 @@
 """Tolerances of files as degrees of freedom: elements, compounds, irregularities, what replaces what."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +13,12 @@ from pachon.studies.tolerance.elements import with_elements
 from pachon.studies.tolerance.file import ToleranceFile, load_tolerances
 from pachon.studies.tolerance.plan import tolerance_plan
 
+LENS = Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx"
+
 
 @pytest.fixture(scope="module")
 def triplet():
-    return pachon.load_telescope("tests/data/zmx/lens1.zmx")
+    return pachon.load_telescope(LENS)
 
 
 def plan_of(triplet, **content):

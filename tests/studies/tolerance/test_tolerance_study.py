@@ -1,6 +1,7 @@
 """Tolerance studies: against telescopes made by hand, closed forms, and themselves on other workers."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from pachon.studies.tolerance.file import ToleranceFile, load_tolerances, with_s
 from pachon.studies.tolerance.product import tolerance_summary, write_tolerances
 from pachon.studies.tolerance.study import run_tolerances
 
-LENS = "tests/data/zmx/lens1.zmx"
+LENS = str(Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx")
 FIELDS = [[0.0, 0.0], [0.0, 8.0], [0.0, -11.0]]
 CONTENT = {
     "telescope": LENS,
@@ -113,7 +114,7 @@ def test_the_same_numbers_of_any_workers(triplet, study, tmp_path):
         assert 0 < len(opened.results()) < len(opened.points())
     with pytest.raises(ConfigError, match="--resume"):
         run_tolerances(triplet, file, store)
-    with pytest.raises(ConfigError, match=r"another sweep.*draws"):
+    with pytest.raises(ConfigError, match=r"another tolerance study.*draws"):
         run_tolerances(triplet, file_of(draws=31), store, resume=True)
     resumed = run_tolerances(triplet, file, store, resume=True)
     folders = []
@@ -229,3 +230,15 @@ def test_a_thousand_traced_triplets(triplet):
     off = np.sqrt(np.mean((linear.draws - traced.draws) ** 2)) / spread
     print(f"{len(traced.tolerances)} tolerances, 1000 draws: {seconds:.1f} s; linear off by {off:.4f} of the spread")
     assert off < 0.02
+
+
+def test_what_thirds_of_a_deviation_do_in_the_draws(study):
+    """The groups once more by sorting; 30 draws, so that thirds are ten of them."""
+    effect, error = study.effects
+    for i, column in enumerate(study.deviations.T):
+        order = np.argsort(column)
+        for end, inner in enumerate((order[:10], order[-10:])):
+            outer = np.setdiff1d(order, inner)
+            a, b = study.draws[inner], study.draws[outer]
+            assert effect[end, i] == pytest.approx(a.mean() - b.mean(), rel=1e-12)
+            assert error[end, i] == pytest.approx(np.hypot(a.std(ddof=1) / 10**0.5, b.std(ddof=1) / 20**0.5), rel=1e-12)

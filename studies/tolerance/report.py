@@ -1,0 +1,85 @@
+"""Page of a tolerance study: one HTML file with everything in it, pictures included, that prints well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.page import Picture, render
+from ...core.version import VERSION
+from .file import ToleranceFile
+from .study import ToleranceStudy
+
+#: Tolerances in the table, the costliest.
+_SHOWN = 50
+
+
+def tolerance_page(
+    study: ToleranceStudy, file: ToleranceFile, summary: dict[str, Any], pictures: tuple[bytes, ...]
+) -> str:
+    """Return the page of a study with its pictures (PNG): sensitivity, inverse sensitivity, draws, yield."""
+    title = study.merit.title
+    loss, at = f"{summary['loss_percent']:g} %", "at least" if study.merit.larger else "at most"
+    captions = (
+        (
+            "Sensitivity",
+            f"Left: change of the {title} where one tolerance stands at its lower or upper end, the others at zero, "
+            "after compensation. Right: mean over the drawn telescopes with the lowest, or the highest, third of the "
+            "deviation less that of the other telescopes, with the standard error of the difference; all tolerances "
+            "act at once there.",
+        ),
+        (
+            "Inverse sensitivity",
+            f"Size of each tolerance whose worse end alone costs {loss} of the {title} as designed, over the size of "
+            "the tolerance. Below 1 the tolerance is looser than that.",
+        ),
+        ("Monte Carlo", f"Histogram of the {title} of the drawn telescopes, all tolerances at once, compensated."),
+        (
+            "Yield",
+            f"Fraction of the telescopes whose {title} is {at} the requirement on the horizontal axis. The band is "
+            "Wilson's interval of one standard deviation.",
+        ),
+    )
+    return render(
+        Path(__file__).parent / "templates",
+        "tolerance.html",
+        summary=summary,
+        title=title,
+        unit=study.merit.unit,
+        pictures=[Picture(name, data, shows) for (name, shows), data in zip(captions, pictures, strict=True)],
+        rows=_rows(study),
+        left=max(0, len(study.tolerances) - _SHOWN),
+        compensators=_compensators(study),
+        seed=file.seed,
+        pachon=VERSION,
+    )
+
+
+def _rows(study: ToleranceStudy) -> list[tuple[str, ...]]:
+    """Return the cells of the costliest tolerances."""
+    scale, (effect, error) = study.merit.scale, study.effects
+    rows = []
+    for i in study.offenders[:_SHOWN]:
+        tolerance, unit = study.tolerances[i], "" if study.units[i] == "1" else f" {study.units[i]}"
+        merits = [scale * v for v in (study.lower[i], study.upper[i], study.cost[i])]
+        drawn = [
+            f"{scale * effect[end, i]:.2g} ± {scale * error[end, i]:.1g}" if np.isfinite(error[end, i]) else "-"
+            for end in range(2)
+        ]
+        inverse = f"{study.inverse[i]:.3g}{unit}" if np.isfinite(study.inverse[i]) else "-"
+        kind = tolerance.distribution.replace("_", " ")
+        numbers = ["light is lost" if not np.isfinite(v) else f"{v:.4g}" for v in merits]
+        rows.append((tolerance.name, f"{tolerance.size:.3g}{unit}", kind, *numbers, inverse, *drawn))
+    return rows
+
+
+def _compensators(study: ToleranceStudy) -> list[tuple[str, ...]]:
+    """Return name, root mean square and largest motion of each compensator."""
+    rows = []
+    for name, unit, moves in zip(study.compensators, study.compensator_units, study.moves.T, strict=True):
+        text = "" if unit == "1" else f" {unit}"
+        sizes = np.sqrt((moves**2).mean()), np.quantile(np.abs(moves), 0.9), np.abs(moves).max()
+        rows.append((name, *(f"{size:.3g}{text}" for size in sizes)))
+    return rows
