@@ -70,6 +70,7 @@ class CcdComputation:
     def _write(self, name: str, folder: Path, threads: int) -> str | None:
         """Write the product of a CCD; or return the reason why it cannot be modelled."""
         experiment = with_kept_screens(self.experiment)
+        experiment.make_screens(threads)
         write = partial(write_ccd, experiment, folder)
         return simulate_ccds(experiment, write, (name,), strict=False, threads=threads).not_modelled.get(name)
 

@@ -42,7 +42,7 @@ from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
 from .defaults import given, resolve
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
-from .simulate.screen_cover import check_samples
+from .simulate.screen_cover import check_samples, corner_fields
 from .star_list import StarList, listed_stars, pointing_of
 
 #: Keys of the stars that a configuration without a catalogue did not have once.
@@ -230,6 +230,17 @@ class Experiment:
         """Kinds of screens that the engine keeps of the atmosphere; none where there is none."""
         return () if self.atmosphere is None else ENGINES[self.config.psf.engine].screens
 
+    @check_arguments
+    def make_screens(self, threads: int | None = None) -> None:
+        """Make the screens of the atmosphere, where they are not made, as far as the CCDs of the configuration need."""
+        if self.atmosphere is None or not self.screen_kinds:
+            return
+        fields = corner_fields(self.telescope, self.camera, self.config.ccds or ())
+        # Half a pupil of room, for stars beyond the edges of the CCDs and the curvature of the field.
+        rows = self.atmosphere.rows_under(field_direction(*fields.T), self.telescope.pupil_diameter)
+        for kind in self.screen_kinds:
+            self.atmosphere.screens(kind, threads, rows)
+
     @contextmanager
     @check_arguments
     def screens(self, threads: int | None = None, reporter: Reporter | None = None) -> Iterator[None]:
@@ -249,8 +260,7 @@ class Experiment:
             if self.screen_kinds:
                 reporter = Reporter(quiet=True) if reporter is None else reporter
                 with reporter.stage(f"atmosphere: {self.atmosphere.layer_count} screens"):
-                    for kind in self.screen_kinds:
-                        self.atmosphere.screens(kind, threads)
+                    self.make_screens(threads)
             yield
         finally:
             self.atmosphere.release()

@@ -26,13 +26,13 @@ def swept_lengths(config: Configuration, telescope: Telescope, camera: Camera, s
     distance of the layer.
     """
     air = config.atmosphere
-    slopes = np.tan(_corner_fields(telescope, camera, config.ccds or ()))
+    slopes = np.tan(corner_fields(telescope, camera, config.ccds or ()))
     distances = line_of_sight(np.array(site.altitudes), air.ground_lift_m, math.radians(air.zenith_angle_deg))
     wind = np.array(site.wind_speeds) * air.exposure_s
     return wind + distances * np.ptp(slopes, axis=0).max() + telescope.pupil_diameter
 
 
-def _corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) -> np.ndarray:
+def corner_fields(telescope: Telescope, camera: Camera, names: Sequence[str]) -> np.ndarray:
     """Return the field angles of the corners of CCDs [rad], [n, 2]; ConfigError names those beyond the field."""
 
     def fields(some: Sequence[str]) -> np.ndarray:

@@ -118,7 +118,7 @@ class SingleModes(Atmosphere):
     def slope_unit(self, layer):
         return 2 * np.pi * self.amplitude / self.screen_length / 32767.0
 
-    def slope_screen(self, layer, *, threads=None, out=None):
+    def slope_screen(self, layer, *, threads=None, out=None, rows=None):
         wave = np.cos(2 * np.pi * np.arange(self.screen_size) / self.screen_size)
         counts = np.rint(32767.0 * wave).astype(np.int32)
         screen = np.zeros((self.screen_size, self.screen_size), dtype=np.int32) if out is None else out

@@ -246,6 +246,21 @@ class Atmosphere(LayerScreens):
         heights.setflags(write=False)
         return self._with_shared_screens(altitudes=heights)
 
+    def rows_under(self, directions: np.ndarray, radius: float) -> np.ndarray:
+        """Return the rows of the low screens that light of a pupil crosses, bool [n_layer, screen_size].
+
+        ``directions`` [n, 3] are those in which the light of stars travels, and ``radius`` [m] is that of the pupil.
+        Rows between those of two stars count too, and two on either side for rounding.
+        """
+        size, pixel = self.screen_size, self.screen_pixel
+        if not len(directions):
+            return np.zeros((self.layer_count, size), dtype=bool)
+        middle = self.pupil_centers(directions[:, None], self.times[[0, -1]])[..., 1]
+        first = np.floor((middle.min(axis=(0, 1)) - radius) / pixel) - 2.0
+        last = np.ceil((middle.max(axis=(0, 1)) + radius) / pixel) + 2.0
+        from_first = (np.arange(size) - first[:, None]) % size
+        return np.asarray(from_first <= (last - first)[:, None])
+
     def with_screens_of(self, other: Atmosphere) -> Atmosphere:
         """Return this atmosphere with the screens of another one, stored for both, where they are the same screens."""
         if not self.has_screens_of(other):

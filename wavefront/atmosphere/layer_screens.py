@@ -16,7 +16,7 @@ from ...core.memory import require_bytes
 from ...core.random_streams import stream
 from ...core.units import plane_points
 from .layers import Layers
-from .screens import draw_modes, phase_screen, slope_screen, working_bytes
+from .screens import draw_modes, in_whole_blocks, phase_screen, slope_screen, working_bytes
 from .spline import evaluate
 from .turbulence import slope_variance
 
@@ -101,7 +101,7 @@ class LayerScreens(Layers):
         ndarray of float32, shape [screen_size, screen_size]
             Path [m], ``[y, x]``.
         """
-        return phase_screen(self._modes(layer, "low", stencil), self.screen_size, threads=threads, out=out)
+        return phase_screen(self._modes(layer, "low", stencil, threads), self.screen_size, threads=threads, out=out)
 
     def high_screen(
         self, layer: int, stencil: str = "spline", *, threads: int | None = None, out: np.ndarray | None = None
@@ -110,23 +110,33 @@ class LayerScreens(Layers):
 
         Arguments are those of :meth:`low_screen`; the screen has shape [fine_size, fine_size].
         """
-        return phase_screen(self._modes(layer, "high", stencil), self.fine_size, threads=threads, out=out)
+        return phase_screen(self._modes(layer, "high", stencil, threads), self.fine_size, threads=threads, out=out)
 
     def slope_unit(self, layer: int) -> float:
         """Return the slope of one count of :meth:`slope_screen` [rad]: eight standard deviations fill 15 bits."""
         variance = slope_variance(self.r0, self.outer_scale, self.cutoff, SLOPE_LAG) * float(self.weights[layer])
         return max(8.0 * math.sqrt(variance) / 32767.0, 1e-30)
 
-    def slope_screen(self, layer: int, *, threads: int | None = None, out: np.ndarray | None = None) -> np.ndarray:
+    def slope_screen(
+        self,
+        layer: int,
+        *,
+        threads: int | None = None,
+        out: np.ndarray | None = None,
+        rows: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return the slopes of the low screen of a layer over :data:`SLOPE_LAG`, in counts of :meth:`slope_unit`.
 
         The result is an int32 array of shape [screen_size, screen_size], packed as
-        :func:`~pachon.wavefront.atmosphere.screens.slope_screen` does; the arguments are those of :meth:`low_screen`.
+        :func:`~pachon.wavefront.atmosphere.screens.slope_screen` does; the arguments are those of
+        :meth:`low_screen`, and the rows to compute at least, bool [screen_size], all by default.
         """
-        modes, unit = self._modes(layer, "low", "samples"), self.slope_unit(layer)
-        return slope_screen(modes, self.screen_size, self.screen_length, unit, lag=SLOPE_LAG, threads=threads, out=out)
+        modes, size, length = self._modes(layer, "low", "samples", threads), self.screen_size, self.screen_length
+        return slope_screen(
+            modes, size, length, self.slope_unit(layer), lag=SLOPE_LAG, threads=threads, out=out, rows=rows
+        )
 
-    def _modes(self, layer: int, scale: str, stencil: str) -> np.ndarray:
+    def _modes(self, layer: int, scale: str, stencil: str, threads: int | None = None) -> np.ndarray:
         """Draw the modes of one screen."""
         if not 0 <= layer < self.layer_count:
             raise DomainError(f"layer = {layer!r}: expected 0 to {self.layer_count - 1}")
@@ -141,9 +151,10 @@ class LayerScreens(Layers):
             weight=float(self.weights[layer]),
             stencil=stencil,
             fixed_modulus=self.fixed_modulus,
+            threads=threads,
         )
 
-    def screens(self, kind: str, threads: int | None = None) -> np.ndarray:
+    def screens(self, kind: str, threads: int | None = None, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the screens of all layers, not writable; made at the first call.
 
         Parameters
@@ -152,6 +163,9 @@ class LayerScreens(Layers):
             Packed slopes of the low screens, for rays; the low or the high screens as spline coefficients, for waves.
         threads : int, optional
             Number of threads; all processors by default. No byte depends on it.
+        rows : ndarray of bool, shape [n_layer, screen_size], optional
+            Rows of the slopes that are needed, all by default; the others may be unset. They are made when they are
+            asked for first: a second call that lacks some makes all of them.
 
         Returns
         -------
@@ -177,12 +191,21 @@ class LayerScreens(Layers):
         with _cache_lock:
             if kind not in self._cache:
                 require_bytes(self.screen_bytes([kind]), f"{name} = {size} in {self.layer_count} layers")
-                screens = np.empty((self.layer_count, size, size), dtype=dtype)
-                for layer in range(self.layer_count):
-                    make(layer, threads=threads, out=screens[layer])
+                # Memory of rows that are never made is never touched.
+                screens = np.empty((self.layer_count, size, size), dtype=dtype)[:]
                 screens.setflags(write=False)
-                self._cache[kind] = screens
-            return self._cache[kind]
+                self._cache[kind], self._cache[_made(kind)] = screens, np.zeros((self.layer_count, size), dtype=bool)
+            screens, made = self._cache[kind], self._cache[_made(kind)]
+            wanted = np.ones(made.shape, dtype=bool) if rows is None or kind != "slopes" else rows
+            lacking = (wanted & ~made).any(axis=1)
+            if made.any():
+                wanted = np.ones(made.shape, dtype=bool)
+            for layer in np.flatnonzero(lacking):
+                chosen = in_whole_blocks(wanted[layer] & ~made[layer])
+                some = {} if chosen.all() else {"rows": chosen}
+                make(int(layer), threads=threads, out=screens.base[layer], **some)
+                made[layer] |= chosen
+            return screens
 
     def release(self) -> None:
         """Free the screens; the next call makes the same ones again."""
@@ -205,6 +228,11 @@ class LayerScreens(Layers):
         make, pixel = scales[scale]
         x, y = plane_points(x, y)
         return evaluate(make(layer), pixel, x, y)
+
+
+def _made(kind: str) -> str:
+    """Return the key of the rows of a kind of screens that are made, bool [n_layer, size]."""
+    return f"{kind}: rows"
 
 
 def screen_samples(value: int, name: str) -> int:

@@ -75,6 +75,7 @@ def draw_modes(
     weight: float = 1.0,
     stencil: str = "samples",
     fixed_modulus: bool = False,
+    threads: int | None = None,
 ) -> np.ndarray:
     """Draw the modes [m] of a screen, complex64, shape [reach + 1, 2 reach + 1], index ``[i, reach + j]``.
 
@@ -95,13 +96,17 @@ def draw_modes(
     amplitude = np.empty((reach + 1, 2 * reach + 1), dtype=np.float32)
     inside = np.empty(amplitude.shape, dtype=bool)
     per_index, pixel_phase = 2.0 * math.pi / length, 2.0 * math.pi / size
-    for first in range(0, reach + 1, _COLUMN_BLOCK):
+
+    def amplitudes(first: int) -> None:
         rows = slice(first, min(first + _COLUMN_BLOCK, reach + 1))
         i = np.arange(rows.start, rows.stop, dtype=np.float64)[:, np.newaxis]
         square = i * i + j * j
         inside[rows] = (square > (band[0] / per_index) ** 2) & (square <= (band[1] / per_index) ** 2)
         spectrum = path_spectrum(np.hypot(i, j) / length, r0, outer_scale) * weight
         amplitude[rows] = np.sqrt(spectrum) * stencil_gain(i * pixel_phase, j * pixel_phase, stencil) / length
+
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        list(pool.map(amplitudes, range(0, reach + 1, _COLUMN_BLOCK)))
     # Of the column i = 0, the modes with j < 0 are the complex conjugates of those with j > 0.
     inside[0, : reach + 1] = False
     return _random_modes(generator, amplitude, inside, fixed_modulus)
@@ -144,6 +149,13 @@ def phase_screen(
     return field
 
 
+def in_whole_blocks(rows: np.ndarray) -> np.ndarray:
+    """Return which rows lie in a block of rows of which at least one is set, bool [size]."""
+    starts = np.arange(0, len(rows), _ROW_BLOCK)
+    lengths = np.diff(np.append(starts, len(rows)))
+    return np.repeat(np.logical_or.reduceat(rows, starts), lengths)
+
+
 def slope_screen(
     modes: np.ndarray,
     size: int,
@@ -153,38 +165,43 @@ def slope_screen(
     lag: float = 0.0,
     threads: int | None = None,
     out: np.ndarray | None = None,
+    rows: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the slopes of modes over a square of side ``length`` [m]: both gradients, packed. Overwrites the modes.
 
     The result, int32, shape [size, size], ``[y, x]``, holds the slope along x in its lower 16 bits and that along y in
     its upper 16, as signed counts of ``unit`` [rad], at most 32767. Each mode of wavenumber k is multiplied by the sinc
     ``sin(k lag / 2) / (k lag / 2)``, which makes a gradient the mean slope over a baseline ``lag`` [m].
+    Of ``rows``, bool [size], at least those that are set are computed, and the rest of the blocks of rows in which they
+    lie (:func:`in_whole_blocks`); no other row is touched. Their bytes do not depend on the other rows.
     """
     reach = len(modes) - 1
     step = 2.0 * math.pi / length
     i = np.arange(reach + 1, dtype=np.float32)[:, np.newaxis] * np.float32(step)
     j = np.arange(-reach, reach + 1, dtype=np.float32) * np.float32(step)
-    for first in range(0, reach + 1, _COLUMN_BLOCK):
-        # NumPy's sinc is sin(pi x)/(pi x).
-        part = slice(first, first + _COLUMN_BLOCK)
-        modes[part] *= np.sinc(np.hypot(i[part], j) * (0.5 * lag / math.pi)) / unit
-    columns = np.empty((2 * reach + 1, size), dtype=np.complex64)
+    wanted = np.ones(size, dtype=bool) if rows is None else in_whole_blocks(rows)
+    # Where a row stands among those that are computed.
+    place = np.concatenate([[0], np.cumsum(wanted)])
+    kept = slice(None) if wanted.all() else np.flatnonzero(wanted)
+    columns = np.empty((2 * reach + 1, place[-1]), dtype=np.complex64)
     packed = np.empty((size, size), dtype=np.int32) if out is None else out
 
     def along_y(first: int) -> None:
         part = slice(first, min(first + _COLUMN_BLOCK, reach + 1))
+        # NumPy's sinc is sin(pi x)/(pi x).
+        modes[part] *= np.sinc(np.hypot(i[part], j) * (0.5 * lag / math.pi)) / unit
         # The gradient along x and i times that along y, of the modes with i and of their conjugates with -i.
         for sign in (1, -1):
             here = modes[part] if sign == 1 else np.conj(modes[part, ::-1])
             padded = _in_fft_order((1j * sign) * i[part] * here - j * here, size)
-            rows = reach + np.arange(part.start, part.stop) * sign
+            lines = reach + np.arange(part.start, part.stop) * sign
             if sign == -1 and part.start == 0:
-                padded, rows = padded[1:], rows[1:]
-            columns[rows] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)
+                padded, lines = padded[1:], lines[1:]
+            columns[lines] = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True)[:, kept]
 
     def along_x(first: int) -> None:
         rows = slice(first, min(first + _ROW_BLOCK, size))
-        padded = _in_fft_order(columns[:, rows].T, size)
+        padded = _in_fft_order(columns[:, place[rows.start] : place[rows.stop]].T, size)
         counts = scipy.fft.ifft(padded, axis=1, norm="forward", overwrite_x=True).view(np.float32)
         np.rint(counts, out=counts)
         np.clip(counts, -32767.0, 32767.0, out=counts)
@@ -192,5 +209,5 @@ def slope_screen(
 
     with ThreadPoolExecutor(thread_count(threads)) as pool:
         list(pool.map(along_y, range(0, reach + 1, _COLUMN_BLOCK)))
-        list(pool.map(along_x, range(0, size, _ROW_BLOCK)))
+        list(pool.map(along_x, (first for first in range(0, size, _ROW_BLOCK) if wanted[first])))
     return packed

@@ -129,6 +129,9 @@ class PsfEngine(ABC):
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
         """Carry the light of stars to the focal plane."""
 
+    def prepare(self, fields: np.ndarray) -> None:  # noqa: B027 - most engines need nothing
+        """Make what all stars at field angles [n_star, 2] [rad] share, before the first batch is rendered."""
+
     def render(self, fields: np.ndarray, offsets: np.ndarray, recenter: Recenter | None = None) -> RenderedStars:
         """Render one batch of stars at field angles [n_star, 2] [rad].
 

@@ -101,11 +101,10 @@ class FastPsfEngine(PsfEngine):
         n_time = 1 if inputs.atmosphere is None else len(inputs.atmosphere.times)
         self._turns = self._channels.turns(n_time, -(-len(self._points) // LANES))
         if inputs.atmosphere is None:
-            self._slopes, self._units = np.zeros((1, 1), dtype=np.int32), np.zeros(1, dtype=np.float32)
+            self._units = np.zeros(1, dtype=np.float32)
         else:
-            slopes = inputs.atmosphere.screens("slopes", inputs.threads)
-            self._slopes = slopes.reshape(len(slopes), -1)
-            self._units = np.array([inputs.atmosphere.slope_unit(n) for n in range(len(slopes))], dtype=np.float32)
+            layers = range(inputs.atmosphere.layer_count)
+            self._units = np.array([inputs.atmosphere.slope_unit(n) for n in layers], dtype=np.float32)
         star_bytes = 4 * len(self._channels.wave) * self._grid_size**2
         self.batch = max(1, min(_BATCH, _BATCH_BYTES // star_bytes))
 
@@ -162,6 +161,19 @@ class FastPsfEngine(PsfEngine):
         """Return the structure function of the air beside that of the rays [m^2] at baselines [m], if any."""
         air = self._atmosphere
         return None if air is None else rest_structure_function(baseline, air.r0, air.outer_scale, air.cutoff)
+
+    def prepare(self, fields: np.ndarray) -> None:
+        """Make the rows of the screens that the light of stars crosses."""
+        self._slopes(fields)
+
+    def _slopes(self, fields: np.ndarray) -> np.ndarray:
+        """Return the slopes [n_layer, samples] of the screens, at least of the rows that the light of stars crosses."""
+        air = self._atmosphere
+        if air is None:
+            return np.zeros((1, 1), dtype=np.int32)
+        # The kernel moves the lattice by up to a sample.
+        rows = air.rows_under(self._direction(fields), 0.5 * self._diameter + air.screen_pixel)
+        return air.screens("slopes", self._threads, rows).reshape(air.layer_count, -1)
 
     def _expose(self, fields: np.ndarray, offsets: np.ndarray) -> Exposed:
         optics = self._trace(fields, self._points, self._threads)
@@ -238,7 +250,7 @@ class FastPsfEngine(PsfEngine):
             deposit_rays.plain if self._channels.depths == 1 else deposit_rays.special,
             n_star,
             [
-                warp_array(self._slopes, wp.int32),
+                warp_array(self._slopes(optics.fields), wp.int32),
                 warp_array(self._units, wp.float32),
                 screen_size,
                 n_layer,

@@ -219,6 +219,7 @@ def make_psfs(
     image = np.empty((len(angles), plane.stamp_size, plane.stamp_size), dtype=np.float32)
     lit_fraction = np.empty((len(angles), len(lengths)))
     reference_point, offset, inside = np.empty((len(angles), 3)), np.empty((len(angles), 2)), np.empty(len(angles))
+    maker.prepare(angles)
     for first in range(0, len(angles), maker.batch):
         part = slice(first, min(first + maker.batch, len(angles)))
         stars = maker.render(angles[part], places[part], centroids)

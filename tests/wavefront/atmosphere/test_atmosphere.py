@@ -180,6 +180,45 @@ def test_screens_are_kept_until_released(kind, size, dtype):
         atmosphere.screens("fine")
 
 
+def test_rows_that_light_crosses_are_made_when_they_are_asked_for():
+    air, whole = small_atmosphere(), small_atmosphere().screens("slopes")
+    rows = np.zeros((6, 512), dtype=bool)
+    rows[:, 200] = True
+    rows[3] = False
+    screens = air.screens("slopes", None, rows)
+    # The block of 128 rows of the one that was asked for; the other layer was not asked for.
+    for layer in (0, 5):
+        np.testing.assert_array_equal(screens[layer, 128:256], whole[layer, 128:256])
+    made = air.screens("slopes", None, rows)
+    assert made is screens
+    # More rows than those: now all of them.
+    rows[0, 300] = True
+    assert air.screens("slopes", None, rows) is screens
+    np.testing.assert_array_equal(screens[0], whole[0])
+    assert air.screens("slopes") is screens
+    np.testing.assert_array_equal(screens, whole)
+
+
+@pytest.mark.parametrize("radius", [4.0, 45.0])
+def test_rows_under_the_light_of_stars(radius):
+    """Brute force: every star, every time step, points around the rim of the pupil."""
+    air = small_atmosphere(time_step=0.1)
+    slopes = np.random.default_rng(1).uniform(-2e-3, 2e-3, (5, 2))
+    directions = np.column_stack([slopes, -np.ones(5)])
+    rows = air.rows_under(directions, radius)
+    crossed = np.zeros_like(rows)
+    for slope in slopes:
+        for time in air.times:
+            for y in np.linspace(-radius, radius, 601):
+                place = y - air.altitudes * slope[1] - air.velocities[:, 1] * time + air.offsets[:, 1]
+                crossed[np.arange(6), np.floor(place / 0.16 + 0.5).astype(int) % 512] = True
+    assert np.all(rows[crossed])
+    # Few rows besides: two on either side, and half a sample of rounding.
+    assert np.all(rows.sum(axis=1) <= crossed.sum(axis=1) + 7)
+    assert rows.all() == (radius > 0.5 * 81.92)
+    assert not air.rows_under(np.empty((0, 3)), radius).any()
+
+
 def test_the_same_air_at_other_times():
     air = small_atmosphere(time_step=0.1)
     part = air.at_times(air.times[5:8])

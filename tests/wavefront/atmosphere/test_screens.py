@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.core.random_streams import stream
-from pachon.wavefront.atmosphere.screens import draw_modes, phase_screen, slope_screen
+from pachon.wavefront.atmosphere.screens import draw_modes, in_whole_blocks, phase_screen, slope_screen
 from pachon.wavefront.atmosphere.spline import STENCILS, evaluate, stencil_gain
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm, path_spectrum, path_variance, structure_function
 
@@ -194,6 +194,20 @@ def test_slopes_are_the_gradient_of_the_screen_of_the_same_stream(size, lag):
         again = slope_screen(modes.copy(), size, length, unit, lag=lag, threads=threads, out=out)
         assert again is out
         assert out.tobytes() == packed.tobytes()
+
+
+def test_rows_of_slopes_do_not_depend_on_the_others():
+    size, length = 500, 80.0
+    modes = draw_modes(stream(1, "test"), size=size, length=length, r0=R0, outer_scale=L0, band=LOW, threads=2)
+    whole = slope_screen(modes.copy(), size, length, 1e-9)
+    rows = np.zeros(size, dtype=bool)
+    rows[[5, 130, 499]] = True
+    some = slope_screen(modes.copy(), size, length, 1e-9, rows=rows, out=np.full((size, size), -7, dtype=np.int32))
+    made = in_whole_blocks(rows)
+    # Blocks of 128 rows: the first, the second and the shorter last one.
+    np.testing.assert_array_equal(np.flatnonzero(~made), np.arange(256, 384))
+    np.testing.assert_array_equal(some[made], whole[made])
+    assert np.all(some[~made] == -7)
 
 
 def test_slopes_beyond_the_counts_are_held():

@@ -361,3 +361,23 @@ def test_screens_too_coarse_for_a_small_pupil_are_refused():
     air = Atmosphere.from_site("cerro_pachon", seed=2, **coarse)
     with pytest.raises(DomainError, match=r"screen_size = 256: expected at least 427, .* 1\.2 m has 4 samples across"):
         make_psfs(telescope, [(0.0, 0.0)], [620e-9], atmosphere=air)
+
+
+@pytest.mark.parametrize("n_pupil", [None, 2000])
+def test_rows_of_the_screens_that_no_light_crosses_do_not_matter(n_pupil):
+    telescope = load_telescope("lsst_v3.3_r")
+
+    def psfs(spoil):
+        air = Atmosphere.from_site("cerro_pachon", 4, screen_size=1024, screen_length=162.5, exposure=1.0)
+        fields = np.array([[0.004, 0.003], [0.004, 0.0031], [0.0041, 0.0029]])
+        if spoil:
+            # All rows but those that the light crosses hold what no screen has.
+            rows = air.rows_under(np.column_stack([fields, -np.ones(3)]), 0.5 * telescope.pupil_diameter + 0.2)
+            assert rows.mean() < 0.3
+            screens = air.screens("slopes", None, rows)
+            screens.base[~air._cache["slopes: rows"]] = 0x7FFF7FFF
+        else:
+            air.screens("slopes")
+        return make_psfs(telescope, fields, 620e-9, atmosphere=air, n_pupil=n_pupil)
+
+    assert psfs(spoil=True).image.tobytes() == psfs(spoil=False).image.tobytes()
