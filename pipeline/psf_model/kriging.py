@@ -6,7 +6,8 @@ Every pixel of the stamps is interpolated by one linear rule, the best one for a
     C_{ij} = s^2 e^{-|x_i - x_j|/L} + \sum_d t_d^2 \sum_{l+m=d} P_{lm}(x_i) P_{lm}(x_j) + (N_i + g)\,\delta_{ij}
 
 of an exponential process, such as turbulence leaves, and a polynomial trend, whose terms of degree d are
-shrunk to nothing where the stars show none. :math:`N_i` is the noise of star i, from the scatter of its outer pixels
+shrunk to nothing where the stars show none. Terms of degree 3 and 4, and the process, are left out unless
+the stars show them. :math:`N_i` is the noise of star i, from the scatter of its outer pixels
 and its photons; :math:`g` what is left. What counts is the shape, so :math:`s, L, t_d, g` are those of the largest
 posterior probability of three numbers of each star, linear in its pixels: the two components of the ellipticity and the
 size. Most pixels have no signal, and would say little. Nothing is left to choose: on fields that the polynomials of a
@@ -19,12 +20,14 @@ Variances are in units of the noise of the middle star.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
 
 from ...core.errors import DomainError
+from .polynomial import term_count
 
 #: Degree of the trend by default.
 ORDER = 4
@@ -34,8 +37,12 @@ COLUMNS = 5
 # Mean and standard deviation of the logarithms of these before the stars are seen: wide but for the length, which
 # forty stars hardly determine. Variances of the trend fall with the degree: nothing is expected of degrees 3 and 4, so
 # that they cost nothing where the stars show nothing.
-_PRIOR = np.array([(-2.0, 2.0), (math.log(0.7), 0.7), (-4.0, 1.5)])
+_PRIOR = np.array([(-5.0, 3.0), (math.log(0.7), 0.7), (-6.0, 2.0)])
 _TREND_WIDTH = 4.0
+# A degree of the trend above the second, or the process, is kept if the posterior's logarithm falls by this much
+# without it: of the prior of such a variance about a seventh, e^-2, lies where noise alone may put a maximum.
+_EVIDENCE = 2.0
+_FIRST_OPTIONAL_DEGREE = 3
 # Where the search starts: nearly all trend of degree 2, nearly all process, all trend of every degree. The logarithms
 # of the trend's variances start, up to the degree given, at the second number for degree 1 and fall by the third for
 # each degree more; beyond, where they are expected.
@@ -47,6 +54,9 @@ _CONSTANT = 1e4
 _MOST_STARS = 300
 # Distance from the centre beyond which a stamp is sky, as a fraction of its side.
 _SKY = 0.35
+# Passes after which the noise of the sky, and the mean of stars that are weighted by it, change no more; the least
+# part of a star's deviation from that mean that is its own; and the least noise over that of the faintest star.
+_SKY_PASSES, _LEAST_OWN, _LEAST_SKY = 3, 0.05, 1e-12
 #: Stars of fewer photons are not in electrons.
 FEWEST_ELECTRONS = 100.0
 
@@ -83,9 +93,7 @@ def star_noise(
     """
     y, x = np.indices(mean.shape) - np.array(mean.shape)[:, None, None] // 2
     sky = (np.hypot(x, y) > _SKY * min(mean.shape)).ravel()
-    outer = deviations[:, sky]
-    rms = 1.4826 * np.median(np.abs(outer - np.median(outer, axis=1)[:, None]), axis=1)
-    noise = rms[:, None] ** 2 * (filters**2).sum(axis=1)
+    noise = _sky_variance(deviations[:, sky])[:, None] * (filters**2).sum(axis=1)
     if gain is not None:
         electrons = images.sum(axis=(1, 2)) * gain
         if np.median(electrons) < FEWEST_ELECTRONS:
@@ -97,38 +105,110 @@ def star_noise(
     return noise
 
 
+def _sky_variance(outer: np.ndarray) -> np.ndarray:
+    """Return the variance of a pixel of sky of each star, [n], from the deviations of outer pixels [n, n_outer].
+
+    About a mean with equal weights bright stars would have the noise of the faint ones.
+    """
+    variance = np.ones(len(outer))
+    for _ in range(_SKY_PASSES):
+        weights = 1.0 / np.maximum(variance, _LEAST_SKY * variance.max())
+        weights /= weights.sum()
+        left = outer - weights @ outer
+        rms = 1.4826 * np.median(np.abs(left - np.median(left, axis=1)[:, None]), axis=1)
+        # A star takes part in the mean that is subtracted from it.
+        variance = rms**2 / np.maximum(1.0 - weights, _LEAST_OWN)
+        if not variance.any():  # without noise
+            break
+    return variance
+
+
 def fit_kernel(points: np.ndarray, numbers: np.ndarray, noise: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return the covariance, columns as in :data:`COLUMNS`, most probable for shape numbers [n, 3].
 
-    `points` [n, 2] are mapped to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those
-    of the trend.
+    Process and higher degrees of the trend have the variance 0 unless the stars show them. `points` [n, 2] are mapped
+    to [-1, 1], `noise` [n, 3] are the variances of the numbers, `terms` [n, n_terms] those of the trend.
     """
     unit = np.median(noise, axis=0)
     chosen = np.sort(np.argsort(noise.sum(axis=1), kind="stable")[:_MOST_STARS])
-    distance = _distances(points[chosen], points[chosen])
     degrees = np.arange(1, max(order_of(terms.shape[1]), COLUMNS - 3) + 1)
     expected = np.where(degrees < 3, 1.0 - degrees, 3.0 - 3.0 * degrees)
-    middle = np.concatenate([_PRIOR[:, 0], expected])
-    width = np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)])
-    values, own = numbers[chosen] / np.sqrt(unit), (noise[chosen] / unit).mean(axis=1)
-
-    def surprise(logarithms: np.ndarray) -> float:
-        covariance = _covariance(np.exp(logarithms), distance, terms[chosen], own)
-        try:
-            root = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            return 1e12
-        whitened = scipy.linalg.solve_triangular(root, values, lower=True, check_finite=False)
-        likelihood = 0.5 * (whitened**2).sum() + values.shape[1] * np.log(np.diagonal(root)).sum()
-        return float(likelihood + 0.5 * (((logarithms - middle) / width) ** 2).sum())
-
+    posterior = Posterior(
+        _distances(points[chosen], points[chosen]),
+        numbers[chosen] / np.sqrt(unit),
+        (noise[chosen] / unit).mean(axis=1),
+        terms[chosen],
+        np.concatenate([_PRIOR[:, 0], expected]),
+        np.concatenate([_PRIOR[:, 1], np.full(len(degrees), _TREND_WIDTH)]),
+    )
+    every = np.ones(3 + len(degrees), dtype=bool)
     found = []
     for process, last, first, fall in _STARTS if len(degrees) > 2 else _STARTS[:2]:
         start = np.concatenate([process, np.where(degrees <= last, first - fall * (degrees - 1), expected)])
-        simplex = start + 1.5 * np.vstack([np.zeros(len(start)), np.eye(len(start))])
-        options = {"maxfev": 60 * len(start), "xatol": 0.1, "fatol": 0.02, "initial_simplex": simplex}
-        found.append(scipy.optimize.minimize(surprise, start, method="Nelder-Mead", options=options))
-    return np.exp(min(found, key=lambda each: each.fun).x)
+        found.append(posterior.minimize(start, every))
+    best, kept = min(found, key=lambda each: each.fun), every
+    # The process last: it stands for degrees that were left out.
+    for column in (*range(len(every) - 1, 1 + _FIRST_OPTIONAL_DEGREE, -1), 0):
+        fewer = kept & (np.arange(len(kept)) != column)
+        without = posterior.minimize(best.x, fewer)
+        if without.fun < best.fun + _EVIDENCE:
+            best, kept = without, fewer
+    return posterior.kernel(best.x, kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior probability of the logarithms of the kernel's columns, for numbers in units of the noise."""
+
+    distance: np.ndarray  #: between stars, [n, n]
+    numbers: np.ndarray  #: of the stars, [n, 3]
+    noise: np.ndarray  #: their variance, [n]
+    terms: np.ndarray  #: of the trend, [n, n_terms]
+    middle: np.ndarray  #: mean of the prior, [n_columns]
+    width: np.ndarray  #: its standard deviation, [n_columns]
+
+    def kernel(self, logarithms: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return the columns, those that are not kept as 0 but for the length."""
+        return np.where(kept | (np.arange(len(kept)) == 1), np.exp(logarithms), 0.0)
+
+    def surprise(self, logarithms: np.ndarray, kept: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return minus the logarithm of the posterior, but for a constant, and its derivatives [n_columns]."""
+        kernel = self.kernel(logarithms, kept)
+        try:
+            root = np.linalg.cholesky(_covariance(kernel, self.distance, self.terms, self.noise))
+        except np.linalg.LinAlgError:
+            return 1e12, np.zeros(len(kept))
+        lower = np.tril(scipy.linalg.lapack.dpotri(root, lower=1)[0])
+        inverse = lower + np.tril(lower, -1).T
+        solved = inverse @ self.numbers
+        count = self.numbers.shape[1]
+        value = 0.5 * (solved * self.numbers).sum() + count * np.log(np.diagonal(root)).sum()
+        # A change dC of the covariance changes the value by half the sum of `change` times dC.
+        change = count * inverse - solved @ solved.T
+        process = change * (kernel[0] * np.exp(-self.distance / kernel[1]))
+        variances = _trend_variances(kernel, self.terms.shape[1])
+        trend = variances * ((change @ self.terms) * self.terms).sum(axis=0)
+        slope = np.zeros(len(kept))
+        slope[0] = process.sum()
+        slope[1] = (process * self.distance).sum() / kernel[1]
+        slope[2] = kernel[2] * np.trace(change)
+        for degree in range(1, order_of(len(trend)) + 1):
+            slope[2 + degree] = trend[term_count(degree - 1) : term_count(degree)].sum()
+        away = np.where(kept, (logarithms - self.middle) / self.width, 0.0)
+        return float(value + 0.5 * (away @ away)), 0.5 * slope + away / self.width
+
+    def minimize(self, start: np.ndarray, kept: np.ndarray) -> scipy.optimize.OptimizeResult:
+        """Return the most probable logarithms from a start, those that are not kept as they were."""
+        reach = 8.0 * self.width
+        return scipy.optimize.minimize(
+            self.surprise,
+            start,
+            args=(kept,),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=np.stack([self.middle - reach, self.middle + reach], axis=1),
+            options={"maxiter": 60, "ftol": 1e-7},
+        )
 
 
 def krige(

@@ -83,6 +83,42 @@ def test_degrees_that_the_stars_do_not_show_cost_nothing_and_others_are_found():
             assert (10.0 < found < 1000.0) if amplitude else found < 0.1
 
 
+def test_a_process_is_found_where_there_is_one_and_none_on_a_polynomial():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-1.0, 1.0, (80, 2))
+    terms, noise = design_matrix(points, EXTENT, 4), np.full((80, 3), 1e-4)
+    distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    rough = np.linalg.cholesky(np.exp(-distance / 0.5)) @ rng.normal(size=(80, 3))
+    smooth = terms[:, :6] @ rng.normal(size=(6, 3)) + 1e-2 * rng.normal(size=(80, 3))
+    with one_blas_thread():
+        # 1e-2 of noise is the unit; the process drawn has a variance of 25.
+        assert 8.0 < kriging.fit_kernel(points, smooth + 5e-2 * rough, noise, terms)[0] < 80.0
+        assert kriging.fit_kernel(points, smooth, noise, terms)[0] == 0.0
+
+
+def test_the_slope_of_the_posterior_is_its_change():
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-1.0, 1.0, (25, 2))
+    distance = np.hypot(*np.moveaxis(points[:, None] - points, -1, 0))
+    terms = design_matrix(points, EXTENT, 4)
+    posterior = kriging.Posterior(
+        distance, 3.0 * rng.normal(size=(25, 3)), rng.uniform(0.1, 2.0, 25), terms, np.zeros(7), np.full(7, 2.0)
+    )
+    at, kept = rng.normal(size=7), np.array([True, True, True, True, True, False, True])
+    value, slope = posterior.surprise(at, kept)
+    variance, length, floor, *trend = np.where(kept, np.exp(at), 0.0)
+    covariance = variance * np.exp(-distance / length) + np.diag(posterior.noise + floor)
+    covariance += terms @ np.diag(np.repeat([1e4, *trend], [1, 2, 3, 4, 5])) @ terms.T
+    likelihood = 1.5 * np.linalg.slogdet(covariance)[1]
+    likelihood += 0.5 * np.sum(posterior.numbers * np.linalg.solve(covariance, posterior.numbers))
+    assert value == pytest.approx(likelihood + 0.5 * ((at[kept] / 2.0) ** 2).sum(), rel=1e-10)
+    for column in range(7):
+        step = np.eye(7)[column] * 1e-5
+        change = (posterior.surprise(at + step, kept)[0] - posterior.surprise(at - step, kept)[0]) / 2e-5
+        # Rounding of values near 100, over the step.
+        assert slope[column] == pytest.approx(change, abs=1e-7 * abs(value))
+
+
 @pytest.fixture(scope="module")
 def fitted():
     stars, places, _, elsewhere = field(5, 30, 1.0)
@@ -148,6 +184,22 @@ def test_the_noise_of_a_star_is_that_of_many_draws(gain):
     scatter = np.std([kriging.shape_numbers(image, relative(draw()))[0] for _ in range(400)], axis=0)
     stated = np.mean([kriging.star_noise(s, relative(s), image, filters, gain) for s in (draw() for _ in range(20))], 0)
     np.testing.assert_allclose(np.sqrt(stated), scatter, rtol=0.12)
+
+
+def test_bright_stars_do_not_have_the_noise_of_faint_ones():
+    # The deviations are from a mean of equal weights, which the faint stars make noisy.
+    rng = np.random.default_rng(8)
+    image, electrons = psfs([0.0], [0.0], [1.5])[0], np.geomspace(3e3, 3e6, 24)
+    stars = electrons[:, None, None] * image
+    stars = stars + rng.normal(size=stars.shape) * np.sqrt(22.0**2 + stars)
+    unit = (stars / electrons[:, None, None]).reshape(24, -1)
+    filters = kriging.shape_numbers(image, unit)[1]
+    stated = kriging.star_noise(stars, unit - unit.mean(axis=0), image, filters, 1.0)
+    squares = (filters**2).sum(axis=1), filters**2 @ image.ravel()
+    true = (22.0 / electrons[:, None]) ** 2 * squares[0] + squares[1] / electrons[:, None]
+    # The sky of one stamp is good to a tenth (it was 20 times too large for the brightest).
+    np.testing.assert_allclose(stated, true, rtol=0.4)
+    assert abs(np.log(stated / true).mean()) < 0.1
 
 
 def test_few_stars_noise_free_ones_and_equal_ones_are_no_trouble():
