@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.errors import ConfigError
 from .interrupt import interruptible
 from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
 from .tables import Rows, print_json
@@ -33,6 +34,12 @@ def visits_command(
     all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
     count: Annotated[int | None, Option("--count", "-n", min=1, help="Visits; 10 by default.")] = None,
     dither_deg: Annotated[float | None, Option(help="Radius of the disc of the pointings [deg].")] = None,
+    roll: Annotated[
+        str | None, Option(help="Position angles of the telescope [deg]: random, or one for each visit, as 0,90.")
+    ] = None,
+    rotator: Annotated[
+        str | None, Option(help="Angles of the camera against the telescope [deg]: random, or one for each visit.")
+    ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder of the stacks.")] = Path("pachon_visits"),
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     resume: Annotated[bool, Option("--resume", help="Go on after the visits that are stacked already.")] = False,
@@ -53,6 +60,8 @@ def visits_command(
     - `pachon visits --raft R22`: ten visits of the central raft, a minute on two cores
     - `pachon visits --all -n 100 -o full`: 100 visits of 189 CCDs, two hours
     - `pachon visits --all -n 200 -o full --resume`: a hundred more
+    - `pachon visits --rotator random`: the camera turned against the telescope too, by up to 90 degrees
+    - `pachon visits -n 2 --roll 0,0 --rotator 0,45`: a telescope that stands still on the sky, its camera turned
     - `pachon visits my_visits.yaml`, where my_visits.yaml may read
 
         run: {band: i, active_optics: {residual_um: 0.2}, reconstruction: {model: focal_plane}}
@@ -64,7 +73,15 @@ def visits_command(
 
     names = one_name_list(ccds=ccds, raft=raft, all="all" if all_ccds else None)
     base = VisitsConfig() if config is None else load_visits_configuration(config)
-    settings = with_options(base, run__ccds=names, run__seed=seed, visits__count=count, visits__dither_deg=dither_deg)
+    settings = with_options(
+        base,
+        run__ccds=names,
+        run__seed=seed,
+        visits__count=count,
+        visits__dither_deg=dither_deg,
+        visits__roll_deg=angles_of("--roll", roll),
+        visits__rotator_deg=angles_of("--rotator", rotator),
+    )
     experiment = settings.experiment(None if config is None else config.parent)
     with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
         result = stack_visits(settings, out, experiment=experiment, resume=resume, threads=threads, reporter=reporter)
@@ -73,6 +90,16 @@ def visits_command(
     elif not quiet:
         _show(result.summary["stacks"])
         print(f"visits: {out.resolve()}")
+
+
+def angles_of(option: str, text: str | None) -> str | tuple[float, ...] | None:
+    """Return the angles of an option [deg], or the word random."""
+    if text is None or text == "random":
+        return text
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"{option} = {text}: expected random, or angles in degrees with commas between") from None
 
 
 def _show(stacks: dict[str, dict[str, Any]]) -> None:

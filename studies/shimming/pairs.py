@@ -18,8 +18,8 @@ from ...core.errors import DomainError
 
 # Bins of a decade of separations, and the fewest, as in the correlations of runs.
 _BINS_PER_DECADE, _FEWEST = 6, 4
-#: Largest number of places; the memory of their pairs grows with its square, to 1.5 GB.
-MOST_PLACES = 10_000
+#: Largest number of places; the memory of their pairs grows with its square, to 1 GB.
+MOST_PLACES = 6_000
 
 
 def separation_edges(shortest: float, longest: float) -> np.ndarray:

@@ -33,8 +33,9 @@ MERITS = ("fwhm", "ellipticity", "xi")
 PARTS = ("rafts", "ccds")
 #: States of the focal plane: as it is, focused as a whole, shimmed, and an ideal plane in focus.
 STATES = ("as built", "focused", "shimmed", "plane")
-# Nodes along the side of a CCD: of the fit, and of the check, which shares none with it.
-_FIT, _CHECK = 3, 4
+# Nodes along the side of a CCD: of the fit by merit, and of the check. Pairs of 3 x 3 nodes have too few separations:
+# what they leave uncorrelated is correlated elsewhere.
+_FIT, _CHECK = {"fwhm": 3, "ellipticity": 3, "xi": 5}, 4
 # Room for motions beyond the largest height [m].
 _ROOM = 10e-6
 #: Merit at each place and its derivative with respect to the height there, of values and slopes [n, 3].
@@ -146,7 +147,7 @@ def shim(
         )
     reporter = Reporter(quiet=True) if reporter is None else reporter
     plane, names = experiment.focal_plane, experiment.config.ccds or ()
-    fit, check = (Places.gauss(plane, names, order) for order in (_FIT, _CHECK))
+    fit, check = (Places.gauss(plane, names, order) for order in (_FIT[merit], _CHECK))
     heights = fit.heights(plane)
     with reporter.stage("widths and ellipticities against height"):
         curves = focus_curves(experiment, fit, float(np.abs(heights).max()) + _ROOM, threads)

@@ -9,14 +9,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
 
 from ...core.arguments import check_arguments
-from ...core.errors import ConfigError, error_context
-from ...core.schema import Count, Section, Whole, plain_number, validated
+from ...core.errors import ConfigError, DomainError, error_context
+from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
 from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
 from ...pipeline.defaults import require_drawn_stars
@@ -39,6 +39,19 @@ class VisitsSection(Section):
     places: Count = Field(20, description="places per area of a CCD where no star is and models are checked")
     snapshots: tuple[Count, ...] = Field((1, 10, 100), description="numbers of visits whose stacks are kept")
     first_epoch: Whole = Field(0, description="epoch of the first visit")
+    roll_deg: Literal["random"] | tuple[Real, ...] = Field(
+        "random",
+        description="position angles of the telescope: random, but for the first visit, or a list, one for each [deg]",
+    )
+    rotator_deg: Literal["random"] | tuple[Real, ...] | None = Field(
+        None, description="angles of the camera against the telescope in place of the run's: random, or a list [deg]"
+    )
+    rotator_limit_deg: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=0, le=180)] = Field(
+        90.0, description="largest angle of the rotator of either sense that is drawn [deg]"
+    )
+
+
+_ANGLES = {key: VisitsSection.model_fields[key].default for key in ("roll_deg", "rotator_deg", "rotator_limit_deg")}
 
 
 class VisitsConfig(Section):
@@ -68,13 +81,29 @@ class VisitsConfig(Section):
     def digest(self, experiment: Experiment) -> str:
         """SHA-256 of all settings that affect a visit; their number does not, nor which stacks are kept."""
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
+        # Angles that are left as they were before there were these keys leave the products of then usable.
+        visits = {key: value for key, value in visits.items() if key not in _ANGLES or value != _ANGLES[key]}
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
 
     def plan(self, seed: int) -> tuple[Visit, ...]:
         """Return the visits."""
+        return self.plan_of(self.visits.count, seed)
+
+    def plan_of(self, count: int, seed: int) -> tuple[Visit, ...]:
+        """Return the visits, if there were so many of them."""
         visits = self.visits
-        dither = float(np.deg2rad(visits.dither_deg))
-        return plan_visits(visits.count, seed, dither=dither, first_epoch=visits.first_epoch)
+        try:
+            return plan_visits(
+                count,
+                seed,
+                dither=float(np.deg2rad(visits.dither_deg)),
+                first_epoch=visits.first_epoch,
+                rolls_deg=visits.roll_deg,
+                rotators_deg=visits.rotator_deg,
+                rotator_limit_deg=visits.rotator_limit_deg,
+            )
+        except DomainError as error:
+            raise ConfigError(f"visits.{error}") from None
 
     @property
     def kept(self) -> tuple[int, ...]:

@@ -1,10 +1,11 @@
-"""Visits to one patch of sky: pointing, roll and epoch of each, and where the sky falls on the detector.
+"""Visits to one patch of sky: pointing, roll, rotator and epoch of each, and where the sky falls on the detector.
 
 Positions on the sky are gnomonic: xi towards east and eta towards north of the common pointing, tangents of angles.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,12 +30,19 @@ class Visit:
         Position angle of the telescope's +y, from north through east [rad].
     pointing : tuple of float
         xi, eta of the pointing.
+    rotator_deg : float or None
+        Angle of the camera against the telescope [deg], as `rotator_deg` of a run has it; that of the run if None.
     """
 
     number: int
     epoch: int
     roll: float = 0.0
     pointing: tuple[float, float] = (0.0, 0.0)
+    rotator_deg: float | None = None
+
+    def __str__(self) -> str:
+        rotator = "" if self.rotator_deg is None else f", rotator {self.rotator_deg:.0f} deg"
+        return f"roll {np.rad2deg(self.roll):.0f} deg{rotator}"
 
     @property
     def matrix(self) -> np.ndarray:
@@ -80,8 +88,17 @@ class Visit:
         return image_jacobians(telescope, self.directions(sky), wavelength, threads) @ cosines[:, :2]
 
 
-def plan_visits(count: int, seed: int, *, dither: float = 0.0, first_epoch: int = 0) -> tuple[Visit, ...]:
-    """Return visits with random rolls about the common pointing, the first without.
+def plan_visits(
+    count: int,
+    seed: int,
+    *,
+    dither: float = 0.0,
+    first_epoch: int = 0,
+    rolls_deg: str | Sequence[float] = "random",
+    rotators_deg: str | Sequence[float] | None = None,
+    rotator_limit_deg: float = 90.0,
+) -> tuple[Visit, ...]:
+    """Return visits about a common pointing, by default with random rolls, the first without.
 
     Parameters
     ----------
@@ -93,21 +110,41 @@ def plan_visits(count: int, seed: int, *, dither: float = 0.0, first_epoch: int 
         Radius of the disc over which the pointings of all but the first visit are spread [rad].
     first_epoch : int
         Epoch of the first visit; those of the others follow.
+    rolls_deg : "random" or sequence of float
+        Rolls [deg]; drawn for all but the first visit, or one for each visit.
+    rotators_deg : "random", sequence of float or None
+        Angles of the camera against the telescope [deg]; drawn evenly for all but the first visit, which has that of
+        the run, or one for each visit, or that of the run for all.
+    rotator_limit_deg : float
+        Largest angle of either sense that is drawn [deg].
 
     Raises
     ------
     DomainError
-        If there is no visit, or the radius is negative or beyond 5 degrees.
+        If there is no visit, the radius is negative or beyond 5 degrees, or angles are given for fewer visits.
     """
     if count < 1:
         raise DomainError(f"visits = {count}: expected at least 1")
     if not 0.0 <= dither <= np.deg2rad(5.0):
         raise DomainError(f"dither = {np.rad2deg(dither):g} deg: expected 0 to 5")
-    visits = [Visit(0, first_epoch)]
-    for number in range(1, count):
+    for name, given in (("roll_deg", rolls_deg), ("rotator_deg", rotators_deg)):
+        if given is not None and not isinstance(given, str) and len(given) < count:
+            raise DomainError(f"{name}: {len(given)} angles for {count} visits, expected one for each")
+    visits = []
+    for number in range(count):
         rng = stream(seed, "visit", number)
         roll = rng.uniform(0.0, 2.0 * np.pi)
         radius, angle = dither * np.sqrt(rng.random()), rng.uniform(0.0, 2.0 * np.pi)
         pointing = (float(radius * np.cos(angle)), float(radius * np.sin(angle)))
-        visits.append(Visit(number, first_epoch + number, float(roll), pointing))
+        if not number:
+            roll, pointing = 0.0, (0.0, 0.0)
+        if not isinstance(rolls_deg, str):
+            roll = np.deg2rad(rolls_deg[number])
+        rotator: float | None = None
+        if rotators_deg == "random" and number:
+            limit = rotator_limit_deg
+            rotator = float(stream(seed, "visit", number, "rotator").uniform(-limit, limit))
+        elif rotators_deg is not None and not isinstance(rotators_deg, str):
+            rotator = float(rotators_deg[number])
+        visits.append(Visit(number, first_epoch + number, float(roll), pointing, rotator))
     return tuple(visits)

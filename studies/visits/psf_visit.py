@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
+from ...models.telescope import Telescope
 from ...pipeline.config import with_options
 from ...pipeline.experiment import Experiment
 from ...pipeline.focal_plane_psf.stars import CcdStars, FocalPlaneStars
@@ -83,8 +84,16 @@ class _CcdResult(NamedTuple):
 
 
 def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
-    """Return the experiment of a visit: telescope and heights of all; own turbulence, residual aberration and noise."""
-    return Experiment.from_config(with_options(experiment.config, atmosphere__epoch=visit.epoch))
+    """Return the experiment of a visit: own turbulence, residual aberration, noise and, where it has one, rotator."""
+    own = with_options(experiment.config, atmosphere__epoch=visit.epoch, rotator_deg=visit.rotator_deg)
+    return Experiment.from_config(own)
+
+
+def visit_telescope(experiment: Experiment, visit: Visit) -> Telescope:
+    """Return the telescope of all visits, its camera at the angle of a visit."""
+    if visit.rotator_deg is None:
+        return experiment.telescope
+    return experiment.telescope.with_rotator(np.deg2rad(visit.rotator_deg - experiment.config.rotator_deg))
 
 
 def visit_psfs(

@@ -115,7 +115,7 @@ def stack_visits(
         reporter.line(f"{sums.visits} of {len(visits)} visits are stacked already")
     scale = pixel_scale_of(frame)
     for visit in visits[sums.visits :]:
-        reporter.line(f"visit {visit.number + 1} of {len(visits)}, roll {np.rad2deg(visit.roll):.0f} deg")
+        reporter.line(f"visit {visit.number + 1} of {len(visits)}, {visit}")
         try:
             seen = visit_psfs(
                 visit_experiment(experiment, visit), visit, points, frame, threads=threads, reporter=reporter
@@ -202,17 +202,18 @@ def _write_products(
     stacks: dict[int, PsfStack],
     found: dict[int, Correlated],
 ) -> dict[str, Any]:
-    write_ecsv(
-        folder / "visits.ecsv",
-        {
-            "visit": (np.array([v.number for v in visits]), "", "number of the visit"),
-            "epoch": (np.array([v.epoch for v in visits]), "", "of turbulence, residual aberration and noise"),
-            "roll": (np.rad2deg([v.roll for v in visits]), "deg", "position angle of the telescope's +y"),
-            "xi": (np.array([v.pointing[0] for v in visits]) / ARCSEC, "arcsec", "pointing towards east, gnomonic"),
-            "eta": (np.array([v.pointing[1] for v in visits]) / ARCSEC, "arcsec", "pointing towards north"),
-        },
-        {"what": "visits in the order of the stack", **stamp.meta()},
-    )
+    columns = {
+        "visit": (np.array([v.number for v in visits]), "", "number of the visit"),
+        "epoch": (np.array([v.epoch for v in visits]), "", "of turbulence, residual aberration and noise"),
+        "roll": (np.rad2deg([v.roll for v in visits]), "deg", "position angle of the telescope's +y"),
+        "xi": (np.array([v.pointing[0] for v in visits]) / ARCSEC, "arcsec", "pointing towards east, gnomonic"),
+        "eta": (np.array([v.pointing[1] for v in visits]) / ARCSEC, "arcsec", "pointing towards north"),
+    }
+    if any(v.rotator_deg is not None for v in visits):
+        run = config.run.rotator_deg
+        angles = np.array([run if v.rotator_deg is None else v.rotator_deg for v in visits])
+        columns["rotator"] = (angles, "deg", "of the camera, from +x towards +y of the telescope")
+    write_ecsv(folder / "visits.ecsv", columns, {"what": "visits in the order of the stack", **stamp.meta()})
     summary = {
         **stamp.meta(),
         "configuration": config.model_dump(mode="json", by_alias=True),

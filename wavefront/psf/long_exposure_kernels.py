@@ -211,12 +211,12 @@ def transform_pupils(
 
     A wavelength has ``n_depth`` channels, with the light of the same points at other places.
 
-    Arguments: place, light, cut as ``place_points`` leaves them; fade_x, fade_y [channel, packet]: their filters along x, with their weights, and along y;
-    wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]: xx, xy, yy of jacobian @
-    jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of the table per step of
-    frequency, for a unit Jacobian; along_x [star, packet, depth * n_point + point, 2] and along_y [star, row, depth *
-    n_point + point, 2]: room for cosines and sines, side by side as the sums over points read them; spectrum [star, 4,
-    row, packet]: real and imaginary parts at +n, and at -n.
+    Arguments: place, light, cut, lean as ``place_points`` leaves them; fade_x, fade_y [channel, packet]: filters along
+    x, with their weights, and along y; wavelength [wave] [m]; rows [packet of columns]: their number; metric [star, 3]:
+    xx, xy, yy of jacobian @ jacobian.T; table [wave, sample]: filter against the baseline; per_step [wave]: samples of
+    the table per step of frequency, for a unit Jacobian; along_x [star, packet, depth * n_point + point, 2] and along_y
+    [star, row, depth * n_point + point, 2]: room for cosines and sines, side by side as the sums over points read them;
+    spectrum [star, 4, row, packet]: real and imaginary parts at +n, and at -n.
     """
     star = first + wp.tid()
     n_wave = wavelength.shape[0]

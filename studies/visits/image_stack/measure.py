@@ -30,7 +30,6 @@ from .picture import stacks_png
 from .stack_images import ImageStack, galaxies_on
 from .tiles import Tile
 from .transfer import broadened, mean_transfer
-from .visit_wcs import VisitWcs
 
 #: Largest distance of a detected object from a true one [pixel].
 MATCH_RADIUS = 3.0
@@ -144,8 +143,7 @@ def measure_tile(
     reach = REACH * cell_of(stack.experiment, stack.frame) / float(np.sqrt(stack.visits.visits.places))
     places = np.flatnonzero(~psfs.star)
     at = np.stack([objects.x, objects.y], axis=1) + tile.first
-    ccds = stack.wcs(threads).values()
-    images = [VisitWcs(ccd, visit) for visit in stack.plan[: psfs.visits] for ccd in ccds]
+    images = [ccd for _, wcs in stack.wcs(stack.plan[: psfs.visits], threads) for ccd in wcs.values()]
     transfer = mean_transfer(tile, stack.frame, images)
     tree = cKDTree(np.stack([psfs.x, psfs.y], axis=1)[places])
     distance, nearest = tree.query(at * scale, distance_upper_bound=reach)

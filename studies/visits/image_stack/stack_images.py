@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from ....pipeline.simulate.star_field import magnitudes_at
 from ....sky.population import GalaxyPopulation
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit
-from ..psf_visit import StackFrame, magnitude_limits, middle_wavelength, stack_limit, visit_experiment
+from ..psf_visit import StackFrame, magnitude_limits, middle_wavelength, stack_limit, visit_experiment, visit_telescope
 from ..visits import pixel_scale_of, sky_points_of
 from .config import ImageStackConfig, load_image_stack_configuration
 from .resample import add_resampled
@@ -96,7 +97,6 @@ class ImageStack:
             raise ProductError(f"{visits_folder}: no images; expected the folder of pachon stack-images")
         settings = _resolved(settings or ImageStackConfig(), before, visits, experiment)
         frame = StackFrame.of(experiment, STACK_STAMP)
-        dither = float(np.deg2rad(visits.visits.dither_deg))
         content = {"visits": visits.digest(experiment), "images": settings.model_dump(mode="json")}
         seed = experiment.config.seed
         population = GalaxyPopulation(given(settings.faintest), seed)
@@ -106,7 +106,7 @@ class ImageStack:
             settings,
             experiment,
             frame,
-            choose_tiles(experiment, frame, given(settings.side), settings.tiles, dither),
+            choose_tiles(experiment, frame, given(settings.side), settings.tiles, visits),
             Sky(sky_points_of(experiment, visits, frame), population.galaxies_in),
             Stamp(digest(content), seed),
         )
@@ -127,14 +127,20 @@ class ImageStack:
         """The visits."""
         return self.visits.plan(self.experiment.config.seed)
 
-    def wcs(self, threads: int | None = None) -> dict[str, CcdWcs]:
-        """Return the world coordinates of the CCDs about the pointing of a visit, at a position angle of 0."""
-        telescope, camera = self.experiment.telescope, self.experiment.camera
-        wavelength = middle_wavelength(self.experiment)
-        return {
-            name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
-            for name in given(self.experiment.config.ccds)
-        }
+    def wcs(self, visits: Sequence[Visit], threads: int | None = None) -> Iterator[tuple[Visit, dict[str, VisitWcs]]]:
+        """Yield visits with the world coordinates of their CCDs."""
+        camera, wavelength = self.experiment.camera, middle_wavelength(self.experiment)
+        known: dict[float | None, dict[str, CcdWcs]] = {}
+        for visit in visits:
+            # About the visit's own pointing, at a position angle of 0, all visits of a rotator angle have the same.
+            if visit.rotator_deg not in known:
+                telescope = visit_telescope(self.experiment, visit)
+                own = {
+                    name: ccd_wcs(telescope, camera, name, wavelength=wavelength, threads=threads)
+                    for name in given(self.experiment.config.ccds)
+                }
+                known = {visit.rotator_deg: own}
+            yield visit, {name: VisitWcs(ccd, visit) for name, ccd in known[visit.rotator_deg].items()}
 
     def path(self, visits: int, tile: Tile) -> Path:
         """Return the path of the image of a tile in the stack of a number of visits."""
@@ -201,11 +207,10 @@ def stack_images(
             raise ProductError(f"{stack.folder} {text}")
     if done:
         reporter.line(f"images of {done} of {len(plan)} visits are stacked already")
-    wcs = stack.wcs(threads)
-    for visit in plan[done:]:
+    for visit, wcs in stack.wcs(plan[done:], threads):
         # Tiles written before an interruption may be ahead by a visit.
         due = {tile: s for tile, s in sums.items() if s.visits == visit.number}
-        reporter.line(f"visit {visit.number + 1} of {len(plan)}, roll {np.rad2deg(visit.roll):.0f} deg")
+        reporter.line(f"visit {visit.number + 1} of {len(plan)}, {visit}")
         _add_visit(stack, visit, due, wcs, threads, reporter)
         for tile, own in due.items():
             own.visits += 1
@@ -220,21 +225,21 @@ def _add_visit(
     stack: ImageStack,
     visit: Visit,
     due: dict[Tile, TileSums],
-    wcs: dict[str, CcdWcs],
+    wcs: dict[str, VisitWcs],
     threads: int | None,
     reporter: Reporter,
 ) -> None:
     """Draw the CCDs of a visit that touch tiles, and add them to the sums."""
     exposure, windows = stack.exposure(), {}
     for name, own in wcs.items():
-        window = window_on(list(due), stack.frame, VisitWcs(own, visit))
+        window = window_on(list(due), stack.frame, own)
         if window is not None:
             windows[name] = window
     experiment = visit_experiment(stack.experiment, visit)
     bar = reporter.stage(f"images of {len(windows)} CCDs", total=len(windows))
     with experiment.screens(threads, reporter), bar as stage:
         for i, (name, window) in enumerate(windows.items(), start=1):
-            seen = VisitWcs(wcs[name], visit)
+            seen = wcs[name]
             try:
                 exposed = visit_image(
                     experiment,

@@ -14,8 +14,8 @@ from ....core.products import Stamp, image_hdu, read_fits, write_fits
 from ....imaging.draw import SkyPixels, Window
 from ....imaging.wcs import CcdWcs
 from ....pipeline.experiment import Experiment
-from ..plan import plan_visits
-from ..psf_visit import StackFrame, middle_wavelength
+from ..config import VisitsConfig
+from ..psf_visit import StackFrame, middle_wavelength, visit_telescope
 from ..stack import VISITS_CARD
 
 #: Bit of the mask of a pixel without data of any visit.
@@ -71,7 +71,7 @@ class Tile:
         )
 
 
-def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int, dither: float) -> list[Tile]:
+def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int, config: VisitsConfig) -> list[Tile]:
     """Return tiles of which the CCDs of visits see at least half on average, from the pointing outwards.
 
     The first visits of the plan decide, whatever the number of visits of a stack.
@@ -86,8 +86,8 @@ def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int
         Pixels along a side of a tile.
     most : int
         Most tiles.
-    dither : float
-        Of the pointings [rad].
+    config : VisitsConfig
+        Configuration of the visits.
 
     Raises
     ------
@@ -105,14 +105,16 @@ def choose_tiles(experiment: Experiment, frame: StackFrame, side: int, most: int
     inside = (np.arange(_POINTS) + 0.5) * side / _POINTS
     offsets = np.stack(np.meshgrid(inside, inside), axis=-1).reshape(-1, 2)
     to_sky = np.linalg.inv(frame.matrix).T
-    plan = plan_visits(_VISITS, experiment.config.seed, dither=dither)
+    angles = [given for given in (config.visits.roll_deg, config.visits.rotator_deg) if isinstance(given, tuple)]
+    plan = config.plan_of(min([_VISITS, *map(len, angles)]), experiment.config.seed)
+    telescopes = [visit_telescope(experiment, visit) for visit in plan]
     wavelength = middle_wavelength(experiment)
     chosen: list[Tile] = []
     for tile in tiles:
         sky = (offsets + tile.first) @ to_sky
         seen = 0.0
-        for visit in plan:
-            at = visit.on_detector(experiment.telescope, sky, wavelength)
+        for visit, telescope in zip(plan, telescopes, strict=True):
+            at = visit.on_detector(telescope, sky, wavelength)
             near = np.any([camera.depth(ccd, *at.T) >= 0.0 for ccd in ccds], axis=0)
             seen += near.mean() / len(plan)
         if seen >= 0.5:

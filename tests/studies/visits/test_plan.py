@@ -75,3 +75,29 @@ def test_points_of_the_sky_do_not_depend_on_its_size():
     # More stars leave the first ones, and all places, where they were.
     more = draw_points(3, 0.006, 0.004, 12, 6)
     assert set(map(tuple, small.sky)) <= set(map(tuple, more.sky))
+
+
+def test_angles_are_drawn_or_listed():
+    plain, drawn = plan_visits(40, 5, dither=0.01), plan_visits(40, 5, dither=0.01, rotators_deg="random")
+    # Rolls and pointings are those without a rotator.
+    assert [(v.roll, v.pointing, v.epoch) for v in drawn] == [(v.roll, v.pointing, v.epoch) for v in plain]
+    assert drawn[0].rotator_deg is None
+    angles = np.array([v.rotator_deg for v in drawn[1:]])
+    # Even over +-90 degrees: the rms is 90 / sqrt(3) = 52, to 10 % for 39 visits.
+    assert np.abs(angles).max() < 90.0
+    assert angles.std() == pytest.approx(52.0, rel=0.2)
+    few = plan_visits(3, 5, rotators_deg="random", rotator_limit_deg=10.0)
+    assert [v.rotator_deg for v in few[1:]] == pytest.approx(angles[:2] / 9.0)
+    listed = plan_visits(2, 5, rolls_deg=[0.0, 30.0, 60.0], rotators_deg=[-20.0, 45.0])
+    assert [v.rotator_deg for v in listed] == [-20.0, 45.0]
+    assert [v.roll for v in listed] == pytest.approx([0.0, np.pi / 6])
+    with pytest.raises(DomainError, match=r"^rotator_deg: 2 angles for 3 visits, expected one for each$"):
+        plan_visits(3, 5, rotators_deg=[1.0, 2.0])
+
+
+def test_a_camera_turned_back_by_the_roll_stands_still_on_the_sky(lsst_r):
+    sky = np.random.default_rng(2).uniform(-0.01, 0.01, (6, 2))
+    still = Visit(0, 0).on_detector(lsst_r, sky, LIGHT)
+    turned = Visit(1, 1, roll=np.deg2rad(25.0), rotator_deg=25.0)
+    found = turned.on_detector(lsst_r.with_rotator(np.deg2rad(turned.rotator_deg)), sky, LIGHT)
+    np.testing.assert_allclose(found, still, atol=1e-9)

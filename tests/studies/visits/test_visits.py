@@ -7,11 +7,13 @@ from pachon.commands.cli import main
 from pachon.core.errors import PachonError
 from pachon.core.progress import Reporter
 from pachon.core.units import ARCSEC
+from pachon.pipeline.config import digest, with_options
+from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
 from pachon.studies.visits.config import load_visits_configuration
 from pachon.studies.visits.plan import Visit
-from pachon.studies.visits.psf_visit import StackFrame, visit_experiment, visit_psfs
+from pachon.studies.visits.psf_visit import StackFrame, visit_experiment, visit_psfs, visit_telescope
 from pachon.studies.visits.sky_points import draw_points
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import SUMS_NAME, cell_of, stack_path, stack_visits
@@ -176,3 +178,46 @@ def test_bad_files_end_in_one_line(tmp_path, capsys):
         assert error.count("\n") == 1
         assert expected in error
         assert "bad.yaml" in error
+
+
+def test_a_visit_with_a_rotator_angle_is_the_run_with_it(visits_config):
+    config = visits_config()
+    rotated = config.model_copy(update={"run": config.run.model_copy(update={"rotator_deg": 35.0})})
+    one, other = config.experiment(), rotated.experiment()
+    visit = Visit(1, 3, roll=0.4, rotator_deg=35.0)
+    frame = StackFrame.of(one, 31)
+    points = draw_points(1, 0.003, cell_of(one, frame), 20, 8)
+    own = visit_experiment(one, visit)
+    assert own.config == visit_experiment(other, Visit(1, 3, roll=0.4)).config
+    assert own.telescope == Experiment.from_config(with_options(other.config, atmosphere__epoch=3)).telescope
+    found = visit_psfs(own, visit, points, frame)
+    expected = visit_psfs(visit_experiment(other, Visit(1, 3)), Visit(1, 3, roll=0.4), points, frame)
+    assert found.index.tobytes() == expected.index.tobytes()
+    assert found.true.tobytes() == expected.true.tobytes()
+    assert found.model.tobytes() == expected.model.tobytes()
+    # The camera's heights are at other places of the sky than without a rotator.
+    plain = visit_psfs(visit_experiment(one, Visit(1, 3)), Visit(1, 3, roll=0.4), points, frame)
+    both = np.intersect1d(plain.index, found.index)
+    assert 10 < len(both) < len(found.index)
+    images = [seen.true[np.isin(seen.index, both)] for seen in (plain, found)]
+    assert np.abs(images[0] - images[1]).max() > 1e-3
+    # Tiles and images take the telescope of the visit.
+    assert np.allclose(visit_telescope(one, visit).surfaces[-1].matrix, own.telescope.surfaces[-1].matrix, atol=1e-15)
+    assert visit_telescope(other, Visit(0, 0)) is other.telescope
+
+
+def test_keys_of_angles_leave_older_stacks_usable(visits_config):
+    config = visits_config()
+    experiment = config.experiment()
+    before = {"dither_deg": 0.0, "stars": 20, "places": 8, "first_epoch": 0}
+    expected = digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": before})
+    assert config.digest(experiment) == expected
+    assert visits_config(rotator_deg="random").digest(experiment) != expected
+
+
+def test_angles_of_the_command_line(capsys, tmp_path):
+    assert main(["visits", "-n", "3", "--rotator", "0,45", "-o", str(tmp_path / "a")]) == 2
+    assert "visits.rotator_deg: 2 angles for 3 visits, expected one for each" in capsys.readouterr().err
+    assert main(["visits", "--roll", "north", "-o", str(tmp_path / "b")]) == 2
+    assert "--roll = north: expected random, or angles in degrees with commas between" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

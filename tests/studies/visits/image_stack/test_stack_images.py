@@ -14,7 +14,6 @@ from pachon.studies.visits.image_stack.config import ImageStackConfig
 from pachon.studies.visits.image_stack.stack_images import ImageStack, stack_images
 from pachon.studies.visits.image_stack.tiles import TileSums, choose_tiles
 from pachon.studies.visits.image_stack.transfer import broadened, mean_transfer
-from pachon.studies.visits.image_stack.visit_wcs import VisitWcs
 
 SMALL = ImageStackConfig(faintest=21.5, side=128)
 
@@ -45,8 +44,8 @@ def test_stars_are_the_psfs_of_the_stack(noise_free, visits, tolerance):
     stack, psfs = noise_free
     tile, psf = stack.tiles[0], psfs[visits]
     image = stack.image(visits, tile)
-    ccds = stack.wcs().values()
-    transfer = mean_transfer(tile, stack.frame, [VisitWcs(ccd, v) for v in stack.plan[:visits] for ccd in ccds])
+    ccds = [ccd for _, wcs in stack.wcs(stack.plan[:visits]) for ccd in wcs.values()]
+    transfer = mean_transfer(tile, stack.frame, ccds)
     stars, at = isolated(image.objects, True, 60.0)
     assert len(stars) >= 6
     for i in stars:
@@ -145,10 +144,10 @@ def test_an_image_is_one_of_a_ccd(visits_folder):
 
 def test_tiles_go_outwards_and_are_seen(visits_folder):
     stack = ImageStack.of(visits_folder, SMALL)
-    tiles = choose_tiles(stack.experiment, stack.frame, 1024, 9, 0.0)
+    tiles = choose_tiles(stack.experiment, stack.frame, 1024, 9, stack.visits)
     assert [(t.column, t.row) for t in tiles[:5]] == [(0, 0), (-1, 0), (0, -1), (0, 1), (1, 0)]
     with pytest.raises(DomainError, match="no tile of 20000 pixels"):
-        choose_tiles(stack.experiment, stack.frame, 20000, 1, 0.0)
+        choose_tiles(stack.experiment, stack.frame, 20000, 1, stack.visits)
 
 
 def test_refusals(visits_folder, tmp_path_factory, monkeypatch, capsys):
