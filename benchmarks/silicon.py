@@ -3,11 +3,12 @@
     python benchmarks/silicon.py
 
 Prints absorption and focus against wavelength, sizes and ellipticities of cool and hot stars in r, z and y with and
-without silicon, in focus at its surface and refocused, and the processor time of the engines with and without it. Some
-five minutes.
+without silicon, in focus at its surface and refocused, and the processor time of the engines and of the OPD with and
+without it. Some ten minutes; `python benchmarks/silicon.py times` prints the last alone.
 """
 
 import platform
+import sys
 import time
 
 import numpy as np
@@ -95,7 +96,7 @@ def times():
     long = pachon.Atmosphere.from_site("cerro_pachon", seed=2, **air)
     # The wave engine takes its screens whole, and seconds a star.
     short = pachon.Atmosphere.from_site("cerro_pachon", seed=2, exposure=7.0, **air)
-    for band in "ry":
+    for band in "rizy":
         telescope = pachon.load_telescope(f"lsst_v3.3_{band}")
         light = np.linspace(*telescope.band, 5)
         for engine, atmosphere, count, repeats in (
@@ -117,10 +118,25 @@ def times():
             off, on = (min(seconds[1:]) for seconds in spent.values())
             name = engine + (" without air" if atmosphere is None else "")
             print(f"{band}  {name:18} {off:9.2f} {on:9.2f} {on / off:6.2f}", flush=True)
+        opd_times(band, telescope)
+
+
+def opd_times(band, telescope):
+    field, light = np.deg2rad([0.5, 0.6]), 0.5 * sum(telescope.band)
+    spent = {None: [], SILICON: []}
+    for _ in range(8):
+        for silicon, seconds in spent.items():
+            start = time.process_time()
+            for _ in range(20):
+                pachon.wavefront_opd(telescope, field, light, silicon=silicon, threads=1)
+            seconds.append(1e3 * (time.process_time() - start) / 20)
+    off, on = (min(seconds[1:]) for seconds in spent.values())
+    print(f"{band}  {'OPD of a field':18} {off:9.2f} {on:9.2f} {on / off:6.2f}", flush=True)
 
 
 if __name__ == "__main__":
     print(f"pachon {pachon.__version__}, Python {platform.python_version()}, {platform.machine()}\n")
-    absorption()
-    colours()
+    if sys.argv[1:] != ["times"]:
+        absorption()
+        colours()
     times()

@@ -20,10 +20,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, PrivateAttr
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
@@ -67,7 +68,14 @@ class Design(Section):
 
 
 #: Sections and keys of a configuration that may name a file, besides the telescope.
-_FILES = (("atmosphere", "site"), ("focal_plane", "heights"))
+_FILES = (
+    ("atmosphere", "site"),
+    ("focal_plane", "heights"),
+    ("active_optics", "states"),
+    ("stars", "catalogue"),
+)
+# Parameters whose values may name files.
+_FILE_PARAMETERS = {"telescope", "camera", *(f"{section}.{key}" for section, key in _FILES)}
 
 
 class SweepFile(Section):
@@ -85,6 +93,7 @@ class SweepFile(Section):
     xi_target: Annotated[Real, Field(gt=0)] | None = Field(
         None, description="xi+ that the report shares out between the causes"
     )
+    _folder: Path = PrivateAttr(default=Path())
 
     @property
     def digest(self) -> str:
@@ -97,13 +106,25 @@ class SweepFile(Section):
             for section, key in _FILES:
                 content = self.base.get(section)
                 named.append(content.get(key) if isinstance(content, dict) else None)
-        files = [path for path in named if isinstance(path, str) and Path(path).is_file()]
-        contents = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in files}
-        if isinstance(telescope, str) and Path(telescope).is_file():
-            contents[telescope] = prescription_digest(telescope)
+        for name in _FILE_PARAMETERS - {"telescope"}:
+            named += self._values(name)
+        contents = {path: hashlib.sha256(file.read_bytes()).hexdigest() for path, file in self._existing(named)}
+        telescopes = [telescope, *self._values("telescope")]
+        contents |= {path: prescription_digest(str(file)) for path, file in self._existing(telescopes)}
         # A key that is not given leaves the digests of older sweeps as they were.
         left_out = {"fields_deg"} if self.fields_deg is None else set()
         return digest({"sweep": self.model_dump(mode="json", exclude=left_out), "files": contents})
+
+    def _values(self, name: str) -> list[Any]:
+        """Return the values of a parameter, if it is one."""
+        parameter = self.parameters.get(name)
+        return [] if parameter is None else [parameter.nominal, *(parameter.values or ())]
+
+    def _existing(self, names: Iterable[Any]) -> Iterator[tuple[str, Path]]:
+        """Yield those names that are paths of files, from the folder of the sweep on, and the files."""
+        for name in names:
+            if isinstance(name, str) and (self._folder / name).is_file():
+                yield name, self._folder / name
 
 
 @check_arguments
@@ -120,7 +141,9 @@ def load_sweep(path: str | os.PathLike[str]) -> SweepFile:
         if isinstance(base, dict) and section in base:
             base = {**base, section: _with_path(base[section], key, folder)}
     content["base"] = base
-    return read_sweep(content, str(path))
+    sweep = read_sweep(content, str(path))
+    sweep._folder = folder
+    return sweep
 
 
 def _with_path(section: Any, key: str, folder: Path) -> Any:

@@ -510,3 +510,21 @@ def test_asphere_of_the_planted_fault_is_what_it_says():
     shape = load_telescope("lsst_v3.3_r").surface("L2_exit").shape
     assert isinstance(shape, EvenAsphere)
     assert tuple(shape.coefficients) == (0.0, -0.001656)
+
+
+def test_a_rotated_camera_has_the_figures_that_symmetry_demands(mine):
+    """Optics symmetric about the axis, and the mean of all air: the camera may be at any angle."""
+    (mine / "run.yaml").write_text(yaml.safe_dump({**RUN, "rotator_deg": 90.0}))
+    turned = check_baseline(mine / "camera.json", threads=1)
+    assert turned.passed
+    assert turned.notes == ("the configuration is not the one that the baseline was made from",)
+    # M2 off its axis: the angle now matters, and the camera is compared at the angle of the configuration.
+    telescope = load_telescope(str(mine / "telescope.yaml")).perturbed("M2", shift=(2e-4, 0.0, 0.0))
+    save_telescope(telescope, mine / "telescope.yaml")
+    found = {}
+    for angle in (0.0, 90.0):
+        (mine / "run.yaml").write_text(yaml.safe_dump({**RUN, "rotator_deg": angle}))
+        check = check_baseline(mine / "camera.json", threads=1)
+        found[angle] = {d.name: d.found for d in check.out}
+    assert kinds_out(check) >= {"rms_e"}
+    assert found[0.0] != found[90.0]

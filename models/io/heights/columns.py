@@ -28,6 +28,12 @@ def frame_of(metadata: Any, default: Frame, file: str | Path) -> Frame:
     return cast(Frame, given)
 
 
+def in_telescope_frame(points: Sequence[np.ndarray], frame: Frame) -> np.ndarray:
+    """Return x, y and z of points in the telescope frame, shape [3, n]."""
+    x, y, z = points
+    return np.stack([y, x, -z] if frame == "CCS" else [x, y, z])
+
+
 def lengths(table: Table, name: str, file: str | Path, rows: Sequence[str] = ()) -> np.ndarray:
     """Return a column in metres; `rows` are the names of its rows in messages.
 

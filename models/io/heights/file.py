@@ -22,7 +22,7 @@ from ....core.files import parsing, require_file
 from ...camera.camera import Camera
 from ...camera.ccd_surfaces import CcdSurfaces
 from ...camera.height_fit import fit_heights
-from .columns import frame_of, lengths
+from .columns import frame_of, in_telescope_frame, lengths
 from .images import image_points
 from .zernike_table import COLUMNS, zernike_heights
 
@@ -101,8 +101,8 @@ def _table_points(table: Table, path: Path) -> np.ndarray:
         if name not in table.colnames:
             wanted = f"expected x, y, z, or {', '.join(COLUMNS)}"
             raise PrescriptionError(f"columns {', '.join(table.colnames)}: {wanted}", file=path)
-    x, y, z = (lengths(table, name, path) for name in "xyz")
-    return np.stack([y, x, -z] if frame_of(table.meta, "telescope", path) == "CCS" else [x, y, z])
+    points = [lengths(table, name, path) for name in "xyz"]
+    return in_telescope_frame(points, frame_of(table.meta, "telescope", path))
 
 
 def _fitted(points: np.ndarray, camera: Camera) -> tuple[MeasuredHeights, np.ndarray]:

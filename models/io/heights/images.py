@@ -16,7 +16,7 @@ import numpy as np
 
 from ....core.errors import PrescriptionError, error_context
 from ..grid_file import length_unit
-from .columns import frame_of
+from .columns import frame_of, in_telescope_frame
 
 # Pixels along a side that a fit can use.
 _MOST_PIXELS = 64
@@ -36,10 +36,9 @@ def image_points(images: Sequence[Any], primary: Any, file: Path) -> dict[str, n
         if not name or name in points:
             raise PrescriptionError(f"image {number}: EXTNAME = {name!r}: expected the name of a CCD, once", file=file)
         with error_context(file=file, place=name):
-            points[name] = _points(hdu.data, hdu.header)
-        if frame_of(hdu.header, frame_of(primary, "telescope", file), file) == "CCS":
-            x, y, z = points[name]
-            points[name] = np.stack([y, x, -z])
+            own = _points(hdu.data, hdu.header)
+        frame = frame_of(hdu.header, frame_of(primary, "telescope", file), file)
+        points[name] = in_telescope_frame(own, frame)
     return points
 
 

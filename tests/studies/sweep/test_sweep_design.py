@@ -126,3 +126,36 @@ def test_another_table_or_prescription_is_another_sweep(tmp_path):
     second = load_sweep(tmp_path / "sweep.yaml").digest
     Table({"a": [2.0]}).write(tmp_path / "points.ecsv", overwrite=True)
     assert len({first, second, load_sweep(tmp_path / "sweep.yaml").digest}) == 3
+
+
+def test_swept_files_count_by_their_content(tmp_path):
+    rows = "focal_plane.heights: {nominal: a.ecsv, values: [a.ecsv, b.ecsv, lsstcam]}"
+    (tmp_path / "sweep.yaml").write_text(f"parameters:\n  {rows}\n")
+    for name in "ab":
+        (tmp_path / f"{name}.ecsv").write_text(name)
+    first = load_sweep(tmp_path / "sweep.yaml")
+    assert load_sweep(tmp_path / "sweep.yaml").digest == first.digest
+    # Values stay as they are written, for tables and labels.
+    assert first.parameters["focal_plane.heights"].values == ("a.ecsv", "b.ecsv", "lsstcam")
+    digests = {first.digest}
+    for name in "ba":
+        (tmp_path / f"{name}.ecsv").write_text("other")
+        digests.add(load_sweep(tmp_path / "sweep.yaml").digest)
+    assert len(digests) == 3
+    # Elsewhere with the same content it is the same sweep.
+    (tmp_path / "moved").mkdir()
+    for path in tmp_path.glob("*.*"):
+        (tmp_path / "moved" / path.name).write_bytes(path.read_bytes())
+    assert load_sweep(tmp_path / "moved" / "sweep.yaml").digest in digests
+
+
+@pytest.mark.parametrize(("section", "key"), [("stars", "catalogue"), ("active_optics", "states")])
+def test_files_of_the_base_count_by_their_content(tmp_path, section, key):
+    (tmp_path / "sweep.yaml").write_text(
+        f"base: {{{section}: {{{key}: own.ecsv}}}}\nparameters: {{seed: {{values: [1], nominal: 1}}}}\n"
+    )
+    digests = set()
+    for text in ("one", "two"):
+        (tmp_path / "own.ecsv").write_text(text)
+        digests.add(load_sweep(tmp_path / "sweep.yaml").digest)
+    assert len(digests) == 2
