@@ -52,7 +52,7 @@ class ImageConfig(Section):
 
     exposures: Count = Field(1, description="exposures that are summed, all of one PSF")
     noise: Switch = Field(True, description="false for the expected image")
-    gain: Positive = Field(1.0, description="electrons of one ADU")
+    gain: Positive | None = Field(None, description="electrons of one ADU; that of the camera by default")
     sky_mag: Real | None = Field(None, description="sky [AB mag/arcsec^2]; the dark sky of the band by default")
     subtract_background: Switch = Field(True, description="subtract the expected sky and dark current")
     way: Literal["direct", "eigen"] = Field(
@@ -99,6 +99,8 @@ class ImagesConfig(Section):
                 content["galaxies"][key] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
         for key in ("preview", "cutouts"):
             del content["image"][key]
+        if self.image.gain is None:
+            content["image"]["gain"] = experiment.band.gain
         return digest({"run": experiment.config_hash, **content})
 
     def to_yaml(self) -> str:

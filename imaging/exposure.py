@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,15 +14,9 @@ from ..core.errors import DomainError
 from ..core.random_streams import stream
 from ..core.threads import thread_count
 from ..core.units import pure_numbers, require_positive
-from ..pipeline.simulate.photometry import (
-    DARK_CURRENT,
-    FULL_WELL,
-    PIXEL_SCALE,
-    READ_NOISE,
-    Band,
-    band_named,
-    sky_electrons_per_pixel,
-)
+from ..models.camera.photometry import DARK_CURRENT, FULL_WELL, PIXEL_SCALE, READ_NOISE, Band
+from ..pipeline.experiment import Experiment
+from ..pipeline.simulate.photometry import band_named, sky_electrons_per_pixel
 
 #: Bit of the mask of a pixel that reaches the full well.
 SATURATED = 1
@@ -60,6 +55,8 @@ class Exposure:
         Whether the expected sky and dark current are subtracted.
     noise : bool
         Whether there is noise; without it an image is the expected one.
+    photometry : Band, optional
+        Zero point, sky and extinction; by default those of the LSST in the band.
     """
 
     band: str = "r"
@@ -73,9 +70,24 @@ class Exposure:
     full_well: float = FULL_WELL
     subtract_background: bool = True
     noise: bool = True
+    photometry: Band | None = None
+
+    @classmethod
+    def of_run(cls, experiment: Experiment, exposures: int = 1, **settings: Any) -> Exposure:
+        """Return exposures with the time, the band and the pixels of a run's camera, but for other `settings`."""
+        band = experiment.band
+        own: dict[str, Any] = {
+            "gain": band.gain,
+            "pixel_scale": band.pixel_scale,
+            "read_noise": band.read_noise,
+            "dark_current": band.dark_current,
+            "full_well": band.full_well,
+        }
+        return cls(band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(own | settings))
 
     def __post_init__(self) -> None:
-        band_named(self.band)
+        if self.photometry is None:
+            object.__setattr__(self, "photometry", band_named(self.band))
         for name in ("time", "gain", "full_well", "pixel_scale"):
             require_positive(getattr(self, name), name)
         if self.exposures < 1:
@@ -104,7 +116,7 @@ class Exposure:
     @property
     def background(self) -> float:
         """Expected electrons of sky and dark current in a pixel."""
-        sky = sky_electrons_per_pixel(self.band, self.total_time, self.pixel_scale, sky=self.sky)
+        sky = sky_electrons_per_pixel(self._band, self.total_time, self.pixel_scale, sky=self.sky)
         return sky + self.dark_current * self.total_time
 
     @property
@@ -118,7 +130,7 @@ class Exposure:
 
     @property
     def _band(self) -> Band:
-        return band_named(self.band)
+        return band_named(self.photometry or self.band)
 
     @property
     def _brightness(self) -> float:

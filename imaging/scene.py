@@ -13,7 +13,6 @@ from ..core.arguments import check_arguments
 from ..core.errors import ConfigError, DomainError, shown
 from ..core.products import Stamp, card_text
 from ..core.units import ARCSEC
-from ..pipeline.defaults import pixel_angle
 from ..pipeline.experiment import Experiment
 from ..pipeline.simulate.ccd_exposure import ccd_stars, expose_positions
 from ..pipeline.simulate.photometry import effective_fwhm
@@ -139,7 +138,7 @@ def draw_ccd(
             f"{camera.pixel_size * 1e6:g} um and an atmosphere"
         )
     if exposure is None:
-        exposure = Exposure(config.band or "r", config.atmosphere.exposure_s, pixel_scale=nominal_scale(experiment))
+        exposure = Exposure.of_run(experiment)
     wcs = ccd_wcs(
         experiment.telescope,
         camera,
@@ -198,11 +197,6 @@ def draw_ccd(
         config.seed,
         config.atmosphere.epoch,
     )
-
-
-def nominal_scale(experiment: Experiment) -> float:
-    """Return the angle of a pixel [rad] to a thousandth of an arc second, as cameras state it: 0.2 for the LSST."""
-    return round(pixel_angle(experiment.telescope, experiment.camera.pixel_size) / ARCSEC, 3) * ARCSEC
 
 
 def ellipticities(galaxies: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -29,7 +29,7 @@ from .draw import Window
 from .exposure import Exposure
 from .image_file import is_whole
 from .preview import cutouts_png, preview_png
-from .scene import check_density, draw_ccd, nominal_scale, stamped
+from .scene import check_density, draw_ccd, stamped
 
 #: Limits of the bins over which the light of a population is summed.
 _MAGNITUDES = 200
@@ -175,17 +175,11 @@ def _window(config: ImagesConfig, experiment: Experiment, name: str) -> Window:
 def _exposure(config: ImagesConfig, experiment: Experiment) -> Exposure:
     """Return depth and noise of the images."""
     image = config.image
+    settings = {"sky": image.sky_mag, "subtract_background": image.subtract_background, "noise": image.noise}
+    if image.gain is not None:
+        settings["gain"] = image.gain
     with error_context(key="image"):
-        return Exposure(
-            given(experiment.config.band),
-            experiment.config.atmosphere.exposure_s,
-            image.exposures,
-            gain=image.gain,
-            sky=image.sky_mag,
-            pixel_scale=nominal_scale(experiment),
-            subtract_background=image.subtract_background,
-            noise=image.noise,
-        )
+        return Exposure.of_run(experiment, image.exposures, **settings)
 
 
 def _galaxies(config: ImagesConfig, experiment: Experiment, exposure: Exposure) -> Any:

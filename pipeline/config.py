@@ -33,6 +33,8 @@ from ..core.yaml_reader import read_mapping
 
 BandName = Literal["u", "g", "r", "i", "z", "y"]
 _Model = TypeVar("_Model", bound=Section)
+#: Values of the height budget that a resolved configuration has without their being given.
+_CAMERAS_OWN = {"budget": "simulated"}
 _Declination = Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=-90, le=90)]
 
 
@@ -60,6 +62,20 @@ class StarsConfig(Section):
     )
 
 
+class PhotometryConfig(Section):
+    """Zero point, sky and noise; by default those of the camera in the band."""
+
+    zero_point: Real | None = Field(None, description="AB magnitude of one electron a second at airmass 1")
+    dark_sky: Real | None = Field(None, description="sky [AB mag/arcsec^2]")
+    extinction: NotNegative | None = Field(None, description="loss in the air [mag/airmass]")
+    pixel_arcsec: Positive | None = Field(None, description="angle of a pixel of the CCDs [arcsec]")
+    read_noise_e: NotNegative | None = Field(None, description="rms read noise of an exposure [electron/pixel]")
+    dark_current_e_s: NotNegative | None = Field(None, description="dark current [electron/s/pixel]")
+    full_well_e: Positive | None = Field(None, description="largest signal of an unsaturated pixel [electron]")
+    gain: Positive | None = Field(None, description="electrons of one ADU of images")
+    source: str | None = Field(None, description="where the camera's numbers are from")
+
+
 class PointingConfig(Section):
     """Where the telescope looks."""
 
@@ -79,8 +95,8 @@ class MotionConfig(Section):
 class FocalPlaneConfig(Section):
     """Heights of the CCD surfaces (Jee & Tyson 2011, Table 1)."""
 
-    budget: Literal["simulated", "specification", "flat"] = Field(
-        "simulated", description="column of Table 1 that the heights are drawn from, or flat"
+    budget: Literal["simulated", "specification", "flat"] | None = Field(
+        None, description="column of Table 1 that the heights are drawn from, or flat; that of the camera by default"
     )
     global_: Switch = Field(True, alias="global", description="figure of the whole focal plane")
     raft: Switch = Field(True, description="height of each raft")
@@ -106,7 +122,12 @@ class FocalPlaneConfig(Section):
     def changed(self) -> tuple[str, ...]:
         """Keys of the height budget whose values are not the default ones."""
         before, now = FocalPlaneConfig().model_dump(by_alias=True), self.model_dump(by_alias=True)
-        return tuple(key for key in now if key not in ("heights", "moved") and now[key] != before[key])
+        # The budget is that of the camera where none is named.
+        return tuple(
+            key
+            for key in now
+            if key not in ("heights", "moved") and now[key] not in (before[key], _CAMERAS_OWN.get(key))
+        )
 
     @property
     def sizes(self) -> dict[str, Any]:
@@ -253,6 +274,7 @@ class Configuration(Section):
         None, description="for celestial coordinates: {ra_deg: 53.1, dec_deg: -27.8, position_angle_deg: 30}"
     )
     wavelengths_nm: tuple[Positive, ...] | None = Field(None, description="wavelengths that make up the band [nm]")
+    photometry: PhotometryConfig = PhotometryConfig()
     stars: StarsConfig = StarsConfig()
     focal_plane: FocalPlaneConfig = FocalPlaneConfig()
     active_optics: ActiveOpticsConfig = ActiveOpticsConfig()

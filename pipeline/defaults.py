@@ -19,6 +19,7 @@ from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera
 from ..models.camera.cameras import CAMERAS, load_camera
 from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
+from ..models.camera.photometry import nearest_band
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
 from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
@@ -26,14 +27,13 @@ from ..models.io.site_file import load_site
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
 from ..models.telescope import Telescope
-from ..raytrace.rays import field_direction
-from ..wavefront.chief_rays import image_jacobians
 from ..wavefront.psf.clear_pupil import check_rings
 from ..wavefront.psf.fast import PUPIL_POINTS, PUPIL_POINTS_STILL
 from ..wavefront.psf.long_exposure import PUPIL_POINTS as PUPIL_POINTS_LONG
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .alignment_states import in_state
 from .config import BandName, Configuration, ReconstructionConfig
+from .photometry import band_of, pixel_angle, resolved_photometry
 from .psf_model.fit import COMPONENTS, ORDERS
 from .psf_model.polynomial import term_count
 from .sensor.brighter_fatter import PIXEL_SIZE as BRIGHTER_FATTER_PIXEL
@@ -80,12 +80,10 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     """
     name, band = config.telescope, config.band
     if name is None:
-        band = band or "r"
-        name = f"lsst_v3.3_{band}"
-    else:
-        name = _absolute(name, folder, bundled_names())
-        band = band or _band_of(name)
+        name = f"lsst_v3.3_{band or 'r'}"
+    name = _absolute(name, folder, bundled_names())
     telescope = load_telescope(name)
+    band = band or _band_of(name, telescope)
     camera_name = None
     if config.camera is not None:
         camera_name = _absolute(config.camera, folder, CAMERAS, CAMERA_ENDINGS)
@@ -96,18 +94,20 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     if plane.heights is not None:
         heights = _absolute(plane.heights, folder, tuple(AS_MEASURED), HEIGHT_ENDINGS)
         plane = plane.model_copy(update={"heights": heights})
+    elif plane.budget is None:
+        plane = plane.model_copy(update={"budget": camera.height_budget})
     active = config.active_optics
     if active.states is not None:
         active = active.model_copy(update={"states": _absolute(active.states, folder, (), STATE_ENDINGS)})
     site = load_site(site_name)
-    stars = config.stars
+    stars, light = config.stars, resolved_photometry(config.photometry, telescope, camera, band)
     if stars.catalogue is not None:
-        width, seconds = PROVISIONAL_FWHM, atmosphere.exposure_s
+        width, seconds, measured = PROVISIONAL_FWHM, atmosphere.exposure_s, band_of(band, light)
         stars = _filled(
             stars.model_copy(update={"catalogue": _absolute(stars.catalogue, folder, (), STAR_ENDINGS)}),
             {
-                "brightest": round(saturation_magnitude(band, seconds, width), 3),
-                "faintest": round(limiting_magnitude(stars.snr_min, band, seconds, width), 3),
+                "brightest": round(saturation_magnitude(measured, seconds, width), 3),
+                "faintest": round(limiting_magnitude(stars.snr_min, measured, seconds, width), 3),
             },
         )
     wavelengths = config.wavelengths_nm
@@ -121,6 +121,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
             "camera": camera_name,
             "ccds": chosen_ccds(camera, default_ccds(camera) if config.ccds is None else config.ccds),
             "wavelengths_nm": wavelengths,
+            "photometry": light,
             "stars": stars,
             "focal_plane": plane,
             "active_optics": active,
@@ -189,13 +190,6 @@ def _stamps(config: Configuration, telescope: Telescope, camera: Camera) -> dict
         pixels = side * ARCSEC / pixel_angle(telescope, pixel)
         found["stamp"] = max(2 * round(0.5 * (pixels - 1.0)) + 1, _FEWEST)
     return found
-
-
-def pixel_angle(telescope: Telescope, pixel_size: float) -> float:
-    """Return the angle of a pixel [m] in the middle of the field [rad]."""
-    axis = field_direction([0.0], [0.0])
-    jacobian = image_jacobians(telescope, axis, telescope.default_wavelength)[0]
-    return pixel_size / math.sqrt(abs(float(np.linalg.det(jacobian))))
 
 
 def as_configured(telescope: Telescope, config: Configuration) -> Telescope:
@@ -354,11 +348,11 @@ def _filled(section: _Model, defaults: Mapping[str, object]) -> _Model:
     return section.model_copy(update={key: v for key, v in defaults.items() if getattr(section, key) is None})
 
 
-def _band_of(name: str) -> BandName:
-    """Return the band that the name of a model ends in, such as lsst_v3.3_i; r where it does not."""
+def _band_of(name: str, telescope: Telescope) -> BandName:
+    """Return the band that the name of a model ends in, such as lsst_v3.3_i, or the one nearest to its wavelengths."""
     ending = Path(name).stem.rpartition("_")[2] if Path(name).suffix.lower() in ENDINGS else name.rpartition("_")[2]
     bands: dict[str, BandName] = {"u": "u", "g": "g", "r": "r", "i": "i", "z": "z", "y": "y"}
-    return bands.get(ending, "r")
+    return bands.get(ending, "r" if telescope.band is None else bands[nearest_band(telescope.band)])
 
 
 def _absolute(name: str, folder: Path | None, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,17 +17,14 @@ from ..core.errors import ConfigError, PachonError, PrescriptionError, error_con
 from ..core.files import read_bytes
 from ..core.progress import Reporter
 from ..core.random_streams import stream
-from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
 from ..models.camera.camera import Camera
-from ..models.camera.cameras import CAMERAS
-from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.height_budget import load_budget
+from ..models.camera.photometry import Band
 from ..models.camera.silicon import Silicon
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
-from ..models.io.prescription import ENDINGS, bundled_names, prescription_digest
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
@@ -38,15 +34,13 @@ from ..wavefront.atmosphere.atmosphere import Atmosphere
 from ..wavefront.atmosphere.refraction import dispersion_shift
 from ..wavefront.chief_rays import chief_rays
 from ..wavefront.psf.engines import ENGINES
-from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration, digest
+from .config_hash import hashed_content
 from .defaults import given, resolve
+from .photometry import band_of
 from .sensor.displacement import Displacement, EdgeRolloff, TreeRings
 from .simulate.screen_cover import check_samples, corner_fields
 from .star_list import StarList, listed_stars, pointing_of
-
-#: Keys of the stars that a configuration without a catalogue did not have once.
-_CATALOGUE_KEYS = ("catalogue", "columns", "brightest", "faintest")
 
 
 @dataclass(frozen=True)
@@ -123,6 +117,11 @@ class Experiment:
     def camera(self) -> Camera:
         """The camera."""
         return self.focal_plane.camera
+
+    @cached_property
+    def band(self) -> Band:
+        """Zero point, sky and noise of the camera in the band."""
+        return band_of(given(self.config.band), self.config.photometry)
 
     @property
     def wavelengths(self) -> np.ndarray:
@@ -279,55 +278,7 @@ class Experiment:
         The list of CCDs is left out, since no CCD depends on the others. A file named in the configuration counts by
         its content, not by its path, and so do the files that a prescription names.
         """
-        content = self.config.as_dict()
-        del content["ccds"]
-        if not self.config.detector.silicon:
-            # Nothing is made of it.
-            del content["detector"]
-        name = given(self.config.telescope)
-        content["telescope"] = name if name in bundled_names() else prescription_digest(name)
-        content = hashed_camera(content)
-        content["focal_plane"] = hashed_heights(content["focal_plane"])
-        content["active_optics"] = hashed_states(content["active_optics"])
-        content["stars"] = hashed_stars(content["stars"])
-        if self.config.pointing is None:
-            del content["pointing"]
-        content["atmosphere"]["site"] = _name_or_content(given(self.config.atmosphere.site), ())
-        return digest(content)
-
-
-def hashed_camera(content: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration for a hash: a camera file by its content; no key where the telescope's own is taken."""
-    name = content["camera"]
-    rest = {key: value for key, value in content.items() if key != "camera"}
-    return rest if name is None else rest | {"camera": _name_or_content(name, CAMERAS, CAMERA_ENDINGS)}
-
-
-def hashed_heights(section: dict[str, Any]) -> dict[str, Any]:
-    """Return the section of the focal plane for a hash: a file of heights by its content; no key where there is none.
-
-    So configurations without measured heights keep the hashes that they had before there were any.
-    """
-    name = section["heights"]
-    rest = {key: value for key, value in section.items() if key != "heights"}
-    return rest if name is None else rest | {"heights": _name_or_content(name, tuple(AS_MEASURED), HEIGHT_ENDINGS)}
-
-
-def hashed_states(section: dict[str, Any]) -> dict[str, Any]:
-    """Return the section of the active optics for a hash, as :func:`hashed_heights` does that of the focal plane."""
-    name = section["states"]
-    rest = {key: value for key, value in section.items() if key != "states"}
-    return rest if name is None else rest | {"states": _name_or_content(name, (), STATE_ENDINGS)}
-
-
-def hashed_stars(section: dict[str, Any]) -> dict[str, Any]:
-    """Return the section of the stars for a hash: a catalogue by its content, no keys of it where there is none."""
-    name = section["catalogue"]
-    if name is None:
-        return {key: value for key, value in section.items() if key not in _CATALOGUE_KEYS}
-    return {key: value for key, value in section.items() if key != "observed"} | {
-        "catalogue": _name_or_content(name, (), STAR_ENDINGS)
-    }
+        return digest(hashed_content(self.config))
 
 
 def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
@@ -341,7 +292,7 @@ def _focal_plane(config: Configuration, camera: Camera) -> FocalPlane:
     elif plane.budget == "flat":
         focal_plane = FocalPlane.flat(camera)
     else:
-        budget = replace(load_budget(plane.budget), **plane.sizes)
+        budget = replace(load_budget(given(plane.budget)), **plane.sizes)
         focal_plane = FocalPlane.from_budget(camera, seed=config.seed, terms=plane.terms, budget=budget)
     for name, motion in plane.moved.items():
         focal_plane = focal_plane.with_moved(
@@ -400,10 +351,3 @@ def _atmosphere(config: Configuration, site: Site) -> Atmosphere | None:
         )
     except PachonError as error:
         raise ConfigError(f"atmosphere: {error}") from None
-
-
-def _name_or_content(name: str, bundled: Sequence[str], endings: Sequence[str] = ENDINGS) -> str:
-    """Return a bundled name, or the hash of the file of that name."""
-    if name in bundled or Path(name).suffix.lower() not in endings:
-        return name
-    return hashlib.sha256(Path(name).read_bytes()).hexdigest()

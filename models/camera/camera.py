@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_unique, unknown_name
 from ...core.units import plane_points
+from .photometry import CameraPhotometry
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -97,6 +98,8 @@ class Camera:
     """Angle of each CCD from +x towards +y [deg], [n_ccd]; or [1] if all are alike. Quarter turns are exact."""
     placement: np.ndarray | None = None
     """Nominal height [m] and rotations about x and y of the focal plane [rad] of each CCD, [n_ccd, 3]; zero if None."""
+    photometry: CameraPhotometry = field(default_factory=CameraPhotometry)  #: zero points, sky, noise
+    height_budget: str = "flat"  #: budget that heights are drawn from by default, as :class:`~.HeightBudget` names them
 
     def __post_init__(self) -> None:
         n = len(self.ccd_names)

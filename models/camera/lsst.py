@@ -8,6 +8,7 @@ import numpy as np
 
 from ...core.arguments import check_arguments
 from .camera import Camera
+from .photometry import LSST
 
 #: Rafts of the LSST camera whose CCDs are of Imaging Technology Laboratory; the others are Teledyne e2v's.
 _ITL_RAFTS = {"R01", "R02", "R03", "R10", "R20", "R41", "R42", "R43"}
@@ -42,6 +43,8 @@ def lsst_camera() -> Camera:
         pixels=np.array([4096, 4096]),
         pixel_size=10e-6,
         vendors=tuple("itl" if name[:3] in _ITL_RAFTS else "e2v" for name in names),
+        photometry=LSST,
+        height_budget="simulated",
     )
 
 
@@ -73,6 +76,8 @@ def _corner_camera(name: str, sensors: tuple[str, ...], pixels: int) -> Camera:
         centers=np.array(centers),
         pixels=np.array([pixels, pixels]),
         pixel_size=10e-6,
+        photometry=LSST,
+        height_budget="simulated",
     )
 
 

@@ -18,16 +18,17 @@ from __future__ import annotations
 import hashlib
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from ...core.errors import PachonError, PrescriptionError
 from ...core.files import read_bytes
-from ...core.schema import Count, Positive, Real, Section, validated
+from ...core.schema import Count, Fraction, NotNegative, Positive, Real, Section, validated
 from ...core.yaml_reader import read_mapping
 from ..camera.camera import Camera
+from ..camera.photometry import DARK_CURRENT, FULL_WELL, LSST, READ_NOISE, THROUGHPUT, Band, CameraPhotometry
 from .yaml.values import ROWS, OptionalText, Text
 
 #: Pixels along x and y of a CCD.
@@ -49,6 +50,52 @@ class CcdSection(Section):
     ry_urad: Real = 0.0
 
 
+class BandSection(Section):
+    """One band, measured."""
+
+    zero_point: Real
+    dark_sky: Real
+    extinction: NotNegative
+    effective_nm: Positive
+
+    def band(self, name: str, source: str) -> Band:
+        """Return the band."""
+        wavelength = self.effective_nm / 1e9
+        return Band(
+            name, self.zero_point, self.dark_sky, self.extinction, wavelength, (wavelength, wavelength), source=source
+        )
+
+
+class PhotometrySection(Section):
+    """Zero points, sky and noise."""
+
+    source: Text
+    throughput: Fraction = THROUGHPUT
+    read_noise_e: NotNegative = READ_NOISE
+    dark_current_e_s: NotNegative = DARK_CURRENT
+    full_well_e: Positive = FULL_WELL
+    gain: Positive = 1.0
+    area_m2: Positive | None = None
+    bands: dict[Literal["u", "g", "r", "i", "z", "y"], BandSection] = Field(default_factory=dict)
+
+    def photometry(self) -> CameraPhotometry:
+        """Return the photometry of the camera."""
+        if not self.throughput:
+            raise PrescriptionError("photometry.throughput = 0: expected more than 0", key="photometry.throughput")
+        if self.bands and self.area_m2 is None:
+            text = "photometry.area_m2: expected the collecting area [m2] of the telescope that the bands are those of"
+            raise PrescriptionError(text, key="photometry.area_m2")
+        return CameraPhotometry(
+            tuple(band.band(name, self.source) for name, band in self.bands.items()),
+            self.area_m2 or 0.0,
+            self.throughput,
+            self.read_noise_e,
+            self.dark_current_e_s,
+            self.full_well_e,
+            self.gain,
+        )
+
+
 class CameraFile(Section):
     """A camera file."""
 
@@ -58,6 +105,8 @@ class CameraFile(Section):
     license: Text = ""
     pixel_um: Positive
     pixels: Pixels | None = None
+    photometry: Literal["lsst"] | PhotometrySection | None = None
+    height_budget: Literal["simulated", "specification", "flat"] = "flat"
     ccds: Annotated[tuple[CcdSection, ...], ROWS, Field(min_length=1)]
 
     def camera(self) -> Camera:
@@ -75,7 +124,14 @@ class CameraFile(Section):
             vendors=self._vendors(),
             rotation_deg=np.array([ccd.rotation_deg for ccd in self.ccds]),
             placement=placement if placement.any() else None,
+            photometry=self._photometry(),
+            height_budget=self.height_budget,
         )
+
+    def _photometry(self) -> CameraPhotometry:
+        if isinstance(self.photometry, PhotometrySection):
+            return self.photometry.photometry()
+        return LSST if self.photometry == "lsst" else CameraPhotometry()
 
     def _pixels_of(self, ccd: CcdSection) -> Any:
         found = self.pixels if ccd.pixels is None else ccd.pixels

@@ -202,7 +202,7 @@ def ccd_stars(experiment: Experiment, name: str, width: float, least_light: floa
     Observed stars are those of the catalogue where the configuration has one.
     """
     config, camera, listed = experiment.config, experiment.camera, experiment.star_list
-    band, exposure = config.band or "r", config.atmosphere.exposure_s
+    band, exposure = experiment.band, config.atmosphere.exposure_s
     bounds, turn = ccd_bounds(camera, name)
     drawn = make_star_field(
         name,

@@ -37,7 +37,8 @@ def observe_ccd(
     """
     config = experiment.config
     seconds = config.atmosphere.exposure_s
-    sky, noise = sky_electrons_per_pixel(config.band or "r", seconds, pixel_scale), instrument_noise(seconds)
+    sky = sky_electrons_per_pixel(experiment.band, seconds, pixel_scale)
+    noise = instrument_noise(experiment.band, seconds)
     exposed, full_well = images.astype(np.float64), None
     if noisy:
         clean = observe_stamps(exposed, electrons, sky, noise, _stream(experiment, "noise", name))
@@ -65,7 +66,7 @@ def collected_images(
     config = experiment.config
     if config.sensor.brighter_fatter is None:
         return images
-    sky = sky_electrons_per_pixel(config.band or "r", config.atmosphere.exposure_s, pixel_scale)
+    sky = sky_electrons_per_pixel(experiment.band, config.atmosphere.exposure_s, pixel_scale)
     return brighter_fatter(images, electrons, sensor=config.sensor.brighter_fatter, sky=sky)
 
 

@@ -1,19 +1,18 @@
-"""Photon rates, noise and magnitude limits of the LSST, in electrons.
+"""Photon rates, noise and magnitude limits of a camera, in electrons.
 
-Zero points, dark sky, extinction, instrument noise and the signal-to-noise formula are those of SMTN-002 ("Calculating
-LSST limiting magnitudes and SNR", throughputs v1.9, airmass 1), whose conventions go back to Ivezic et al. 2019
-(ApJ 873, 111).
+The signal-to-noise formula is that of SMTN-002 ("Calculating LSST limiting magnitudes and SNR"), whose conventions go
+back to Ivezic et al. 2019 (ApJ 873, 111).
 
 Arguments of the same name have the same meaning throughout. Magnitudes are AB above the atmosphere; `band` is a
-:class:`Band` or its name, `exposure` a time [s], `fwhm` the effective FWHM of a star (that of the Gaussian with as many
-noise-equivalent pixels) and `pixel_scale` the side of a pixel, both [rad] or a Quantity; `sky` is a brightness
-[AB mag/arcsec^2], by default the dark sky of the band. A value that is not positive and finite raises
+:class:`~pachon.models.camera.photometry.Band`, or the name of one of the LSST; `exposure` is a time [s], `fwhm` the
+effective FWHM of a star (that of the Gaussian with as many noise-equivalent pixels) and `pixel_scale` the side of a
+pixel, by default the camera's, both [rad] or a Quantity; `sky` is a brightness [AB mag/arcsec^2], by default the dark
+sky of the band. A value that is not positive and finite raises
 :class:`~pachon.core.errors.DomainError`, an unknown band :class:`~pachon.core.errors.UnknownNameError`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,49 +20,16 @@ from scipy.special import erf
 
 from ...core.errors import DomainError, unknown_name
 from ...core.units import ARCSEC, positive_angle, require_positive
+from ...models.camera.photometry import BANDS, Band
 
-PIXEL_SCALE = 0.2 * ARCSEC
-"""Angle of one LSST pixel [rad]."""
-READ_NOISE = 8.8
-"""Read noise of one exposure [e-/pixel]: the upper limit that SMTN-002 takes from the camera requirements (LSE-59)."""
-DARK_CURRENT = 0.2
-"""Dark current [e-/s/pixel]: the upper limit that SMTN-002 takes from the camera requirements (LSE-59)."""
-FULL_WELL = 1.0e5
-"""Largest signal of an unsaturated pixel [e-]: just under the lower of the two measured turn-offs of the photon
-transfer curve, 103 000 (e2v) and 129 000 (ITL) (SITCOMTN-148, Table 6)."""
 PROVISIONAL_FWHM = 0.6 * ARCSEC
 """Effective FWHM of stars [rad] for magnitude limits before any star is drawn."""
 # Noise-equivalent pixels of a Gaussian whose FWHM is one pixel (SMTN-002).
 _PIXELS_PER_SQUARE_FWHM = 2.266
 
 
-@dataclass(frozen=True)
-class Band:
-    """One LSST filter at the zenith under a dark sky; all but the range of wavelengths from SMTN-002."""
-
-    name: str  #: ``u`` to ``y``
-    zero_point: float  #: AB magnitude of one electron a second, atmosphere at airmass 1 included
-    dark_sky: float  #: brightness [AB mag/arcsec^2]
-    extinction: float  #: loss in the atmosphere, ``kAtm`` [mag/airmass]
-    effective_wavelength: float  #: [m]
-    wavelength_range: tuple[float, float]  #: [m] at half the maximum throughput (LSST throughputs v1.9, airmass 1.2)
-
-
-BANDS = {
-    band.name: band
-    for band in (
-        Band("u", 26.52, 23.05, 0.47, 366e-9, (349e-9, 396e-9)),
-        Band("g", 28.51, 22.25, 0.21, 482e-9, (403e-9, 551e-9)),
-        Band("r", 28.36, 21.20, 0.13, 622e-9, (550e-9, 690e-9)),
-        Band("i", 28.17, 20.46, 0.10, 754e-9, (692e-9, 821e-9)),
-        Band("z", 27.78, 19.61, 0.07, 869e-9, (818e-9, 922e-9)),
-        Band("y", 26.82, 18.60, 0.17, 971e-9, (924e-9, 1015e-9)),
-    )
-}
-
-
 def band_named(band: str | Band) -> Band:
-    """Return the band of a name; a band is returned as it is."""
+    """Return the band of the LSST of a name; a band is returned as it is."""
     if isinstance(band, Band):
         return band
     if band not in BANDS:
@@ -89,7 +55,7 @@ def magnitude_of(counts: Any, band: str | Band, exposure: float) -> np.ndarray:
 
 
 def sky_electrons_per_pixel(
-    band: str | Band, exposure: float, pixel_scale: Any = PIXEL_SCALE, *, sky: float | None = None
+    band: str | Band, exposure: float, pixel_scale: Any = None, *, sky: float | None = None
 ) -> float:
     """Return the electrons of the sky in one pixel.
 
@@ -98,17 +64,18 @@ def sky_electrons_per_pixel(
     """
     band = band_named(band)
     exposure = require_positive(exposure, "exposure", "seconds")
-    area = (positive_angle(pixel_scale, "pixel_scale") / ARCSEC) ** 2
+    area = (_pixel(band, pixel_scale) / ARCSEC) ** 2
     brightness = band.dark_sky if sky is None else float(sky)
     return float(exposure * area * 10.0 ** (0.4 * (band.zero_point + band.extinction - brightness)))
 
 
-def instrument_noise(exposure: float) -> float:
+def instrument_noise(band: str | Band, exposure: float) -> float:
     """Return the rms of read noise and dark current in one pixel and exposure [e-] (SMTN-002)."""
-    return float(np.sqrt(READ_NOISE**2 + DARK_CURRENT * require_positive(exposure, "exposure", "seconds")))
+    band = band_named(band)
+    return float(np.sqrt(band.read_noise**2 + band.dark_current * require_positive(exposure, "exposure", "seconds")))
 
 
-def effective_pixels(fwhm: Any, pixel_scale: Any = PIXEL_SCALE) -> float:
+def effective_pixels(fwhm: Any, pixel_scale: Any) -> float:
     """Return the noise-equivalent number of pixels of a star, ``2.266 (FWHM/pixel)^2`` (SMTN-002)."""
     width, pixel = positive_angle(fwhm, "fwhm"), positive_angle(pixel_scale, "pixel_scale")
     return _PIXELS_PER_SQUARE_FWHM * (width / pixel) ** 2
@@ -129,7 +96,7 @@ def signal_to_noise(
     exposure: float,
     fwhm: Any,
     *,
-    pixel_scale: Any = PIXEL_SCALE,
+    pixel_scale: Any = None,
     sky: float | None = None,
 ) -> np.ndarray:
     """Return the S/N of PSF photometry, ``C / sqrt(C + n_eff (sky + noise^2))`` (SMTN-002)."""
@@ -143,7 +110,7 @@ def limiting_magnitude(
     exposure: float,
     fwhm: Any,
     *,
-    pixel_scale: Any = PIXEL_SCALE,
+    pixel_scale: Any = None,
     sky: float | None = None,
 ) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio: :func:`signal_to_noise` solved for C."""
@@ -158,9 +125,9 @@ def saturation_magnitude(
     exposure: float,
     fwhm: Any,
     *,
-    pixel_scale: Any = PIXEL_SCALE,
+    pixel_scale: Any = None,
     sky: float | None = None,
-    full_well: float = FULL_WELL,
+    full_well: float | None = None,
 ) -> float:
     """Return the magnitude at which the central pixel of a star reaches the full well [e-].
 
@@ -168,16 +135,24 @@ def saturation_magnitude(
     limit is a safe one. DomainError if the sky alone fills the well.
     """
     sigma = positive_angle(fwhm, "fwhm") / np.sqrt(8.0 * np.log(2.0))
-    pixel = positive_angle(pixel_scale, "pixel_scale")
+    band = band_named(band)
+    pixel = _pixel(band, pixel_scale)
     background = sky_electrons_per_pixel(band, exposure, pixel, sky=sky)
-    room = require_positive(full_well, "full_well", "electrons") - background
+    well = require_positive(band.full_well if full_well is None else full_well, "full_well", "electrons")
+    room = well - background
     if room <= 0.0:
-        raise DomainError(f"full_well = {full_well}: expected more than the {background:.0f} electrons of the sky")
+        raise DomainError(f"full_well = {well}: expected more than the {background:.0f} electrons of the sky")
     central = erf(0.5 * pixel / (np.sqrt(2.0) * sigma)) ** 2
     return float(magnitude_of(room / central, band, exposure))
 
 
 def _footprint_variance(band: str | Band, exposure: float, fwhm: Any, pixel_scale: Any, sky: float | None) -> float:
     """Return the variance of sky and instrument under a star [e-^2]."""
+    band = band_named(band)
     background = sky_electrons_per_pixel(band, exposure, pixel_scale, sky=sky)
-    return effective_pixels(fwhm, pixel_scale) * (background + instrument_noise(exposure) ** 2)
+    return effective_pixels(fwhm, _pixel(band, pixel_scale)) * (background + instrument_noise(band, exposure) ** 2)
+
+
+def _pixel(band: Band, pixel_scale: Any) -> float:
+    """Return the side of a pixel [rad], by default that of the camera."""
+    return band.pixel_scale if pixel_scale is None else positive_angle(pixel_scale, "pixel_scale")

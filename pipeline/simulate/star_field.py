@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import DomainError
 from ...core.random_streams import stream
 from ...core.units import metres, require_positive
+from ...models.camera.photometry import Band
 from . import photometry
 
 COUNT_SLOPE = 0.2
@@ -27,7 +28,7 @@ class StarField:
     observed: np.ndarray  #: likewise
     magnitude: np.ndarray  #: AB, of the observed stars
     electrons: np.ndarray  #: of the observed stars
-    band: str
+    band: Band
     exposure: float  #: [s]
     bright: float  #: magnitude limits of the observed stars
     faint: float
@@ -65,7 +66,7 @@ def make_star_field(
     *,
     fwhm: Any,
     pixel_size: Any,
-    band: str | photometry.Band = "r",
+    band: str | Band = "r",
     exposure: float = 15.0,
     snr: float = 30.0,
     bright: float | None = None,
@@ -122,7 +123,7 @@ def make_star_field(
         observed=_turned(_uniform(seed, ccd_name, "observed", n_observed, inner), edges, turn),
         magnitude=magnitude,
         electrons=photometry.electrons(magnitude, band, exposure),
-        band=band.name,
+        band=band,
         exposure=float(exposure),
         bright=float(bright),
         faint=float(faint),

@@ -22,8 +22,9 @@ from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
+from ...pipeline.config_hash import hashed_camera, hashed_heights, hashed_photometry, hashed_states
 from ...pipeline.defaults import as_configured, with_paper_model
-from ...pipeline.experiment import Experiment, hashed_camera, hashed_heights, hashed_states
+from ...pipeline.experiment import Experiment
 from ..metrics.camera import CAMERA
 from ..metrics.metric import REASONS, Metric, MetricGroup
 from ..metrics.optics import OPTICS
@@ -278,7 +279,7 @@ def _stamps(telescope: Telescope, experiment: Experiment | None) -> dict[str, An
         # The telescope has a hash of its own, and paths differ between machines.
         del content["telescope"], content["ccds"]
         content["atmosphere"]["site"] = Path(content["atmosphere"]["site"]).name
-        content = hashed_camera(content)
+        content = hashed_photometry(hashed_camera(content), experiment.config)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["active_optics"] = hashed_states(content["active_optics"])
         hashed = digest(content)

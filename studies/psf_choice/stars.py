@@ -94,7 +94,7 @@ def observe(experiment: Experiment, ccd: SimulatedCcd, snr_min: float, draw: int
     rng = stream(seed, "study", "noise", name, draw)
     electrons = stars.electrons * light
     collected = collected_images(experiment, exposed.image, exposed.pixel_scale, electrons)
-    images = observe_stamps(collected, electrons, sky, instrument_noise(places.exposure), rng)
+    images = observe_stamps(collected, electrons, sky, instrument_noise(places.band, places.exposure), rng)
     found = _look_at(experiment, ccd.exposure, images)
     snr = signal_to_noise(stars.magnitude - 2.5 * np.log10(light), places.band, places.exposure, width)
     # The noise of e is proportional to 1/(S/N); the factor is that of all stars together.

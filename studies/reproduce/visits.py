@@ -63,7 +63,7 @@ def image_of_the_sky(bench: Bench) -> Reproduced:
         )
     width = effective_fwhm(star.image, star.pixel_scale)
     seconds = scene.exposure.time
-    limit = limiting_magnitude(5.0, scene.exposure.band, seconds, width)
+    limit = limiting_magnitude(5.0, experiment.band, seconds, width)
     deep = limit + 1.25 * np.log10(_DEEP / seconds)
     hdus = [image_hdu("ELECTRONS", scene.electrons, "expected electrons of galaxies and stars in one exposure")]
     here = (

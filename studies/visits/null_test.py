@@ -80,15 +80,14 @@ def null_test(
     experiment = config.experiment()
     frame = StackFrame.of(experiment, STACK_STAMP)
     cell, scale = cell_of(experiment, frame), pixel_scale_of(frame)
-    settings, seed = experiment.config, experiment.config.seed
-    band, seconds = settings.band or "r", settings.atmosphere.exposure_s
+    seed = experiment.config.seed
     reach = REACH * float(cell / np.sqrt(config.visits.places))
     make_folder(folder / "galaxies")
     results = {}
     for visits in config.kept:
         stamp = Stamp(digest({"visits": config.digest(experiment), "stack": visits}), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
-        exposure = Exposure(band=band, time=seconds, exposures=visits, pixel_scale=scale)
+        exposure = Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=scale)
         population = GalaxyPopulation(stack_limit(experiment, _FAINTEST_SNR, visits), seed)
         chosen = _tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:

@@ -170,7 +170,7 @@ def _star_fields(
     """Return the stars of each CCD and, as its holdout positions, all points on it; and the indices of the latter."""
     camera, config = experiment.camera, experiment.config
     xy = visit.on_detector(experiment.telescope, points.sky, middle_wavelength(experiment), threads)
-    band, seconds = config.band or "r", config.atmosphere.exposure_s
+    band, seconds = experiment.band, config.atmosphere.exposure_s
     bright, faint = magnitude_limits(experiment)
     fields, index = {}, {}
     # Beyond its field of view a telescope may have no light, and is not asked for.
@@ -205,14 +205,14 @@ def _star_fields(
 def magnitude_limits(experiment: Experiment) -> tuple[float, float]:
     """Return the magnitude limits of the stars, bright and faint, which are the same in every visit."""
     config = experiment.config
-    bright = saturation_magnitude(config.band or "r", config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    bright = saturation_magnitude(experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
     return bright, stack_limit(experiment, config.stars.snr_min, 1)
 
 
 def stack_limit(experiment: Experiment, snr: float, visits: int) -> float:
     """Return the magnitude of a star of a signal-to-noise ratio in a stack of visits of nominal seeing."""
     config = experiment.config
-    one = limiting_magnitude(snr, config.band or "r", config.atmosphere.exposure_s, _NOMINAL_FWHM)
+    one = limiting_magnitude(snr, experiment.band, config.atmosphere.exposure_s, _NOMINAL_FWHM)
     return float(one + 1.25 * np.log10(visits))
 
 

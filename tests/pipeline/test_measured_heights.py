@@ -8,7 +8,8 @@ from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.lsst import lsst_camera
 from pachon.pipeline.config import Configuration, load_configuration, to_yaml, with_options
-from pachon.pipeline.experiment import Experiment, hashed_heights
+from pachon.pipeline.config_hash import hashed_heights
+from pachon.pipeline.experiment import Experiment
 from pachon.studies.attribution.causes import checked_causes, without
 from pachon.studies.baseline.baseline import _stamps
 from pachon.studies.sweep.file import load_sweep

@@ -113,14 +113,9 @@ class ImageStack:
 
     def exposure(self, visits: int = 1) -> Exposure:
         """Return depth and noise of the stack of a number of visits."""
-        config = self.experiment.config
-        return Exposure(
-            config.band or "r",
-            config.atmosphere.exposure_s,
-            visits,
-            pixel_scale=pixel_scale_of(self.frame),
-            noise=self.settings.noise,
-        )
+        # Stacks are in electrons.
+        scale, noise = pixel_scale_of(self.frame), self.settings.noise
+        return Exposure.of_run(self.experiment, visits, gain=1.0, pixel_scale=scale, noise=noise)
 
     @property
     def plan(self) -> tuple[Visit, ...]:

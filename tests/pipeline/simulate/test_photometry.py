@@ -47,7 +47,7 @@ def test_published_depths_of_a_30_s_visit(band, fwhm, depth):
 
 def test_instrument_noise_of_one_exposure_is_nine_electrons():
     # SMTN-002: "the total instrumental noise per exposure is 9 photo-electrons", rounded.
-    assert photometry.instrument_noise(15.0) == pytest.approx(9.0, abs=0.05)
+    assert photometry.instrument_noise("r", 15.0) == pytest.approx(9.0, abs=0.05)
 
 
 def test_signal_to_noise_written_out():
@@ -78,7 +78,7 @@ def test_brightest_pixel_at_saturation():
     central = weights @ np.exp(-(x**2 + y**2) / (2 * sigma**2)) @ weights / (2 * np.pi * sigma**2)
     counts = photometry.electrons(photometry.saturation_magnitude("r", 15.0, 0.7 * ARCSEC), "r", 15.0)
     peak = counts * central + photometry.sky_electrons_per_pixel("r", 15.0)
-    assert peak == pytest.approx(photometry.FULL_WELL, rel=1e-5)  # trapezoidal rule over 200 steps
+    assert peak == pytest.approx(photometry.BANDS["r"].full_well, rel=1e-5)  # trapezoidal rule over 200 steps
 
 
 @pytest.mark.parametrize("value", [0.0, -15.0, np.nan, np.inf])

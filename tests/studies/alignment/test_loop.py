@@ -9,7 +9,8 @@ from astropy.table import QTable
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, UnknownNameError
-from pachon.pipeline.experiment import Experiment, hashed_states
+from pachon.pipeline.config_hash import hashed_states
+from pachon.pipeline.experiment import Experiment
 from pachon.studies.alignment.config import AlignConfig, load_align_configuration
 from pachon.studies.alignment.loop import align
 from pachon.studies.alignment.product import write_alignment

@@ -1,0 +1,63 @@
+"""Photometry of a configuration: the camera's zero point, sky and noise where it names none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..core.errors import ConfigError, error_context
+from ..core.units import ARCSEC
+from ..models.camera.camera import Camera
+from ..models.camera.photometry import BANDS, Band
+from ..models.telescope import Telescope
+from ..raytrace.rays import field_direction
+from ..wavefront.chief_rays import image_jacobians
+from .config import BandName, PhotometryConfig
+
+#: Keys of the configuration and attributes of a band; pixels are in other units.
+_SAME = {
+    "zero_point": "zero_point",
+    "dark_sky": "dark_sky",
+    "extinction": "extinction",
+    "read_noise_e": "read_noise",
+    "dark_current_e_s": "dark_current",
+    "full_well_e": "full_well",
+    "gain": "gain",
+    "source": "source",
+}
+
+
+def resolved_photometry(
+    section: PhotometryConfig, telescope: Telescope, camera: Camera, band: BandName
+) -> PhotometryConfig:
+    """Return the section with the camera's numbers where there are none."""
+    missing = [key for key, value in section.model_dump().items() if value is None]
+    found: dict[str, float | str] = {}
+    if set(missing).intersection(_SAME):
+        low, high = telescope.band or (0.0, 0.0)
+        ends = (low, high) if high > low else BANDS[band].wavelength_range
+        area = 0.25 * math.pi * telescope.pupil_diameter**2 * (1.0 - telescope.pupil_obscuration**2)
+        with error_context(key="band"):
+            own = camera.photometry.band(camera.name, band, area, ends)
+        found = {key: getattr(own, name) for key, name in _SAME.items()}
+    if "pixel_arcsec" in missing:
+        # To a thousandth, as cameras state it: 0.2 for the LSST.
+        found["pixel_arcsec"] = round(pixel_angle(telescope, camera.pixel_size) / ARCSEC, 3)
+    return section.model_copy(update={key: found[key] for key in missing})
+
+
+def band_of(name: BandName, section: PhotometryConfig) -> Band:
+    """Return the band of a resolved section; ConfigError where it is not resolved."""
+    values = {attribute: getattr(section, key) for key, attribute in _SAME.items()}
+    if section.pixel_arcsec is None or None in values.values():
+        raise ConfigError("the configuration is not resolved")
+    return replace(BANDS[name], pixel_scale=section.pixel_arcsec * ARCSEC, **values)
+
+
+def pixel_angle(telescope: Telescope, pixel_size: float) -> float:
+    """Return the angle of a pixel [m] in the middle of the field [rad]."""
+    axis = field_direction([0.0], [0.0])
+    jacobian = image_jacobians(telescope, axis, telescope.default_wavelength)[0]
+    return pixel_size / math.sqrt(abs(float(np.linalg.det(jacobian))))
