@@ -1,0 +1,29 @@
+"""Pickups of files against the values that stand in them."""
+
+from __future__ import annotations
+
+import math
+
+from ..links import Pickup
+from ..telescope import Telescope
+from ..thickness import thickness
+
+#: Relative difference from a pickup that rounding in files makes.
+_ROUNDING = 1e-6
+
+
+def unmet_pickup(telescope: Telescope, pickup: Pickup) -> str | None:
+    """Return what a pickup should have made of a telescope that does not meet it, None where it does."""
+    follower, source = (telescope.surface(name) for name in (pickup.surface, pickup.source))
+    if pickup.quantity == "glass":
+        return None if follower.medium_after == source.medium_after else f"the glass of {pickup.source}"
+    if pickup.quantity == "thickness":
+        names = telescope.surface_names
+        here, there = (thickness(telescope, names.index(s.name)) for s in (follower, source))
+    else:
+        key = "conic" if pickup.quantity == "conic" else "radius"
+        here, there = (s.shape.parameters.get(key, 0.0 if key == "conic" else math.inf) for s in (follower, source))
+    wanted = pickup.scale * there + pickup.offset
+    if here == wanted or abs(here - wanted) <= _ROUNDING * max(abs(wanted), abs(here)):
+        return None
+    return f"{wanted:.9g}, not {here:.9g}"
