@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+
 from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
 

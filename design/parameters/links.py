@@ -69,9 +69,7 @@ def with_followers(
     DomainError
         If a thickness cannot be solved for.
     """
-    found = _Growing(
-        telescope, list(parameters), list(map(float, values)), list(np.eye(len(parameters))), parse, apply
-    )
+    found = _Growing(telescope, list(parameters), list(map(float, values)), list(np.eye(len(parameters))), parse, apply)
     data, names = telescope.design_data, telescope.surface_names
     found.pick_up(data.pickups)
     if data.solves and _centred(telescope):

@@ -36,9 +36,9 @@ from ...models.media.medium import Medium, abbe_number, with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
 from ...models.telescope import Telescope, rotation_matrix
+from ...models.thickness import front_surface, light_axis, thickness, with_thicknesses
 from .links import Followers, has_links, with_followers
 from .shape_terms import shape_with_term, term_unit
-from ...models.thickness import front_surface, light_axis, thickness, with_thicknesses
 
 _OF_MEDIA = ("n", "abbe")
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
@@ -239,8 +239,8 @@ def shapes_with_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> 
 def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter, float]) -> Telescope:
     """Return the telescope with changes applied, each in the unit of its parameter; the argument stays as it is.
 
-    What follows by pickups and solves of the design data changes too (:mod:`.links`). Errors are those of :meth:`Parameter.parse`, and a DomainError if a value is not finite or the result is not a valid
-    telescope.
+    What follows by pickups and solves of the design data changes too (:mod:`.links`). Errors are those of
+    :meth:`Parameter.parse`, and a DomainError if a value is not finite or the result is not a valid telescope.
     """
     parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
     changes = [float(v) for v in values.values()]

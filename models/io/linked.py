@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import math
 
+from ...core.errors import PrescriptionError
 from ..links import Pickup
 from ..telescope import Telescope
 from ..thickness import thickness
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6
+
+
+def require_met(telescope: Telescope) -> Telescope:
+    """Return a telescope; a PrescriptionError where a value of its file is not that of its pickup."""
+    for pickup in telescope.design_data.pickups:
+        if (expected := unmet_pickup(telescope, pickup)) is not None:
+            raise PrescriptionError(f"{pickup.address}: expected {expected}")
+    return telescope
 
 
 def unmet_pickup(telescope: Telescope, pickup: Pickup) -> str | None:

@@ -25,9 +25,11 @@ from ...paraxial import with_floating_pupil
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_angles
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from ..linked import require_met
 from .apertures import aperture_lines
 from .design import design_lines, stop_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
+from .links import add_link_lines
 from .reader import PUPIL_COMMENT
 from .shapes import shape_lines
 from .text import number_text
@@ -46,7 +48,7 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
 
     PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file.
     """
-    t = telescope
+    t = require_met(telescope)
     if t.surfaces[-1].interaction != Interaction.DETECTOR:
         raise PrescriptionError(f"{t.name}: a Zemax file needs a detector as its last surface")
     if t.obstructions:
@@ -77,6 +79,7 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
         )
     place = -first
     before = t.medium_before
+    numbered: dict[str, tuple[int, list[str]]] = {}
     for surface in t.surfaces:
         x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex))
         if len(blocks) > 1:
@@ -91,16 +94,19 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
             ]
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
+            numbered[surface.name] = len(blocks) - 1, own
         else:
             values = [x / unit, y / unit, *np.degrees(rotation_angles(axes))]
             medium = _glass_line(before, glasses)
             blocks.append([*_break_lines(values, 0), *medium, "DISZ 0"])
             blocks.append([*own, "DISZ 0"])
+            numbered[surface.name] = len(blocks) - 1, blocks[-1]
             if surface is not t.surfaces[-1]:
                 blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.medium_after, glasses)])
         before = surface.medium_after
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
+    add_link_lines(data, numbered, unit)
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
