@@ -1,4 +1,4 @@
-"""Sample systems of optiland and ray-optics against the peers themselves: the comparison of a benchmark, with limits."""
+"""Sample systems of optiland and ray-optics against the peers themselves: a benchmark with limits."""
 
 import importlib.util
 import sys
