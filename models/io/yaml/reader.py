@@ -16,7 +16,7 @@ from ...media.medium import Medium
 from ...obstruction import Obstruction
 from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
-from ..linked import require_met
+from ..writable import require_met
 from .apertures import ApertureKeys, ObstructionSection
 from .design import DesignSection
 from .media import AnyMedium

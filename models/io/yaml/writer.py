@@ -10,7 +10,7 @@ from typing import Any
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
-from ..linked import require_met
+from ..writable import require_met
 from .apertures import aperture_items, obstruction_items
 from .design import design_items
 from .media import medium_items

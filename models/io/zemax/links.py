@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from ...design_data import DesignData
 from ...links import Pickup, Solve
 from ...telescope import Telescope
-from ..linked import unmet_pickup
+from ..writable import unmet_pickup
 from .file import Block, Findings
 from .text import number_text
 

@@ -1,4 +1,4 @@
-"""Pickups of files against the values that stand in them."""
+"""What files can hold: pickups that the values meet, and telescopes that lens files can be made of."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ import math
 
 from ...core.errors import PrescriptionError
 from ..links import Pickup
+from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6
+
+
+def require_sequential(telescope: Telescope, file: str) -> None:
+    """Raise a PrescriptionError for a telescope without a detector at its end, or with meshes; `file` is for it."""
+    if telescope.surfaces[-1].interaction != Interaction.DETECTOR:
+        raise PrescriptionError(f"{file} needs a detector as its last surface")
+    if telescope.obstructions:
+        raise PrescriptionError(f"obstruction {telescope.obstructions[0].name}: {file} cannot hold meshes")
 
 
 def require_met(telescope: Telescope) -> Telescope:
