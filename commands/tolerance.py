@@ -41,8 +41,8 @@ def tolerance_command(
     """Find what tolerances cost, how tight they must be, and how many telescopes meet a requirement.
 
     Every tolerance is traced at both of its ends (sensitivity), the size that costs a stated loss is found (inverse
-    sensitivity), and telescopes are drawn with all of them at once; compensators follow. A page, tables (ECSV), plots and
-    summary.json go into one folder, with the store of what was computed.
+    sensitivity), and telescopes are drawn with all of them at once; compensators follow. A page, tables (ECSV), plots
+    and summary.json go into one folder, with the store of what was computed.
 
     **Examples**
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.arguments import check_arguments
 from ..core.errors import PrescriptionError
+from .links import Pickup, Solve, check_links
 
 #: Units that a lens file counts lengths in [m].
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -68,6 +69,10 @@ class DesignData:
         Whether chief rays leave the object parallel to the axis.
     afocal : bool
         Whether the image is at infinity.
+    pickups : tuple of Pickup
+        Radii, conic constants, thicknesses and glasses that follow those of other surfaces.
+    solves : tuple of Solve
+        Thicknesses that are solved for.
 
     Raises
     ------
@@ -90,6 +95,8 @@ class DesignData:
     pressure: float | None = None
     telecentric: bool = False
     afocal: bool = False
+    pickups: tuple[Pickup, ...] = ()
+    solves: tuple[Solve, ...] = ()
 
     def __post_init__(self) -> None:
         for key, choices in (
@@ -139,6 +146,7 @@ class DesignData:
             _refuse(f"stop = {self.stop!r}: expected the name of a surface, such as {surface_names[0]!r}")
         if self.aiming != "off" and self.stop is None:
             _refuse(f"aiming = {self.aiming!r}: expected a surface that is the stop (stop: NAME)")
+        check_links(self.pickups, self.solves, surface_names)
         low, high = wavelength_range
         for wavelength in self.wavelengths:
             if not low <= wavelength <= high:

@@ -256,8 +256,30 @@ def chromatic_sums(
     return ChromaticSums(tuple(s.name for s in trace.surfaces), np.stack([a * change, b * change], axis=-1))
 
 
-def _trace(telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False) -> _Trace:
-    """Trace the ray at the rim of the pupil, parallel to the axis, and one through its centre with a slope.
+def paraxial_rays(telescope: Telescope, surface: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return the marginal and the chief ray behind a surface: a place z [m], the height there [m] and the slope.
+
+    Slopes are along the light that enters. The marginal ray comes from the axis of the object through the rim of the
+    entrance pupil, the chief ray has the slope of the edge of the field. DomainError as for :func:`first_order`.
+    """
+    rim = 0.5 * telescope.pupil_diameter
+    chief = math.tan(telescope.field_radius)
+    marginal = rim / (telescope.object_distance - telescope.stop_z)
+    trace = _trace(telescope, None, chief, section=True, marginal=marginal)
+    names = telescope.surface_names
+    acting = [i for i, s in enumerate(trace.surfaces) if names.index(s.name) <= names.index(surface)]
+    if not acting:
+        return (telescope.stop_z, rim, marginal), (telescope.stop_z, 0.0, chief)
+    last = acting[-1]
+    z = trace.surfaces[last].vertex[2]
+    (h, hb), (u, ub) = map(float, trace.h[last]), map(float, trace.u_after[last])
+    return (z, h, u), (z, hb, ub)
+
+
+def _trace(
+    telescope: Telescope, wavelength: Any, slope: float, *, section: bool = False, marginal: float = 0.0
+) -> _Trace:
+    """Trace the ray at the rim of the pupil, of slope `marginal`, and one through its centre with a slope.
 
     Curvatures are means over azimuth, or with ``section`` those in the plane x = 0 (y = 0 where all are flat there).
     """
@@ -272,7 +294,7 @@ def _trace(telescope: Telescope, wavelength: Any, slope: float, *, section: bool
     if section:
         along_x, along_y = -np.array([curvatures_across(s) for s in surfaces]).T
         curvature = along_y if along_y.any() else along_x
-    h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([0.0, slope])
+    h, u = np.array([0.5 * telescope.pupil_diameter, 0.0]), np.array([marginal, slope])
     z, index = telescope.stop_z, float(telescope.medium_before.index(w))
     rows = []
     for surface, c in zip(surfaces, curvature, strict=True):

@@ -22,6 +22,8 @@ from .telescope import Telescope
 
 #: Height at the stop, over that of a ray from its middle, below which the entrance pupil is at infinity.
 _NO_IMAGE = 1e-9
+#: Difference of two pupils that rounding makes, over their size.
+_ROUNDING = 1e-12
 
 
 @dataclass
@@ -197,6 +199,18 @@ def with_floating_pupil(telescope: Telescope) -> Telescope:
             f"{telescope.name}: {data.aperture} = {data.aperture_value:g}: expected a pupil of finite size"
         )
     return replace(telescope, stop_z=telescope.surfaces[0].vertex[2] - image.z + 0.0, pupil_diameter=diameter)
+
+
+def stop_makes_pupil(t: Telescope) -> bool:
+    """Return whether stop and aperture are stated, and make the entrance pupil of the telescope."""
+    if t.design_data.stop is None or t.design_data.aperture is None:
+        return False
+    try:
+        made = with_floating_pupil(t)
+    except DomainError:
+        return False
+    close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
+    return math.isclose(made.stop_z, t.stop_z, **close) and math.isclose(made.pupil_diameter, t.pupil_diameter, **close)
 
 
 def require_on_axis(surface: Surface, name: str) -> None:

@@ -145,6 +145,8 @@ from .models.io.heights.zernike_table import corner_sensors as corner_sensors
 from .models.io.prescription import load_telescope as load_telescope
 from .models.io.prescription import save_telescope as save_telescope
 from .models.io.site_file import load_site as load_site
+from .models.links import Pickup as Pickup
+from .models.links import Solve as Solve
 from .models.media.air import Air as Air
 from .models.media.dispersion import Dispersion as Dispersion
 from .models.media.dispersion import model_glass as model_glass

@@ -11,8 +11,8 @@ from ...core.errors import DomainError
 from ...models.first_order import first_order, footprints
 from ...models.surface import Interaction
 from ...models.telescope import Telescope
+from ...models.thickness import front_surface, light_axis, thickness
 from ..layout.sections import outer_radius
-from ..parameters.thickness import front_surface, light_axis, thickness
 from .operand import GoalOperand, operand_kind
 
 

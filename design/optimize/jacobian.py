@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from ...raytrace.adjoint.backward_pass import OutputGradient, backward_pass
 from ...raytrace.adjoint.forward_pass import ForwardPass
 from ...raytrace.adjoint.sphere_adjoint import SPHERE_COLUMNS
 from ...wavefront.reference_sphere import sphere_distance_derivatives
-from ..parameters.parameters import Parameter, apply, index_surfaces, shapes_with_terms, twists
+from ..parameters.links import has_links, without_links
+from ..parameters.parameters import Parameter, apply, index_surfaces, linked, shapes_with_terms, twists
 from ..parameters.shape_terms import term_polynomial
 
 #: Kinds of parameters that change the index of a medium.
@@ -40,6 +41,8 @@ class ParameterColumns:
     #: [n_column, n_parameter] derivatives of the columns with respect to the parameters; see :meth:`weights_at`.
     weights: np.ndarray
     abbe_numbers: dict[int, float]  #: Abbe numbers by the places of their parameters
+    #: [n_parameter, n] derivatives of the parameters, followers included, with respect to those that were given.
+    chain: np.ndarray | None = None
 
     @classmethod
     def at(
@@ -47,6 +50,16 @@ class ParameterColumns:
     ) -> ParameterColumns:
         """Return the columns for derivatives at given changes of the parameters; at none by default."""
         values = np.zeros(len(parameters)) if values is None else values
+        if has_links(telescope):
+            found = linked(telescope, parameters, values)
+            own = cls._alone(telescope, found.parameters, found.values)
+            return replace(own, chain=found.chain)
+        return cls._alone(telescope, parameters, values)
+
+    @classmethod
+    def _alone(cls, telescope: Telescope, parameters: tuple[Parameter, ...], values: np.ndarray) -> ParameterColumns:
+        """Return the columns of parameters that nothing follows, or with all of their followers among them."""
+        telescope = without_links(telescope)
         moved = apply(telescope, dict(zip(parameters, values, strict=True)))
         names = telescope.surface_names
         shaped = [(p, names.index(one.target), one) for p, one in enumerate(parameters) if one.kind == "shape"]
@@ -135,6 +148,10 @@ class ParameterColumns:
 
     def weights_at(self, wavelength: float) -> np.ndarray:
         """Return the weights of the columns at a wavelength [m]; dispersion changes indices by amounts of its own."""
+        weights = self._weights_at(wavelength)
+        return weights if self.chain is None else weights @ self.chain
+
+    def _weights_at(self, wavelength: float) -> np.ndarray:
         if not self.abbe_numbers:
             return self.weights
         factors = np.ones(len(self.parameters))

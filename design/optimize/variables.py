@@ -10,6 +10,7 @@ import numpy as np
 from ...core.errors import ConfigError, DomainError, UnknownNameError, check_unique
 from ...core.random_streams import stream
 from ...models.telescope import Telescope
+from ..parameters.links import followers, quantity_of
 from ..parameters.parameters import Parameter, parse_parameters
 from .geometry_operands import clear_radius
 
@@ -106,6 +107,8 @@ def _of_address(telescopes: Sequence[Telescope], names: list[str], text: str | P
         each = tuple(found[place] if found else None for found in parsed)
         first = next(i for i, p in enumerate(each) if p)
         solver = tuple(p if p is None else _for_solver(p, t) for p, t in zip(each, telescopes, strict=True))
+        if quantity_of(parameter, telescopes[first]) in followers(telescopes[first]):
+            raise ConfigError(f"variable {parameter.address} follows other values: expected one of those")
         start = parameter.value(telescopes[first])
         inside = solver[first]
         assert inside is not None

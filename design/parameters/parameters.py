@@ -24,6 +24,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -35,8 +36,9 @@ from ...models.media.medium import Medium, abbe_number, with_index_change
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
 from ...models.telescope import Telescope, rotation_matrix
+from ...models.thickness import front_surface, light_axis, thickness, with_thicknesses
+from .links import Followers, has_links, with_followers
 from .shape_terms import shape_with_term, term_unit
-from .thickness import front_surface, light_axis, thickness, with_thicknesses
 
 _OF_MEDIA = ("n", "abbe")
 MOTIONS = ("dx", "dy", "dz", "rx", "ry", "rz")
@@ -237,14 +239,29 @@ def shapes_with_terms(telescope: Telescope, parameters: Iterable[Parameter]) -> 
 def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter, float]) -> Telescope:
     """Return the telescope with changes applied, each in the unit of its parameter; the argument stays as it is.
 
-    Errors are those of :meth:`Parameter.parse`, and a DomainError if a value is not finite or the result is not a valid
-    telescope.
+    What follows by pickups and solves of the design data changes too (:mod:`.links`). Errors are those of
+    :meth:`Parameter.parse`, and a DomainError if a value is not finite or the result is not a valid telescope.
     """
     parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
     changes = [float(v) for v in values.values()]
     for parameter, change in zip(parameters, changes, strict=True):
         if not np.isfinite(change):
             raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
+    if has_links(telescope):
+        found = linked(telescope, parameters, changes)
+        parameters, changes = list(found.parameters), found.values.tolist()
+    return _apply_alone(telescope, dict(zip(parameters, changes, strict=True)))
+
+
+def linked(telescope: Telescope, parameters: Iterable[Parameter], changes: Iterable[float]) -> Followers:
+    """Return parameters and changes with those of all that follows them, and the derivatives."""
+    parse = partial(Parameter.parse, telescope=telescope)
+    return with_followers(telescope, tuple(parameters), tuple(changes), parse, _apply_alone)
+
+
+def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Telescope:
+    """Return the telescope with changes of parameters applied, and nothing that follows them."""
+    parameters, changes = tuple(values), tuple(values.values())
     start = telescope
     telescope = with_shape_terms(telescope, [p for p, v in zip(parameters, changes, strict=True) if v])
     shapes: dict[str, Shape] = {}

@@ -13,6 +13,7 @@ from ...design.optimize.geometry_operands import clear_radius
 from ...design.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...design.parameters.degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
 from ...design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
+from ...design.parameters.links import followers
 from ...design.parameters.parameters import Parameter
 from ...design.parameters.tolerances import Tolerance
 from ...models.media.medium import abbe_number
@@ -86,12 +87,15 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
 
 
 def _common(file: ToleranceFile, telescope: Telescope, elements: tuple[str, ...]) -> Iterator[ToleranceSection]:
-    """Yield the tolerances of all surfaces, elements and gaps."""
+    """Yield the tolerances of all surfaces, elements and gaps; what follows other values has those of its sources."""
+    following = followers(telescope)
 
     def sections(body: str, of: Any, keys: dict[str, str]) -> Iterator[ToleranceSection]:
         for key, name in keys.items():
             if (size := getattr(of, key)) is not None:
-                yield ToleranceSection(name=f"{body}.{name}", size=size)
+                quantity = {"n": "glass", "abbe_percent": "glass"}.get(name, name.partition("_")[0])
+                if (body, quantity) not in following:
+                    yield ToleranceSection(name=f"{body}.{name}", size=size)
 
     acting = [s for s in telescope.surfaces if s.interaction in (Interaction.MIRROR, Interaction.REFRACT)]
     inner = {member for element in elements for member in telescope.groups[element]}

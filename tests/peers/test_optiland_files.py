@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.wavefront.request import Request
 
 pytest.importorskip("optiland")
 
@@ -85,7 +86,61 @@ def test_rays_of_ours_written_for_optiland(name, tmp_path):
     assert_same_rays(tmp_path / "ours.json", near=2e-13)
 
 
-def test_a_telecentric_object_space_is_refused(tmp_path):
-    with pytest.raises(pachon.PrescriptionError, match="telecentric object space cannot be written"):
-        pachon.save_telescope(pachon.load_telescope(TELECENTRIC), tmp_path / "ours.json")
+def launched_alike(path):
+    """Compare rays of all fields through points of the pupil, launched and aimed by either program."""
+    from optiland.fileio import load_optiland_file
+
+    telescope, optic = pachon.load_telescope(path), load_optiland_file(str(path))
+    if telescope.design_data.aiming != "off":
+        optic.ray_tracer.set_aiming("robust", max_iter=100, tol=1e-12)
+    points = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -0.7], [0.7, 0.0], [-0.5, 0.6]])
+    radius = 0.5 * telescope.pupil_diameter
+    largest = max(np.hypot(f.x, f.y) for f in optic.fields.fields)
+    request = Request.of(telescope, wavelengths=telescope.default_wavelength)
+    landing = request.bundles(telescope.default_wavelength, radius * points * [-1, 1]).landing()
+    found = []
+    for field, here in zip(optic.fields.fields, landing, strict=True):
+        rays = optic.trace_generic(
+            Hx=field.x / largest, Hy=field.y / largest, Px=points[:, 0], Py=points[:, 1],
+            wavelength=optic.primary_wavelength,
+        )  # fmt: skip
+        there = 1e-3 * np.stack([-np.asarray(rays.x), np.asarray(rays.y)], axis=-1)
+        found.append(np.abs(here - there).max())
+    return telescope, optic, max(found)
+
+
+@pytest.mark.parametrize("name", ["CookeTriplet", "ReverseTelephoto", "WideAngle100FOV", "HubbleTelescope"])
+def test_design_data_written_for_optiland(name, tmp_path):
+    sample(name, str(tmp_path / "sample.json"))
+    read = pachon.load_telescope(tmp_path / "sample.json").with_design(aiming="real", field_weights=())
+    pachon.save_telescope(read, tmp_path / "again.json")
+    telescope, optic, far = launched_alike(tmp_path / "again.json")
+    assert telescope.design_data == read.design_data
+    assert float(np.ravel(optic.paraxial.EPD())[0]) == pytest.approx(1e3 * read.pupil_diameter, rel=1e-12)
+    # A nanometre.
+    assert far < 1e-9
+
+
+def test_a_telecentric_object_space_written_for_optiland(tmp_path):
+    sample("UVProjectionLens", str(tmp_path / "sample.json"))
+    read = pachon.load_telescope(tmp_path / "sample.json")
+    assert read.design_data.telecentric
+    pachon.save_telescope(read, tmp_path / "again.json")
+    telescope, optic, far = launched_alike(tmp_path / "again.json")
+    assert telescope.design_data == read.design_data
+    assert optic.obj_space_telecentric
+    assert far < 1e-9
+
+
+def test_what_optiland_cannot_hold_is_refused(tmp_path):
+    telecentric = pachon.load_telescope(TELECENTRIC)
+    shifted = pachon.load_telescope(ZEMAX[0]).with_design(
+        field_type="angle", fields=((0.0, 0.0),), field_weights=(), vignetting=((0.1, 0.0, 0.0, 0.0, 0.0),)
+    )
+    for telescope, words in (
+        (telecentric.with_design(stop=None), "a telecentric object space needs its stop"),
+        (shifted, "compressions alone"),
+    ):
+        with pytest.raises(pachon.PrescriptionError, match=words):
+            pachon.save_telescope(telescope, tmp_path / "ours.json")
     assert not list(tmp_path.iterdir())

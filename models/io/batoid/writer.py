@@ -16,6 +16,7 @@ from ....core.errors import PrescriptionError, error_context
 from ...media.medium import Medium
 from ...surface import Interaction, Surface
 from ...telescope import Telescope, rotation_angles
+from ..writable import require_sequential
 from . import ROOT
 from .apertures import obscuration_items
 from .media import medium_items
@@ -40,10 +41,7 @@ def telescope_to_batoid(telescope: Telescope) -> str:
     """
     t = telescope
     with error_context(subject=t.name):
-        if t.surfaces[-1].interaction != Interaction.DETECTOR:
-            raise PrescriptionError("a batoid file needs a detector as its last surface")
-        if t.obstructions:
-            raise PrescriptionError(f"obstruction {t.obstructions[0].name}: a batoid file cannot hold meshes")
+        require_sequential(t, "a batoid file")
         if math.isfinite(t.object_distance):
             raise PrescriptionError(f"object_distance = {t.object_distance!r}: a batoid file has no object but the sky")
         nested = _nested_groups(t)

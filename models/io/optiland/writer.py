@@ -1,14 +1,14 @@
 """Write a telescope as a file of optiland (.json).
 
-The axes are rotated as by the reader of Zemax files: light enters along +z, the first surface is at z = 0. A plane of
-its own in front carries the stop, so that the entrance pupil is that of the telescope; the reader takes it off again.
+The axes are rotated as by the reader of Zemax files: light enters along +z, the first surface is at z = 0. Where stop
+and aperture of the design data do not make the entrance pupil, a plane of its own in front carries the stop, so that
+the entrance pupil is that of the telescope; the reader takes it off again.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,12 @@ from ....core.errors import PrescriptionError, error_context
 from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
+from ..writable import require_sequential
 from ..zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
 from ..zemax.reader import PUPIL_COMMENT
+from .design import MM, own_stop, system_items
 from .media import material_items
 from .shapes import geometry_items
-
-MM = 1e-3
 
 
 def telescope_to_optiland(telescope: Telescope) -> str:
@@ -32,12 +32,8 @@ def telescope_to_optiland(telescope: Telescope) -> str:
     """
     t = telescope
     with error_context(subject=t.name):
-        if t.surfaces[-1].interaction != Interaction.DETECTOR:
-            raise PrescriptionError("a file of optiland needs a detector as its last surface")
-        if t.obstructions:
-            raise PrescriptionError(f"obstruction {t.obstructions[0].name}: a file of optiland cannot hold meshes")
-        if t.design_data.telecentric:
-            raise PrescriptionError("a telecentric object space cannot be written")
+        require_sequential(t, "a file of optiland")
+        stop, system = own_stop(t), system_items(t)
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)
         surfaces = [
@@ -47,11 +43,13 @@ def telescope_to_optiland(telescope: Telescope) -> str:
                 "material_post": before,
                 "comment": "",
             },
-            _items(_system(-t.stop_z - first), {"type": "Plane", "radius": math.inf}, before, PUPIL_COMMENT, stop=True),
         ]
+        if stop is None:
+            plane = {"type": "Plane", "radius": math.inf}
+            surfaces.append(_items(_system(-t.stop_z - first), plane, before, PUPIL_COMMENT, stop=True))
         for surface in t.surfaces:
             try:
-                surfaces.append(_surface_items(surface, first))
+                surfaces.append(_surface_items(surface, first, stop=surface.name == stop))
             except PrescriptionError as error:
                 raise PrescriptionError(f"surface {surface.name}: {error}") from None
     heights = [s["geometry"]["cs"]["z"] for s in surfaces]
@@ -62,13 +60,7 @@ def telescope_to_optiland(telescope: Telescope) -> str:
     content = {
         "version": 1.0,
         "name": t.description or t.name,
-        "aperture": {"type": "EPD", "value": t.pupil_diameter / MM},
-        "fields": {
-            "fields": [_field(fraction * math.degrees(t.field_radius)) for fraction in (0.0, 0.7, 1.0)],
-            "telecentric": False,
-            "field_definition": {"field_type": "AngleField"},
-        },
-        "wavelengths": {"wavelengths": _waves(t), "polarization": "ignore"},
+        **system,
         "apodization": None,
         "pickups": [],
         "solves": {"solves": []},
@@ -121,7 +113,7 @@ def _items(
     }
 
 
-def _surface_items(surface: Surface, first: float) -> dict[str, Any]:
+def _surface_items(surface: Surface, first: float, *, stop: bool) -> dict[str, Any]:
     if surface.interaction == Interaction.PHASE:
         raise PrescriptionError("phase screens cannot be written")
     x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex) + 0.0)
@@ -131,6 +123,7 @@ def _surface_items(surface: Surface, first: float) -> dict[str, Any]:
         geometry_items(rotated_shape(surface.shape), MM),
         material_items(surface.medium_after),
         surface.name,
+        stop=stop,
         mirror=surface.interaction == Interaction.MIRROR,
         aperture=None if surface.aperture is None else _aperture_items(rotated_aperture(surface.aperture)),
     )
@@ -154,14 +147,3 @@ def _aperture_items(aperture: Aperture) -> dict[str, Any]:
             return {"type": "OffsetRadialAperture", **radii, "offset_x": region.x / MM, "offset_y": region.y / MM}
         return {"type": "RadialAperture", **radii}
     raise PrescriptionError(f"aperture {type(region).__name__}: expected a disc, ring, obscuring disc or rectangle")
-
-
-def _field(angle: float) -> dict[str, float]:
-    return {"x": 0.0, "y": angle, "vx": 0.0, "vy": 0.0, "weight": 1.0}
-
-
-def _waves(t: Telescope) -> list[dict[str, Any]]:
-    """Return the default wavelength and the edges of the band; the decimal point is moved, so that they load equal."""
-    lengths = dict.fromkeys([t.default_wavelength, *(t.band or ())])
-    values = [float(Decimal(repr(float(length))).scaleb(6)) for length in lengths]
-    return [{"value": v, "is_primary": i == 0, "unit": "um", "weight": 1.0} for i, v in enumerate(values)]

@@ -12,6 +12,10 @@
       environment: {temperature_k: 293.15, pressure_pa: 101325}
       telecentric: false
       afocal: false
+      pickups:                                      # scale times the value of another surface, plus an offset
+        - {surface: S7, radius: S1, scale: -1}       # or conic (with conic_offset), thickness, glass
+      solves:
+        - {surface: S7, marginal_height: 0}          # or chief_height, edge_thickness with a radius
 """
 
 from __future__ import annotations
@@ -24,13 +28,18 @@ from pydantic import AfterValidator
 from ....core.schema import Section, checked, expected
 from ....core.yaml_reader import as_number
 from ...design_data import DesignData
+from ...links import PICKED, SOLVED, Pickup, Solve
 from .values import (
+    ROWS,
     Flag,
     Info,
+    Length,
+    Number,
     Numbers,
     OptionalLength,
     OptionalNumber,
     OptionalText,
+    Text,
     Turn,
     Wave,
     Wavelengths,
@@ -113,6 +122,51 @@ class EnvironmentSection(Section):
     pressure_pa: OptionalNumber = None
 
 
+class PickupSection(Section):
+    """Value of a surface that follows that of another, whose name stands behind the quantity."""
+
+    surface: Text
+    radius: OptionalText = None
+    conic: OptionalText = None
+    thickness: OptionalText = None
+    glass: OptionalText = None
+    scale: Number = 1.0
+    offset: Length = 0.0
+    conic_offset: Number = 0.0
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        if sum(key in content for key in PICKED) != 1:
+            raise expected(f"one of {', '.join(PICKED)}")
+        if ("offset" if "conic" in content else "conic_offset") in content:
+            raise expected("conic_offset for a conic, and offset for a length")
+
+    def pickup(self) -> Pickup:
+        """Return the pickup."""
+        quantity = next(key for key in PICKED if getattr(self, key) is not None)
+        return Pickup(self.surface, quantity, getattr(self, quantity), self.scale, self.offset + self.conic_offset)
+
+
+class SolveSection(Section):
+    """Thickness behind a surface that is solved for."""
+
+    surface: Text
+    marginal_height: OptionalLength = None
+    chief_height: OptionalLength = None
+    edge_thickness: OptionalLength = None
+    radius: Length = 0.0
+
+    @classmethod
+    def check(cls, content: dict[str, Any]) -> None:  # noqa: D102
+        if sum(key in content for key in SOLVED) != 1:
+            raise expected(f"one of {', '.join(SOLVED)}")
+
+    def solve(self) -> Solve:
+        """Return the solve."""
+        kind = next(key for key in SOLVED if getattr(self, key) is not None)
+        return Solve(self.surface, kind, getattr(self, kind), self.radius)
+
+
 class DesignSection(Section):
     """Design data."""
 
@@ -125,6 +179,8 @@ class DesignSection(Section):
     environment: EnvironmentSection | None = None
     telecentric: Flag = False
     afocal: Flag = False
+    pickups: Annotated[tuple[PickupSection, ...], ROWS] = ()
+    solves: Annotated[tuple[SolveSection, ...], ROWS] = ()
 
     def data(self) -> DesignData:
         """Return the design data."""
@@ -139,6 +195,8 @@ class DesignSection(Section):
         if self.environment is not None:
             found |= {"temperature": self.environment.temperature_k, "pressure": self.environment.pressure_pa}
         found |= {"telecentric": self.telecentric, "afocal": self.afocal}
+        found["pickups"] = tuple(section.pickup() for section in self.pickups)
+        found["solves"] = tuple(section.solve() for section in self.solves)
         return DesignData(length_unit=self.length, stop=self.stop, aiming=self.aiming, **found)
 
 
@@ -169,4 +227,18 @@ def design_items(data: DesignData) -> dict[str, Any]:
     environment = {"temperature_k": data.temperature, "pressure_pa": data.pressure}
     if stated := {key: value for key, value in environment.items() if value is not None}:
         found["environment"] = stated
-    return found | {key: True for key in ("telecentric", "afocal") if getattr(data, key)}
+    found |= {key: True for key in ("telecentric", "afocal") if getattr(data, key)}
+    if data.pickups:
+        found["pickups"] = [_pickup_items(pickup) for pickup in data.pickups]
+    if data.solves:
+        found["solves"] = [
+            {"surface": s.surface, s.kind: s.value} | ({"radius": s.radius} if s.radius else {}) for s in data.solves
+        ]
+    return found
+
+
+def _pickup_items(pickup: Pickup) -> dict[str, Any]:
+    offset = "conic_offset" if pickup.quantity == "conic" else "offset"
+    items: dict[str, Any] = {"surface": pickup.surface, pickup.quantity: pickup.source}
+    items |= {"scale": pickup.scale} if pickup.scale != 1.0 else {}
+    return items | ({offset: pickup.offset} if pickup.offset else {})

@@ -16,6 +16,7 @@ from ...media.medium import Medium
 from ...obstruction import Obstruction
 from ...surface import IDENTITY, Interaction, Matrix, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
+from ..writable import require_met
 from .apertures import ApertureKeys, ObstructionSection
 from .design import DesignSection
 from .media import AnyMedium
@@ -250,7 +251,7 @@ def telescope_of(content: dict[str, Any], path: Path) -> Telescope:
     """Return the telescope of the content of a prescription file; errors as for :func:`read_telescope`."""
     prescription = validated(Prescription, content, str(path), PrescriptionError, {"folder": path.parent})
     with error_context(file=path):
-        return prescription.telescope()
+        return require_met(prescription.telescope())
 
 
 def _chosen(key: str, name: str | None, media: dict[str, Medium], default: Medium) -> Medium:

@@ -10,6 +10,7 @@ from typing import Any
 from ...media.medium import Medium
 from ...surface import IDENTITY, Surface
 from ...telescope import VACUUM, Telescope
+from ..writable import require_met
 from .apertures import aperture_items, obstruction_items
 from .design import design_items
 from .media import medium_items
@@ -21,8 +22,11 @@ INTERACTION_NAMES = {value: name for name, value in INTERACTIONS.items()}
 
 
 def telescope_to_yaml(telescope: Telescope) -> str:
-    """Return the text of the prescription file of a telescope; it loads back equal to the last bit."""
-    t = telescope
+    """Return the text of the prescription file of a telescope; it loads back equal to the last bit.
+
+    PrescriptionError if a value is not that of its pickup.
+    """
+    t = require_met(telescope)
     names = _medium_names(t)
     low, high = t.band or t.wavelength_range
     head: dict[str, Any] = {

@@ -34,6 +34,7 @@ from .apertures import read_aperture
 from .design import Fields, length_unit, read_aiming, read_environment, read_fields, stated_fields
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
 from .frame import HALF_TURN, rotated_aperture, rotated_axes, rotated_shape
+from .links import with_links
 from .shapes import read_shape
 from .system import UNITS, Pupil, Wavelengths, read_pupil, read_wavelengths
 
@@ -79,6 +80,7 @@ class _LensReader:
         self.origin, self.axes = np.zeros(3), np.eye(3)
         self.medium = self.first_medium = self._glass(file.surfaces[0], VACUUM)[1]
         self.surfaces: list[Surface] = []
+        self.names: dict[int, str] = {}
         self.paraxial = ParaxialSurfaces()
         self.stop: Block | None = None
 
@@ -107,12 +109,13 @@ class _LensReader:
         self.file.surfaces[0].report_rest(IGNORED_SURFACE, findings)
         if pupil_plane:
             del self.surfaces[0]
+            del self.names[1]
         z0 = _first_power(self.surfaces)
         surfaces = tuple(self._placed(s, z0) for s in self.surfaces)
         low, high = self._wavelength_range(waves.values)
         reach = max(max(abs(v) for s in surfaces for v in s.vertex), abs(pupil.image.z + z0), pupil.diameter)
         limit = min(max(2 * pupil.field_radius, math.radians(5.0)), math.radians(85.0))
-        return Telescope(
+        telescope = Telescope(
             name=self.file.path.stem,
             source=f"{self.file.program} file {self.file.path.name}",
             version=(header.text("VERS").split() or ["1"])[0],
@@ -134,6 +137,7 @@ class _LensReader:
             groups=element_groups(surfaces, self.first_medium),
             design_data=data,
         )
+        return with_links(telescope, self.file.surfaces, self.names, self.unit, findings)
 
     def _design_data(self, fields: Fields, waves: Wavelengths, pupil: Pupil, stop: str | None) -> DesignData:
         telecentric = pupil.image.telecentric
@@ -226,12 +230,13 @@ class _LensReader:
         else:
             interaction = Interaction.PASS if after == self.medium else Interaction.REFRACT
         semi_diameter = block.number("DIAM", 0.0) * self.unit
+        self.names[number] = self._name(number, block.text("COMM"), last)
         self.paraxial.add(shape.curvatures, self.medium, after, mirror=mirror)
         self.medium = after
         x, y, z = (float(v) for v in self.origin)
         self.surfaces.append(
             Surface(
-                name=self._name(number, block.text("COMM"), last),
+                name=self.names[number],
                 interaction=interaction,
                 shape=rotated_shape(shape),
                 vertex=(x, y, z),

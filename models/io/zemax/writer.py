@@ -17,17 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from ....core.errors import DomainError, PrescriptionError
+from ....core.errors import PrescriptionError, error_context
 from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
-from ...paraxial import with_floating_pupil
+from ...paraxial import stop_makes_pupil
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_angles
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
+from ..writable import require_met, require_sequential
 from .apertures import aperture_lines
 from .design import design_lines, stop_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
+from .links import add_link_lines
 from .reader import PUPIL_COMMENT
 from .shapes import shape_lines
 from .text import number_text
@@ -35,8 +37,6 @@ from .text import number_text
 MM = 1e-3
 #: Names of the units of a file [m].
 UNIT_NAMES = {1e-3: "MM", 1e-2: "CM", 0.0254: "IN", 1.0: "METER"}
-#: Difference of two pupils that rounding makes, over their size.
-_ROUNDING = 1e-12
 #: AGF coefficients of a glass of constant index: Schott's formula with its first term alone.
 CONSTANT_FORMULA = 1
 
@@ -46,15 +46,13 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
 
     PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file.
     """
-    t = telescope
-    if t.surfaces[-1].interaction != Interaction.DETECTOR:
-        raise PrescriptionError(f"{t.name}: a Zemax file needs a detector as its last surface")
-    if t.obstructions:
-        raise PrescriptionError(f"{t.name}: obstruction {t.obstructions[0].name}: a Zemax file cannot hold meshes")
+    t = require_met(telescope)
+    with error_context(subject=t.name):
+        require_sequential(t, "a Zemax file")
     glasses = _glass_names(t)
     data = t.design_data
     unit = MM if data == DesignData() else data.unit
-    own_stop = _stop_makes_pupil(t)
+    own_stop = stop_makes_pupil(t)
     if data.telecentric and not own_stop:
         raise PrescriptionError(f"{t.name}: a telecentric object space needs its stop and its aperture in a Zemax file")
     lines = [
@@ -77,6 +75,7 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
         )
     place = -first
     before = t.medium_before
+    numbered: dict[str, tuple[int, list[str]]] = {}
     for surface in t.surfaces:
         x, y, z = (float(v) for v in HALF_TURN @ np.array(surface.vertex))
         if len(blocks) > 1:
@@ -91,31 +90,22 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
             ]
         if x == 0 and y == 0 and np.array_equal(axes, np.eye(3)):
             blocks.append(own)
+            numbered[surface.name] = len(blocks) - 1, own
         else:
             values = [x / unit, y / unit, *np.degrees(rotation_angles(axes))]
             medium = _glass_line(before, glasses)
             blocks.append([*_break_lines(values, 0), *medium, "DISZ 0"])
             blocks.append([*own, "DISZ 0"])
+            numbered[surface.name] = len(blocks) - 1, blocks[-1]
             if surface is not t.surfaces[-1]:
                 blocks.append([*_break_lines([-v for v in values], 1), *_glass_line(surface.medium_after, glasses)])
         before = surface.medium_after
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
+    add_link_lines(data, numbered, unit)
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))
-
-
-def _stop_makes_pupil(t: Telescope) -> bool:
-    """Return whether stop and aperture are stated, and make the entrance pupil of the telescope."""
-    if t.design_data.stop is None or t.design_data.aperture is None:
-        return False
-    try:
-        made = with_floating_pupil(t)
-    except DomainError:
-        return False
-    close = {"rel_tol": _ROUNDING, "abs_tol": _ROUNDING * t.pupil_diameter}
-    return math.isclose(made.stop_z, t.stop_z, **close) and math.isclose(made.pupil_diameter, t.pupil_diameter, **close)
 
 
 def _field_lines(t: Telescope, unit: float) -> list[str]:

@@ -207,3 +207,17 @@ def test_a_compensator_without_effect(triplet):
     content = {"tolerances": [{"name": "S1.dx_um", "size": 1}], "compensators": ["Image.dx_um"], "draws": 2, "rings": 2}
     with pytest.raises(DomainError, match=r"compensator 'Image.dx_um' has no effect"):
         pachon.run_tolerances(triplet, ToleranceFile.model_validate(content))
+
+
+def test_what_follows_other_values_has_no_tolerance_of_its_own(triplet):
+    pickups = (pachon.Pickup("S7", "radius", "S1"), pachon.Pickup("S6", "glass", "S1"))
+    solves = (pachon.Solve("S4", "edge_thickness", 1e-3, radius=1e-3),)
+    linked = triplet.with_design(pickups=pickups, solves=solves)
+    content = {
+        "surfaces": {"radius_percent": 0.1},
+        "elements": {"index": 1e-3, "thickness_um": 5},
+        "gaps": {"thickness_um": 5},
+    }
+    names = [{t.name for t in plan_of(one, **content).tolerances} for one in (triplet, linked)]
+    assert names[0] - names[1] == {"S7.radius_percent", "S6.n", "S4.thickness_um"}
+    assert names[1] < names[0]

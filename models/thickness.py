@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.errors import DomainError
-from ...models.surface import Interaction, Vector
-from ...models.telescope import Telescope
+from ..core.errors import DomainError
+from .surface import Interaction, Vector
+from .telescope import Telescope
 
 
 def front_surface(telescope: Telescope, target: str) -> int:

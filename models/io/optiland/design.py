@@ -1,0 +1,103 @@
+"""Aperture, fields, wavelengths and ray aiming of a telescope as entries of a file of optiland.
+
+The stop and the stated aperture are written where they make the entrance pupil; else the diameter of the pupil, with
+a plane of its own for the stop. Fields are in degrees or millimetres, rotated with the axes: x changes its sign.
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+from typing import Any
+
+from ....core.errors import PrescriptionError
+from ...design_data import DesignData
+from ...paraxial import stop_makes_pupil
+from ...telescope import Telescope
+from .reader import APERTURES, FIELD_TYPES
+
+MM = 1e-3
+#: Keys of the aperture by that of the design data; a working focal ratio has none.
+_APERTURES = {"entrance_pupil": "EPD", "f_number": "imageFNO", "object_na": "objectNA", "stop": "float_by_stop_size"}
+#: Fields by the type of design data, in the order of Zemax.
+_FIELDS = {"angle": 0, "object_height": 1, "paraxial_image_height": 2, "real_image_height": 3}
+
+
+def own_stop(t: Telescope) -> str | None:
+    """Return the surface that is the stop in a file of optiland, None where a plane in front has to be it.
+
+    PrescriptionError for a telecentric object space without a stop and the aperture that optiland has for it.
+    """
+    data = t.design_data
+    stop = data.stop if data.aperture in _APERTURES and stop_makes_pupil(t) else None
+    if data.telecentric and (stop is None or data.aperture != "object_na"):
+        raise PrescriptionError("a telecentric object space needs its stop, and object_na as aperture, in optiland")
+    return stop
+
+
+def system_items(t: Telescope) -> dict[str, Any]:
+    """Return the entries of aperture, fields, wavelengths and ray aiming.
+
+    PrescriptionError for vignetting factors that optiland has not.
+    """
+    data, stop = t.design_data, own_stop(t)
+    aperture: dict[str, Any] = {"type": "EPD", "value": t.pupil_diameter / MM}
+    if stop is not None and data.aperture is not None and data.aperture_value is not None:
+        kind = _APERTURES[data.aperture]
+        assert kind in APERTURES
+        size = {"EPD": 1 / MM, "float_by_stop_size": 2 / MM}.get(kind, 1.0)
+        aperture = {"type": kind, "value": data.aperture_value * size}
+    found = {"aperture": aperture, "fields": _fields(t), "wavelengths": _wavelengths(t)}
+    if stop is not None and data.aiming != "off":
+        # Its aiming is at the radius of the real marginal ray; optiland has none at the paraxial one.
+        found["ray_tracer"] = {"ray_aiming_config": {"mode": "robust", "max_iter": 100, "tol": 1e-10}}
+    return found
+
+
+def _fields(t: Telescope) -> dict[str, Any]:
+    data, kind = t.design_data, 0
+    edge = math.degrees(t.field_radius)
+    rows = [(0.0, fraction * edge, 0.0, 0.0, 1.0) for fraction in (0.0, 0.7, 1.0)]
+    if data.fields:
+        kind = _FIELDS[data.field_type]
+        size = math.degrees(1.0) if kind == 0 else 1 / MM
+        weights = data.field_weights or (1.0,) * len(data.fields)
+        factors = [_compression(row) for row in data.vignetting] or [(0.0, 0.0)] * len(data.fields)
+        rows = [
+            (-x * size + 0.0, y * size, *compression, weight)
+            for (x, y), compression, weight in zip(data.fields, factors, weights, strict=True)
+        ]
+    keys = ("x", "y", "vx", "vy", "weight")
+    definition = next(name for name, number in FIELD_TYPES.items() if number == kind)
+    return {
+        "fields": [dict(zip(keys, row, strict=True)) for row in rows],
+        "telecentric": data.telecentric,
+        "field_definition": {"field_type": definition},
+    }
+
+
+def _compression(row: tuple[float, float, float, float, float]) -> tuple[float, float]:
+    """Return the compressions of vignetting factors, the only ones that optiland has."""
+    if row[0] or row[1] or row[4]:
+        raise PrescriptionError(f"vignetting = {list(row)}: optiland has compressions alone, no decentre and no angle")
+    return row[2], row[3]
+
+
+def _wavelengths(t: Telescope) -> dict[str, Any]:
+    """Return the stated wavelengths, or the default and the edges of the band.
+
+    The decimal point of a number is moved, so that it loads back equal.
+    """
+    data: DesignData = t.design_data
+    lengths = list(data.wavelengths or dict.fromkeys([t.default_wavelength, *(t.band or ())]))
+    weights = data.wavelength_weights or (1.0,) * len(lengths)
+    rows = [
+        {
+            "value": float(Decimal(repr(float(length))).scaleb(6)),
+            "is_primary": length == t.default_wavelength,
+            "unit": "um",
+            "weight": weight,
+        }
+        for length, weight in zip(lengths, weights, strict=True)
+    ]
+    return {"wavelengths": rows, "polarization": "ignore"}

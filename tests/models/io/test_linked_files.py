@@ -1,0 +1,127 @@
+"""Pickups and solves in files: read, written back, refused where the file has another value."""
+
+from pathlib import Path
+
+import pytest
+
+import pachon
+from pachon.core.errors import PrescriptionError, PrescriptionWarning
+
+LENS = Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx"
+#: Two equal lenses back to back, as Zemax writes pickups of radius, thickness and glass, and a paraxial back focus.
+SYMMETRIC = """\
+VERS 140124 258 36214
+MODE SEQ
+UNIT MM X W X CM MR CPMM
+ENPD 10
+FTYP 0 0 1 1 0 0 0
+XFLN 0
+YFLN 0
+WAVM 1 0.5875618 1
+PWAV 1
+SURF 0
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ INFINITY
+SURF 1
+  STOP
+  TYPE STANDARD
+  CURV 1.0E-2 0 0 0 0 ""
+  DISZ 4
+  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0
+SURF 2
+  TYPE STANDARD
+  CURV -2.0E-3 0 0 0 0 ""
+  DISZ 2
+SURF 3
+  TYPE STANDARD
+  CURV 2.0E-3 4 2 -1. 0 ""
+  DISZ 4
+  PZUP 1 1 0 0
+  GLAS N-BK7 2 1 1.5 40 0 0 0 0 0 0
+SURF 4
+  TYPE STANDARD
+  CURV -2.0E-2 4 1 -2.0 0 ""
+  DISZ 50
+  MAZH 0 0
+SURF 5
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ 0
+"""
+PICKUPS = (
+    pachon.Pickup("S3", "radius", "S2", -1.0),
+    pachon.Pickup("S3", "thickness", "S1"),
+    pachon.Pickup("S3", "glass", "S1"),
+    # The factor is one of the curvature, so half of it one of the radius.
+    pachon.Pickup("S4", "radius", "S1", -0.5),
+)
+
+
+def loaded(folder, text):
+    (folder / "lens.zmx").write_text(text)
+    return pachon.load_telescope(folder / "lens.zmx")
+
+
+def test_pickups_and_solves_of_zemax_live_on(tmp_path):
+    lens = loaded(tmp_path, SYMMETRIC)
+    assert lens.design_data.pickups == PICKUPS
+    assert lens.design_data.solves == (pachon.Solve("S4", "marginal_height"),)
+    changed = pachon.apply_changes(lens, {"S1.radius_mm": 1.0, "S1.thickness_mm": 0.5})
+    assert changed.surface("S4").shape.radius == pytest.approx(-0.5 * changed.surface("S1").shape.radius, rel=1e-14)
+    assert changed.surfaces[-1].vertex[2] == pytest.approx(pachon.first_order(changed).focus_z, abs=1e-15)
+    # The same lens with the linked values typed by hand.
+    focus = -changed.surfaces[-1].vertex[2] * 1e3 - 11.0
+    by_hand = (
+        SYMMETRIC.replace("CURV 1.0E-2", f"CURV {1 / 99!r}")
+        .replace("CURV -2.0E-2", f"CURV {-2 / 99!r}")
+        .replace("DISZ 4\n", "DISZ 4.5\n")
+        .replace("DISZ 50", f"DISZ {focus!r}")
+    )
+    typed = loaded(tmp_path, by_hand)
+    for one, other in zip(changed.surfaces, typed.surfaces, strict=True):
+        assert one.vertex == pytest.approx(other.vertex, abs=1e-15)
+        assert one.shape.curvature == pytest.approx(other.shape.curvature, rel=1e-14)
+
+
+@pytest.mark.parametrize("name", ["again.zmx", "again.yaml"])
+def test_they_are_written_back(tmp_path, name):
+    lens = loaded(tmp_path, SYMMETRIC)
+    # A radius with a factor has no place in a Zemax file that every program would read alike.
+    kept = PICKUPS if name.endswith("yaml") else PICKUPS[:3]
+    offset = pachon.Pickup("S3", "thickness", "S1", 2.0, -4e-3)
+    lens = lens.with_design(pickups=(PICKUPS[0], offset, *PICKUPS[2:]))
+    pachon.save_telescope(lens, tmp_path / name)
+    again = pachon.load_telescope(tmp_path / name).design_data
+    assert set(again.pickups) == {offset, *kept} - {PICKUPS[1]}
+    assert again.solves == lens.design_data.solves
+
+
+def test_all_kinds_in_yaml_with_units(tmp_path):
+    lens = pachon.load_telescope(LENS)
+    solves = (pachon.Solve("S1", "edge_thickness", 1e-3, radius=4e-3), pachon.Solve("S7", "chief_height", 4e-3))
+    lens = lens.with_design(pickups=(pachon.Pickup("S6", "conic", "S1", -1.0, 0.0),), solves=solves)
+    pachon.save_telescope(lens, tmp_path / "lens.yaml")
+    assert pachon.load_telescope(tmp_path / "lens.yaml").design_data == lens.design_data
+
+
+def test_what_is_not_met_is_said(tmp_path):
+    with pytest.warns(PrescriptionWarning, match=r"surface 3: pickup S3.radius: the file has another value"):
+        lens = loaded(tmp_path, SYMMETRIC.replace("CURV 2.0E-3 4", "CURV 2.1E-3 4"))
+    assert [p.address for p in lens.design_data.pickups] == [p.address for p in PICKUPS[1:]]
+    wrong = lens.with_design(pickups=(PICKUPS[0],))
+    with pytest.raises(PrescriptionError, match=r"pickup S3.radius: expected -0.5, not -0.476190476"):
+        pachon.save_telescope(wrong, tmp_path / "wrong.yaml")
+    lens = loaded(tmp_path, SYMMETRIC)
+    pachon.save_telescope(lens, tmp_path / "good.yaml")
+    text = (tmp_path / "good.yaml").read_text()
+    for old, new, words in (
+        ("marginal_height: 0.0", "height: 0.0", "design.solves"),
+        ("radius: S2", "radius: S9", "S9"),
+        ("thickness: S1", "thickness: S1, conic: S1", "one of radius, conic, thickness, glass"),
+    ):
+        assert old in text
+        (tmp_path / "bad.yaml").write_text(text.replace(old, new))
+        with pytest.raises(PrescriptionError, match=words) as found:
+            pachon.load_telescope(tmp_path / "bad.yaml")
+        assert "\n" not in str(found.value)
