@@ -21,12 +21,24 @@ class Column(NamedTuple):
 
     def title(self, summary: dict[str, Any]) -> str:
         """Return the heading."""
-        return self.heading(summary) if callable(self.heading) else self.heading
+        from ..core.units import angular
+
+        heading = self.heading(summary) if callable(self.heading) else self.heading
+        return heading if self.key(summary) == self.values else angular(heading)
 
     def texts(self, result: Any, summary: dict[str, Any]) -> list[str]:
         """Return the cells of the column."""
-        values = summary[self.values] if isinstance(self.values, str) else self.values(result)
+        key = self.key(summary)
+        values = key(result) if callable(key) else summary[key]
         return number_texts(values if self.scale == 1.0 else self.scale * values, self.form)
+
+    def key(self, summary: dict[str, Any]) -> Any:
+        """Return the values: their function or key, that of angles where the image is at infinity; None if absent."""
+        from ..core.units import angular
+
+        if callable(self.values):
+            return self.values
+        return next((key for key in (self.values, angular(self.values)) if key in summary), None)
 
 
 #: Field angles, or heights of an object at a finite distance: the first column of most tables.

@@ -193,3 +193,10 @@ def field_label(field: np.ndarray) -> str:
     """Return a field point [rad] as error messages name it, in degrees."""
     x, y = np.rad2deg(field)
     return f"field = ({x:.6g}, {y:.6g}) deg"
+
+
+def angular(text: str) -> str:
+    """Return a text or key with micro- and milliradians in place of micrometres and millimetres."""
+    for length, angle in (("µm", "µrad"), ("_um", "_urad"), ("_mm", "_mrad"), ("mm", "mrad")):
+        text = text.replace(length, angle)
+    return text

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from ..core.docstrings import Description
 from ..core.plotting import plain_text
 from ..core.result import Result
-from ..core.units import arcseconds
+from ..core.units import angular, arcseconds
 from ..raytrace.rays import object_points
 from ..wavefront.request import Request
 from .drawing import field_text
@@ -23,6 +24,8 @@ class FieldResult(Result):
     """Base of results over field points: telescope, field points, wavelengths and pupil points of the computation."""
 
     _table: ClassVar[tuple[str, ...]] = ("fields",)
+    #: Attributes that are lengths on the image; angles [rad] where the image is at infinity.
+    _on_image: ClassVar[tuple[str, ...]] = ()
 
     request: Request
 
@@ -91,14 +94,33 @@ class FieldResult(Result):
             return [field_text(field) for field in self.fields]
         return [f"({x:.4g}, {y:.4g}) mm" if x else f"{y:.4g} mm" for x, y in 1e3 * self.object_heights]
 
+    @property
+    def in_angles(self) -> bool:
+        """Whether the image is at infinity, so that sizes of it are angles: a metre stands for a radian."""
+        return self.request.telescope.design_data.afocal
+
+    def _described(self, name: str) -> Description:
+        found = super()._described(name)
+        if not (self.in_angles and name in self._on_image):
+            return found
+        return found._replace(unit={"m": "rad", "rad / m": "", "1 / m": "1 / rad"}.get(found.unit, found.unit))
+
+    def on_image(self, items: dict[str, Any]) -> dict[str, Any]:
+        """Return entries of a summary, lengths on the image, under names of angles where it is at infinity."""
+        return {angular(name): value for name, value in items.items()} if self.in_angles else items
+
+    def image_text(self, text: str) -> str:
+        """Return a text with units of lengths on the image, with those of angles where it is at infinity."""
+        return angular(text) if self.in_angles else text
+
     def of_sky(self, items: dict[str, Any]) -> dict[str, Any]:
         """Return entries of a summary that are angles on the sky: nothing where there is none."""
         return items if self.on_sky else {}
 
     def size_text(self, size: float, plate_scale: Any) -> str:
         """Return a size on the detector [m] as text: in micrometres and, on the sky, in arc seconds."""
-        text = f"{size * 1e6:.3g} µm"
-        return f'{text} = {size * arcseconds(plate_scale):.3g}"' if self.on_sky else text
+        text = self.image_text(f"{size * 1e6:.3g} µm")
+        return f'{text} = {size * arcseconds(plate_scale):.3g}"' if self.on_sky and not self.in_angles else text
 
     def _nanometres(self) -> str:
         """Return the wavelengths as titles of plots give them."""

@@ -38,7 +38,7 @@ class FirstOrder(Values):
     wavelength : float
         Vacuum wavelength [m].
     focal_length : float
-        Effective focal length [m].
+        Effective focal length [m]; infinite, as are the places of the focus, where an afocal telescope has none.
     f_number : float
         Focal length over the diameter of the entrance pupil.
     back_focus : float
@@ -53,6 +53,9 @@ class FirstOrder(Values):
         Diameters of the pupils [m].
     effective_area : float
         Area of the entrance pupil less its obscuration [m^2].
+    angular_magnification : float
+        Slope of the chief ray behind the telescope over that in front of it, both along the light; of an afocal
+        telescope its magnifying power, negative where the image is upside down.
     """
 
     wavelength: float
@@ -66,6 +69,7 @@ class FirstOrder(Values):
     exit_pupil_z: float
     exit_pupil_diameter: float
     effective_area: float
+    angular_magnification: float
 
     @property
     def arcsec_per_um(self) -> float:
@@ -158,10 +162,10 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
     last_z = trace.surfaces[-1].vertex[2]
     n, (h, hb), (u, ub) = float(trace.n_after[-1]), map(float, trace.h[-1]), map(float, trace.u_after[-1])
     power = -n * u / (abs(float(trace.n[0])) * radius)
-    if abs(power) * radius < 1e-9:
+    parallel = abs(power) * radius < 1e-9
+    if parallel and not telescope.design_data.afocal:
         raise DomainError(f"telescope {telescope.name}: expected one with a focus; its power is {power:.3g} 1/m")
-    focal_length = 1.0 / power
-    to_focus = -h / u
+    focal_length, to_focus = (math.inf, math.inf) if parallel else (1.0 / power, -h / u)
     to_pupil = -hb / ub if ub != 0 else math.inf
     return FirstOrder(
         wavelength=trace.wavelength,
@@ -175,6 +179,8 @@ def first_order(telescope: Telescope, wavelength: ArrayLike | None = None) -> Fi
         exit_pupil_z=last_z - to_pupil,
         exit_pupil_diameter=2 * abs(h + u * to_pupil),
         effective_area=math.pi * radius**2 * (1 - telescope.pupil_obscuration**2),
+        # The chief ray has unit slope in front; along an axis that mirrors turn, slopes change their sign with it.
+        angular_magnification=math.copysign(1.0, n) * ub,
     )
 
 

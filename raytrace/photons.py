@@ -13,6 +13,7 @@ from ..models.camera.focal_plane import FocalPlane
 from ..models.media.medium import ConstantIndex
 from ..models.telescope import Telescope
 from .detector import land_bundle
+from .ideal_lens import require_image
 from .kernels.packet import from_packets, lane_flags, lanes, packet_count, ray_packets, to_packets
 from .kernels.photons import trace_photons
 from .launch import aimed_points
@@ -79,6 +80,7 @@ def land_photons(
         If the telescope does not cover a wavelength, or its object is at a finite distance.
     """
     require_distant_object(telescope)
+    require_image(telescope, "a trace of photons")
     n = len(beam.wavelength)
     packed, count = pack_surfaces(telescope), packet_count(n)
     landing = wp.empty((6, count), dtype=lanes, device="cpu")

@@ -10,6 +10,7 @@ from ..core.errors import DomainError
 from ..core.units import field_label, length, metres
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
+from ..raytrace.ideal_lens import imaged
 from ..raytrace.launch import launch_bundles
 from ..raytrace.rays import RayStatus, field_angles, field_direction, require_distant_object
 from ..raytrace.trace import TraceResult, trace
@@ -37,7 +38,7 @@ def chief_rays(
     """
     require_distant_object(telescope)
     rays = launch_bundles(telescope, directions, wavelength, np.zeros((1, 2)))
-    return trace(telescope, rays, focal_plane=focal_plane, threads=threads)
+    return imaged(telescope, trace(telescope, rays, focal_plane=focal_plane, threads=threads), wavelength)
 
 
 def reference_rays(
@@ -52,6 +53,7 @@ def reference_rays(
     """
     rays = request.launch(wavelength, np.zeros((1, 2)))
     end = trace(request.telescope, rays, focal_plane=focal_plane, threads=request.threads)
+    end = imaged(request.telescope, end, wavelength)
     lost = np.isin(end.status, (RayStatus.MISSED, RayStatus.TOTAL_REFLECTION, RayStatus.NOT_CONVERGED))
     if lost.any():
         raise DomainError(f"{field_label(request.fields[lost][0])}: the chief ray does not reach the image{advice}")

@@ -13,6 +13,7 @@ from ..core.units import length
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
 from ..models.telescope import Telescope
+from ..raytrace.ideal_lens import imaged
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import RayStatus, pupil_points
 from ..raytrace.trace import trace
@@ -96,7 +97,7 @@ def wavefront_opd(
         raise DomainError(f"field of shape {request.fields.shape}: expected two angles")
     w, index = request.wavelength, refractive_indices(telescope, request.wavelength)[-2]
     rays = request.launch(w, np.stack([x.ravel(), y.ravel()], axis=-1))
-    end = trace(telescope, rays, focal_plane=focal_plane, threads=threads)
+    end = imaged(telescope, trace(telescope, rays, focal_plane=focal_plane, threads=threads), w)
     lit = inside.ravel() & ((end.status == RayStatus.OK) | (end.status == RayStatus.GAP))
     if reference == "chief":
         sphere = _spheres(request, radius, focal_plane)[0]
@@ -208,7 +209,7 @@ def _silicon_opd(request: Request, silicon: Silicon, x: np.ndarray, y: np.ndarra
 
 def _sphere_radius(telescope: Telescope, sphere_radius: ArrayLike | None) -> float:
     if sphere_radius is None:
-        return telescope.reference_sphere_radius
+        return telescope.sphere_radius
     radius = length(sphere_radius, "sphere_radius")
     if not radius > 0:
         raise DomainError(f"sphere_radius = {sphere_radius!r}: expected a positive length in metres")

@@ -37,6 +37,8 @@ def traced_opds(
     first stage, up to the first aperture, selects those of the second.
     """
     telescope, directions = request.telescope, request.directions
+    if telescope.design_data.afocal:
+        return _behind_ideal_lens(request, np.stack([x, y], axis=-1), radius, progress)
     whole = pack_surfaces(telescope)
     stages = [whole]
     stop = next((i for i, s in enumerate(telescope.surfaces) if s.aperture is not None), None)
@@ -88,4 +90,17 @@ def traced_opds(
             )
         if progress is not None:
             progress(part.stop - first)
+    return value
+
+
+def _behind_ideal_lens(
+    request: Request, points: np.ndarray, radius: float, progress: Callable[[int], None] | None
+) -> np.ndarray:
+    """Return :func:`traced_opds` of an afocal telescope, to spheres about the images of its chief rays."""
+    value = np.empty((len(request.fields), len(points)))
+    for i in range(len(value)):
+        bundle = request.at_fields(slice(i, i + 1)).bundles(request.wavelength, points)
+        value[i] = np.where(bundle.lit, bundle.opd(radius), np.nan)[0]
+        if progress is not None:
+            progress(1)
     return value

@@ -16,6 +16,7 @@ from ..core.launch import launch
 from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
+from ..raytrace.ideal_lens import require_image
 from ..raytrace.kernels.packet import LANES, lane_flags, lanes, packet_count, ray_packets, to_packets
 from ..raytrace.kernels.pupil import trace_pupils as trace_pupils_kernel
 from ..raytrace.pack.surfaces import pack_surfaces, refractive_indices
@@ -86,6 +87,7 @@ def trace_pupils(
     request = Request.of(telescope, fields, wavelengths, sampling=CHIEF_RAY, projection=projection, threads=threads)
     request = replace(request, vignetting=vignetting)
     require_distant_object(telescope)
+    require_image(telescope, "a PSF")
     direction, waves = request.directions, request.wavelengths
     pupil = np.asarray(pupil, dtype=np.float64)
     n_star, n_wave, n_pupil = len(direction), len(waves), len(pupil)

@@ -14,6 +14,7 @@ from ..core.errors import DomainError, shown
 from ..core.units import metres, pure_numbers, radians
 from ..models.design_data import vignetted
 from ..models.telescope import Telescope
+from ..raytrace.ideal_lens import imaged
 from ..raytrace.launch import aimed_points
 from ..raytrace.pack.surfaces import refractive_indices
 from ..raytrace.rays import Rays, RayStatus, field_direction, straight_bundles
@@ -232,7 +233,7 @@ class Request:
         points = self.pupil.points if pupil is None else pupil
         # The chief ray is traced as one more point of the pupil.
         rays = self.launch(wavelength, np.concatenate([points, np.zeros((*points.shape[:-2], 1, 2))], axis=-2))
-        end = trace(self.telescope, rays, threads=self.threads)
+        end = imaged(self.telescope, trace(self.telescope, rays, threads=self.threads), wavelength)
         n, detector = len(self.fields), self.telescope.surfaces[-1]
         position = detector.to_local(end.position).reshape(n, -1, 3)
         direction = (end.direction @ detector.matrix).reshape(n, -1, 3)

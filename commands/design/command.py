@@ -130,7 +130,7 @@ def design_command(
     def rows(result: Study) -> Rows:
         summary = numbers_of(result.summary())
         # A result has no arc seconds, for example, where there is no sky.
-        shown = [column for column in columns if callable(column.values) or column.values in summary]
+        shown = [column for column in columns if column.key(summary) is not None]
         cells = [column.texts(result, summary) for column in shown]
         text = caption.format_map(summary) if isinstance(caption, str) else caption(summary)
         lines = [*zip(*cells, strict=True)]

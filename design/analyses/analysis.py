@@ -131,7 +131,7 @@ def band_wavelengths(telescope: Telescope, wavelengths: ArrayLike | None, count:
 
 def require_focus(telescope: Telescope, *values: np.ndarray) -> None:
     """Raise a DomainError where values are not finite since the light of a telescope is parallel."""
-    if not all(np.isfinite(value).all() for value in values):
+    if telescope.design_data.afocal or not all(np.isfinite(value).all() for value in values):
         raise DomainError(f"telescope {telescope.name}: expected one with a focus; its light is parallel")
 
 

@@ -14,6 +14,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, RED
 from ...core.units import pure_numbers
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..drawing import finish_axes, wavelength_colors
@@ -171,6 +172,7 @@ def lateral_color(
     DomainError
         If a chief ray does not reach the detector.
     """
+    require_image(telescope, "a lateral colour")
     request = line_request(telescope, fields, band_wavelengths(telescope, wavelengths), projection, threads)
     point = np.zeros((1, 2))
     landing = np.stack([request.bundles(float(w), point).chief_landing() for w in request.wavelengths], axis=1)

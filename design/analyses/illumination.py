@@ -22,6 +22,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE
 from ...core.units import require_count
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.request import Request
 from ..drawing import finish_axes
 from .analysis import Analysis, Columns, field_line
@@ -126,6 +127,7 @@ def relative_illumination(
     """
     count = require_count(n_pupil, "n_pupil", 16, 10**6)
     line = field_line(telescope) if fields is None else fields
+    require_image(telescope, "a relative illumination")
     request = Request.of(
         telescope, line, wavelength, sampling="spiral", n_pupil=count, projection=projection, threads=threads
     )

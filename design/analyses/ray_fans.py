@@ -109,23 +109,28 @@ class RayFans(Fans):
         return f"ray fans, {self._nanometres()}"
 
     def _table_columns(self) -> Columns:
+        unit = "urad" if self.in_angles else "um"
         shift = {
-            "along_field": (self.displacement[..., 0] * 1e6, "um", "transverse aberration along the field"),
-            "across_field": (self.displacement[..., 1] * 1e6, "um", "transverse aberration across the field"),
+            "along_field": (self.displacement[..., 0] * 1e6, unit, "transverse aberration along the field"),
+            "across_field": (self.displacement[..., 1] * 1e6, unit, "transverse aberration across the field"),
         }
         return self._fan_columns() | shift
 
     def _values(self) -> dict[str, Any]:
         return {
             "pupil": self.pupil,
-            "largest_um": self.largest * 1e6,
-            "tangential_um": self.along[:, :, 0] * 1e6,
-            "sagittal_um": self.along[:, :, 1] * 1e6,
+            **self.on_image(
+                {
+                    "largest_um": self.largest * 1e6,
+                    "tangential_um": self.along[:, :, 0] * 1e6,
+                    "sagittal_um": self.along[:, :, 1] * 1e6,
+                }
+            ),
             "lit": self.lit,
         }
 
     def _draw(self, panels: Sequence[Axes]) -> None:
-        self._draw_curves(panels, self.along * 1e6, ("along field [µm]", "across [µm]"))
+        self._draw_curves(panels, self.along * 1e6, [self.image_text(t) for t in ("along field [µm]", "across [µm]")])
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,8 @@ class OpdFans(Fans):
     def _values(self) -> dict[str, Any]:
         return {
             "pupil": self.pupil,
-            "reference_sphere_m": self.radius,
+            # A plane wave where the image is at infinity.
+            "reference_sphere_m": None if self.in_angles else self.radius,
             "peak_to_valley_waves": self.peak_to_valley / self.wavelengths,
             "tangential_waves": self.waves[:, :, 0],
             "sagittal_waves": self.waves[:, :, 1],
@@ -237,7 +243,7 @@ def opd_fans(
     DomainError
         If there are too few rays, or the radius is zero or not finite.
     """
-    radius = telescope.reference_sphere_radius if sphere_radius is None else length(sphere_radius, "sphere_radius")
+    radius = telescope.sphere_radius if sphere_radius is None else length(sphere_radius, "sphere_radius")
     require_positive(abs(radius), "sphere_radius", "metres")
     request, pupil, _, bundles = _traced(telescope, fields, wavelengths, n_points, projection, threads)
     value = np.stack([b.opd(radius) for b in bundles], axis=1).reshape(len(request.fields), len(bundles), 2, -1)

@@ -120,7 +120,7 @@ def strehl(
     rms, ratio, peak = (np.full(shape, np.nan) for _ in range(3))
     for w, wavelength in enumerate(map(float, request.wavelengths)):
         bundles = request.bundles(wavelength)
-        opd = bundles.opd(telescope.reference_sphere_radius)
+        opd = bundles.opd(telescope.sphere_radius)
         for i, lit in enumerate(bundles.lit):
             rms[i, w], ratio[i, w] = _without_tilt(opd[i], lit, request, wavelength)
         if from_psf:

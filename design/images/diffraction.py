@@ -20,6 +20,7 @@ from ...core.arguments import check_arguments
 from ...core.errors import DomainError, check_choice
 from ...core.units import field_label, length, require_count
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import PupilSampling, pupil_sampling
 from ...wavefront.request import Request, relative_weights
 from ..metrics.principal_rays import principal_rays_of
@@ -83,6 +84,7 @@ def fft_psf(
     DomainError
         If a number is out of range, no light passes, or the lattice is too coarse for the spots or the image.
     """
+    require_image(telescope, "a diffraction image")
     request = Request.of(
         telescope, fields, wavelengths, wavelength_weights=wavelength_weights, projection=projection, threads=threads
     )
@@ -138,6 +140,7 @@ def huygens_psf(
     :meth:`pachon.Request.of`: by default a square lattice, 160 across. Gauss quadrature needs far fewer points where
     nothing is vignetted.
     """
+    require_image(telescope, "a diffraction image")
     request = Request.of(
         telescope,
         fields,

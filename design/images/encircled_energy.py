@@ -15,6 +15,7 @@ from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import arcseconds, metres, pure_numbers, require_count
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import PupilSampling
 from ..drawing import FEW, field_colors, finish_axes, second_scale
 from ..metrics.spots import SpotDiagram, spots
@@ -142,6 +143,7 @@ def encircled_energy(
         If radii do not ascend, or no light passes.
     """
     check_choice("kind", kind, KINDS)
+    require_image(telescope, "an encircled energy")
     given = None if radii is None else np.atleast_1d(metres(radii, "radii"))
     if given is not None and not (
         given.ndim == 1 and np.isfinite(given).all() and (given >= 0).all() and (np.diff(given) > 0).all()

@@ -55,12 +55,15 @@ class Mtf(FieldResult):
     geometric_tangential, geometric_sagittal : ndarray, shape [n_field, n_frequency]
         Modulation transfer of the rays alone, without diffraction.
     f_number : ndarray, shape [n_field, 2]
-        Focal ratios, tangential and sagittal; the cut-off is 1 / (wavelength f_number).
+        Focal ratios, tangential and sagittal; the cut-off is 1 / (wavelength f_number). Of an afocal telescope that
+        of an ideal lens of 1 m.
     plate_scale : ndarray, shape [n_field, 2]
         Angle on the sky over length on the detector [rad/m], tangential and sagittal.
     obscuration : float
         Inner over outer diameter of the entrance pupil.
     """
+
+    _on_image = ("frequency", "plate_scale")
 
     frequency: np.ndarray
     tangential: np.ndarray
@@ -110,13 +113,14 @@ class Mtf(FieldResult):
             "wavelength_nm": self.wavelengths * 1e9,
             **self.field_items(),
             "obscuration": self.obscuration,
-            "f_number": self.f_number,
-            "cutoff_cycles_per_mm": self.cutoff * 1e-3,
+            # That of the ideal lens, where the image is at infinity.
+            **({} if self.in_angles else {"f_number": self.f_number}),
+            **self.on_image({"cutoff_cycles_per_mm": self.cutoff * 1e-3}),
             **self.of_sky({"cutoff_cycles_per_arcsec": self.cutoff / arcsec}),
-            "half_contrast_cycles_per_mm": half * 1e-3,
+            **self.on_image({"half_contrast_cycles_per_mm": half * 1e-3}),
             **self.of_sky({"half_contrast_cycles_per_arcsec": half / arcsec}),
-            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
-            "frequency_cycles_per_mm": self.frequency * 1e-3,
+            **self.on_image(self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6})),
+            **self.on_image({"frequency_cycles_per_mm": self.frequency * 1e-3}),
             "tangential": self.tangential,
             "sagittal": self.sagittal,
             "tangential_limit": self.tangential_limit,
@@ -138,7 +142,7 @@ class Mtf(FieldResult):
                 if i % columns == 0:
                     axes.set_ylabel("contrast")
                 if i + columns >= count:
-                    axes.set_xlabel("spatial frequency [cycles/mm]")
+                    axes.set_xlabel(self.image_text("spatial frequency [cycles/mm]"))
                     axes.tick_params(labelbottom=True)
             legend_below(figure, panels[0], 3 if columns > 1 else 2)
             return self._titled(figure, f"modulation transfer, {self._nanometres()}")

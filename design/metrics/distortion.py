@@ -13,6 +13,7 @@ from ...core.errors import DomainError, check_choice
 from ...core.plotting import BLUE, ORANGE, RED, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
 from ..drawing import finish_axes
@@ -142,6 +143,7 @@ def distortion(
     """
     check_choice("reference", reference, REFERENCES)
     points = field_lattice(telescope, _ACROSS) if fields is None else fields
+    require_image(telescope, "a distortion")
     request = Request.of(
         telescope,
         points,

@@ -246,7 +246,7 @@ def wavefront_zernikes(
         threads=threads,
         one_wavelength=True,
     )
-    points, sample, w = request.fields, request.pupil, request.wavelength
+    points, sample = request.fields, request.pupil
     most = len(sample) if ordering == "noll" else min(len(sample), FRINGE_TERMS)
     jmax = require_count(jmax, "jmax", 1, most)
     x, y = request.unit_pupil.T
@@ -254,19 +254,28 @@ def wavefront_zernikes(
     terms = (annular_zernikes(jmax, x, y, telescope.pupil_obscuration) if noll else fringe_zernikes(jmax, x, y)).T
     coefficients, residual = np.empty((len(points), jmax)), np.empty(len(points))
     for part, some in request.parts():
-        optics = trace_pupils(
-            telescope,
-            some.fields,
-            w,
-            sample.points,
-            vignetting=some.vignetting,
-            projection=projection,
-            threads=threads,
-        )
-        value = -optics.path[:, 0]
-        used = np.isfinite(value) & (optics.lit[:, 0] | (pupil == "full"))
+        value, lit = _wavefronts(some)
+        used = np.isfinite(value) & (lit | (pupil == "full"))
         coefficients[part], residual[part] = _fit(terms, value, used, sample.weights, some.fields, pupil)
     return FieldZernikes(request, coefficients, residual, telescope.pupil_obscuration, pupil, ordering)
+
+
+def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:
+    """Return the OPD [m] of the pupil points of a request, and which are lit, [n_field, n_pupil] each."""
+    telescope, w = request.telescope, request.wavelength
+    if telescope.design_data.afocal:
+        bundles = request.bundles(w)
+        return bundles.opd(telescope.sphere_radius), bundles.lit
+    optics = trace_pupils(
+        telescope,
+        request.fields,
+        w,
+        request.pupil.points,
+        vignetting=request.vignetting,
+        projection=request.projection,
+        threads=request.threads,
+    )
+    return -optics.path[:, 0], optics.lit[:, 0]
 
 
 #: Most rings of field points.

@@ -20,6 +20,7 @@ from ...core.errors import DomainError
 from ...core.plotting import RED, figure_at, plain_text, styled
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.request import Request
 from ..drawing import draw_circle, field_text, panels_of
 from ..result import FieldResult
@@ -213,6 +214,7 @@ def ghosts(
     """
     n_pupil = require_count(n_pupil, "n_pupil", 400)
     where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
+    require_image(telescope, "a map of ghosts")
     request = Request.of(
         telescope,
         where,

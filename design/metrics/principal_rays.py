@@ -19,6 +19,7 @@ from ...core.errors import DomainError
 from ...core.plotting import BLUE, GREY, ORANGE, figure_at, styled
 from ...core.units import field_label
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import imaged
 from ...raytrace.launch import launch_bundles
 from ...raytrace.rays import RayStatus, field_direction
 from ...raytrace.trace import trace
@@ -82,6 +83,8 @@ class PrincipalRays(FieldResult):
         "exit_pupil_diameter",
     )
 
+    _on_image = ("chief_landing", "plate_scale")
+
     chief_position: np.ndarray
     chief_direction: np.ndarray
     chief_landing: np.ndarray
@@ -110,10 +113,10 @@ class PrincipalRays(FieldResult):
             "telescope": self.telescope,
             "wavelength_nm": self.wavelength * 1e9,
             **self.field_items(),
-            "chief_landing_mm": self.chief_landing * 1e3,
+            **self.on_image({"chief_landing_mm": self.chief_landing * 1e3}),
             "chief_incidence_deg": np.rad2deg(self.chief_angle),
-            "f_number": self.f_number,
-            **self.of_sky({"plate_scale_arcsec_per_um": np.rad2deg(self.plate_scale) * 3600e-6}),
+            **({} if self.in_angles else {"f_number": self.f_number}),
+            **self.on_image(self.of_sky({"plate_scale_arcsec_per_um": np.rad2deg(self.plate_scale) * 3600e-6})),
             "exit_pupil_m": self.exit_pupil,
             "exit_pupil_distance_m": self.exit_pupil_distance,
             "exit_pupil_diameter_m": self.exit_pupil_diameter,
@@ -125,7 +128,7 @@ class PrincipalRays(FieldResult):
         order = np.argsort(radius, kind="stable")
         pairs = [
             ("working focal ratio", self.f_number),
-            ('plate scale ["/µm]', np.rad2deg(self.plate_scale) * 3600e-6),
+            (self.image_text('plate scale ["/µm]'), np.rad2deg(self.plate_scale) * 3600e-6),
             ("exit pupil, from the detector [m]", self.exit_pupil_distance),
             ("diameter of the exit pupil [m]", self.exit_pupil_diameter),
         ]
@@ -196,6 +199,7 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     through = np.repeat(request.vignetted(np.concatenate([np.zeros((n, 1, 2)), _NEAR * rim, rim], axis=1)), 5, axis=0)
     directions = field_direction(near[:, 0], near[:, 1], "gnomonic")
     end = trace(telescope, launch_bundles(telescope, directions, wavelength, through), threads=request.threads)
+    image = imaged(telescope, end, wavelength).position.reshape(n, 5, 9, 3)
     position, direction = end.position.reshape(n, 5, 9, 3), end.direction.reshape(n, 5, 9, 3)
     chief_position, chief_direction = position[:, 0, 0], direction[:, 0, 0]
     reached = (end.status.reshape(n, 5, 9)[:, :, :5] <= RayStatus.VIGNETTED).all(axis=(1, 2))
@@ -206,7 +210,8 @@ def principal_rays_of(request: Request) -> PrincipalRays:
     sky = directions.reshape(n, 5, 3)
     moved = position[:, [1, 2], 0] - position[:, [3, 4], 0]
     rotated = direction[:, [1, 2], 0] - direction[:, [3, 4], 0]
-    scale = np.linalg.norm(sky[:, [1, 2]] - sky[:, [3, 4]], axis=-1) / np.linalg.norm(moved, axis=-1)
+    on_image = np.linalg.norm(image[:, [1, 2], 0] - image[:, [3, 4], 0], axis=-1)
+    scale = np.linalg.norm(sky[:, [1, 2]] - sky[:, [3, 4]], axis=-1) / on_image
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -(moved * rotated).sum(axis=-1) / (rotated**2).sum(axis=-1)
         pupil_center = chief_position + distance.mean(axis=1)[:, None] * chief_direction
@@ -219,7 +224,7 @@ def principal_rays_of(request: Request) -> PrincipalRays:
         request=request,
         chief_position=chief_position,
         chief_direction=chief_direction,
-        chief_landing=detector.to_local(chief_position)[:, :2],
+        chief_landing=detector.to_local(image[:, 0, 0])[:, :2],
         chief_angle=np.arccos(np.clip(np.abs(chief_direction @ normal), 0.0, 1.0)),
         marginal_position=position[:, 0, 5:],
         marginal_direction=direction[:, 0, 5:],

@@ -63,6 +63,17 @@ class SpotDiagram(FieldResult):
         "plate_scale",
     )
 
+    _on_image = (
+        "displacement",
+        "reference_point",
+        "plate_scale",
+        "airy_radius",
+        "centroid",
+        "rms_radius",
+        "rms_xy",
+        "geometric_radius",
+    )
+
     displacement: np.ndarray
     weight: np.ndarray
     reference_point: np.ndarray
@@ -128,12 +139,16 @@ class SpotDiagram(FieldResult):
             "wavelength_nm": self.wavelengths * 1e9,
             "rays_per_field": int(np.prod(self.weight.shape[1:])),
             **self.field_items(),
-            "reference_mm": self.reference_point * 1e3,
-            "centroid_um": self.centroid * 1e6,
-            "rms_xy_um": self.rms_xy * 1e6,
-            **{f"{name}_um": value * 1e6 for name, value in sizes.items()},
+            **self.on_image(
+                {
+                    "reference_mm": self.reference_point * 1e3,
+                    "centroid_um": self.centroid * 1e6,
+                    "rms_xy_um": self.rms_xy * 1e6,
+                    **{f"{name}_um": value * 1e6 for name, value in sizes.items()},
+                }
+            ),
             **self.of_sky({f"{name}_arcsec": value * arcsec for name, value in sizes.items()}),
-            **self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6}),
+            **self.on_image(self.of_sky({"plate_scale_arcsec_per_um": arcsec * 1e-6})),
             "lit_fraction": self.lit_fraction,
         }
 

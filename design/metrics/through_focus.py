@@ -18,6 +18,7 @@ from ...core.errors import DomainError
 from ...core.plotting import figure_at, styled
 from ...core.units import field_label, metres
 from ...models.telescope import Telescope
+from ...raytrace.ideal_lens import require_image
 from ...wavefront.bundles import Bundles
 from ...wavefront.pupil_sampling import PupilSampling
 from ...wavefront.request import Request
@@ -134,6 +135,7 @@ def through_focus(
     DomainError
         If heights do not ascend, no light of a field reaches the detector, or it arrives parallel.
     """
+    require_image(telescope, "a focus")
     request = Request.of(
         telescope,
         fields,
@@ -201,7 +203,7 @@ def _mean_squares(request: Request, bundles: list[Bundles]) -> np.ndarray:
 
 def _wavefronts(request: Request, bundles: list[Bundles], heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rms wavefront [m] and Strehl ratio, shape [n_field, n_height] each."""
-    radius, weights = request.telescope.reference_sphere_radius, request.pupil.weights
+    radius, weights = request.telescope.sphere_radius, request.pupil.weights
     plane = np.stack([np.ones(len(weights)), *request.unit_pupil.T], axis=-1)
     square, strehl = np.zeros((2, len(bundles[0].chief_path), len(heights)))
     for bundle, fraction in zip(bundles, request.weights, strict=True):

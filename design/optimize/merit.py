@@ -16,6 +16,7 @@ from ...core.units import field_label
 from ...models.telescope import Telescope
 from ...raytrace.adjoint.backward_pass import landing_gradient
 from ...raytrace.adjoint.forward_pass import forward_pass
+from ...raytrace.ideal_lens import require_image
 from ...raytrace.rays import Rays, RayStatus, straight_bundles
 from ...raytrace.trace import trace
 from ...wavefront.pupil_sampling import PupilSampling
@@ -51,6 +52,7 @@ class Beams:
 
         Weights of the fields are those that the design data state, where neither fields nor weights are given.
         """
+        require_image(telescope, "a merit of spots or wavefronts")
         count = _RINGS if n_pupil is None and sampling == "gauss" else n_pupil
         request = Request.of(telescope, fields, wavelengths, sampling=sampling, n_pupil=count, **options)
         weights = request.stated_weights if field_weights is None else field_weights

@@ -117,11 +117,16 @@ def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str,
     with contextlib.suppress(DomainError):
         optics = first_order(telescope, wavelength)
         detector = telescope.surfaces[-1].vertex[2]
-        rows += [
+        lens = [
             ("effective focal length", text(optics.focal_length)),
             ("focal ratio", f"f/{abs(optics.f_number):.6g}"),
             ("back focus", text(optics.back_focus)),
             ("plate scale", f"{abs(optics.plate_scale) / ARCSEC * unit:.6g} arcsec/{name}"),
+        ]
+        if telescope.design_data.afocal:
+            lens = [("angular magnification", f"{optics.angular_magnification:.8g}")]
+        rows += [
+            *lens,
             ("exit pupil", f"{text(detector - optics.exit_pupil_z)} from the detector along the incoming light"),
             ("diameter of the exit pupil", text(optics.exit_pupil_diameter)),
             ("Petzval radius", text(_petzval_radius(telescope, wavelength))),

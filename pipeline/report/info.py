@@ -32,6 +32,7 @@ FIRST_ORDER_KEYS = (
     "exit_pupil_z_m",
     "exit_pupil_diameter_m",
     "focus_z_m",
+    "angular_magnification",
 )
 
 
@@ -56,7 +57,12 @@ def describe(telescope: Telescope) -> dict[str, Any]:
             "exit_pupil_z_m": optics.exit_pupil_z,
             "exit_pupil_diameter_m": optics.exit_pupil_diameter,
             "focus_z_m": optics.focus_z,
+            "angular_magnification": None,
         }
+        if telescope.design_data.afocal:
+            # Of an image at infinity there is neither a focus nor a scale of lengths.
+            first |= dict.fromkeys(("focal_length_m", "f_number", "plate_scale_arcsec_per_um", "focus_z_m"))
+            first["angular_magnification"] = optics.angular_magnification
     wavelength = telescope.default_wavelength
     low, high = telescope.band or telescope.wavelength_range
     return {
@@ -180,7 +186,12 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     def length(value: float) -> str:
         return f"{value / unit:.7g} {name}"
 
-    if d["focal_length_m"] is None:
+    pupil = ("exit pupil", "")
+    if d["exit_pupil_z_m"] is not None:
+        pupil = ("exit pupil", f"{length(d['exit_pupil_diameter_m'])} at z = {length(d['exit_pupil_z_m'])}")
+    if d["angular_magnification"] is not None:
+        lens, image = [("afocal, angular magnification", f"{d['angular_magnification']:.7g}")], [pupil]
+    elif d["focal_length_m"] is None:
         lens, image = [("first-order figures", "none: the surfaces do not share one axis, or there is no focus")], []
     else:
         lens = [
@@ -189,7 +200,7 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
             ("plate scale", f'{d["plate_scale_arcsec_per_um"]:.6f}"/µm'),
         ]
         image = [
-            ("exit pupil", f"{length(d['exit_pupil_diameter_m'])} at z = {length(d['exit_pupil_z_m'])}"),
+            pupil,
             ("paraxial focus", f"z = {length(d['focus_z_m'])}"),
         ]
     far = d["object_distance_m"]

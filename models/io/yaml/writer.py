@@ -32,8 +32,9 @@ def telescope_to_yaml(telescope: Telescope) -> str:
     head: dict[str, Any] = {
         "name": t.name,
         "description": t.description,
-        "source": t.source,
-        "version": t.version,
+        # A file must have both; a telescope that is built by hand need not.
+        "source": t.source or "not stated",
+        "version": t.version or "not stated",
         "units": {"length": "m"},
         "stop": {"z": t.stop_z},
         "pupil": {"diameter": t.pupil_diameter, "obscuration": t.pupil_obscuration},

@@ -1,5 +1,6 @@
 """Design data in files: read from Zemax, CODE V and YAML, and written back."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -211,3 +212,12 @@ def test_yaml_is_in_the_units_of_its_file(tmp_path):
     assert data.fields[1] == pytest.approx(np.deg2rad((0.1, 0.2)), rel=1e-15)
     assert data.vignetting[1][4] == pytest.approx(np.pi / 2, rel=1e-15)
     assert (data.aperture_value, data.wavelengths, data.temperature) == (8.4, (5e-7, 6e-7), 280.0)
+
+
+def test_a_telescope_built_by_hand_can_be_read_again(tmp_path):
+    """Neither source nor version is needed to build one; a file has both."""
+    bare = replace(pachon.load_telescope("paul_baker"), source="", version="")
+    pachon.save_telescope(bare, tmp_path / "bare.yaml")
+    again = pachon.load_telescope(tmp_path / "bare.yaml")
+    assert again.surfaces == bare.surfaces
+    assert again.source == again.version == "not stated"
