@@ -8,11 +8,13 @@ a path is a telescope like any other, for the ordinary trace; stretches that sev
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...core.errors import DomainError, unknown_name
+from ...core.threads import thread_count
 from ...models.design_data import DesignData
 from ...models.media.medium import Medium
 from ...models.surface import Interaction, Surface
@@ -46,6 +48,20 @@ def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.
     return np.where(square > 0, 0.5 * (s**2 + p**2), 1.0)
 
 
+def refracted_reflectivity(turn: np.ndarray, before: float, after: float) -> np.ndarray:
+    """Return the reflectivity of a bare interface for light that it refracts, from the cosine of the angle of turn.
+
+    Snell's law in vectors, n' d' - n d along the normal, gives both cosines from the cosine t of the angle by which the
+    ray is turned. In Fresnel's ratios their common length cancels: with a = n^2 + n'^2, b = 2 n n' and c = n'^2 - n^2
+    they are (a - b t) / c across the plane of incidence and (a - b / t) / c in it.
+    """
+    if before == after:
+        return np.zeros_like(turn)
+    square, double = before * before + after * after, 2.0 * before * after
+    across, along = square - double * turn, square - double / turn
+    return np.asarray((across * across + along * along) * (0.5 / (after * after - before * before) ** 2))
+
+
 class Coatings:
     """Reflectivity of every surface that is not a mirror."""
 
@@ -66,11 +82,16 @@ class Coatings:
                 raise DomainError(f"reflectivity of {name} = {value!r}: expected a number from 0 to 1")
         self._fixed = {i: table[s.name] for i, s in enumerate(telescope.surfaces) if s.name in table}
 
-    def at(self, place: int, cosine: np.ndarray, before: float, after: float) -> np.ndarray:
-        """Return the reflectivity for light from one refractive index to another."""
+    def reflected(self, place: int, turn: np.ndarray, before: float, after: float) -> np.ndarray | float:
+        """Return the reflectivity for light that is reflected, from the cosine of the angle by which that turns it."""
         if place in self._fixed:
-            return np.full_like(cosine, self._fixed[place])
+            return self._fixed[place]
+        cosine = np.sqrt(np.maximum(0.5 * (1.0 - turn), 0.0))
         return fresnel_reflectivity(cosine, before, after)
+
+    def refracted(self, place: int, turn: np.ndarray, before: float, after: float) -> np.ndarray | float:
+        """Return the reflectivity for light that is refracted, from the cosine of the angle by which that turns it."""
+        return self._fixed[place] if place in self._fixed else refracted_reflectivity(turn, before, after)
 
 
 @dataclass(frozen=True)
@@ -121,18 +142,29 @@ class GhostTrace:
         return self._landing("", "", self._forward[-1])
 
     def ghosts(self) -> Iterator[GhostLight]:
-        """Yield the ghosts of :func:`ghost_pairs`, in that order."""
-        names = self._telescope.surface_names
+        """Yield the ghosts of :func:`ghost_pairs`, in that order.
+
+        Those of one first surface are a job of a thread: most of the time goes into arithmetic of NumPy on one thread.
+        """
         seconds: dict[int, list[int]] = {}
         for first, second in ghost_pairs(self._telescope):
             seconds.setdefault(first, []).append(second)
-        for first, of_first in seconds.items():
-            back = [*range(first, min(of_first), -1)]
-            # Light behind each surface on the way back, by its index.
-            behind = dict(zip(back, self._through(back, self._forward[first - 1], backward=True), strict=True))
-            for second in of_first:
-                *_, end = self._through(range(second, len(names)), behind[second + 1], reflected=True)
-                yield self._landing(names[first], names[second], end)
+        count = min(thread_count(self._threads), max(len(seconds), 1))
+        with ThreadPoolExecutor(count) as pool:
+            for lights in pool.map(self._ghosts_of, seconds.keys(), seconds.values()):
+                yield from lights
+
+    def _ghosts_of(self, first: int, of_first: Sequence[int]) -> list[GhostLight]:
+        """Return the ghosts of a first surface and some second ones."""
+        names = self._telescope.surface_names
+        back = [*range(first, min(of_first), -1)]
+        # Light behind each surface on the way back, by its index.
+        behind = dict(zip(back, self._through(back, self._forward[first - 1], backward=True), strict=True))
+        lights = []
+        for second in of_first:
+            *_, end = self._through(range(second, len(names)), behind[second + 1], reflected=True)
+            lights.append(self._landing(names[first], names[second], end))
+        return lights
 
     def _through(
         self, places: Sequence[int], beam: _Beam, *, backward: bool = False, reflected: bool = False
@@ -150,15 +182,14 @@ class GhostTrace:
         weight, coming = beam.weight[lit], beam.direction[lit]
         rays = Rays(beam.position[lit], coming, np.zeros(len(weight)), self._wavelength)
         stretch = self._stretch(surfaces, self._media[places[0] + (behind if turns else before)])
-        for k, met in enumerate(trace(stretch, rays, "all", threads=self._threads)):
+        for k, met in enumerate(trace(stretch, rays, "all", threads=1)):
             place, n, n_behind = places[k], self._index[places[k] + before], self._index[places[k] + behind]
             # Cosine of the angle by which the surface turns the ray.
             turn = np.einsum("ij,ij->j", coming.T, met.direction.T)
             if turns and k == 0:
-                cosine = np.sqrt(np.maximum(0.5 * (1.0 - turn), 0.0))
-                weight = weight * self._coatings.at(place, cosine, n_behind, n)
+                weight = weight * self._coatings.reflected(place, turn, n_behind, n)
             elif surfaces[k].interaction == Interaction.REFRACT:
-                weight = weight * (1.0 - self._coatings.at(place, _incidence(turn, n, n_behind), n, n_behind))
+                weight = weight * (1.0 - self._coatings.refracted(place, turn, n, n_behind))
             weight = np.where(met.status == RayStatus.OK, weight, 0.0)
             coming = met.direction
             yield _Beam(met.position, coming, weight)
@@ -186,15 +217,3 @@ class GhostTrace:
         detector, lit = self._telescope.surfaces[-1], beam.weight > 0.0
         position = detector.to_local(beam.position[lit])[:, :2]
         return GhostLight(first, second, position, beam.direction[lit] @ detector.matrix, beam.weight[lit])
-
-
-def _incidence(turn: np.ndarray, n: float, n_behind: float) -> np.ndarray:
-    """Return cosines of incidence, from the cosines of the angles by which rays are turned between two indices.
-
-    Snell's law in vectors: n' times the direction behind the surface less n times that in front lies along the normal.
-    """
-    if n == n_behind:
-        # No normal is to be had, and nothing is reflected.
-        return np.ones_like(turn)
-    normal = np.sqrt(n * n + n_behind * n_behind - 2.0 * n * n_behind * turn)
-    return np.abs(n_behind * turn - n) / normal

@@ -7,7 +7,9 @@ Reflectivities are Fresnel's for bare glass at the angle of each ray, mean of bo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from ...core.arguments import check_arguments
 from ...core.docstrings import Description, described
 from ...core.errors import DomainError
 from ...core.plotting import RED, figure_at, plain_text, styled
+from ...core.threads import thread_count
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
@@ -243,14 +246,16 @@ def ghosts(
             progress(1)
     edge = telescope.field_radius * np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
     rim = request.at_fields(edge).bundles(request.wavelength, np.zeros((1, 2))).chief_landing()
-    found = [_measure(landing, direct) for landing in landings if landing.weight.sum() > 0]
+    with ThreadPoolExecutor(thread_count(threads)) as pool:
+        lit = [landing for landing in landings if landing.weight.sum() > 0]
+        found = list(pool.map(partial(_measure, direct=direct), lit))
     # Where no ray from the edge of the field arrives, the map covers whole ghosts.
     radius = float(np.nanmax(np.linalg.norm(rim, axis=-1), initial=0.0)) or max(
         (g.diameter for g in found), default=1.0
     )
     edges = np.linspace(-1.1 * radius, 1.1 * radius, _MAP + 1)
     together = np.zeros((_MAP, _MAP))
-    for landing in landings:
+    for landing in lit:
         together += _irradiance(landing, edges, edges) / direct
     return Ghosts(
         request=request,

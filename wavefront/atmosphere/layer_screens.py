@@ -196,14 +196,15 @@ class LayerScreens(Layers):
                 screens.setflags(write=False)
                 self._cache[kind], self._cache[_made(kind)] = screens, np.zeros((self.layer_count, size), dtype=bool)
             screens, made = self._cache[kind], self._cache[_made(kind)]
+            base: Any = screens.base
             wanted = np.ones(made.shape, dtype=bool) if rows is None or kind != "slopes" else rows
             lacking = (wanted & ~made).any(axis=1)
             if made.any():
                 wanted = np.ones(made.shape, dtype=bool)
             for layer in np.flatnonzero(lacking):
                 chosen = in_whole_blocks(wanted[layer] & ~made[layer])
-                some = {} if chosen.all() else {"rows": chosen}
-                make(int(layer), threads=threads, out=screens.base[layer], **some)
+                some: dict[str, Any] = {} if chosen.all() else {"rows": chosen}
+                make(int(layer), threads=threads, out=base[layer], **some)
                 made[layer] |= chosen
             return screens
 

@@ -7,7 +7,13 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError, UnknownNameError
-from pachon.design.metrics.ghost_paths import Coatings, GhostTrace, fresnel_reflectivity, ghost_pairs
+from pachon.design.metrics.ghost_paths import (
+    Coatings,
+    GhostTrace,
+    fresnel_reflectivity,
+    ghost_pairs,
+    refracted_reflectivity,
+)
 from pachon.design.metrics.ghosts import ghosts
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.shape import Conic, Plane
@@ -57,6 +63,19 @@ def test_fresnel():
     assert fresnel_reflectivity(inside, 1.5, 1.0) == pytest.approx(float(fresnel_reflectivity(np.cos(0.7), 1.0, 1.5)))
     assert fresnel_reflectivity(np.cos(0.8), 1.5, 1.0) == 1.0
     assert fresnel_reflectivity(np.array(0.3), 1.2, 1.2) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1.0, 1.5), (1.8, 1.0), (1.45, 1.46)])
+def test_reflectivity_from_the_angle_of_turn(before, after):
+    # Snell's law in the plane, and Fresnel's equations in sines and tangents of sums and differences of the angles.
+    incidence = np.linspace(0.02, 0.97, 40) * np.arcsin(min(1.0, after / before))
+    refraction = np.arcsin(before / after * np.sin(incidence))
+    across = np.sin(incidence - refraction) / np.sin(incidence + refraction)
+    along = np.tan(incidence - refraction) / np.tan(incidence + refraction)
+    found = refracted_reflectivity(np.cos(incidence - refraction), before, after)
+    # Cancellation of cosines near 1: 1e-16 over the square of the difference of the indices.
+    assert found == pytest.approx(0.5 * (across**2 + along**2), rel=1e-9, abs=1e-12)
+    assert refracted_reflectivity(np.array([0.9, 1.0]), 1.2, 1.2).tolist() == [0.0, 0.0]
 
 
 def test_the_ghost_of_a_plate(with_plate):
