@@ -2,8 +2,8 @@
 
 Run: python benchmarks/height_cost.py [--bands r y]
 
-No turbulence and no noise: all is due to the optics, in silicon, at the seeing of Cerro Pachon. First the FWHM of plane
-CCDs at several heights and distances from the axis: best focus, and the slope of the FWHM with height off it. Then
+No turbulence and no noise: all is due to the optics, in silicon, at the seeing of Cerro Pachon. First FWHM and
+size of plane CCDs at several heights and distances from the axis: best focus, and the slope with height off it. Then
 planes, LSSTCam as built and the simulated budget of Jee & Tyson (2011), each at its best focus as a whole: mean FWHM,
 rms e, xi+ of e, and of what polynomials of order 2 and 4 of each CCD leave, fitted to the very places (no noise).
 """
@@ -26,7 +26,7 @@ _PLACES = 8
 
 
 def stars(instrument, fields, plane):
-    """Return FWHM [arcsec], e1, e2 of long-exposure PSFs on a plane."""
+    """Return FWHM [arcsec], e1, e2 and size [arcsec] of long-exposure PSFs on a plane."""
     found = []
     for first in range(0, len(fields), 2048):
         psfs = pachon.make_psfs(
@@ -39,7 +39,8 @@ def stars(instrument, fields, plane):
             silicon=Silicon(),
         )
         shapes = measure_shapes(psfs.image, psfs.pixel_scale, instrument.weight_fwhm)
-        found.append(np.stack([fwhm(psfs.image, psfs.pixel_scale) / ARCSEC, shapes.e1, shapes.e2], axis=1))
+        widths = fwhm(psfs.image, psfs.pixel_scale) / ARCSEC, shapes.size / ARCSEC
+        found.append(np.stack([widths[0], shapes.e1, shapes.e2, widths[1]], axis=1))
     return np.concatenate(found)
 
 
@@ -48,20 +49,21 @@ def against_height(instrument, camera) -> float:
     flat, radius, foci = pachon.FocalPlane.flat(camera), np.hypot(*camera.centers.T), []
     for distance in (0.0, 0.1, 0.2, 0.3):
         fields = instrument.fields(camera.centers[np.argsort(np.abs(radius - distance))[:4]])
-        width = [stars(instrument, fields, level_plane(flat, h * 1e-6))[:, 0].mean() for h in _HEIGHTS]
-        fit = np.polynomial.Polynomial.fit(_HEIGHTS, np.square(width), 4)
-        fine = np.linspace(_HEIGHTS[0], _HEIGHTS[-1], 1201)
-        values = np.sqrt(fit(fine))
-        best = fine[values.argmin()]
-        slopes = np.interp(best + np.array(_OFF_FOCUS), fine, np.gradient(values, fine))
-        foci.append(best)
-        print(
-            f"  {np.degrees(np.hypot(*fields.T)).mean():5.2f} deg   best focus {best:6.1f} um   FWHM {values.min():.4f}"
-            + "   slope ["
-            + ", ".join(f"{1e3 * s:.1f} mas/um at {o:g} um" for s, o in zip(slopes, _OFF_FOCUS, strict=True))
-            + "]"
-        )
-    return float(np.mean(foci))
+        measured = np.array([stars(instrument, fields, level_plane(flat, h * 1e-6)).mean(axis=0) for h in _HEIGHTS])
+        line = f"  {np.degrees(np.hypot(*fields.T)).mean():5.2f} deg"
+        for label, width in (("FWHM", measured[:, 0]), ("size", measured[:, 3])):
+            fit = np.polynomial.Polynomial.fit(_HEIGHTS, np.square(width), 4)
+            fine = np.linspace(_HEIGHTS[0], _HEIGHTS[-1], 1201)
+            values = np.sqrt(fit(fine))
+            best = fine[values.argmin()]
+            slopes = np.interp(best + np.array(_OFF_FOCUS), fine, np.gradient(values, fine))
+            line += f"   {label} {values.min():.4f} at {best:6.1f} um, slope ["
+            line += ", ".join(f"{1e3 * s:.1f} mas/um at {o:g} um" for s, o in zip(slopes, _OFF_FOCUS, strict=True))
+            line += "]"
+            foci.append(best)
+        print(line, flush=True)
+    # Those of the FWHM.
+    return float(np.mean(foci[::2]))
 
 
 def correlations(instrument, camera, focus) -> None:
@@ -79,8 +81,10 @@ def correlations(instrument, camera, focus) -> None:
         for raft in camera.raft_names:
             moved = moved.with_moved(raft, dz=1e-6 * focus - plane.height(*xy.T).mean())
         found = stars(instrument, fields, moved)
-        print(f"  {label:16s} FWHM {found[:, 0].mean():.4f}   rms e {1e3 * np.sqrt((found[:, 1:] ** 2).mean()):.2f}e-3")
-        for name, left in [("e", found[:, 1:])] + [(f"order {n}", residual(found[:, 1:], u, v, n)) for n in (2, 4)]:
+        print(
+            f"  {label:16s} FWHM {found[:, 0].mean():.4f}   rms e {1e3 * np.sqrt((found[:, 1:3] ** 2).mean()):.2f}e-3"
+        )
+        for name, left in [("e", found[:, 1:3])] + [(f"order {n}", residual(found[:, 1:3], u, v, n)) for n in (2, 4)]:
             catalogue = treecorr.Catalog(x=fields[:, 0], y=fields[:, 1], g1=left[:, 0], g2=left[:, 1], patch=ccd)
             pairs = treecorr.GGCorrelation(
                 bin_type="Log", min_sep=1.5 * ARCMIN, max_sep=180.0 * ARCMIN, nbins=5, cross_patch_weight="match"

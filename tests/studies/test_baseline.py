@@ -526,5 +526,5 @@ def test_a_rotated_camera_has_the_figures_that_symmetry_demands(mine):
         (mine / "run.yaml").write_text(yaml.safe_dump({**RUN, "rotator_deg": angle}))
         check = check_baseline(mine / "camera.json", threads=1)
         found[angle] = {d.name: d.found for d in check.out}
-    assert kinds_out(check) >= {"rms_e"}
+    assert "psf" in kinds_out(check)
     assert found[0.0] != found[90.0]
