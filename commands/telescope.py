@@ -59,7 +59,8 @@ def info_command(
     if as_json:
         print_json(description)
         return
-    console.print(f"{description['name']}: {description['description']}", highlight=False)
+    title = ": ".join(filter(None, (description["name"], description["description"])))
+    console.print(title, highlight=False)
     console.print(f"source: {description['source']}\n", highlight=False)
     caption = "In brackets: what a surface is made or drawn to; it stops no light."
     drawn = any(s["clear_m"] is None and s["semi_diameter_m"] for s in description["surfaces"])

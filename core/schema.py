@@ -279,7 +279,7 @@ def known_keys(model: type[BaseModel]) -> tuple[str, ...]:
     return tuple(keys)
 
 
-def shown(value: Any) -> str:
+def json_text(value: Any) -> str:
     """Return a value as JSON, cut short."""
     return cut_short(json.dumps(value, ensure_ascii=False, default=str))
 
@@ -327,7 +327,7 @@ def _in_one_line(problem: Mapping[str, Any], content: Any, source: str, error: t
 
 def _as_in(error: type[PachonError], value: Any) -> str:
     """Return a value cut short: as JSON in configurations, else as Python has it."""
-    return shown(value) if error is ConfigError else cut_short(repr(value))
+    return json_text(value) if error is ConfigError else cut_short(repr(value))
 
 
 #: Keys that tell the entries of a list apart in messages, by the key of the list.

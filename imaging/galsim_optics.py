@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.errors import DomainError
-from ..core.units import ARCSEC, metres, radians, require_positive
+from ..core.units import ARCSEC, angle, metres, require_positive
 from ..models.camera.cameras import load_camera
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.silicon import Silicon
@@ -23,6 +23,7 @@ from ..models.media.silicon import absorption_length, silicon_index
 from ..models.telescope import Telescope
 from ..raytrace.photons import LandedPhotons, PhotonBeam, land_photons
 from ..raytrace.rays import field_angles, field_direction
+from ..sky.pointing import Pointing
 
 
 class PachonOptics(galsim.PhotonOp):
@@ -94,7 +95,7 @@ class PachonOptics(galsim.PhotonOp):
             raise DomainError("ccd and image_pos: expected both or none of them")
         self.telescope, self.focal_plane, self.threads = telescope, focal_plane, threads
         self.silicon, self.diffusion = silicon, float(metres(diffusion, "diffusion"))
-        axes = _telescope_axes(pointing, position_angle)
+        axes = Pointing.of(pointing, angle(position_angle, "position_angle")).axes
         if sky_pos is None:
             assert field is not None
             to_source = -field_direction(*field, projection) @ axes
@@ -225,18 +226,6 @@ def _content(value: Any) -> Any:
     if is_dataclass(value):
         return tuple(_content(getattr(value, field.name)) for field in fields(value))
     return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
-
-
-def _telescope_axes(pointing: ArrayLike, position_angle: ArrayLike) -> np.ndarray:
-    """Return the axes of the telescope as rows, in equatorial coordinates."""
-    angles, rho = radians(pointing, "pointing"), float(radians(position_angle, "position_angle"))
-    if angles.shape != (2,) or not np.isfinite([*angles, rho]).all():
-        raise DomainError(f"pointing = {pointing!r}, position_angle = {position_angle!r}: expected finite angles")
-    ra, dec = angles
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    x, y = east * np.cos(rho) - north * np.sin(rho), east * np.sin(rho) + north * np.cos(rho)
-    return np.stack([x, y, np.cross(x, y)])
 
 
 def _west_and_north(direction: np.ndarray) -> np.ndarray:

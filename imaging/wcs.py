@@ -147,7 +147,7 @@ class CcdWcs:
     @property
     def _turn(self) -> np.ndarray:
         """Rotation of vectors (east, north, outwards) at the reference point into those at the pointing, [3, 3]."""
-        return _axes(*self.pointing) @ _axes(*self.reference).T
+        return Pointing(*self.pointing).axes @ Pointing(*self.reference).axes.T
 
     def _derivative(self, u: np.ndarray) -> np.ndarray:
         """Return d(u + distortion)/du, shape [n, 2, 2]."""
@@ -214,7 +214,7 @@ def ccd_wcs(
     # Equal skies have equal headers: angles are taken modulo a turn.
     center = (aim.ra % (2.0 * np.pi), aim.dec)
     ra, dec = aim.to_celestial(to_sky(np.zeros((1, 2))))[0].tolist()
-    to_reference = _axes(ra, dec) @ _axes(*center).T
+    to_reference = Pointing(ra, dec).axes @ Pointing(*center).axes.T
 
     def traced(points: int) -> tuple[np.ndarray, np.ndarray]:
         """Return places on the CCD, from -1 to 1 along both axes, and on the tangent plane about its middle."""
@@ -322,12 +322,6 @@ def _forward(
     distortion = np.einsum("ab,bij->aij", np.linalg.inv(linear), tables)
     distortion[:, [0, 0, 1], [0, 1, 0]] = 0.0
     return linear, reference, distortion
-
-
-def _axes(ra: float, dec: float) -> np.ndarray:
-    """Return the unit vectors towards east, north and outwards at a place of the sky [rad], as rows."""
-    (sa, sd), (ca, cd) = np.sin([ra, dec]), np.cos([ra, dec])
-    return np.array([[-sa, ca, 0.0], [-sd * ca, -sd * sa, cd], [cd * ca, cd * sa, sd]])
 
 
 def _projected(plane: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

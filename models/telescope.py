@@ -315,6 +315,13 @@ class Telescope:
                     frames[group] = move_frame(*frames[group], rotation=rotation, about=centre, shift=dr)
         return replace(self, surfaces=surfaces, group_frames=frames)
 
+    @property
+    def length_unit(self) -> tuple[str, float]:
+        """Unit of lengths in tables and its length [m]: the file's, else mm for pupils under a metre, m for others."""
+        if self.design_data != DesignData():
+            return self.design_data.length_unit, self.design_data.unit
+        return ("mm", 1e-3) if self.pupil_diameter < 1.0 else ("m", 1.0)
+
     def with_rotator(self, angle: ArrayLike) -> Telescope:
         """Return the telescope with its camera rotated about the camera's own axis.
 

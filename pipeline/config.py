@@ -25,8 +25,8 @@ from ..core.schema import (
     Section,
     Switch,
     Whole,
+    json_text,
     plain_number,
-    shown,
     validated,
 )
 from ..core.yaml_reader import read_mapping
@@ -349,7 +349,9 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """Return one ``key: old -> new`` for each key in which two resolved configurations differ."""
     before, after = dict(_flat(old)), dict(_flat(new))
     keys = [*before, *(k for k in after if k not in before)]
-    return [f"{k}: {shown(before.get(k))} -> {shown(after.get(k))}" for k in keys if before.get(k) != after.get(k)]
+    return [
+        f"{k}: {json_text(before.get(k))} -> {json_text(after.get(k))}" for k in keys if before.get(k) != after.get(k)
+    ]
 
 
 def digest(content: Any) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.errors import ConfigError, error_context
-from ..core.schema import shown
+from ..core.schema import json_text
 from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..core.units import ARCSEC
 from ..design.parameters.changes import apply_changes
@@ -288,12 +288,12 @@ def _check(config: Configuration, telescope: Telescope) -> None:
     if stars.catalogue is None:
         for key in ("columns", "brightest", "faintest"):
             if getattr(stars, key) not in (None, {}):
-                raise ConfigError(f"stars.{key} = {shown(getattr(stars, key))}: expected stars.catalogue")
+                raise ConfigError(f"stars.{key} = {json_text(getattr(stars, key))}: expected stars.catalogue")
     else:
         for key in stars.columns:
             if key not in NAMES:
                 raise ConfigError(
-                    f"stars.columns.{key} = {shown(stars.columns[key])}: expected keys of {', '.join(NAMES)}"
+                    f"stars.columns.{key} = {json_text(stars.columns[key])}: expected keys of {', '.join(NAMES)}"
                 )
         if not given(stars.brightest) < given(stars.faintest):
             raise ConfigError(
@@ -324,7 +324,7 @@ def _check(config: Configuration, telescope: Telescope) -> None:
         key = plane.changed[0]
         value = plane.model_dump(by_alias=True)[key]
         raise ConfigError(
-            f"focal_plane.{key} = {shown(value)}: expected no budget with measured heights, "
+            f"focal_plane.{key} = {json_text(value)}: expected no budget with measured heights, "
             f"focal_plane.heights = {plane.heights}"
         )
     if config.psf.engine == "long_exposure" and not config.atmosphere.enabled:

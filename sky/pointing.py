@@ -64,6 +64,13 @@ class Pointing:
             raise DomainError(f"pointing = {shown(pointing)}: expected right ascension and declination, finite angles")
         return cls(float(center[0]), float(center[1]), position_angle)
 
+    @property
+    def axes(self) -> np.ndarray:
+        """Unit vectors along the telescope's +x, +y and +z (towards the sky) in equatorial coordinates, as rows."""
+        (sa, sd, sr), (ca, cd, cr) = (f([self.ra, self.dec, self.position_angle]) for f in (np.sin, np.cos))
+        east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])
+        return np.stack([cr * east - sr * north, sr * east + cr * north, np.array([cd * ca, cd * sa, sd])])
+
     @check_arguments
     def to_sky(self, slopes: ArrayLike) -> np.ndarray:
         """Return (xi, eta) [rad] of the sources of light of gnomonic slopes (tx, ty), both shape [n, 2]."""

@@ -15,7 +15,6 @@ import numpy as np
 
 from ...core.errors import DomainError
 from ...core.units import ARCSEC
-from ...models.design_data import DesignData
 from ...models.first_order import first_order, seidel_sums
 from ...models.media.medium import ConstantIndex
 from ...models.shapes.shape import Rotational
@@ -30,19 +29,6 @@ _TYPES = {
     Interaction.PASS: "baffle",
     Interaction.PHASE: "phase screen",
 }
-#: Diameter of the pupil below which lengths are in millimetres [m].
-_SMALL = 1.0
-
-
-def length_unit(telescope: Telescope) -> tuple[str, float]:
-    """Return the unit of length of a telescope's tables, and its length [m].
-
-    It is that of the lens file; without design data mm for pupils under a metre, else m.
-    """
-    data = telescope.design_data
-    if data != DesignData():
-        return data.length_unit, data.unit
-    return ("mm", 1e-3) if telescope.pupil_diameter < _SMALL else ("m", 1.0)
 
 
 def prescription_rows(telescope: Telescope, wavelength: float, semi_diameters: dict[str, float]) -> list[list[str]]:
@@ -50,7 +36,7 @@ def prescription_rows(telescope: Telescope, wavelength: float, semi_diameters: d
 
     Semi-diameters are in metres by name of the surface; the wavelength [m] is that of the indices.
     """
-    _, unit = length_unit(telescope)
+    _, unit = telescope.length_unit
     surfaces = telescope.surfaces
     rows = []
     for i, surface in enumerate(surfaces):
@@ -101,7 +87,7 @@ def _more(surface: Surface, unit: float) -> str:
 
 def first_order_rows(telescope: Telescope, wavelength: float) -> list[tuple[str, str]]:
     """Return names and values of the first-order data at a wavelength [m]; of centred telescopes all of them."""
-    name, unit = length_unit(telescope)
+    name, unit = telescope.length_unit
 
     def text(value: float) -> str:
         return f"{value / unit:.8g} {name}" if math.isfinite(value) else "at infinity"

@@ -18,7 +18,7 @@ from ...models.telescope import Telescope
 from ...wavefront.pupil_sampling import CHIEF_RAY
 from ...wavefront.request import Request
 from ..layout.layout import layout
-from .prescription_table import COLUMNS, first_order_rows, length_unit, prescription_rows
+from .prescription_table import COLUMNS, first_order_rows, prescription_rows
 from .sections import SECTIONS, Section, Where
 
 #: Longest drawing that is kept as one [byte]; a longer one becomes pixels.
@@ -83,7 +83,7 @@ def design_report(
         Path(__file__).parent / "templates",
         "design_report.html",
         telescope=telescope,
-        unit=length_unit(telescope)[0],
+        unit=telescope.length_unit[0],
         columns=COLUMNS,
         rows=rows,
         first_order=first,

@@ -82,7 +82,7 @@ def describe(telescope: Telescope) -> dict[str, Any]:
         "object_distance_m": telescope.object_distance if math.isfinite(telescope.object_distance) else None,
         "camera": telescope.camera,
         "groups": {name: list(members) for name, members in telescope.groups.items()},
-        "length_unit": telescope.design_data.length_unit,
+        "length_unit": telescope.length_unit[0],
         "design": asdict(telescope.design_data),
         "surfaces": [
             _row(surface, following, wavelength)

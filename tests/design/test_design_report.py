@@ -9,7 +9,7 @@ import pytest
 
 import pachon
 from pachon.design.report import report, sections
-from pachon.design.report.prescription_table import first_order_rows, length_unit, prescription_rows
+from pachon.design.report.prescription_table import first_order_rows, prescription_rows
 from pachon.models.shapes.shape import EvenAsphere, Plane
 from pachon.models.surface import Interaction, Surface
 from pachon.models.telescope import VACUUM
@@ -58,8 +58,8 @@ def test_the_prescription_is_in_the_signs_of_lens_design(paraboloid):
     mirror = EvenAsphere(4.0, -1.0, (1e-6, -2e-9))
     telescope = paraboloid(2.0, 10.0)
     telescope = replace(telescope, surfaces=(replace(telescope.surfaces[0], shape=mirror), telescope.surfaces[1]))
-    assert length_unit(telescope) == ("mm", 1e-3)
-    assert length_unit(replace(telescope, pupil_diameter=1.0)) == ("m", 1.0)
+    assert telescope.length_unit == ("mm", 1e-3)
+    assert replace(telescope, pupil_diameter=1.0).length_unit == ("m", 1.0)
     first, last = prescription_rows(telescope, 5e-7, {"mirror": 0.1, "detector": 0.02})
     # A concave mirror at the start: radius and thickness negative; a4 = 1e-6 /m^3 is 1e-15 /mm^3.
     assert first[:7] == ["mirror", "mirror", "-4000", "-2000", "mirror", "", "100"]

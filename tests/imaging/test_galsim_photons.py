@@ -317,7 +317,7 @@ def test_an_image_is_drawn_through_the_telescope(lsst_r, wcs):
         (((0.0, 0.0),), {"ccd": "R22_S11"}, "ccd and image_pos: expected both"),
         (((0.5, 0.0),), {}, "expected within 2.5 deg"),
         (((0.0, 0.0),), {"pixel_size": 0.0}, "pixel_size = .*expected a positive"),
-        (((0.0, 0.0),), {"pointing": 3.0}, "expected finite angles"),
+        (((0.0, 0.0),), {"pointing": 3.0}, "expected right ascension and declination, finite angles"),
         ((), {"sky_pos": galsim.CelestialCoord(180 * galsim.degrees, 0 * galsim.degrees)}, "in front of the telescope"),
     ],
 )
