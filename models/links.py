@@ -106,7 +106,8 @@ class Solve:
 def check_links(pickups: Sequence[Pickup], solves: Sequence[Solve], surface_names: Sequence[str]) -> None:
     """Raise PrescriptionError where surfaces are missing, or a value follows two others."""
     taken: set[tuple[str, str]] = set()
-    for link in (*pickups, *solves):
+    links: list[Pickup | Solve] = [*pickups, *solves]
+    for link in links:
         quantity = link.quantity if isinstance(link, Pickup) else "thickness"
         for name in (link.surface, link.source) if isinstance(link, Pickup) else (link.surface,):
             if name not in surface_names or (quantity == "thickness" and name == surface_names[-1]):

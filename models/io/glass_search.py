@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from ...core.errors import nearest
 from ..media.medium import Medium
 from .glass_catalogue import MAKERS, SUBSTANCES, GlassCatalogue
 
@@ -19,6 +20,13 @@ def find_glass(name: str, first: Iterable[GlassCatalogue] = ()) -> Medium | None
         if known is not None:
             return catalogue[known]
     return None
+
+
+def glass_hint(name: str, first: Iterable[GlassCatalogue] = ()) -> str:
+    """Return what to do about a glass of no catalogue: the nearest names, and where its data may come from."""
+    names = dict.fromkeys(glass for catalogue in _all(first) for glass in catalogue)
+    found = nearest(name, names, n=3)
+    return f"expected the catalogue of its maker (--glass-catalogue FILE.agf){f'; {found}' if found else ''}"
 
 
 def _all(first: Iterable[GlassCatalogue]) -> Iterator[GlassCatalogue]:

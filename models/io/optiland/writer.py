@@ -36,7 +36,7 @@ def telescope_to_optiland(telescope: Telescope) -> str:
         stop, system = own_stop(t), system_items(t)
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)
-        surfaces = [
+        surfaces: list[dict[str, Any]] = [
             {
                 "type": "ObjectSurface",
                 "geometry": {"type": "Plane", "cs": _system(-t.object_distance - first), "radius": math.inf},

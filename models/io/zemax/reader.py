@@ -29,7 +29,7 @@ from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
 from ...telescope import VACUUM, Telescope, rotation_matrix
 from ..glass_catalogue import GlassCatalogue
-from ..glass_search import find_glass
+from ..glass_search import find_glass, glass_hint
 from .apertures import read_aperture
 from .design import Fields, length_unit, read_aiming, read_environment, read_fields, stated_fields
 from .file import IGNORED_HEADER, IGNORED_SURFACE, Block, Findings, ZemaxFile
@@ -271,7 +271,8 @@ class _LensReader:
             found = find_glass(name, self.catalogues)
             if found is not None:
                 return False, found
-            error = line.problem(f"{line.shown}: the glass is in no catalogue")
+            hint = glass_hint(name, self.catalogues)
+            error = line.problem(f"{line.shown}: the glass is in no catalogue: {hint}")
             if nd <= 1 or (nd, vd) == PLACEHOLDER:
                 raise error
             self.findings.report(error, "taken as a model glass of its indices")
