@@ -19,7 +19,8 @@ from ..models.design_data import DesignData
 from ..models.surface import Interaction
 from ..models.telescope import Telescope
 from .landing import Landing, derivatives, determinants, find_points, solved
-from .rays import field_angles, field_direction, object_points, straight_bundles
+from .rays import Rays, field_angles, field_direction, object_points, straight_bundles
+from .smooth_pupil import FEWEST, smooth_pupil
 from .trace import trace
 
 #: Step of the differences that the first derivatives come from, in units of the radius of the entrance pupil.
@@ -43,9 +44,30 @@ def entrance_points(telescope: Telescope, directions: np.ndarray, wavelength: fl
     if data.aiming == "off":
         return pupil
     stop = stop_of(telescope)
+    relative = pupil / (0.5 * telescope.pupil_diameter)
+    relative = np.broadcast_to(relative, (len(directions), *pupil.shape[-2:]))
+    if relative.shape[1] < FEWEST:
+        return _one_by_one(telescope, stop, directions, wavelength, relative)
+    found = np.empty(relative.shape)
+    for i, target in enumerate(relative):
+        light = directions[i : i + 1]
+
+        def at_stop(points: np.ndarray, light: np.ndarray = light) -> np.ndarray:
+            return stop.relative(straight_bundles(telescope, light, wavelength, points))
+
+        def search(some: np.ndarray, light: np.ndarray = light) -> np.ndarray:
+            return _one_by_one(telescope, stop, light, wavelength, some[None])[0]
+
+        found[i] = smooth_pupil(target, at_stop, search)
+    return found
+
+
+def _one_by_one(
+    telescope: Telescope, stop: Stop, directions: np.ndarray, wavelength: float, relative: np.ndarray
+) -> np.ndarray:
+    """Return :func:`entrance_points` of pupil points in units of the radius, [n_direction, n_pupil, 2]."""
     n, difference = len(directions), _difference(telescope)
     chief = _chief_points(telescope, stop, directions, wavelength)
-    relative = np.broadcast_to(pupil / (0.5 * telescope.pupil_diameter), (n, *pupil.shape[-2:]))
     target = (stop.radius * relative @ stop.axes.T).reshape(-1, 2)
     rays = np.repeat(directions, relative.shape[1], axis=0)
     landing = stop.landing(telescope, rays, wavelength)
@@ -81,8 +103,8 @@ def pupil_coordinates(telescope: Telescope, direction: np.ndarray, wavelength: f
     if telescope.design_data.aiming == "off":
         return points
     stop = stop_of(telescope)
-    landing = stop.landing(telescope, direction[None], wavelength)(points, np.zeros(len(points), dtype=int))
-    return landing @ stop.axes * (0.5 * telescope.pupil_diameter / stop.radius)
+    rays = straight_bundles(telescope, direction[None], wavelength, points)
+    return stop.relative(rays) * (0.5 * telescope.pupil_diameter)
 
 
 def require_aimed(telescope: Telescope, directions: np.ndarray, points: np.ndarray) -> None:
@@ -112,6 +134,11 @@ class Stop:
     front: Telescope
     radius: float
     axes: np.ndarray
+
+    def relative(self, rays: Rays) -> np.ndarray:
+        """Return where rays meet the stop [n, 2], along the axes of the entrance pupil, in units of the radius."""
+        landing = self.front.surfaces[-1].to_local(trace(self.front, rays).position)[:, :2]
+        return landing @ self.axes / self.radius
 
     def landing(self, telescope: Telescope, directions: np.ndarray, wavelength: float) -> Landing:
         """Return the function from points of the entrance pupil to the stop for rays of given chief directions."""

@@ -13,6 +13,7 @@ from pachon.models.design_data import DesignData
 from pachon.models.io.prescription import load_telescope
 from pachon.raytrace.aiming import stop_of
 from pachon.raytrace.rays import Rays
+from pachon.raytrace.smooth_pupil import FEWEST, smooth_pupil
 
 DATA = Path(__file__).parents[1] / "data" / "zmx"
 WIDE = DATA / "circular_aperture_example_with_aperture.zmx"
@@ -139,3 +140,42 @@ def test_a_stop_that_cannot_be_found_is_said(wide):
         wide.with_design(aiming="true")
     with pytest.raises(PrescriptionError, match="aiming = 'paraxial': expected a surface that is the stop"):
         pachon.Request.of(pachon.load_telescope("auxtel"), aiming="paraxial")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("degrees", "aiming"), [((0.0, 50.0), "paraxial"), ((-20.0, 30.0), "real")])
+def test_very_many_rays_are_those_found_one_by_one(wide, degrees, aiming):
+    """A polynomial and one step of Newton's method, against the search ray by ray."""
+    telescope = wide.with_design(aiming=aiming)
+    angle = np.arange(FEWEST) * 2.399963
+    points = (np.sqrt((np.arange(FEWEST) + 0.5) / FEWEST) * [np.cos(angle), np.sin(angle)]).T
+    many, field = launched(telescope, np.deg2rad(degrees), points), np.deg2rad(degrees)
+    some = np.arange(0, FEWEST, 97)
+    assert at_stop(telescope, many) == pytest.approx(stop_of(telescope).radius * points, abs=2e-14)
+    few = launched(telescope, field, points[some])
+    assert many.position[some] == pytest.approx(few.position, abs=1e-13)
+
+
+def test_rays_that_polynomials_do_not_find_are_searched_for():
+    """A map with a fold outside the unit disk: found within it; beyond, what the search says."""
+
+    def stop(points):
+        # x - x^3 / 6 folds at x = sqrt(2).
+        return np.stack([points[:, 0] - points[:, 0] ** 3 / 6.0, points[:, 1]], axis=-1)
+
+    asked = []
+
+    def search(target):
+        asked.append(len(target))
+        found = np.array([[min(np.roots([-1 / 6, 0, 1, -x]).real, key=abs), y] for x, y in target])
+        found[np.abs(target[:, 0]) > 0.9] = np.nan
+        return found
+
+    x = np.linspace(-0.94, 0.94, 1001)
+    target = np.stack([x, 0.1 * x], axis=-1)
+    points = smooth_pupil(target, stop, search)
+    known = np.isfinite(points[:, 0])
+    assert stop(points[known]) == pytest.approx(target[known], abs=1e-13)
+    assert known[np.abs(x) <= 0.9].all()
+    # The nodes, and what Newton's method has not found: far from every ray.
+    assert sum(asked[1:]) < 100

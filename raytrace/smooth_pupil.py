@@ -1,0 +1,120 @@
+"""Aiming of very many rays of one field: a polynomial through some rays, and one step of Newton's method for each.
+
+The map from points of the stop to points of the entrance pupil is smooth. A polynomial through rays that are found one
+by one predicts all others so well that one trace to the stop and one step leave less than rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+#: Rays of a field from which on this is faster than to find each by itself.
+FEWEST = 1500
+#: Degree of the polynomials, and rings of the rays that they go through, of six rays more each.
+_DEGREE, _RINGS = 10, 9
+#: Distance at the stop, over its radius, at which a ray is found, and one whose square is less than that.
+_FOUND, _NEAR = 1e-13, 1e-7
+#: Error of the slopes of the polynomials over that of their values at most: the square of the degree, and ten times it.
+_SLOPES = 1e3
+#: Steps after which a ray is left to the search; rays at once, and those whose monomials stay in the cache.
+_STEPS, _AT_ONCE, _IN_CACHE = 8, 1 << 18, 1 << 10
+
+#: Function of points [n, 2]; NaN where a ray does not arrive, or is not found.
+PointMap = Callable[[np.ndarray], np.ndarray]
+
+
+def smooth_pupil(target: np.ndarray, stop: PointMap, search: PointMap) -> np.ndarray:
+    """Return the points [n, 2] of the entrance pupil [m] whose rays reach points of the stop, in units of its radius.
+
+    ``stop`` maps points of the entrance pupil to those of the stop; ``search`` finds points of the entrance pupil one
+    by one. It is taken where polynomials fail: beyond folds of the pupil, and where rays do not arrive.
+    """
+    reach = max(1.0, float(np.linalg.norm(target, axis=1).max()))
+    nodes = reach * _nodes()
+    at_nodes = search(nodes)
+    known = np.isfinite(at_nodes).all(axis=1)
+    basis = _basis(nodes[known] / reach)
+    if known.sum() < 1.5 * basis.shape[1]:
+        return search(target)
+    coefficients = np.linalg.lstsq(basis, at_nodes[known], rcond=None)[0]
+    table = np.concatenate([coefficients, *(_derived(coefficients, axis) / reach for axis in (0, 1))], axis=1)
+    sense = np.sign(np.linalg.det(table[0, 2:].reshape(2, 2)))
+    # A step leaves the error of its slopes, times the distance: where that is rounding, no trace has to confirm it.
+    error = float(np.abs(basis @ coefficients - at_nodes[known]).max() / np.abs(table[0, 2:]).max())
+    near = min(_NEAR, _FOUND / max(_SLOPES * error, _FOUND))
+    found = np.empty_like(target)
+    for first in range(0, len(target), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        found[part] = _by_newton(target[part], table, reach, float(sense), near, stop)
+    lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    if len(lost):
+        found[lost] = search(target[lost])
+    return found
+
+
+def _by_newton(
+    target: np.ndarray, table: np.ndarray, reach: float, sense: float, near: float, stop: PointMap
+) -> np.ndarray:
+    """Return the points of the entrance pupil [n, 2], NaN where they are not found.
+
+    A ray is found by the step that begins within a distance `near` of its target, over the radius of the stop.
+    """
+    value = np.empty((len(target), 6))
+    for first in range(0, len(target), _IN_CACHE):
+        part = slice(first, first + _IN_CACHE)
+        value[part] = _basis(target[part] / reach) @ table
+    points, by_x, by_y = value[:, :2].copy(), value[:, 2:4], value[:, 4:]
+    left = np.arange(len(target))
+    for step in range(_STEPS):
+        some = slice(None) if step == 0 else left
+        miss = target[some] - stop(points[some])
+        points[some] += miss[:, :1] * by_x[some] + miss[:, 1:] * by_y[some]
+        left = left[~((np.abs(miss[:, 0]) <= near) & (np.abs(miss[:, 1]) <= near))]
+        if not len(left):
+            break
+    points[left] = np.nan
+    # Beyond a fold the map goes the other way round.
+    points[~((by_x[:, 0] * by_y[:, 1] - by_x[:, 1] * by_y[:, 0]) * sense > 0.0)] = np.nan
+    return points
+
+
+def _nodes() -> np.ndarray:
+    """Return points of the unit disk, denser towards the rim, shape [n, 2]."""
+    rings = np.arange(1, _RINGS + 1)
+    radius = np.sin(0.5 * np.pi * rings / _RINGS)
+    angles = [2.0 * np.pi * np.arange(6 * k) / (6 * k) for k in rings]
+    points = [r * np.stack([np.cos(a), np.sin(a)], axis=-1) for r, a in zip(radius, angles, strict=True)]
+    return np.concatenate([np.zeros((1, 2)), *points])
+
+
+def _powers() -> list[tuple[int, int]]:
+    return [(i, degree - i) for degree in range(_DEGREE + 1) for i in range(degree, -1, -1)]
+
+
+def _basis(points: np.ndarray) -> np.ndarray:
+    """Return the monomials of points, degree by degree, shape [n, n_term]."""
+    terms = np.empty((_TERMS, len(points)))
+    x, y = np.ascontiguousarray(points.T)
+    terms[0] = 1.0
+    k = 1
+    for degree in range(1, _DEGREE + 1):
+        terms[k : k + degree] = terms[k - degree : k] * x
+        terms[k + degree] = terms[k - 1] * y
+        k += degree + 1
+    return terms.T
+
+
+def _derived(coefficients: np.ndarray, axis: int) -> np.ndarray:
+    """Return the coefficients of the derivatives of polynomials along an axis."""
+    place = {power: k for k, power in enumerate(_powers())}
+    out = np.zeros_like(coefficients)
+    for (i, j), k in place.items():
+        power = (i, j)[axis]
+        if power:
+            out[place[(i - 1, j) if axis == 0 else (i, j - 1)]] += power * coefficients[k]
+    return out
+
+
+_TERMS = (_DEGREE + 1) * (_DEGREE + 2) // 2
