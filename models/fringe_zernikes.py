@@ -103,7 +103,8 @@ def fringe_from_noll(coefficients: ArrayLike) -> np.ndarray:
         If a coefficient that is not zero belongs to a term that the Fringe order does not have.
     """
     noll = np.atleast_1d(metres(coefficients, "coefficients"))
-    count = noll.shape[-1]
+    if not (count := noll.shape[-1]):
+        raise DomainError(f"coefficients of shape {noll.shape}: expected at least one")
     other = np.setdiff1d(np.arange(count), _INDEX - 1)
     lost = other[(noll.reshape(-1, count)[:, other] != 0).any(axis=0)]
     if len(lost):

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.table import QTable
 
 from ..core.errors import ConfigError, error_context
+from ..core.files import parsing, read_bytes
 from ..design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ..models.telescope import Telescope
 
@@ -30,10 +31,9 @@ def in_state(telescope: Telescope, path: str, visit: int) -> Telescope:
         If a column is no degree of freedom, or a value is not finite or has a unit that does not convert.
     """
     file = Path(path)
-    try:
-        table = QTable.read(file, format="ascii.ecsv")
-    except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(f"expected a table of states (ECSV): {str(error).splitlines()[0]}", file=file) from None
+    text = read_bytes(file, ConfigError)
+    with parsing(file, "expected a table of states (ECSV)", ConfigError):
+        table = QTable.read(text.decode().splitlines(), format="ascii.ecsv")
     with error_context(file=file):
         if "visit" not in table.colnames or len(table.colnames) < 2:
             raise ConfigError("columns: expected visit, and degrees of freedom such as M2_dz")

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
+from ...core.files import parsing
 from ..options import degrees_pair
 from ..tables import FIELD, Column, Rows
 from .command import Given, Outcome, Study, design_command
@@ -128,10 +129,8 @@ def _grey(path: Path) -> Any:
     """Return a picture as brightness, rows upwards."""
     from matplotlib.image import imread
 
-    try:
+    with parsing(path, "--image: expected a picture, .png", ConfigError):
         values = imread(path)
-    except (OSError, ValueError, SyntaxError) as error:
-        raise ConfigError(f"--image: expected a picture, .png ({error})", file=path) from None
     return (values if values.ndim == 2 else values[..., :3].mean(axis=-1))[::-1].astype(float)
 
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import DomainError, unknown_name
 from ...core.plotting import BLUE, plain_text
+from ...core.units import pure_numbers
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
@@ -232,12 +233,12 @@ def fresnel_transmission(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
     DomainError
         If an index is not positive.
     """
-    if not (n1 > 0 and n2 > 0):
+    if not (0 < n1 < np.inf and 0 < n2 < np.inf):
         raise DomainError(f"n1 = {n1!r}, n2 = {n2!r}: expected positive refractive indices")
-    ci = np.asarray(cosine, dtype=np.float64)
-    square = 1.0 - (n1 / n2) ** 2 * (1.0 - ci**2)
-    ct = np.sqrt(np.maximum(square, 0.0))
-    with np.errstate(invalid="ignore", divide="ignore"):
+    ci = pure_numbers(cosine, "cosine")
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        square = 1.0 - np.square(np.float64(n1) / n2) * (1.0 - ci**2)
+        ct = np.sqrt(np.maximum(square, 0.0))
         s = ((n1 * ci - n2 * ct) / (n1 * ci + n2 * ct)) ** 2
         p = ((n2 * ci - n1 * ct) / (n2 * ci + n1 * ct)) ** 2
     return np.where(square > 0, 1.0 - 0.5 * (s + p), 0.0)

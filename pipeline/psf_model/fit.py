@@ -14,7 +14,7 @@ from .basis import BASES, Basis
 from .checks import as_extent, as_stamps, as_weights, check_apart, check_terms
 from .cross_validation import automatic_orders, choose
 from .description import CleanStars, clean, make_basis, project
-from .polynomial import as_positions, design_matrix, mapped, term_count
+from .polynomial import MOST_ORDER, as_positions, design_matrix, mapped, term_count
 from .shape_noise import ShapeNoise
 
 #: Components of principal components and of shapelets where no number is given (Jee & Tyson 2011, sec. 3).
@@ -81,6 +81,8 @@ def fit_fields(
     if gain is not None and not (np.isfinite(gain) and gain > 0.0):
         raise ConfigError(f"gain = {gain}: expected a number of electrons above 0, or None for no photon noise")
     fixed = None if order == "auto" else int(ORDERS[interpolation] if order is None else order)
+    if fixed is not None and not 0 <= fixed <= MOST_ORDER:
+        raise ConfigError(f"order = {fixed}: expected a polynomial order from 0 to {MOST_ORDER}")
     automatic = fixed is None or n_components == "auto"
     # Those of polynomials; under a process they serve to choose components, and to weigh stars in eigen-PSFs.
     orders = [fixed] if interpolation == "polynomial" and fixed is not None else automatic_orders(n_stars)

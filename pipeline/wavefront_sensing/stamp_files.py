@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.io.registry import IORegistryError
 from astropy.table import Table
 
 from ...core.errors import ProductError
-from ...core.files import require_file
+from ...core.files import parsing, require_file
 
 #: Smallest side of a stamp [pixels].
 _SMALLEST = 8
@@ -63,16 +62,13 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
         If a file cannot be read, has no images, or a table lacks a column or has another number of rows.
     """
     require_file(path, ProductError)
-    try:
-        with fits.open(path, memmap=False) as units:
-            images = [
-                (unit.header, np.asarray(unit.data, dtype=np.float64))
-                for unit in units
-                if unit.is_image and unit.data is not None
-            ]
-            tables = [Table.read(unit) for unit in units if isinstance(unit, fits.BinTableHDU)]
-    except (OSError, ValueError, TypeError) as error:
-        raise ProductError(f"cannot be read as FITS: {' '.join(str(error).split())}", file=path) from None
+    with parsing(path, "cannot be read as FITS", ProductError), fits.open(path, memmap=False) as units:
+        images = [
+            (_described(unit.header), np.asarray(unit.data, dtype=np.float64))
+            for unit in units
+            if unit.is_image and unit.data is not None
+        ]
+        tables = [Table.read(unit) for unit in units if isinstance(unit, fits.BinTableHDU)]
     table = _table(positions) if positions is not None else tables[0] if tables else None
     stacks = [data for _, data in images]
     if not stacks or any(d.ndim not in (2, 3) or min(d.shape[-2:]) < _SMALLEST for d in stacks):
@@ -85,8 +81,13 @@ def read_stamps(path: Path, positions: Path | None = None, size: int = 180) -> D
         return DonutStamps(stamps, *_places(table, len(stamps), positions or path))
     headers = [header for header, data in images for _ in range(len(data) if data.ndim == 3 else 1)]
     known = all("FIELD_X" in h and "FIELD_Y" in h for h in headers)
-    fields = np.deg2rad([[float(h["FIELD_X"]), float(h["FIELD_Y"])] for h in headers]) if known else None
-    return DonutStamps(stamps, fields, np.array([1e-6 * float(h.get("DEFOC_UM", 0.0)) for h in headers]))
+    fields = np.deg2rad([[h["FIELD_X"], h["FIELD_Y"]] for h in headers]) if known else None
+    return DonutStamps(stamps, fields, np.array([1e-6 * h.get("DEFOC_UM", 0.0) for h in headers]))
+
+
+def _described(header: fits.Header) -> dict[str, float]:
+    """Return the place and the defocus of a stamp, as far as its header has them."""
+    return {key: float(header[key]) for key in ("FIELD_X", "FIELD_Y", "DEFOC_UM") if key in header}
 
 
 def border_variance(image: np.ndarray) -> float:
@@ -98,10 +99,8 @@ def border_variance(image: np.ndarray) -> float:
 
 def _table(path: Path) -> Table:
     require_file(path, ProductError)
-    try:
+    with parsing(path, "cannot be read as a table", ProductError):
         return Table.read(path)
-    except (OSError, ValueError, TypeError, IORegistryError) as error:
-        raise ProductError(f"cannot be read as a table: {' '.join(str(error).split())}", file=path) from None
 
 
 def _names(table: Table) -> set[str]:
@@ -109,8 +108,11 @@ def _names(table: Table) -> set[str]:
 
 
 def _column(table: Table, name: str) -> np.ndarray:
-    """Return a column by its name in any case."""
-    return np.asarray(table[next(n for n in table.colnames if n.lower() == name)], dtype=np.float64)
+    """Return a column of numbers by its name in any case; ProductError where it holds something else."""
+    values = np.asarray(table[next(n for n in table.colnames if n.lower() == name)])
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        raise ProductError(f"column {name} of shape {values.shape} and type {values.dtype}: expected a number a row")
+    return values.astype(np.float64)
 
 
 def _places(table: Table, count: int, file: Path) -> tuple[Any, np.ndarray]:

@@ -1,7 +1,7 @@
 """Mutated files of every format that is read: a result or an error of pachon in one line, within 2 s and 500 MB.
 
 YAML prescriptions, configurations and sweeps have a test of their own (``test_bad_input.py``). ``pytest -m slow
-tests/contracts/test_bad_input.py tests/contracts/test_wrong_files.py`` makes 10 000 cases of those and 19 200 of these.
+tests/contracts/test_bad_input.py tests/contracts/test_wrong_files.py`` makes 10 000 cases of those and 32 800 of these.
 """
 
 import base64
@@ -22,14 +22,18 @@ from bounds import CHARACTERS, SECONDS, Hang, bounded
 
 import pachon
 from pachon.core.errors import PachonError
+from pachon.design.optimize.optimize_file import optimization_arguments
 from pachon.imaging.image_file import OBJECT_COLUMNS
 from pachon.models.io.grid_file import read_grid, write_grid
 from pachon.models.io.prescription import DATA
 from pachon.models.mesh_file import load_mesh
+from pachon.pipeline.alignment_states import in_state
 from pachon.pipeline.star_list import place_stars
+from pachon.pipeline.wavefront_sensing.stamp_files import read_stamps
 from pachon.sky.cutouts import read_mosaic
 from pachon.studies.sweep.file import read_sweep
 from pachon.studies.sweep.store import PointResult, SweepStore, create_store, readable_rows
+from pachon.studies.visits.image_stack.config import load_image_stack_configuration
 
 ROOT = Path(__file__).parents[2]
 CORPUS = Path(__file__).parent / "corpus"
@@ -134,6 +138,49 @@ def _psf_model(path):
     pachon.PsfModel.fit(stamps, RNG.uniform(-1, 1, (6, 2)), n_components=2, order=0).write(path)
 
 
+def _donuts():
+    stamp = RNG.normal(size=(12, 12)).astype(np.float32)
+    places = {"FIELD_X": 0.1, "FIELD_Y": -0.2, "DEFOC_UM": 1500.0}
+    return _fits(*(fits.ImageHDU(stamp, fits.Header(places)) for _ in range(2)))
+
+
+def _use_donuts(path):
+    stamps = read_stamps(path)
+    assert len(stamps.images) == len(stamps.defocus)
+
+
+def _use_donut_table(path):
+    (cube := path.with_name("cube.fits")).write_bytes(_fits(fits.ImageHDU(np.ones((2, 12, 12)))))
+    read_stamps(cube, path)
+
+
+def _use_optimization(path):
+    optimization_arguments(pachon.load_optimization(path), pachon.load_telescope(LENS), path)
+
+
+STARS = Table({"ra": [53.1, 53.2], "dec": [-27.8, -27.9], "mag": [18.0, 19.5]})
+STATES = Table({"visit": [3, 4], "M2_dz": [1.0, 2.0]}, units={"M2_dz": "um"})
+OPTIMIZATION = b"""variables: [S1.radius, S2.thickness]
+bounds: {S2.thickness_mm: [0.5, 6], S1.radius_mm: [-20, -10]}
+fields_deg: [[0, 0], [0, 12]]
+operands:
+  - {kind: focal_length_mm, target: 25, weight: 2}
+  - {kind: mtf, field_deg: [0, 0], frequency_per_mm: 40, angle_deg: 90, min: 0.5}
+"""
+TOLERANCES = b"""merit: wavefront
+surfaces: {radius_percent: 0.2}
+elements: {wedge_arcmin: 1}
+tolerances: [{name: M2.dz_um, size: 10, distribution: truncated, limit: 15}]
+compensators: [Detector.dz_um]
+draws: 20
+rings: 2
+"""
+COATINGS = b"""coatings:
+  silver: {wavelength_nm: [400, 600, 1000], efficiency: [0.93, 0.97, 0.98]}
+surfaces: {M1: silver}
+glasses:
+  silica: {thickness_mm: 25, wavelength_nm: [350, 1000], efficiency: [0.995, 0.999]}
+"""
 GRID = pachon.GridSag(np.arange(5.0), np.arange(5.0), np.zeros((5, 5)))
 GALAXIES = pachon.Galaxies.single([0.0, 1e-5], [0.0, 1e-5], [22.0, 23.0], [2e-6, 3e-6])
 LENS = ROOT / "tests/data/zmx/lens1.zmx"
@@ -223,6 +270,18 @@ def _cases(folder):
         "off": (".off", _mesh("off"), lambda p: load_mesh(p, merged=True)),
         "piff": (".piff", (ROOT / "tests/data/piff/gaussian.piff").read_bytes(), _use_piff),
         "star_list": (".csv", b"ra,dec,mag\n53.1,-27.8,18\n53.2,-27.9,19.5\n", _use_stars),
+        "star_list_ecsv": (".ecsv", _text(STARS, "ascii.ecsv"), _use_stars),
+        "star_list_fits": (".fits", _fits(fits.table_to_hdu(STARS)), _use_stars),
+        "camera": (".yaml", (DATA / "camera_comcam.yaml").read_bytes(), pachon.load_camera),
+        "tolerances": (".yaml", TOLERANCES, lambda p: pachon.load_tolerances(p, "paul_baker")),
+        "optimization": (".yaml", OPTIMIZATION, _use_optimization),
+        "align": (".yaml", b"visits: 3\nseed: 2\n", pachon.load_align_configuration),
+        "image_stack": (".yaml", b"tiles: 2\nside: 128\n", load_image_stack_configuration),
+        "coatings": (".yaml", COATINGS, pachon.Coatings.read),
+        "states": (".ecsv", _text(STATES, "ascii.ecsv"),
+                   lambda p: in_state(pachon.load_telescope("lsst_v3.3_r"), str(p), 3)),
+        "donuts": (".fits", _donuts(), _use_donuts),
+        "donut_table": (".csv", b"field_x,field_y,defocus_um\n0.1,0.2,1500\n0.3,0.4,-1500\n", _use_donut_table),
         "store": (".sweep", _written(_store, ".sweep", folder), _use_store),
     }  # fmt: skip
 
@@ -230,7 +289,9 @@ def _cases(folder):
 NAMES = (
     "zmx", "seq", "len", "json", "roa", "zar", "agf", "baseline", "site", "images", "visits", "degrees",
     "heights_ecsv", "heights_fits", "galaxies_ecsv", "galaxies_fits", "stars", "mosaic", "grid", "image",
-    "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "store",
+    "psf_model", "stl", "glb", "gltf", "obj", "ply", "off", "piff", "star_list", "star_list_ecsv",
+    "star_list_fits", "camera", "tolerances", "optimization", "align", "image_stack", "coatings", "states", "donuts",
+    "donut_table", "store",
 )  # fmt: skip
 TOKENS = [
     b"", b"0", b"-1", b"1e400", b"nan", b"inf", b"-0.0", b"9" * 60, b"null", b"[]", b"{}", b"[" * 50, b'"', b"'", b"\0",

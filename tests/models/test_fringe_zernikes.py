@@ -57,3 +57,9 @@ def test_the_wavefront_of_a_lens_in_both_orders():
     assert fringe.summary()["ordering"] == "fringe"
     with pytest.raises(DomainError, match="jmax = 38"):
         pachon.wavefront_zernikes(telescope, fields, jmax=38, ordering="fringe")
+
+
+def test_no_coefficients_are_refused():
+    for convert in (pachon.fringe_from_noll, pachon.noll_from_fringe):
+        with pytest.raises(DomainError, match="coefficients"):
+            convert([])

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy import units as u
 
 import pachon
 from pachon.core.errors import ConfigError, DomainError, UnknownNameError
@@ -32,6 +33,10 @@ def test_a_plate_of_bare_glass(plate):
     # At Brewster's angle p is not reflected: s alone, by ((1 - n^2) / (1 + n^2))^2.
     s = (1.25 / 3.25) ** 2
     assert pachon.fresnel_transmission(np.cos(np.arctan(1.5)), 1.0, 1.5) == pytest.approx(1.0 - 0.5 * s, abs=1e-15)
+    # No light enters what refracts without end.
+    assert pachon.fresnel_transmission([1.0, 0.9], 1e300, 1.5).tolist() == [0.0, 0.0]
+    with pytest.raises(DomainError, match="cosine"):
+        pachon.fresnel_transmission([1.0] * u.kg, 1.0, 1.5)
 
 
 def test_the_angle_of_incidence_is_that_of_the_ray(plate):
