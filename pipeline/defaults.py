@@ -19,9 +19,10 @@ from ..design.parameters.changes import apply_changes
 from ..models.camera.camera import Camera
 from ..models.camera.cameras import CAMERAS, load_camera
 from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
+from ..models.io.bundled import BUNDLED
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
-from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
+from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import load_site
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
@@ -83,7 +84,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
         band = band or "r"
         name = f"lsst_v3.3_{band}"
     else:
-        name = _absolute(name, folder, bundled_names())
+        name = _absolute(name, folder, BUNDLED)
         band = band or _band_of(name)
     telescope = load_telescope(name)
     camera_name = None

@@ -26,9 +26,10 @@ from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
 from ..models.camera.focal_plane import FocalPlane
 from ..models.camera.height_budget import load_budget
 from ..models.camera.silicon import Silicon
+from ..models.io.bundled import BUNDLED
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
-from ..models.io.prescription import ENDINGS, bundled_names, prescription_digest
+from ..models.io.prescription import ENDINGS, prescription_digest
 from ..models.site import Site
 from ..models.telescope import Telescope
 from ..raytrace.rays import field_direction
@@ -254,7 +255,7 @@ class Experiment:
             # Nothing is made of it.
             del content["detector"]
         name = given(self.config.telescope)
-        content["telescope"] = name if name in bundled_names() else prescription_digest(name)
+        content["telescope"] = name if name in BUNDLED else prescription_digest(name)
         content = hashed_camera(content)
         content["focal_plane"] = hashed_heights(content["focal_plane"])
         content["active_optics"] = hashed_states(content["active_optics"])

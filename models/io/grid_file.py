@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy import units as u
 
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import parsing, require_file, write_bytes
@@ -93,6 +92,8 @@ def _axis(header: Any, number: int, size: int) -> np.ndarray:
 
 def length_unit(header: Any, key: str, default: str = "m") -> float:
     """Return the length in metres of the unit that a card names; PrescriptionError where it is none."""
+    from astropy import units as u  # few prescriptions have a grid
+
     text = header.get(key, default)
     try:
         return float(u.Unit(text).to(u.m))

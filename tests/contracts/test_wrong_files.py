@@ -23,8 +23,8 @@ from bounds import CHARACTERS, SECONDS, Hang, bounded
 import pachon
 from pachon.core.errors import PachonError
 from pachon.imaging.image_file import OBJECT_COLUMNS
+from pachon.models.io.bundled import DATA
 from pachon.models.io.grid_file import read_grid, write_grid
-from pachon.models.io.prescription import DATA
 from pachon.models.mesh_file import load_mesh
 from pachon.pipeline.star_list import place_stars
 from pachon.sky.cutouts import read_mosaic
