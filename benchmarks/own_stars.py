@@ -137,7 +137,10 @@ def show(kind, count, results):
         f"\n{kind}, {count} stars: rms of e {level[0]:.2e} and of size {level[1]:.2e} by the best option of each field"
     )
     chosen = ", ".join(f"{kinds.count(k)} x {k}" for k in sorted(set(kinds)))
-    print(f"  the default chose {chosen}, {np.mean(seconds):.1f} s of processor time; its ratio of e +- {error:.2f}")
+    print(
+        f"  the default chose {chosen}, {np.mean(seconds):.1f} s of processor time; its ratio of e +- {error:.2f}, "
+        f"worst {np.exp(logs['default'][:, 0].max()):.2f}"
+    )
     for name, values in sorted(logs.items(), key=lambda item: item[1][:, 0].mean()):
         e, size = np.exp(values.mean(axis=0))
         print(f"  {name:36s} e over the best {e:5.2f}   size {size:5.2f}", flush=True)

@@ -33,18 +33,11 @@ def info_command(
     - `pachon info lsst_v3.3_r`
     - `pachon info my_telescope.yaml --json`
     """
-    from ..pipeline.report.info import (
-        coefficient_lines,
-        describe,
-        figure_rows,
-        list_models,
-        surface_columns,
-        surface_rows,
-    )
-
     console = wide_console()
     if model is None:
-        models = list_models()
+        from ..models.io.bundled import bundled_models
+
+        models = bundled_models()
         if as_json:
             print_json({"models": models})
             return
@@ -55,6 +48,14 @@ def info_command(
             table.add_row(entry["name"], entry["description"])
         console.print(table)
         return
+    from ..pipeline.report.info import (
+        coefficient_lines,
+        describe,
+        figure_rows,
+        surface_columns,
+        surface_rows,
+    )
+
     description = describe(load_model(model, lenient, glass_catalogue or ()))
     if as_json:
         print_json(description)

@@ -51,13 +51,13 @@ def tolerance_command(
     - `pachon tolerance lsst_v3.3_r tol.yaml --processes 4`, and after an interruption `--resume`
     """
     from ..core.files import make_folder
-    from ..models.io.prescription import bundled_names
+    from ..models.io.bundled import BUNDLED
     from ..studies.tolerance.file import load_tolerances, with_settings
     from ..studies.tolerance.product import tolerance_summary, write_tolerances
     from ..studies.tolerance.study import run_tolerances
 
     telescope = load_model(model, lenient)
-    source = model if model in bundled_names() else str(Path(model).resolve())
+    source = model if model in BUNDLED else str(Path(model).resolve())
     file = with_settings(load_tolerances(tolerances, source), method=method, draws=draws, seed=seed)
     folder = out or Path(f"tolerance_{telescope.name}")
     make_folder(folder)

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 import numpy as np
-from astropy import units as u
 from numpy.typing import ArrayLike, NDArray
 
 from .docstrings import described
 from .errors import ConfigError, DomainError, PachonError, shown
-from .units import has_unit, in_unit, real_numbers
+from .units import has_unit, in_unit, is_quantity, real_numbers
 
 Target = TypeVar("Target", bound=Callable[..., Any])
 #: Function of an argument's name and value: the value as the callee takes it, or a _MismatchError.
@@ -98,7 +97,7 @@ def _checked(function: Callable[..., Any], documented: Any) -> Callable[..., Any
 
 def _plain_numbers(value: Any, unit: str, name: str) -> Any:
     """Return a quantity, or a sequence of them, as plain numbers in a unit; an array where it is one."""
-    return in_unit(value, u.Unit(unit), name).tolist()
+    return in_unit(value, unit, name).tolist()
 
 
 def _check_of_parameter(function: Callable[..., Any], name: str) -> _Check | None:
@@ -190,7 +189,7 @@ def _array(name: str, value: Any) -> Any:
 
 
 def _plain_array(name: str, value: Any) -> Any:
-    if isinstance(value, u.Quantity):
+    if is_quantity(value):
         raise _MismatchError(name, value, "numbers without a unit")
     return np.asarray(_array(name, value))
 

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from astropy import units as u
 
 from .errors import DomainError, shown
 
 #: One arcsecond, one arcminute [rad].
 ARCSEC = np.pi / 648000
 ARCMIN = 60.0 * ARCSEC
-#: Arrays that lose their unit or mask where NumPy makes one array of several.
-_APART = (u.Quantity, np.ma.MaskedArray)
-
-
 #: Largest number, so that its powers stay finite.
 _LARGEST = 1e50
+
+
+def is_quantity(value: Any) -> bool:
+    """Return whether a value is an astropy quantity.
+
+    astropy takes a third of a second to import, and without it there are no quantities.
+    """
+    units = sys.modules.get("astropy.units")
+    return units is not None and isinstance(value, units.Quantity)
 
 
 def real_numbers(values: Any) -> Any:
@@ -29,7 +34,7 @@ def real_numbers(values: Any) -> Any:
     """
     if type(values) is np.ndarray:
         return values if values.dtype.kind in "iuf" else None
-    if isinstance(values, (tuple, list)) and any(isinstance(v, _APART) for v in values):
+    if isinstance(values, (tuple, list)) and any(map(_is_apart, values)):
         found = [real_numbers(v) for v in values]
         return None if any(v is None for v in found) else found
     if hasattr(values, "mask") and hasattr(values, "filled"):
@@ -45,6 +50,11 @@ def real_numbers(values: Any) -> Any:
     return values if values.dtype.kind in "iuf" else None
 
 
+def _is_apart(value: Any) -> bool:
+    """Return whether NumPy would lose unit or mask of a value where it makes one array of several."""
+    return isinstance(value, np.ma.MaskedArray) or is_quantity(value)
+
+
 def has_unit(value: Any) -> bool:
     """Return whether a value is a quantity, a column with a unit, or a sequence of them."""
     if isinstance(value, (tuple, list)):
@@ -52,16 +62,18 @@ def has_unit(value: Any) -> bool:
     return getattr(value, "unit", None) is not None
 
 
-def in_unit(value: Any, unit: u.UnitBase, name: str) -> np.ndarray:
-    """Return numbers in a unit, or quantities that convert to it, as a float64 array."""
+def in_unit(value: Any, unit: str, name: str) -> np.ndarray:
+    """Return numbers in a unit, or quantities that convert to it, as a float64 array; "" is no unit."""
     numbers = real_numbers(value)
     # The text is made where it is needed: that of a large array takes longer than many a trace.
     if numbers is None:
         raise DomainError(f"{name} = {shown(value)}: expected a number in {unit} or a quantity")
     if isinstance(numbers, list):
         numbers = [in_unit(v, unit, name) for v in numbers]
-    elif hasattr(numbers, "unit") and (isinstance(numbers, u.Quantity) or unit != u.dimensionless_unscaled):
+    elif hasattr(numbers, "unit") and (unit or is_quantity(numbers)):
         # The unit of a column of pure numbers, such as pixels or magnitudes, says what they count.
+        from astropy import units as u
+
         try:
             numbers = u.Quantity(numbers, copy=None).to_value(unit)
         except u.UnitConversionError:
@@ -83,7 +95,7 @@ def real_array(values: Any, expectation: str) -> np.ndarray:
 def pure_numbers(values: Any, name: str) -> np.ndarray:
     """Return real numbers without a unit as a float64 array."""
     try:
-        return in_unit(values, u.dimensionless_unscaled, name)
+        return in_unit(values, "", name)
     except DomainError:
         raise DomainError(f"{name} = {shown(values)}: expected real numbers without a unit") from None
 
@@ -108,7 +120,7 @@ def require_all_positive(**values: Any) -> None:
 
 def radians(value: Any, name: str) -> np.ndarray:
     """Return an angle in radians as a float64 array; plain numbers are radians already."""
-    return in_unit(value, u.rad, name)
+    return in_unit(value, "rad", name)
 
 
 def positive_angle(value: Any, name: str) -> float:
@@ -118,7 +130,7 @@ def positive_angle(value: Any, name: str) -> float:
 
 def metres(value: Any, name: str) -> np.ndarray:
     """Return a length in metres as a float64 array; plain numbers are metres already."""
-    return in_unit(value, u.m, name)
+    return in_unit(value, "m", name)
 
 
 def length(value: Any, name: str) -> float:

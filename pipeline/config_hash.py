@@ -11,9 +11,10 @@ from ..core.table_files import ENDINGS as STAR_ENDINGS
 from ..models.camera.cameras import CAMERAS
 from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
 from ..models.camera.photometry import BANDS
+from ..models.io.bundled import BUNDLED
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
-from ..models.io.prescription import ENDINGS, bundled_names, prescription_digest
+from ..models.io.prescription import ENDINGS, prescription_digest
 from .alignment_states import ENDINGS as STATE_ENDINGS
 from .config import Configuration
 from .defaults import given
@@ -34,7 +35,7 @@ def hashed_content(config: Configuration) -> dict[str, Any]:
         # Nothing is made of it.
         del content["detector"]
     name = given(config.telescope)
-    content["telescope"] = name if name in bundled_names() else prescription_digest(name)
+    content["telescope"] = name if name in BUNDLED else prescription_digest(name)
     content = hashed_photometry(hashed_camera(content), config)
     content["focal_plane"] = hashed_heights(content["focal_plane"])
     content["active_optics"] = hashed_states(content["active_optics"])

@@ -20,9 +20,10 @@ from ..models.camera.camera import Camera
 from ..models.camera.cameras import CAMERAS, load_camera
 from ..models.camera.cameras import ENDINGS as CAMERA_ENDINGS
 from ..models.camera.photometry import nearest_band
+from ..models.io.bundled import BUNDLED
 from ..models.io.heights.file import ENDINGS as HEIGHT_ENDINGS
 from ..models.io.heights.zernike_table import AS_MEASURED
-from ..models.io.prescription import ENDINGS, bundled_names, load_telescope
+from ..models.io.prescription import ENDINGS, load_telescope
 from ..models.io.site_file import load_site
 from ..models.media.silicon import WAVELENGTH_RANGE as SILICON_RANGE
 from ..models.site import Site
@@ -81,7 +82,7 @@ def resolve(config: Configuration, folder: Path | None = None) -> ResolvedConfig
     name, band = config.telescope, config.band
     if name is None:
         name = f"lsst_v3.3_{band or 'r'}"
-    name = _absolute(name, folder, bundled_names())
+    name = _absolute(name, folder, BUNDLED)
     telescope = load_telescope(name)
     band = band or _band_of(name, telescope)
     camera_name = None

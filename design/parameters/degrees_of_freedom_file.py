@@ -30,8 +30,8 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, PrescriptionError, error_context, unknown_name
 from ...core.schema import Section, checked, expected, mapping, problem, validated
 from ...core.yaml_reader import as_number, read_mapping
+from ...models.io.bundled import DATA
 from ...models.io.grid_file import read_grid
-from ...models.io.prescription import DATA
 from ...models.io.yaml.values import ROWS, Names, Number, PositiveNumber, Text
 from ...models.shapes.freeform import ZernikeSag
 from ...models.shapes.modes import GridModes

@@ -19,9 +19,9 @@ from ...core.errors import PrescriptionError, unknown_name
 from ..media.air import ZERO_CELSIUS, Air
 from ..media.dispersion import FORMULAS, Dispersion
 from ..media.medium import Medium, RelativeToAir, Sellmeier
+from .bundled import DATA
 from .zemax.text import Record, read_text, records
 
-DATA = Path(__file__).parents[1] / "data"
 BUNDLED = DATA / "glasses.agf"
 #: Makers whose catalogues come with the package, in the order in which a glass is looked up.
 MAKERS = ("schott", "ohara", "hoya", "hikari", "sumita", "cdgm")

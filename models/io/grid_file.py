@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy import units as u
 
 from ...core.errors import PrescriptionError, error_context
 from ...core.files import parsing, require_file, write_bytes
@@ -21,6 +20,9 @@ from ..shapes.grid import GridSag
 
 if TYPE_CHECKING:
     from astropy.io import fits
+
+#: First bytes of other formats in which maps of mirrors come.
+_FOREIGN = {b"\x89HDF\r\n\x1a\n": "HDF5", b"MATLAB 5.0 MAT-file": "MATLAB"}
 
 
 def read_grid(path: str | os.PathLike[str]) -> GridSag:
@@ -48,6 +50,12 @@ def fits_image(path: Path, dimensions: int) -> tuple[fits.Header, np.ndarray]:
 
     require_file(path, PrescriptionError)
     with parsing(path, "cannot be read as FITS", PrescriptionError), open(path, "rb") as file:
+        start = file.read(max(map(len, _FOREIGN)))
+        for signature, kind in _FOREIGN.items():
+            if start.startswith(signature):
+                text = f"{kind} file, whose maps have no nodes and no unit: expected a FITS image"
+                raise PrescriptionError(f"{text}, or a pachon.GridSag of its map", file=path)
+        file.seek(0)
         hdus = fits.open(file, memmap=False)
         images = [(hdu.header, hdu.data) for hdu in hdus if hdu.is_image and np.ndim(hdu.data) == dimensions]
     if not images:
@@ -93,6 +101,8 @@ def _axis(header: Any, number: int, size: int) -> np.ndarray:
 
 def length_unit(header: Any, key: str, default: str = "m") -> float:
     """Return the length in metres of the unit that a card names; PrescriptionError where it is none."""
+    from astropy import units as u  # few prescriptions have a grid
+
     text = header.get(key, default)
     try:
         return float(u.Unit(text).to(u.m))

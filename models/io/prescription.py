@@ -31,7 +31,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...core.arguments import check_arguments
 from ...core.errors import PrescriptionError, check_choice, unknown_name
@@ -40,27 +40,12 @@ from ...core.yaml_reader import read_mapping
 from ..mesh_file import files_of_mesh
 from ..telescope import Telescope
 from .batoid import ROOT as BATOID_ROOT
-from .codev.reader import read_codev_file
+from .bundled import BUNDLED, bundled_file
 from .glass_catalogue import GlassCatalogue
 from .yaml.reader import MAX_BYTES, read_telescope, telescope_of
-from .yaml.writer import telescope_to_yaml
-from .zemax.file import Findings, ZemaxFile, read_zemax_file
-from .zemax.reader import read_lens
-from .zemax.writer import catalogue_path, telescope_to_zemax
 
-DATA = Path(__file__).parents[1] / "data"
-BUNDLED = (
-    *(f"lsst_v3.3_{band}" for band in "ugrizy"),
-    "lsst_v3.3_r_obstructed",
-    "lsst_v3.3_g_vacuum_zemax_check",
-    *(f"rubin_v3.14_{band}" for band in "ugrizy"),
-    "comcam_r",
-    "auxtel",
-    "decam",
-    "hsc",
-    "paul_baker",
-)
-
+if TYPE_CHECKING:
+    from .zemax.file import Findings, ZemaxFile
 
 #: Endings of lens files: Zemax and its archives, CODE V, OSLO, optiland, ray-optics.
 _LENS_FILES = (".zmx", ".zar", ".seq", ".len", ".json", ".roa")
@@ -89,12 +74,13 @@ def _parts_reader(ending: str) -> Callable[[Path, Findings], ZemaxFile]:
         from .rayoptics.reader import read_rayoptics_file
 
         return read_rayoptics_file
-    return read_codev_file if ending == ".seq" else read_zemax_file
+    if ending == ".seq":
+        from .codev.reader import read_codev_file
 
+        return read_codev_file
+    from .zemax.file import read_zemax_file
 
-def bundled_names() -> tuple[str, ...]:
-    """Return the names of the prescriptions that come with the package."""
-    return BUNDLED
+    return read_zemax_file
 
 
 @check_arguments
@@ -142,6 +128,8 @@ def load_telescope(
 
         return batoid_telescope(content, path, lenient=lenient)
     if path.suffix.lower() in _LENS_FILES:
+        from .zemax.reader import read_lens
+
         parts = _parts_reader(path.suffix.lower())
         return read_lens(path, parts, lenient=lenient, glass_catalogues=glass_catalogues)
     if isinstance(name_or_path, os.PathLike) or len(path.parts) > 1 or path.is_file():
@@ -192,7 +180,7 @@ def _texts(content: Any) -> Iterator[str]:
 @cache
 def _bundled(name: str) -> Telescope:
     # Telescopes are immutable, and a sweep loads the same at every point.
-    return read_telescope(DATA / f"{name}.yaml")
+    return read_telescope(bundled_file(name))
 
 
 @check_arguments
@@ -224,6 +212,8 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     format = format or WRITTEN[target.suffix.lower()]
     check_choice("format", format, ("pachon", "batoid", "zemax", "optiland"))
     if format == "zemax":
+        from .zemax.writer import catalogue_path, telescope_to_zemax
+
         lens, glasses = telescope_to_zemax(telescope)
         if glasses:
             write_bytes(catalogue_path(target), glasses.encode(), PrescriptionError)
@@ -236,5 +226,7 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
 
         lens = telescope_to_optiland(telescope)
     else:
+        from .yaml.writer import telescope_to_yaml
+
         lens = telescope_to_yaml(telescope)
     write_bytes(target, lens.encode(), PrescriptionError)

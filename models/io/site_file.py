@@ -13,9 +13,9 @@ from ...core.errors import PrescriptionError, error_context, unknown_name
 from ...core.schema import Section, validated
 from ...core.yaml_reader import read_mapping
 from ..site import Site, Weather
+from .bundled import DATA
 from .yaml.values import ROWS, Number, OptionalNumber, PositiveNumber, Text
 
-DATA = Path(__file__).parents[1] / "data"
 BUNDLED = ("cerro_pachon", "cerro_tololo", "maunakea")
 
 

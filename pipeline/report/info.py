@@ -15,7 +15,6 @@ from ...core.units import ARCSEC
 from ...models.aperture import Annulus, Circle, Complement
 from ...models.design_data import LENGTH_UNITS
 from ...models.first_order import first_order
-from ...models.io.prescription import bundled_names, load_telescope
 from ...models.io.yaml.apertures import aperture_items
 from ...models.io.yaml.values import Turn, flow
 from ...models.io.yaml.writer import INTERACTION_NAMES
@@ -34,12 +33,6 @@ FIRST_ORDER_KEYS = (
     "focus_z_m",
     "angular_magnification",
 )
-
-
-def list_models() -> list[dict[str, Any]]:
-    """Return name, description and source of each bundled model."""
-    telescopes = [load_telescope(name) for name in bundled_names()]
-    return [{"name": t.name, "description": t.description, "source": t.source} for t in telescopes]
 
 
 def describe(telescope: Telescope) -> dict[str, Any]:

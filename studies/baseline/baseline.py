@@ -18,7 +18,8 @@ import numpy as np
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, PachonError
 from ...core.version import VERSION
-from ...models.io.prescription import bundled_names, load_telescope
+from ...models.io.bundled import BUNDLED
+from ...models.io.prescription import load_telescope
 from ...models.io.yaml.writer import telescope_to_yaml
 from ...models.telescope import Telescope
 from ...pipeline.config import digest, load_configuration, with_options
@@ -132,7 +133,7 @@ def make_baseline(
     metrics = {name: stored(name, *each) for name, each in found.items()}
     baseline = Baseline(
         **_stamps(telescope, experiment),
-        model=_relative(model, folder, bundled_names()),
+        model=_relative(model, folder, BUNDLED),
         configuration=None if configuration is None else _relative(str(configuration), folder, ()),
         plan=plan,
         reasons={key: text for key, text in REASONS.items() if any(m.reason == key for m in metrics.values())},
@@ -298,7 +299,7 @@ def _notes(baseline: Baseline, changed: Sequence[str]) -> tuple[str, ...]:
 
 def _absolute(name: str, folder: Path) -> str:
     """Return a bundled name as it is, and the path of a file as an absolute one."""
-    return name if name in bundled_names() else str((folder / name).resolve())
+    return name if name in BUNDLED else str((folder / name).resolve())
 
 
 def _relative(name: str, folder: Path, bundled: Sequence[str]) -> str:

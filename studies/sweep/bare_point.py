@@ -16,7 +16,8 @@ import numpy as np
 from ...core.errors import ConfigError, unknown_name
 from ...design.optimize.optimize import optimize
 from ...design.parameters.changes import apply_changes, parse_change
-from ...models.io.prescription import bundled_names, load_telescope
+from ...models.io.bundled import BUNDLED
+from ...models.io.prescription import load_telescope
 from ...models.telescope import Telescope
 from ...pipeline.config import Configuration, configuration_of
 from ..metrics.bare_telescope import BARE, BareScene
@@ -90,7 +91,7 @@ def check_bare_sweep(sweep: SweepFile, parameters: dict[str, Any], folder: Path)
 
 
 def _path(name: str, folder: Path) -> str:
-    return name if name in bundled_names() or not (folder / name).is_file() else str(folder / name)
+    return name if name in BUNDLED or not (folder / name).is_file() else str(folder / name)
 
 
 @lru_cache(maxsize=64)

@@ -14,7 +14,7 @@ import pytest
 from pachon.commands import cli
 from pachon.commands.cli import main
 from pachon.models.io import prescription
-from pachon.models.io.prescription import bundled_names
+from pachon.models.io.bundled import BUNDLED
 from pachon.models.io.site_file import DATA
 from pachon.pipeline import memory
 from pachon.pipeline import run as run_module
@@ -161,7 +161,7 @@ def test_screens_too_large_for_the_memory_are_one_line(capsys, in_folder, monkey
 @pytest.mark.long
 def test_info_lists_models_and_shows_one(capsys):
     assert main(["info", "--json"]) == 0
-    assert [m["name"] for m in json.loads(capsys.readouterr().out)["models"]] == list(bundled_names())
+    assert [m["name"] for m in json.loads(capsys.readouterr().out)["models"]] == list(BUNDLED)
     assert main(["info", "lsst_v3.3_r", "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
     # Published properties of the LSST: f/1.23, 10.3 m, 3.5 degrees of field.

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from pachon.core.errors import PachonError
-from pachon.models.io.prescription import DATA, load_telescope
+from pachon.models.io.bundled import DATA
+from pachon.models.io.prescription import load_telescope
 from pachon.pipeline.config import load_configuration, to_yaml
 from pachon.pipeline.experiment import Experiment
 from pachon.raytrace.launch import launch_rays

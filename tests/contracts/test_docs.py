@@ -9,7 +9,7 @@ import matplotlib
 import pytest
 
 import pachon
-from pachon.models.io.prescription import DATA
+from pachon.models.io.bundled import DATA
 from pachon.pipeline.psf_model.model import PsfModel
 
 DOCS = Path(__file__).parents[2] / "docs"

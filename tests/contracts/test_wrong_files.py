@@ -24,8 +24,8 @@ import pachon
 from pachon.core.errors import PachonError
 from pachon.design.optimize.optimize_file import optimization_arguments
 from pachon.imaging.image_file import OBJECT_COLUMNS
+from pachon.models.io.bundled import DATA
 from pachon.models.io.grid_file import read_grid, write_grid
-from pachon.models.io.prescription import DATA
 from pachon.models.mesh_file import load_mesh
 from pachon.pipeline.alignment_states import in_state
 from pachon.pipeline.star_list import place_stars

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pachon
-from pachon.models.io.prescription import bundled_names
+from pachon.models.io.bundled import BUNDLED
 from pachon.raytrace.rays import RayStatus
 
 batoid = pytest.importorskip("batoid")
@@ -53,8 +53,8 @@ def peer_rays(optic, telescope, field, wavelength, pupil):
 
 
 def test_every_bundled_telescope_has_a_peer():
-    elsewhere = {n for n in bundled_names() if n.startswith("lsst_v3.3_") and n != "lsst_v3.3_r_obstructed"}
-    assert set(PEERS) | elsewhere | {"paul_baker"} == set(bundled_names())
+    elsewhere = {n for n in BUNDLED if n.startswith("lsst_v3.3_") and n != "lsst_v3.3_r_obstructed"}
+    assert set(PEERS) | elsewhere | {"paul_baker"} == set(BUNDLED)
 
 
 @pytest.mark.parametrize("name", PEERS)

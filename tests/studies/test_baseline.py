@@ -17,7 +17,8 @@ import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError
 from pachon.models.camera.focal_plane import FocalPlane
-from pachon.models.io.prescription import DATA, load_telescope, save_telescope
+from pachon.models.io.bundled import DATA
+from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.shapes.shape import EvenAsphere
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd

@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from pachon import PachonError, load_camera, load_telescope
+from pachon.models.io.bundled import DATA
 from pachon.models.io.camera_file import CcdSection
-from pachon.models.io.prescription import DATA, prescription_digest, save_telescope
+from pachon.models.io.prescription import prescription_digest, save_telescope
 
 TEXT = """\
 name: mine

@@ -7,7 +7,8 @@ import yaml
 
 from pachon.core.errors import PrescriptionError, UnknownNameError
 from pachon.models.aperture import Annulus, Circle
-from pachon.models.io.prescription import DATA, bundled_names, load_telescope, save_telescope
+from pachon.models.io.bundled import BUNDLED, DATA
+from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.io.yaml.writer import telescope_to_yaml
 from pachon.models.media.medium import ConstantIndex, Sellmeier
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
@@ -102,7 +103,7 @@ def test_groups_are_the_camera_and_its_lenses():
     assert telescope.groups["Filter"] == ("Filter_entrance", "Filter_exit")
 
 
-@pytest.mark.parametrize("name", bundled_names())
+@pytest.mark.parametrize("name", BUNDLED)
 def test_bundled_files_round_trip_and_keep_to_a_surface_a_line(name, tmp_path):
     telescope = load_telescope(name)
     save_telescope(telescope, tmp_path / "copy.yaml")

@@ -107,6 +107,8 @@ def test_bad_grid_files_are_refused_in_one_line(tmp_path):
         return tmp_path / name
 
     (tmp_path / "text.fits").write_text("no FITS at all")
+    (tmp_path / "figure.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    (tmp_path / "figure.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64" + bytes(100))
     holes = np.zeros((5, 5))
     holes[1, 3] = np.nan
     bare = tmp_path / "bare.fits"
@@ -114,6 +116,8 @@ def test_bad_grid_files_are_refused_in_one_line(tmp_path):
     cases = [
         (tmp_path / "none.fits", "no such file"),
         (tmp_path / "text.fits", "cannot be read as FITS"),
+        (tmp_path / "figure.h5", "HDF5 file, whose maps have no nodes and no unit: expected a FITS image"),
+        (tmp_path / "figure.mat", "MATLAB file, whose maps have no nodes and no unit: expected a FITS image"),
         (written("cube.fits", np.zeros((2, 5, 5))), "expected a FITS image of two dimensions"),
         (written("nan.fits", holes), r"values\[1, 3\] = nan: expected finite numbers"),
         (written("few.fits", np.zeros((3, 5))), "grid y has 3 nodes: expected at least 4"),

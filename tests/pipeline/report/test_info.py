@@ -5,11 +5,12 @@ import json
 import pytest
 
 from pachon.models.first_order import first_order
-from pachon.models.io.prescription import bundled_names, load_telescope
+from pachon.models.io.bundled import BUNDLED
+from pachon.models.io.prescription import load_telescope
 from pachon.pipeline.report.info import FIRST_ORDER_KEYS, describe, figure_rows, surface_rows
 
 
-@pytest.mark.parametrize("name", bundled_names())
+@pytest.mark.parametrize("name", BUNDLED)
 def test_every_bundled_telescope_can_be_described(name):
     telescope = load_telescope(name)
     description = describe(telescope)

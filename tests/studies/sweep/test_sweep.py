@@ -15,7 +15,8 @@ import pytest
 from pachon.commands.cli import main
 from pachon.core.dask_cluster import check_versions
 from pachon.core.errors import ConfigError, PachonError
-from pachon.models.io.prescription import DATA, load_telescope
+from pachon.models.io.bundled import DATA
+from pachon.models.io.prescription import load_telescope
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.focal_plane_stage import apply_focal_plane_model
 from pachon.pipeline.simulate.ccd_exposure import expose_ccd
