@@ -14,7 +14,9 @@ exposures; those of the means of CCDs likewise. The predicted error is that of t
 import argparse
 import resource
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -134,11 +136,14 @@ def rms(values: np.ndarray) -> float:
 
 
 class Kept:
-    """A map that keeps the normal equations of the last step."""
+    """A map, over processes, that keeps the normal equations of the last step."""
+
+    def __init__(self, over: Callable[..., Iterable[Any]]) -> None:
+        self.map = over
 
     def __call__(self, job: Callable[..., Any], jobs: Sequence[Any]) -> Iterator[Any]:
         self.parts: list[Any] = []
-        for part in map(job, jobs):
+        for part in self.map(job, jobs):
             self.parts.append(part)
             yield part
 
@@ -170,11 +175,13 @@ def instrument_of(experiment: Experiment) -> Instrument:
     )
 
 
-def one_row(paths: list[Path], heights: str, folder: Path, steps: int, threads: int | None) -> dict[str, float]:
+def one_row(
+    paths: list[Path], heights: str, folder: Path, steps: int, threads: int | None, kept: Kept
+) -> dict[str, float]:
     """Return errors of the heights from some exposures."""
-    experiment, camera, kept = experiment_of(heights, 0), three_rafts(), Kept()
+    experiment, camera = experiment_of(heights, 0), three_rafts()
     budget = "simulated" if heights == "budget" else None
-    start = time.process_time()
+    start = time.perf_counter()
     found = pachon.fit_static_heights(
         paths,
         experiment.telescope,
@@ -188,7 +195,7 @@ def one_row(paths: list[Path], heights: str, folder: Path, steps: int, threads: 
         threads=threads,
         map_jobs=kept,
     )
-    seconds = time.process_time() - start
+    seconds = time.perf_counter() - start
     if budget is None:
         prior = HeightPrior.broad(camera, degree=STATIC_DEGREE)
     else:
@@ -239,7 +246,8 @@ def main() -> None:
     parser.add_argument("--heights", choices=("budget", "lsstcam"), default="budget")
     parser.add_argument("--exposures", default="1,3,10,30,100")
     parser.add_argument("--steps", type=int, default=2, help="Gauss-Newton steps")
-    parser.add_argument("--threads", type=int)
+    parser.add_argument("--threads", type=int, help="of each process")
+    parser.add_argument("--workers", type=int, default=1, help="processes of the fit")
     parser.add_argument("--plot", type=Path, help="picture; by default in FOLDER")
     options = parser.parse_args()
     counts = [int(n) for n in options.exposures.split(",")]
@@ -248,9 +256,11 @@ def main() -> None:
     rows: list[dict[str, float]] = []
     columns = ("exposures", "heights", "error", "predicted", "means", "predicted_means", "slope", "median", "seconds")
     print(" ".join(f"{name:>15s}" for name in columns))
-    for count in counts:
-        rows.append(one_row(paths[:count], options.heights, folder / "fits", options.steps, options.threads))
-        print(" ".join(f"{rows[-1][name]:15.3f}" for name in columns), flush=True)
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        kept = Kept(pool.map if options.workers > 1 else map)
+        for count in counts:
+            rows.append(one_row(paths[:count], options.heights, folder / "fits", options.steps, options.threads, kept))
+            print(" ".join(f"{rows[-1][name]:15.3f}" for name in columns), flush=True)
     table = Table(rows)
     table.write(folder / "errors.ecsv", overwrite=True)
     draw(table, options.plot or folder / "errors.png")
