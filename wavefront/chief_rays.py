@@ -65,15 +65,10 @@ def image_jacobians(
     telescope: Telescope, directions: np.ndarray, wavelength: float, threads: int | None = None
 ) -> np.ndarray:
     """Return d(position on the detector)/d(direction cosines) [m], shape [n, 2, 2], by central differences."""
-    jacobian = np.empty((len(directions), 2, 2))
-    for axis in range(2):
-        ends = []
-        for sign in (1.0, -1.0):
-            cosines = directions[:, :2].copy()
-            cosines[:, axis] += sign * JACOBIAN_STEP
-            ends.append(_landing(telescope, _downwards(cosines), wavelength, threads))
-        jacobian[:, :, axis] = (ends[0] - ends[1]) / (2 * JACOBIAN_STEP)
-    return jacobian
+    steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    cosines = (directions[:, :2] + steps[:, None]).reshape(-1, 2)
+    ends = _landing(telescope, _downwards(cosines), wavelength, threads).reshape(2, 2, -1, 2)
+    return np.moveaxis((ends[:, 0] - ends[:, 1]) / (2 * JACOBIAN_STEP), 0, -1)
 
 
 @check_arguments

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from .inputs import (
 )
 from .joint import JointFit, field_terms, fit_field, fit_freedoms
 from .light import Instrument
-from .likelihood import model_image
+from .likelihood import model_image, pulls
 from .result import DonutFit
 from .seeing import Seeing
 from .stamps import Pixels
@@ -295,15 +296,18 @@ def _collected(
         star = stars[i] if joint is None else joint.stars[k]
         solution, place = (star.solution, 0) if joint is None else (joint.solution, k)
         stamp = star.stamp
-        if solution is None or stamp is None:
+        if solution is None or stamp is None or star.full is None:
             continue
+        full = replace(star.full, rays=stamp.rays)
         found = solution.stars[place]
         values[i, : len(found)] = found
         errors[i, : len(found)] = np.sqrt(np.diag(solution.star_covariance(place)))
-        chi2[i], n_pixels[i] = solution.chi2[place], stamp.used.sum()
-        ny, nx = stamp.image.shape
-        model[i, :ny, :nx] = model_image(stamp, found, solution.waves[place])
-        used[i, :ny, :nx] = stamp.used
+        ny, nx = full.image.shape
+        best = star.model if joint is None else None
+        best = model_image(full, found, solution.waves[place]) if best is None else best
+        model[i, :ny, :nx] = best
+        used[i, :ny, :nx] = full.used
+        chi2[i], n_pixels[i] = (pulls(full, best)[full.used] ** 2).sum(), full.used.sum()
         if joint is None:
             zernikes[i], covariance[i] = solution.shared[:n_noll], solution.shared_covariance[:n_noll, :n_noll]
         else:

@@ -111,7 +111,8 @@ def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFre
     if light is None or stamp is None or solution is None:
         return star
     fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
-    across = instrument.sampling(light, Pixels(stamp.image, stamp.variance, stamp.used), fwhm).across
+    pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
+    across = instrument.sampling(light, pixels, fwhm).across
     cells = pupil_cells(freedoms.apply(light.telescope, at), light.direction, instrument.middle, across)
     waves = (instrument.wavelengths, instrument.wavelength_weights)
     rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, at, stamp.grid.footprint)
