@@ -62,7 +62,8 @@ class FreedomRays:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths, self._points = direction, wavelengths, cells.points
         self._cells, self._footprint = cells, footprint
-        self.weights = np.outer(wavelength_weights, cells.weights).ravel()
+        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
+        self.rates = np.zeros((len(self._weights), 0))
         middle = float(wavelengths[len(wavelengths) // 2])
         columns = ParameterColumns.at(self._prepared, self._parameters, self._matrix @ at)
 
@@ -83,6 +84,10 @@ class FreedomRays:
         ]
         middle = float(self._wavelengths[len(self._wavelengths) // 2])
         return np.concatenate(places) - chief_landing(changed, self._direction, middle)
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light, at the values of the construction."""
+        return self._weights
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point."""

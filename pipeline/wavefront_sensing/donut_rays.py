@@ -9,6 +9,7 @@ are exact for a wavefront of any size.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Protocol
 
 import numpy as np
@@ -23,9 +24,12 @@ from .pupil_cells import PupilCells
 
 
 class LightRays(Protocol):
-    """Landing points of one star's light as functions of the unknowns of its wavefront."""
+    """Landing points of one star's light as functions of unknowns: those of the wavefront, then shifts of rims."""
 
-    weights: np.ndarray  #: fractions of the light of the points, [n]
+    rates: np.ndarray  #: derivatives of :meth:`weights` with respect to the shifts of rims [1/m], [n, n_shift]
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light of the points, shape [n]."""
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], detector x and y, shape [n, 2]."""
@@ -34,7 +38,7 @@ class LightRays(Protocol):
         """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivatives of :meth:`landing` with respect to the unknowns, shape [2, n, n_unknown]."""
+        """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
 
 
 class ZernikeRays:
@@ -65,7 +69,9 @@ class ZernikeRays:
     ) -> None:
         self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
         self._cells, self._points = cells, cells.points
-        self.weights = np.outer(wavelength_weights, cells.weights).ravel()
+        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
+        rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
+        self.rates = np.kron(wavelength_weights[:, None], rates)
         middle = float(wavelengths[len(wavelengths) // 2])
         self._chief = chief_landing(telescope, direction, middle)
         radius = 0.5 * telescope.pupil_diameter
@@ -96,13 +102,24 @@ class ZernikeRays:
         x, y = np.moveaxis(self._gradients, 1, 0)
         return np.stack([jacobian[0, :, i, None] * x.T + jacobian[1, :, i, None] * y.T for i in range(2)])
 
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light; see :class:`LightRays`."""
+        return self._weights + self.rates @ unknowns[len(self._gradients) :]
+
+    def at_shifts(self, unknowns: np.ndarray) -> ZernikeRays:
+        """Return the light with its rims held where unknowns have them, for unknowns of the wavefront alone."""
+        held = copy(self)
+        held._weights, held.rates = self.weights(unknowns), self.rates[:, :0]
+        return held
+
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points for coefficients [m]; see :class:`LightRays`."""
+        coefficients = unknowns[: len(self._gradients)]
         # Several images of one wavefront follow each other.
-        if self._last is None or not np.array_equal(self._last[0], unknowns):
-            slopes = -np.tensordot(unknowns, self._gradients, axes=1).T[None]
+        if self._last is None or not np.array_equal(self._last[0], coefficients):
+            slopes = -np.tensordot(coefficients, self._gradients, axes=1).T[None]
             landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths]) - self._chief
-            self._last = (unknowns.copy(), landing)
+            self._last = (coefficients.copy(), landing)
         return self._last[1]
 
     def spread(self, landing: np.ndarray) -> np.ndarray:

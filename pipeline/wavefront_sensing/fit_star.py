@@ -157,7 +157,8 @@ class _StarFitter:
         self._donut = light.diameter > SMALLEST_DONUT * instrument.pixel
         self._strength, self._fixed = strength, fixed_strength
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
-        n = len(instrument.noll)
+        self._precision = np.concatenate([instrument.precision, light.shift_precision])
+        n = len(self._precision)
         self._map = np.eye(n)[None] if wavefront else np.zeros((1, n, 0))
         self._rays: dict[int, ZernikeRays] = {}
         #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
@@ -214,7 +215,7 @@ class _StarFitter:
         unknowns = np.zeros(len(NUISANCES))
         unknowns[[FLUX, STRENGTH]] = 1.0, self._strength
         unknowns[[X, Y]] = -stamp.grid.scale * stamp.grid.offset
-        return model_image(stamp, unknowns, np.zeros(len(self._instrument.noll)))
+        return model_image(stamp, unknowns, np.zeros(len(self._precision)))
 
     def start(self, stamp: Stamp, template: np.ndarray) -> tuple[np.ndarray, Match]:
         """Return unknowns of the star where its template fits best."""
@@ -229,7 +230,7 @@ class _StarFitter:
     ) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((stamp,), self._map, self._instrument.precision[:n], self._fixed)
+        group = Group((stamp,), self._map, self._precision[:n], self._fixed)
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance)
 
     def with_companion(
@@ -298,7 +299,7 @@ def _beside(stamp: Stamp, solution: Solution) -> float:
     star, wave = solution.stars[0], solution.waves[0]
     place = stamp.grid.places(star, stamp.rays.landing(wave))
     outside = np.abs(place) > 0.5 * np.array(stamp.grid.shape[::-1])
-    return float(stamp.rays.weights @ outside.any(axis=1))
+    return float(stamp.rays.weights(wave) @ outside.any(axis=1))
 
 
 def _clipped(full: Stamp, model: np.ndarray, misfit: float) -> np.ndarray:

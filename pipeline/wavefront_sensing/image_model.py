@@ -155,14 +155,14 @@ class ImageGrid:
 
     def image(self, unknowns: np.ndarray, light: LandedLight) -> np.ndarray:
         """Return the image [electrons], shape [ny, nx]; arguments as in :meth:`derivatives`."""
-        spectrum, shift = self._spectra(unknowns, light, None)
+        spectrum, shift = self._spectra(unknowns, light)
         if shift is not None:
             spectrum *= 1.0 + unknowns[RATIO] * shift
         star = self._pixels(spectrum)[..., 0].astype(np.float64)
         return np.asarray(unknowns[FLUX] * star + unknowns[BACKGROUND] * self.scale**2)
 
     def derivatives(
-        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray
+        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray, rates: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the image and its derivatives.
 
@@ -174,18 +174,20 @@ class ImageGrid:
             Landing points of the light.
         response : ndarray, shape [2, n, n_wave]
             Derivatives of the landing points with respect to the unknowns of the wavefront [m].
+        rates : ndarray, shape [n, n_shift]
+            Derivatives of the fractions of the light with respect to shifts of rims.
 
         Returns
         -------
         image : ndarray, shape [ny, nx]
             Electrons a pixel.
-        columns : ndarray of float32, shape [ny, nx, n_unknown + n_wave]
-            Derivatives by the unknowns, then by those of the wavefront, over their scales.
-        scales : ndarray, shape [n_unknown + n_wave]
+        columns : ndarray of float32, shape [ny, nx, n_unknown + n_wave + n_shift]
+            Derivatives by the unknowns, then by those of the wavefront and the shifts, over their scales.
+        scales : ndarray, shape [n_unknown + n_wave + n_shift]
             Scales of the columns.
         """
         flux, strength = unknowns[FLUX], unknowns[STRENGTH]
-        spectra, shift = self._spectra(unknowns, light, response)
+        spectra, shift = self._spectra(unknowns, light, response, rates)
         star, moved = spectra[..., :1], spectra[..., 1:]
         extra = []
         if shift is not None:
@@ -207,9 +209,13 @@ class ImageGrid:
         return flux * columns[..., FLUX].astype(np.float64) + level, columns, scales
 
     def _spectra(
-        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None
+        self,
+        unknowns: np.ndarray,
+        light: LandedLight,
+        response: np.ndarray | None = None,
+        rates: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return spectra of a star of unit flux and its derivatives by x, y and wave, and the shift of a second one."""
+        """Return spectra of a star of unit flux and its derivatives by x, y, wave and rims, and a second one's shift."""
         points = self.places(unknowns, light.landing)
         splines = self._deposit(points, light.spread / self.pixel**2, response is not None)
         weights = light.weights.astype(np.float32)[:, None]
@@ -218,6 +224,8 @@ class ImageGrid:
             _, along_x, along_y = splines
             moved = (response / self.pixel * light.weights[:, None]).astype(np.float32)
             deposits.append(along_x @ moved[0] + along_y @ moved[1])
+        if rates is not None and rates.shape[1]:
+            deposits.append(splines[0] @ rates.astype(np.float32))
         spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
         turbulence = np.exp(-self._exponent * unknowns[STRENGTH] ** (5.0 / 3.0))
         spectra *= (self._detector * turbulence).astype(np.float32)[..., None]

@@ -16,9 +16,9 @@ from ...wavefront.chief_rays import image_jacobians
 from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
-from .pupil_cells import pupil_cells
 from .seeing import Seeing
 from .stamps import Pixels
+from .vignetting import cells_with_rims, movable_rims, shift_spread
 
 #: Points across the pupil for the size of an image, and the least and most cells for its model.
 _SURVEY, _FEWEST, _MOST = 48, 48, 400
@@ -81,8 +81,8 @@ class Instrument:
         telescope = self._with_detector(direction, defocus)
         along = (np.arange(_SURVEY) - 0.5 * (_SURVEY - 1)) * telescope.pupil_diameter / _SURVEY
         points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-        end = trace(telescope, parallel_rays(telescope, direction[None], self.middle, points), threads=1)
-        lit = end.status == RayStatus.OK
+        ends = trace(telescope, parallel_rays(telescope, direction[None], self.middle, points), "all", threads=1)
+        end, lit = ends[-1], ends[-1].status == RayStatus.OK
         if not lit.any():
             raise DomainError("no light passes the telescope")
         detector = telescope.surfaces[-1]
@@ -94,7 +94,7 @@ class Instrument:
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
         # Light passes up to half a cell beyond the outermost points.
         diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
-        return Light(telescope, direction, diameter, depth, jacobian)
+        return Light(telescope, direction, diameter, depth, jacobian, movable_rims(telescope, ends))
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
@@ -147,7 +147,7 @@ class Instrument:
 
     def rays(self, light: Light, across: int) -> ZernikeRays:
         """Return the light of a star through so many cells across the pupil."""
-        cells = pupil_cells(light.telescope, light.direction, self.middle, across)
+        cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims)
         return ZernikeRays(
             light.telescope, light.direction, self.wavelengths, self.wavelength_weights, cells, self.noll
         )
@@ -187,6 +187,8 @@ class Light:
         Distance from the detector to the best focus along the detector's z [m].
     jacobian : ndarray, shape [2, 2]
         Derivative of the chief ray's landing point by direction cosines [m].
+    rims : dict
+        Surfaces whose rims stand aside by an unknown amount, with the diameter of the beam there [m].
     """
 
     telescope: Telescope
@@ -194,6 +196,12 @@ class Light:
     diameter: float
     depth: float
     jacobian: np.ndarray
+    rims: dict[str, float]
+
+    @property
+    def shift_precision(self) -> np.ndarray:
+        """Inverse variances of the shifts of the rims along x and y [1/m^2], shape [n_shift]."""
+        return np.full(2 * len(self.rims), shift_spread(self.telescope) ** -2.0)
 
     @property
     def scale(self) -> float:

@@ -41,12 +41,15 @@ class PupilCells:
         Second moments of the lit parts about their centroids [m^2].
     side : float
         Side of a cell [m].
+    rates : ndarray, shape [n, n_shift], optional
+        Derivatives of the weights by shifts of rims [1/m]; cells of zero weight may have them.
     """
 
     points: np.ndarray
     weights: np.ndarray
     moments: np.ndarray
     side: float
+    rates: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.weights)

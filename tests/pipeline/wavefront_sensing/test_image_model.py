@@ -77,8 +77,8 @@ def test_derivatives_are_central_differences(behind_focus, companion):
     joined = np.concatenate([star, wave])
     steps = np.concatenate([[1e3, 3e-2, 3e-2, 1.0, 0.05], np.full(len(companion), 0.02), np.full(len(NOLL), 5e-9)])
     landing = stamp.rays.landing(wave)
-    light = LandedLight(landing, stamp.rays.weights, stamp.rays.spread(landing))
-    image, columns, scales = stamp.grid.derivatives(star, light, stamp.rays.response(wave))
+    light = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
+    image, columns, scales = stamp.grid.derivatives(star, light, stamp.rays.response(wave), stamp.rays.rates)
     np.testing.assert_allclose(image, model_image(stamp, star, wave), atol=1e-6 * image.max())
     for k, step in enumerate(steps):
         ends = []
