@@ -25,7 +25,7 @@ from .fit_star import SMALLEST_DONUT, StarFit, fit_star
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, RATIO, STRENGTH, X, Y
 from .inputs import (
-    next_terms,
+    further_terms,
     noll_indices,
     one_for_each,
     outer_scale_of,
@@ -58,6 +58,7 @@ def fit_donuts(
     pixel_size: ArrayLike = 10e-6,
     sky_variance: ArrayLike = 0.0,
     noll: Iterable[int] = range(4, 23),
+    left_out: ArrayLike = 200e-9,
     higher_order: ArrayLike = 0.0,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None,
@@ -101,6 +102,9 @@ def fit_donuts(
         Variance of sky and readout [electron^2 a pixel].
     noll : iterable of int
         Noll indices of the wavefront, from 4.
+    left_out : float or Quantity
+        Rms of each term from Z4 to Z22 that `noll` leaves out [m]. These are fitted too, with that prior, those up to
+        Z28 with a tenth of it, and not returned: errors of `zernikes` have what is not known of them. 0 is none.
     higher_order : float or Quantity
         Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
         what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
@@ -164,8 +168,8 @@ def fit_donuts(
     directions = field_direction(angles[:, 0], angles[:, 1], projection)
     waves = wavelength_points(telescope, wavelength)
     terms = noll_indices(noll, "noll", 4)
-    size = small_length(higher_order, "higher_order")
-    further = next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
+    left, size = (small_length(v, n) for v, n in ((left_out, "left_out"), (higher_order, "higher_order")))
+    further, precision = further_terms(terms, *((left, size) if degrees_of_freedom is None else (0.0, 0.0)))
     field_indices = None if field_noll is None else noll_indices(field_noll, "field_noll", 1)
     shifts = one_for_each(metres(defocus, "defocus"), count, "defocus")
     if (np.abs(shifts) > _MOST_DEFOCUS).any():
@@ -190,7 +194,7 @@ def fit_donuts(
         Seeing(float(waves[len(waves) // 2]), outer_scale_of(outer_scale)),
         spread,
         np.concatenate([terms, further]),
-        np.concatenate([np.zeros(len(terms)), np.full(len(further), size**-2.0 if size else 0.0)]),
+        np.concatenate([np.zeros(len(terms)), precision]),
         focal_plane,
         cells,
     )

@@ -24,6 +24,8 @@ _FOUND = 8.0
 #: Least gain of twice the logarithm of the likelihood by a second star or another focus, and the largest part of the
 #: misfit that may be left: what turbulence and missing terms of the wavefront do to an image, neither explains.
 _GAIN, _LEFT = 100.0, 0.5
+#: Loss a coarse pixel from which on second stars are searched for at these distances over the diameter of the donut.
+_POOR, _NEAR_RADII, _NEAR_ANGLES = 1.0, (0.08, 0.2), 6
 #: Least flux of a second star over that of the first.
 _LEAST_RATIO = 0.01
 #: Fraction of the light that may fall beside the stamp.
@@ -256,7 +258,29 @@ class _StarFitter:
             )
             if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
                 best = trial
+        if best.loss / stamp.used.sum() > _POOR:
+            best = self._with_near_companion(roomy or self.stamp(self._light, pixels, blended=True), best, first)
         return _central_first(best)
+
+    def _with_near_companion(self, stamp: Stamp, best: Solution, first: np.ndarray) -> Solution:
+        """Return the best solution with a second star that overlaps most of the first, if that explains much more.
+
+        A fit of one star takes two for one that is larger and oddly shaped, so that the residuals do not show where
+        the second stands: places around the first are tried, without aberrations.
+        """
+        diameter = self._light.diameter / self._instrument.pixel
+        nothing = np.zeros_like(best.shared)
+        for radius in _NEAR_RADII:
+            for angle in np.arange(_NEAR_ANGLES) * 2.0 * np.pi / _NEAR_ANGLES:
+                offset = radius * diameter * np.array([np.cos(angle), np.sin(angle)])
+                star = np.array([*first, 1.0, *offset])
+                star[FLUX] *= 0.5
+                # The template stands in the middle of the two.
+                star[[X, Y]] -= 0.5 * offset
+                trial = self.solve(stamp, star, nothing, COARSE)
+                if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
+                    best = trial
+        return best
 
     def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, here: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""

@@ -215,7 +215,7 @@ class ImageGrid:
         response: np.ndarray | None = None,
         rates: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return spectra of a star of unit flux and its derivatives by x, y, wave and rims, and a second one's shift."""
+        """Return spectra of a star of unit flux, its derivatives by x, y, wave and rims, and a second one's shift."""
         points = self.places(unknowns, light.landing)
         splines = self._deposit(points, light.spread / self.pixel**2, response is not None)
         weights = light.weights.astype(np.float32)[:, None]

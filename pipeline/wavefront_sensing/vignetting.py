@@ -32,7 +32,7 @@ def shift_spread(telescope: Telescope) -> float:
 
 
 def movable_rims(telescope: Telescope, ends: Sequence[TraceResult]) -> dict[str, float]:
-    """Return the surfaces whose rims matter, with the diameter of the beam there [m], of rays traced to all surfaces."""
+    """Return the surfaces whose rims matter, with the diameter of the beam there [m], from rays at all surfaces."""
     beams, before = {}, np.zeros(len(ends[0].status), dtype=bool)
     lit = ends[-1].status == RayStatus.OK
     for surface, end in zip(telescope.surfaces, ends, strict=True):
