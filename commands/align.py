@@ -29,6 +29,7 @@ def align_command(
     ] = None,
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_align"),
+    resume: Annotated[bool, Option("--resume", help="Go on with the visits in the folder.")] = False,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -38,12 +39,14 @@ def align_command(
     Fifty degrees of freedom are off at first and drift. In each visit the eight halves of the wavefront sensors image a
     star each, through turbulence and with noise; Zernikes are fitted to the donuts, the state is estimated and
     corrected. Tables of visits, states and estimates (ECSV), summary.json, pictures and the configuration go into one
-    folder. A visit takes some five seconds; a loop is not resumed.
+    folder. A visit takes some four seconds. A loop that was killed goes on by --resume, to the same bytes, and so does
+    one that is to have more visits.
 
     **Examples**
 
     - `pachon align`: 20 visits, two minutes
     - `pachon align -n 100 --heights lsstcam --believed-heights nominal -o ignored`: sensors as built, taken as nominal
+    - `pachon align -n 200 --resume -o ignored`: a hundred visits more
     - `pachon align my_loop.yaml`, where my_loop.yaml may read
 
         visits: 50
@@ -51,7 +54,6 @@ def align_command(
         donuts: {electrons: 1e6, second_stars: 0.14}
         control: {gain: 0.7}
     """
-    from ..core.files import make_folder
     from ..pipeline.config import with_options
     from ..studies.alignment.config import AlignConfig, load_align_configuration
     from ..studies.alignment.loop import align
@@ -66,10 +68,9 @@ def align_command(
         control__gain=gain,
         seed=seed,
     )
-    make_folder(out)
     folder = None if config is None else config.parent
-    with interruptible(quiet) as reporter:
-        found = align(settings, folder=folder, threads=threads, reporter=reporter)
+    with interruptible(quiet, f"finished visits are in {out}, and --resume goes on from there") as reporter:
+        found = align(settings, folder=folder, store=out, resume=resume, threads=threads, reporter=reporter)
     write_alignment(found, out)
     summary = alignment_summary(found)
     if as_json:

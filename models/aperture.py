@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -293,3 +293,14 @@ class Complement(Region):
 
 
 Aperture = Circle | Annulus | Rectangle | Vane | Polygon | Union | Intersection | Complement
+
+
+def shifted(aperture: Aperture, x: float, y: float) -> Aperture:
+    """Return an aperture shifted in the plane of its surface [m]."""
+    if isinstance(aperture, Union | Intersection):
+        return type(aperture)(tuple(shifted(part, x, y) for part in aperture.parts))
+    if isinstance(aperture, Complement):
+        return Complement(shifted(aperture.part, x, y))
+    if isinstance(aperture, Polygon):
+        return Polygon(tuple((a + x, b + y) for a, b in aperture.corners))
+    return replace(aperture, x=aperture.x + x, y=aperture.y + y)

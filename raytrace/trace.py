@@ -16,7 +16,7 @@ from ..core.warp_arrays import warp_array
 from ..models.camera.focal_plane import FocalPlane
 from ..models.telescope import Telescope
 from .detector import land_on_ccds
-from .kernels.packet import from_packets, lanes, packet_count, ray_packets, to_packets
+from .kernels.packet import RayPackets, from_packets, lanes, packet_count, ray_packets, to_packets
 from .kernels.trace import trace_rays
 from .pack.surfaces import pack_surfaces, refractive_indices
 from .rays import Rays, RayStatus
@@ -92,7 +92,8 @@ def trace_packets(telescope: Telescope, rays: Rays, n_stored: int, *, threads: i
     packed = pack_surfaces(telescope)
     count = packet_count(len(rays))
     indices = refractive_indices(telescope, rays.wavelength)
-    start, end = ray_packets(), ray_packets(n_stored, count)
+    # The status of the start is not read.
+    start, end = RayPackets(), ray_packets(n_stored, count)
     start.position = warp_array(to_packets(rays.position.T[None]), lanes)
     start.direction = warp_array(to_packets(rays.direction.T[None]), lanes)
     start.path = warp_array(to_packets(rays.path_length[None]), lanes)

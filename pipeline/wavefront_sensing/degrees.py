@@ -63,7 +63,8 @@ class FreedomRays:
         self._prepared, self._parameters, self._matrix = freedoms.parameter_matrix(telescope)
         self._direction, self._wavelengths, self._points = direction, wavelengths, cells.points
         self._cells, self._footprint = cells, footprint
-        self.weights = np.outer(wavelength_weights, cells.weights).ravel()
+        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
+        self.rates = np.zeros((len(self._weights), 0))
         middle = float(wavelengths[len(wavelengths) // 2])
         #: Where the chief ray crosses the plane of the entrance pupil: that of the telescope as it is believed to be.
         self._chief = np.reshape(aimed_points(telescope, direction[None], middle, np.zeros((1, 2))), (1, 2))
@@ -89,6 +90,10 @@ class FreedomRays:
         if not np.isfinite(chief).all():
             raise DomainError("the chief ray does not reach the image")
         return np.concatenate(places) - chief
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light, at the values of the construction."""
+        return self._weights
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point."""

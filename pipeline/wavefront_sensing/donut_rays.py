@@ -9,6 +9,7 @@ are exact for a wavefront of any size. Where rays are aimed, Zernikes are functi
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Protocol
 
 import numpy as np
@@ -28,9 +29,12 @@ _DIFFERENCE = 1e-4
 
 
 class LightRays(Protocol):
-    """Landing points of one star's light as functions of the unknowns of its wavefront."""
+    """Landing points of one star's light as functions of unknowns: those of the wavefront, then shifts of rims."""
 
-    weights: np.ndarray  #: fractions of the light of the points, [n]
+    rates: np.ndarray  #: derivatives of :meth:`weights` with respect to the shifts of rims [1/m], [n, n_shift]
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light of the points, shape [n]."""
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points minus that of the chief ray [m], detector x and y, shape [n, 2]."""
@@ -39,7 +43,7 @@ class LightRays(Protocol):
         """Return second moments of the image of each point, beside the footprint of the cells [m^2], [n, 2, 2]."""
 
     def response(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivatives of :meth:`landing` with respect to the unknowns, shape [2, n, n_unknown]."""
+        """Return the derivatives of :meth:`landing` with respect to the unknown wavefront, shape [2, n, n_wave]."""
 
 
 class ZernikeRays:
@@ -70,35 +74,55 @@ class ZernikeRays:
     ) -> None:
         self._telescope, self._direction, self._wavelengths = telescope, direction, wavelengths
         self._cells, self._points = cells, cells.points
-        self.weights = np.outer(wavelength_weights, cells.weights).ravel()
+        self._weights = np.outer(wavelength_weights, cells.weights).ravel()
+        rates = np.zeros((len(cells), 0)) if cells.rates is None else cells.rates
+        self.rates = np.kron(wavelength_weights[:, None], rates)
         middle = float(wavelengths[len(wavelengths) // 2])
         self._chief = chief_landing(telescope, direction, middle)
         #: Derivatives of the terms along x and y of the plane of the entrance pupil [1/m], [n_term, 2, n_point].
         self._gradients = _gradients(telescope, direction, middle, cells.points, noll)
         self._response = -np.concatenate([self._jacobian_times_gradients(float(w)) for w in wavelengths], axis=1)
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
         #: Sides of the image of a cell [m], columns of a matrix.
-        self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 2))))
+        self.footprint = cells.footprint(self._landing(middle, np.zeros((1, 1, 2)))[0])
 
     def _landing(self, wavelength: float, slopes: np.ndarray) -> np.ndarray:
-        """Return detector x and y [m] of rays whose direction cosines are changed by slopes [n, 2] or [1, 2]."""
-        cosines = np.broadcast_to(self._direction[:2] + slopes, self._points.shape)
-        down = -np.sqrt(1.0 - (cosines**2).sum(axis=1, keepdims=True))
-        directions = np.concatenate([cosines, down], axis=1)
-        return landing_of(
-            self._telescope, parallel_rays(self._telescope, directions, wavelength, self._points[:, None])
+        """Return detector x and y [m] of rays, [m, n, 2], with direction cosines changed by slopes [m, n or 1, 2]."""
+        cosines = np.broadcast_to(self._direction[:2] + slopes, (len(slopes), *self._points.shape))
+        down = -np.sqrt(1.0 - (cosines**2).sum(axis=2, keepdims=True))
+        directions = np.concatenate([cosines, down], axis=2).reshape(-1, 3)
+        points = np.tile(self._points, (len(slopes), 1))[:, None]
+        return landing_of(self._telescope, parallel_rays(self._telescope, directions, wavelength, points)).reshape(
+            cosines.shape
         )
 
     def _jacobian_times_gradients(self, wavelength: float) -> np.ndarray:
         """Return J(p) times the gradients of the terms, shape [2, n_point, n_term]."""
-        step = JACOBIAN_STEP * np.eye(2)
-        along = [(self._landing(wavelength, s[None]) - self._landing(wavelength, -s[None])) for s in step]
-        jacobian = np.stack(along, axis=-1) / (2.0 * JACOBIAN_STEP)  # [n_point, detector axis, direction axis]
-        return np.einsum("pij,tjp->ipt", jacobian, self._gradients)
+        steps = JACOBIAN_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        along = self._landing(wavelength, steps[:, None])
+        jacobian = (along[0::2] - along[1::2]) / (2.0 * JACOBIAN_STEP)  # [direction axis, n_point, detector axis]
+        x, y = np.moveaxis(self._gradients, 1, 0)
+        return np.stack([jacobian[0, :, i, None] * x.T + jacobian[1, :, i, None] * y.T for i in range(2)])
+
+    def weights(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return fractions of the light; see :class:`LightRays`."""
+        return self._weights + self.rates @ unknowns[len(self._gradients) :]
+
+    def at_shifts(self, unknowns: np.ndarray) -> ZernikeRays:
+        """Return the light with its rims held where unknowns have them, for unknowns of the wavefront alone."""
+        held = copy(self)
+        held._weights, held.rates = self.weights(unknowns), self.rates[:, :0]
+        return held
 
     def landing(self, unknowns: np.ndarray) -> np.ndarray:
         """Return landing points for coefficients [m]; see :class:`LightRays`."""
-        slopes = -np.einsum("t,tjp->pj", unknowns, self._gradients)
-        return np.concatenate([self._landing(float(w), slopes) for w in self._wavelengths]) - self._chief
+        coefficients = unknowns[: len(self._gradients)]
+        # Several images of one wavefront follow each other.
+        if self._last is None or not np.array_equal(self._last[0], coefficients):
+            slopes = -np.tensordot(coefficients, self._gradients, axes=1).T[None]
+            landing = np.concatenate([self._landing(float(w), slopes)[0] for w in self._wavelengths]) - self._chief
+            self._last = (coefficients.copy(), landing)
+        return self._last[1]
 
     def spread(self, landing: np.ndarray) -> np.ndarray:
         """Return the spread of the image of each point; see :class:`LightRays`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from .fit_star import SMALLEST_DONUT, StarFit, fit_star
 from .flags import DonutFlag
 from .image_model import BACKGROUND, FLUX, RATIO, STRENGTH, X, Y
 from .inputs import (
-    next_terms,
+    further_terms,
     noll_indices,
     one_for_each,
     outer_scale_of,
@@ -34,7 +35,7 @@ from .inputs import (
 )
 from .joint import JointFit, field_terms, fit_field, fit_freedoms
 from .light import Instrument
-from .likelihood import model_image
+from .likelihood import model_image, pulls
 from .result import DonutFit
 from .seeing import Seeing
 from .stamps import Pixels
@@ -57,6 +58,7 @@ def fit_donuts(
     pixel_size: ArrayLike = 10e-6,
     sky_variance: ArrayLike = 0.0,
     noll: Iterable[int] = range(4, 23),
+    left_out: ArrayLike = 200e-9,
     higher_order: ArrayLike = 0.0,
     degrees_of_freedom: DegreesOfFreedom | None = None,
     prior: ArrayLike | Mapping[str, Any] | Sequence[Tolerance] | None = None,
@@ -100,6 +102,9 @@ def fit_donuts(
         Variance of sky and readout [electron^2 a pixel].
     noll : iterable of int
         Noll indices of the wavefront, from 4.
+    left_out : float or Quantity
+        Rms of each term from Z4 to Z22 that `noll` leaves out [m]. These are fitted too, with that prior, those up to
+        Z28 with a tenth of it, and not returned: errors of `zernikes` have what is not known of them. 0 is none.
     higher_order : float or Quantity
         Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
         what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
@@ -163,8 +168,8 @@ def fit_donuts(
     directions = field_direction(angles[:, 0], angles[:, 1], projection)
     waves = wavelength_points(telescope, wavelength)
     terms = noll_indices(noll, "noll", 4)
-    size = small_length(higher_order, "higher_order")
-    further = next_terms(terms) if size > 0.0 and degrees_of_freedom is None else terms[:0]
+    left, size = (small_length(v, n) for v, n in ((left_out, "left_out"), (higher_order, "higher_order")))
+    further, precision = further_terms(terms, *((left, size) if degrees_of_freedom is None else (0.0, 0.0)))
     field_indices = None if field_noll is None else noll_indices(field_noll, "field_noll", 1)
     shifts = one_for_each(metres(defocus, "defocus"), count, "defocus")
     if (np.abs(shifts) > _MOST_DEFOCUS).any():
@@ -189,7 +194,7 @@ def fit_donuts(
         Seeing(float(waves[len(waves) // 2]), outer_scale_of(outer_scale)),
         spread,
         np.concatenate([terms, further]),
-        np.concatenate([np.zeros(len(terms)), np.full(len(further), size**-2.0 if size else 0.0)]),
+        np.concatenate([np.zeros(len(terms)), precision]),
         focal_plane,
         cells,
     )
@@ -295,15 +300,18 @@ def _collected(
         star = stars[i] if joint is None else joint.stars[k]
         solution, place = (star.solution, 0) if joint is None else (joint.solution, k)
         stamp = star.stamp
-        if solution is None or stamp is None:
+        if solution is None or stamp is None or star.full is None:
             continue
+        full = replace(star.full, rays=stamp.rays)
         found = solution.stars[place]
         values[i, : len(found)] = found
         errors[i, : len(found)] = np.sqrt(np.diag(solution.star_covariance(place)))
-        chi2[i], n_pixels[i] = solution.chi2[place], stamp.used.sum()
-        ny, nx = stamp.image.shape
-        model[i, :ny, :nx] = model_image(stamp, found, solution.waves[place])
-        used[i, :ny, :nx] = stamp.used
+        ny, nx = full.image.shape
+        best = star.model if joint is None else None
+        best = model_image(full, found, solution.waves[place]) if best is None else best
+        model[i, :ny, :nx] = best
+        used[i, :ny, :nx] = full.used
+        chi2[i], n_pixels[i] = (pulls(full, best)[full.used] ** 2).sum(), full.used.sum()
         if joint is None:
             zernikes[i], covariance[i] = solution.shared[:n_noll], solution.shared_covariance[:n_noll, :n_noll]
         else:

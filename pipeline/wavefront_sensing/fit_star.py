@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from .donut_rays import ZernikeRays
 from .flags import DonutFlag
-from .image_model import BACKGROUND, FLUX, NUISANCES, RATIO, STRENGTH, X, Y
-from .light import Instrument, Light
+from .image_model import FLUX, NUISANCES, RATIO, STRENGTH, X, Y
+from .light import Instrument, Light, Sampling
 from .likelihood import Stamp, model_image, pulls
 from .solve import COARSE, FINE, Group, Solution, solve
 from .stamps import Match, Pixels, match_template, without_cosmic_rays
@@ -23,6 +24,8 @@ _FOUND = 8.0
 #: Least gain of twice the logarithm of the likelihood by a second star or another focus, and the largest part of the
 #: misfit that may be left: what turbulence and missing terms of the wavefront do to an image, neither explains.
 _GAIN, _LEFT = 100.0, 0.5
+#: Loss a coarse pixel from which on second stars are searched for at these distances over the diameter of the donut.
+_POOR, _NEAR_RADII, _NEAR_ANGLES = 1.0, (0.08, 0.2), 6
 #: Least flux of a second star over that of the first.
 _LEAST_RATIO = 0.01
 #: Fraction of the light that may fall beside the stamp.
@@ -31,6 +34,8 @@ _BESIDE = 0.05
 _EXPLAINED = 0.5
 #: Pulls of pixels that are clipped, over that of typical pixels, and rounds of clipping.
 _CLIP, _ROUNDS = 7.0, 3
+#: Most scales of the last fits, and cells across the pupil over those that are needed.
+_SCALES, _ENOUGH = 3, 1.25
 
 
 @dataclass(frozen=True)
@@ -45,14 +50,20 @@ class StarFit:
         Light of the star.
     stamp : Stamp or None
         Pixels and model of the last fit.
+    full : Stamp or None
+        All pixels of the detector, of which those of the fit may be sums.
     solution : Solution or None
         Its unknowns.
+    model : ndarray or None
+        Best image of all pixels [electrons].
     """
 
     flags: DonutFlag
     light: Light | None = None
     stamp: Stamp | None = None
+    full: Stamp | None = None
     solution: Solution | None = None
+    model: np.ndarray | None = None
 
 
 def fit_star(
@@ -71,143 +82,213 @@ def fit_star(
     wavefront : bool
         Whether the wavefront is fitted; where not, it is zero.
     """
-    fitter = _StarFitter(instrument, light, strength, fixed_strength, wavefront)
     across = light.diameter / instrument.pixel
     donut = across > SMALLEST_DONUT
     clean = without_cosmic_rays(pixels) if donut else pixels
+    fitter = _StarFitter(instrument, light, clean, strength, fixed_strength, wavefront)
     flags = DonutFlag.OK
-    coarse = fitter.stamp(light, clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if donut else 1))
-    start, found = fitter.start(coarse)
+    small = clean.smoothed(max(1, round(across / _COARSE_DIAMETER)) if donut else 1)
+    coarse = fitter.stamp(light, small)
+    template = fitter.template(coarse)
+    start, found = fitter.start(coarse, template)
     if found.significance < _FOUND:
         flags |= DonutFlag.NO_DONUT
     if found.flux < len(NUISANCES) + (len(instrument.noll) if wavefront else 0):
         flags |= DonutFlag.TOO_FEW_PHOTONS
     if flags:
         return StarFit(flags, light)
-    best = fitter.solve(coarse, start)
+    best = fitter.solve(coarse, start, tolerance=COARSE if donut else FINE)
     if donut:
-        best = fitter.with_companion(coarse, best, found)
-        if fitter.other_focus_is_better(coarse, best):
+        best = fitter.with_companion(small, coarse, best, start, template)
+        if fitter.other_focus_is_better(small, coarse, best):
             return StarFit(DonutFlag.DEFOCUS_SIGN, light)
-    if not _explained(coarse.stamp, best):
+    if not _explained(coarse, best):
         return StarFit(DonutFlag.NO_DONUT, light)
-    if _beside(coarse.stamp, best) > _BESIDE:
+    if _beside(coarse, best) > _BESIDE:
         return StarFit(DonutFlag.CUT_OFF, light)
-    fine = fitter.stamp(light, clean, companion=len(best.stars[0]) > RATIO)
-    start = fitter.transferred(best.stars[0], coarse.pixels, fine.pixels)
-    solution = fitter.solve(fine, start, best.shared)
-    sharper = fitter.sharper(light, fine, solution)
-    if sharper is not None:
-        fine, solution = sharper, fitter.solve(sharper, solution.stars[0], solution.shared)
-    stamp = fine.stamp
-    for _ in range(_ROUNDS):
-        kept = _clipped(stamp, solution)
-        if (kept == stamp.used).all():
+    # The seeing of a solution decides how finely the next one is sampled.
+    blended, fine = len(best.stars[0]) > RATIO, None
+    for _ in range(_SCALES):
+        finer = fitter.sampled(best, blended, fine)
+        if finer is fine:
             break
-        stamp = replace(stamp, used=kept)
-        solution = fitter.solve(replace(fine, stamp=stamp), solution.stars[0], solution.shared)
-    if (stamp.used != pixels.used).any():
+        fine, best = finer, fitter.solve(finer.stamp, best.stars[0], best.shared)
+    assert fine is not None
+    stamp, full = fine.stamp, fitter.every_pixel(fine)
+    model = model_image(full, best.stars[0], best.waves[0])
+    for _ in range(_ROUNDS):
+        kept = _clipped(full, model, best.loss / stamp.used.sum())
+        if (kept == full.used).all():
+            break
+        full = replace(full, used=kept)
+        summed = replace(clean, used=kept).binned(fine.pixels.side)
+        stamp = replace(stamp, used=summed.used)
+        best = fitter.solve(stamp, best.stars[0], best.shared)
+        model = model_image(full, best.stars[0], best.waves[0])
+    if (full.used != pixels.used).any():
         flags |= DonutFlag.CLIPPED
-    if len(solution.stars[0]) > RATIO:
+    if blended:
         flags |= DonutFlag.BLENDED
-    if not solution.converged:
+    if not best.converged:
         flags |= DonutFlag.NOT_CONVERGED
-    return StarFit(flags, light, stamp, solution)
+    return StarFit(flags, light, stamp, full, best, model)
 
 
 @dataclass(frozen=True)
-class _Scaled:
-    """A stamp in pixels of some size."""
+class _Fine:
+    """A stamp for the last fits, and how it is sampled."""
 
     stamp: Stamp
     pixels: Pixels
+    sampling: Sampling
 
 
 class _StarFitter:
     """Solutions for one star on stamps of several scales."""
 
     def __init__(
-        self, instrument: Instrument, light: Light, strength: float, fixed_strength: bool, wavefront: bool
+        self,
+        instrument: Instrument,
+        light: Light,
+        clean: Pixels,
+        strength: float,
+        fixed_strength: bool,
+        wavefront: bool,
     ) -> None:
-        self._instrument, self._light = instrument, light
+        self._instrument, self._light, self._clean = instrument, light, clean
+        self._donut = light.diameter > SMALLEST_DONUT * instrument.pixel
         self._strength, self._fixed = strength, fixed_strength
         self._fwhm = float(instrument.seeing.fwhm(np.asarray(strength)))
-        n = len(instrument.noll)
+        self._precision = np.concatenate([instrument.precision, light.shift_precision])
+        n = len(self._precision)
         self._map = np.eye(n)[None] if wavefront else np.zeros((1, n, 0))
+        self._rays: dict[int, ZernikeRays] = {}
+        #: Cells across the pupil that the last fits are expected to need, so that the first ones share them.
+        self._across = self._sampling(self._fwhm, self._side(self._fwhm))[1].across
 
-    def stamp(self, light: Light, pixels: Pixels, *, companion: bool = False) -> _Scaled:
-        """Return the stamp of a star's light in given pixels; a second star needs room beside it."""
+    def _of(self, light: Light, across: int) -> ZernikeRays:
+        """Return the light through at least so many cells across the pupil, and at most a quarter more."""
+        if light is not self._light:
+            return self._instrument.rays(light, across)
+        for cells, rays in self._rays.items():
+            if across <= cells <= _ENOUGH * across:
+                return rays
+        return self._rays.setdefault(across, self._instrument.rays(light, across))
+
+    def stamp(self, light: Light, pixels: Pixels, *, blended: bool = False) -> Stamp:
+        """Return the stamp of a star's light in coarse pixels; a second star needs room beside it."""
+        sampling = self._instrument.sampling(light, pixels, self._fwhm)
         # Second stars may stand anywhere beside the stamp.
-        reach = light.diameter if companion or pixels.side > 1 else 0.0
-        return _Scaled(self._instrument.stamp(light, pixels, self._fwhm, reach), pixels)
+        reach = light.diameter * (1.0 if blended else 0.5) if pixels.side > 1 else 0.0
+        rays = self._of(light, max(sampling.across, self._across))
+        return self._instrument.stamp(light, pixels, rays, sampling.oversampling, reach)
 
-    def sharper(self, light: Light, scaled: _Scaled, found: Solution) -> _Scaled | None:
-        """Return the stamp with a finer grid where the seeing that was found needs one."""
-        fwhm = float(self._instrument.seeing.fwhm(found.stars[0][STRENGTH]))
-        sampling, grid = self._instrument.sampling(light, scaled.pixels, fwhm), scaled.stamp.grid
-        if sampling.oversampling <= grid.oversampling:
-            return None
-        return _Scaled(self._instrument.stamp(light, scaled.pixels, fwhm, grid.reach), scaled.pixels)
+    def _side(self, fwhm: float) -> int:
+        """Return how many pixels are summed along each axis for the last fits in a seeing [rad]."""
+        return self._instrument.binning(self._light, self._clean, fwhm) if self._donut else 1
 
-    def template(self, scaled: _Scaled) -> np.ndarray:
+    def sampled(self, found: Solution, blended: bool, last: _Fine | None) -> _Fine:
+        """Return a stamp fine enough for the seeing of a solution: the last one if that is, nearly."""
+        instrument, light = self._instrument, self._light
+        if last is None:
+            pixels, sampling = self._sampling(self._fwhm, self._side(self._fwhm))
+        else:
+            fwhm = float(instrument.seeing.fwhm(found.stars[0][STRENGTH]))
+            if not self._sampling(_ENOUGH * fwhm, last.pixels.side)[1].finer_than(last.sampling):
+                return last
+            pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side))
+        rays = self._of(light, sampling.across)
+        stamp = instrument.stamp(light, pixels, rays, sampling.oversampling, light.diameter if blended else 0.0)
+        return _Fine(stamp, pixels, sampling)
+
+    def _sampling(self, fwhm: float, side: int) -> tuple[Pixels, Sampling]:
+        pixels = self._clean.binned(side)
+        return pixels, self._instrument.sampling(self._light, pixels, fwhm)
+
+    def every_pixel(self, fine: _Fine) -> Stamp:
+        """Return the stamp with all pixels of the detector."""
+        if fine.pixels.side == 1:
+            return fine.stamp
+        rays, grid = self._of(self._light, fine.sampling.across), fine.stamp.grid
+        return self._instrument.stamp(self._light, self._clean, rays, 1, grid.reach)
+
+    def template(self, stamp: Stamp) -> np.ndarray:
         """Return the image of a star of unit flux at the centre of the stamp."""
         unknowns = np.zeros(len(NUISANCES))
-        unknowns[FLUX], unknowns[STRENGTH] = 1.0, self._strength
-        return model_image(scaled.stamp, unknowns, np.zeros(len(self._instrument.noll)))
+        unknowns[[FLUX, STRENGTH]] = 1.0, self._strength
+        unknowns[[X, Y]] = -stamp.grid.scale * stamp.grid.offset
+        return model_image(stamp, unknowns, np.zeros(len(self._precision)))
 
-    def start(self, scaled: _Scaled) -> tuple[np.ndarray, Match]:
+    def start(self, stamp: Stamp, template: np.ndarray) -> tuple[np.ndarray, Match]:
         """Return unknowns of the star where its template fits best."""
-        stamp = scaled.stamp
-        found = match_template(stamp.image, stamp.used, stamp.variance, self.template(scaled))
+        found = match_template(stamp.image, stamp.used, stamp.variance, template)
         unknowns = np.zeros(len(NUISANCES))
-        unknowns[[FLUX, X, Y, STRENGTH]] = max(found.flux, 1.0), found.x, found.y, self._strength
+        unknowns[[FLUX, STRENGTH]] = max(found.flux, 1.0), self._strength
+        unknowns[[X, Y]] = ([found.x, found.y] - stamp.grid.offset) * stamp.grid.scale
         return unknowns, found
 
-    def solve(self, scaled: _Scaled, star: np.ndarray, shared: np.ndarray | None = None) -> Solution:
+    def solve(
+        self, stamp: Stamp, star: np.ndarray, shared: np.ndarray | None = None, tolerance: float = FINE
+    ) -> Solution:
         """Return the best unknowns from a start."""
         n = self._map.shape[2]
-        group = Group((scaled.stamp,), self._map, self._instrument.precision[:n], self._fixed)
-        tolerance = FINE if scaled.pixels.side == 1 else COARSE
+        group = Group((stamp,), self._map, self._precision[:n], self._fixed)
         return solve(group, [star], np.zeros(n) if shared is None else shared, tolerance=tolerance)
 
-    def transferred(self, star: np.ndarray, coarse: Pixels, fine: Pixels) -> np.ndarray:
-        """Return the unknowns of a star in other pixels."""
-        scale = coarse.side / fine.side
-        star = star.copy()
-        star[[X, Y]] = (star[[X, Y]] - coarse.offset) * scale + fine.offset
-        star[BACKGROUND] /= scale**2
-        star[RATIO + 1 :] *= scale
-        return star
-
-    def with_companion(self, scaled: _Scaled, single: Solution, first: Match) -> Solution:
+    def with_companion(
+        self, pixels: Pixels, stamp: Stamp, single: Solution, first: np.ndarray, template: np.ndarray
+    ) -> Solution:
         """Return the solution with a second star if there is one, else that without."""
-        stamp, wave = scaled.stamp, single.waves[0]
+        wave = single.waves[0]
         best, misfit = single, single.loss / stamp.used.sum()
-        template = self.template(scaled)
+        roomy = None
         starts = [(single.stars[0], wave, single.shared)]
         if misfit > 3.0:
-            plain = np.zeros(len(NUISANCES))
-            plain[[FLUX, X, Y, STRENGTH]] = first.flux, first.x, first.y, self._strength
-            starts.append((plain, np.zeros_like(wave), np.zeros_like(single.shared)))
+            starts.append((first, np.zeros_like(wave), np.zeros_like(single.shared)))
         for star, aberration, shared in starts:
             rest = stamp.image - model_image(stamp, star, aberration)
             second = match_template(rest, stamp.used, stamp.variance, template)
             if second.significance < _FOUND:
                 continue
-            ratio, offset = second.flux / star[FLUX], (second.x - star[X], second.y - star[Y])
-            trial = self.solve(scaled, np.array([*star, ratio, *offset]), shared)
+            place = ([second.x, second.y] - stamp.grid.offset) * stamp.grid.scale
+            if roomy is None:
+                roomy = self.stamp(self._light, pixels, blended=True)
+            trial = self.solve(
+                roomy, np.array([*star, second.flux / star[FLUX], *(place - star[[X, Y]])]), shared, COARSE
+            )
             if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
                 best = trial
+        if best.loss / stamp.used.sum() > _POOR:
+            best = self._with_near_companion(roomy or self.stamp(self._light, pixels, blended=True), best, first)
         return _central_first(best)
 
-    def other_focus_is_better(self, scaled: _Scaled, here: Solution) -> bool:
+    def _with_near_companion(self, stamp: Stamp, best: Solution, first: np.ndarray) -> Solution:
+        """Return the best solution with a second star that overlaps most of the first, if that explains much more.
+
+        A fit of one star takes two for one that is larger and oddly shaped, so that the residuals do not show where
+        the second stands: places around the first are tried, without aberrations.
+        """
+        diameter = self._light.diameter / self._instrument.pixel
+        nothing = np.zeros_like(best.shared)
+        for radius in _NEAR_RADII:
+            for angle in np.arange(_NEAR_ANGLES) * 2.0 * np.pi / _NEAR_ANGLES:
+                offset = radius * diameter * np.array([np.cos(angle), np.sin(angle)])
+                star = np.array([*first, 1.0, *offset])
+                star[FLUX] *= 0.5
+                # The template stands in the middle of the two.
+                star[[X, Y]] -= 0.5 * offset
+                trial = self.solve(stamp, star, nothing, COARSE)
+                if _explains_more(trial, best) and trial.stars[0][RATIO] > _LEAST_RATIO:
+                    best = trial
+        return best
+
+    def other_focus_is_better(self, pixels: Pixels, stamp: Stamp, here: Solution) -> bool:
         """Return whether the image fits a detector on the other side of focus better."""
-        count = scaled.stamp.used.sum()
-        if here.loss / count < 1.5:
+        if here.loss / stamp.used.sum() < 1.5:
             return False
-        other = self.stamp(self._light.mirrored(), scaled.pixels)
-        start, _ = self.start(other)
-        return _explains_more(self.solve(other, start), here)
+        other = self.stamp(self._light.mirrored(), pixels)
+        start, _ = self.start(other, self.template(other))
+        return _explains_more(self.solve(other, start, tolerance=COARSE), here)
 
 
 def _explains_more(trial: Solution, other: Solution) -> bool:
@@ -240,13 +321,13 @@ def _explained(stamp: Stamp, solution: Solution) -> bool:
 def _beside(stamp: Stamp, solution: Solution) -> float:
     """Return the fraction of the star's light that lands beside the stamp."""
     star, wave = solution.stars[0], solution.waves[0]
-    place = stamp.rays.landing(wave) / stamp.grid.pixel + star[[X, Y]]
+    place = stamp.grid.places(star, stamp.rays.landing(wave))
     outside = np.abs(place) > 0.5 * np.array(stamp.grid.shape[::-1])
-    return float(stamp.rays.weights @ outside.any(axis=1))
+    return float(stamp.rays.weights(wave) @ outside.any(axis=1))
 
 
-def _clipped(stamp: Stamp, solution: Solution) -> np.ndarray:
+def _clipped(full: Stamp, model: np.ndarray, misfit: float) -> np.ndarray:
     """Return the pixels without those far off the model, cosmic rays and dead ones, and their neighbours."""
-    pull = np.where(stamp.used, pulls(stamp, model_image(stamp, solution.stars[0], solution.waves[0])), 0.0)
-    far = np.abs(pull) > _CLIP * max(1.0, float(np.sqrt(solution.loss / stamp.used.sum())))
-    return stamp.used & ~maximum_filter(far, 3) if far.any() else stamp.used
+    pull = np.where(full.used, pulls(full, model), 0.0)
+    far = np.abs(pull) > _CLIP * max(1.0, float(np.sqrt(misfit)))
+    return full.used & ~maximum_filter(far, 3) if far.any() else full.used

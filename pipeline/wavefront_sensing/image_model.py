@@ -17,9 +17,10 @@ from scipy.sparse import csc_array
 
 from ...wavefront.psf.image_plane import square_transfer
 from .seeing import Seeing
+from .stamps import Pixels
 
 #: Unknowns of every star before those of its wavefront: flux [electrons], x and y of the chief ray from the centre of
-#: the stamp [pixels], background [electrons a pixel], strength of the turbulence [1/m].
+#: the detector's stamp [its pixels], background [electrons a pixel of these], strength of the turbulence [1/m].
 NUISANCES = ("flux", "x", "y", "background", "strength")
 #: Further unknowns where there is a second star: its flux over that of the first, and its offset [pixels].
 COMPANION = ("ratio", "offset_x", "offset_y")
@@ -50,10 +51,8 @@ class ImageGrid:
 
     Parameters
     ----------
-    shape : tuple of int
-        Pixels of the stamp, (ny, nx).
-    pixel : float
-        Distance between the pixels of the stamp [m].
+    pixels : Pixels
+        The stamp.
     side : float
         Side of a pixel of the detector [m].
     seeing : Seeing
@@ -72,8 +71,7 @@ class ImageGrid:
 
     def __init__(
         self,
-        shape: tuple[int, int],
-        pixel: float,
+        pixels: Pixels,
         side: float,
         seeing: Seeing,
         jacobian: np.ndarray,
@@ -82,7 +80,10 @@ class ImageGrid:
         oversampling: int,
         reach: float,
     ) -> None:
+        shape, pixel = (pixels.image.shape[0], pixels.image.shape[1]), side * pixels.side
         self.shape, self.pixel, self.footprint = shape, pixel, footprint
+        #: Pixels of the detector along one of the stamp, and the centre of its stamp from that of this one [pixels].
+        self.scale, self.offset = float(pixels.side), np.array(pixels.offset)
         self.oversampling, self.reach = oversampling, reach
         margin = max(8, math.ceil(reach / pixel))
         self._size = tuple(fft.next_fast_len(oversampling * (n + margin), real=True) for n in shape)
@@ -90,7 +91,7 @@ class ImageGrid:
         self._middle = [0.5 * (n - 1) * oversampling for n in shape]
         turns = [fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])]  # cycles a cell
         y, x = np.meshgrid(*turns, indexing="ij")
-        self._phase = -2.0 * math.pi * oversampling * np.stack([x, y])  # for shifts in pixels
+        self._phase = -2.0 * math.pi * oversampling / pixels.side * np.stack([x, y])  # for shifts in detector pixels
         wave = 2.0 * math.pi * oversampling / pixel * np.stack([x, y])  # rad/m
         baseline = np.hypot(*np.tensordot(jacobian.T, wave, axes=1)) * seeing.wavelength / (2.0 * math.pi)
         self._exponent = seeing.exponent(baseline)
@@ -99,14 +100,18 @@ class ImageGrid:
         # A cell of the grid holds less light than a pixel.
         self._detector = (
             oversampling**2
-            * square_transfer(wave[0], wave[1], side)
+            * square_transfer(wave[0], wave[1], side * pixels.width)
             * np.exp(-0.5 * blur**2 * (wave**2).sum(axis=0))
             * cell
             / spline
         )
 
-    def _deposit(self, points: np.ndarray, spread: np.ndarray) -> tuple[csc_array, csc_array, csc_array]:
-        """Return the spline and its derivatives along x and y [1/pixel] at points [n, 2] as sparse matrices.
+    def places(self, unknowns: np.ndarray, landing: np.ndarray) -> np.ndarray:
+        """Return places (x, y) of light [n, 2] that lands about the chief ray [m], in pixels from the centre."""
+        return landing / self.pixel + (unknowns[[X, Y]] / self.scale + self.offset)
+
+    def _deposit(self, points: np.ndarray, spread: np.ndarray, derivatives: bool) -> list[csc_array]:
+        """Return the spline at points [n, 2], and its derivatives along x and y [1/pixel], as sparse matrices.
 
         Spreads [n, 2, 2] of the points, in pixels as they are, change the spline by half its second derivatives.
         """
@@ -114,10 +119,10 @@ class ImageGrid:
         for axis in (0, 1):
             place = self._middle[1 - axis] + self.oversampling * points[:, axis]
             low = np.floor(place)
-            t = (place - low)[:, None]
+            t = (place - low).astype(np.float32)[:, None]
             powers = np.concatenate([np.ones_like(t), t, t * t, t**3], axis=1)
             # The spline and its first three derivatives, per pixel.
-            values.append([self.oversampling**k * (powers[:, : 4 - k] @ _SPLINES[k]) for k in range(4)])
+            values.append([powers[:, : 4 - k] @ (self.oversampling**k * _SPLINES[k]) for k in range(4)])
             indices.append((low.astype(np.int64)[:, None] + np.arange(-1, 3)) % self._size[1 - axis])
         cells = (indices[1][:, :, None] * self._size[1] + indices[0][:, None, :]).reshape(-1).astype(np.int32)
         starts = np.arange(0, cells.size + 1, 16, dtype=np.int32)
@@ -127,17 +132,20 @@ class ImageGrid:
             return np.asarray(along_y[:, :, None] * along_x[:, None, :])
 
         def matrix(values: np.ndarray) -> csc_array:
-            return csc_array((values.astype(np.float32).ravel(), cells, starts), shape=shape)
+            return csc_array((values.ravel(), cells, starts), shape=shape)
 
         x, y = values
-        (xx, xy), (_, yy) = np.moveaxis(spread, 0, -1)[..., None]
+        (xx, xy), (_, yy) = np.moveaxis(spread.astype(np.float32), 0, -1)[..., None]
 
         def spline(i: int, j: int) -> csc_array:
             """Return the derivative of order i along x and j along y."""
-            wide_x = x[i] + 0.5 * xx * x[i + 2]
-            return matrix(taps(wide_x, y[j]) + taps(x[i], 0.5 * yy * y[j + 2]) + taps(xy * x[i + 1], y[j + 1]))
+            wide_y = y[j] + np.float32(0.5) * yy * y[j + 2]
+            values = taps(x[i], wide_y)
+            values += taps(np.float32(0.5) * xx * x[i + 2], y[j])
+            values += taps(xy * x[i + 1], y[j + 1])
+            return matrix(values)
 
-        return spline(0, 0), spline(1, 0), spline(0, 1)
+        return [spline(i, j) for i, j in (((0, 0), (1, 0), (0, 1)) if derivatives else ((0, 0),))]
 
     def _pixels(self, spectra: np.ndarray) -> np.ndarray:
         """Return the pixels of spectra [ky, kx, n], shape [ny, nx, n]."""
@@ -147,13 +155,14 @@ class ImageGrid:
 
     def image(self, unknowns: np.ndarray, light: LandedLight) -> np.ndarray:
         """Return the image [electrons], shape [ny, nx]; arguments as in :meth:`derivatives`."""
-        spectrum, shift = self._spectra(unknowns, light, None)
+        spectrum, shift = self._spectra(unknowns, light)
         if shift is not None:
             spectrum *= 1.0 + unknowns[RATIO] * shift
-        return np.asarray(unknowns[FLUX] * self._pixels(spectrum)[..., 0].astype(np.float64) + unknowns[BACKGROUND])
+        star = self._pixels(spectrum)[..., 0].astype(np.float64)
+        return np.asarray(unknowns[FLUX] * star + unknowns[BACKGROUND] * self.scale**2)
 
     def derivatives(
-        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray
+        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray, rates: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the image and its derivatives.
 
@@ -165,18 +174,20 @@ class ImageGrid:
             Landing points of the light.
         response : ndarray, shape [2, n, n_wave]
             Derivatives of the landing points with respect to the unknowns of the wavefront [m].
+        rates : ndarray, shape [n, n_shift]
+            Derivatives of the fractions of the light with respect to shifts of rims.
 
         Returns
         -------
         image : ndarray, shape [ny, nx]
             Electrons a pixel.
-        columns : ndarray of float32, shape [ny, nx, n_unknown + n_wave]
-            Derivatives by the unknowns, then by those of the wavefront, over their scales.
-        scales : ndarray, shape [n_unknown + n_wave]
+        columns : ndarray of float32, shape [ny, nx, n_unknown + n_wave + n_shift]
+            Derivatives by the unknowns, then by those of the wavefront and the shifts, over their scales.
+        scales : ndarray, shape [n_unknown + n_wave + n_shift]
             Scales of the columns.
         """
         flux, strength = unknowns[FLUX], unknowns[STRENGTH]
-        spectra, shift = self._spectra(unknowns, light, response)
+        spectra, shift = self._spectra(unknowns, light, response, rates)
         star, moved = spectra[..., :1], spectra[..., 1:]
         extra = []
         if shift is not None:
@@ -185,27 +196,36 @@ class ImageGrid:
             extra = [second, *(turn * second for turn in turns)]
             both = 1.0 + np.float32(unknowns[RATIO]) * shift
             star, moved = star * both, moved * both
-        level = np.zeros_like(star)
-        level[0, 0] = self._size[0] * self._size[1]
+        uniform = np.zeros_like(star)
+        uniform[0, 0] = self._size[0] * self._size[1]
         growth = (-5.0 / 3.0 * self._exponent * strength ** (2.0 / 3.0)).astype(np.float32)[..., None]
         columns = self._pixels(
-            np.concatenate([star, moved[..., :2], level, growth * star, *extra, moved[..., 2:]], axis=-1)
+            np.concatenate([star, moved[..., :2], uniform, growth * star, *extra, moved[..., 2:]], axis=-1)
         )
         scales = np.full(columns.shape[-1], flux)
-        scales[[FLUX, BACKGROUND]] = 1.0
-        return flux * columns[..., FLUX].astype(np.float64) + unknowns[BACKGROUND], columns, scales
+        scales[[FLUX, BACKGROUND]] = 1.0, self.scale**2
+        scales[[X, Y]] /= self.scale
+        level = unknowns[BACKGROUND] * self.scale**2
+        return flux * columns[..., FLUX].astype(np.float64) + level, columns, scales
 
     def _spectra(
-        self, unknowns: np.ndarray, light: LandedLight, response: np.ndarray | None
+        self,
+        unknowns: np.ndarray,
+        light: LandedLight,
+        response: np.ndarray | None = None,
+        rates: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return spectra of a star of unit flux and its derivatives by x, y and wave, and the shift of a second one."""
-        points = light.landing / self.pixel + unknowns[[X, Y]]
-        value, along_x, along_y = self._deposit(points, light.spread / self.pixel**2)
+        """Return spectra of a star of unit flux, its derivatives by x, y, wave and rims, and a second one's shift."""
+        points = self.places(unknowns, light.landing)
+        splines = self._deposit(points, light.spread / self.pixel**2, response is not None)
         weights = light.weights.astype(np.float32)[:, None]
-        deposits = [value @ weights]
+        deposits = [spline @ weights for spline in splines]
         if response is not None:
+            _, along_x, along_y = splines
             moved = (response / self.pixel * light.weights[:, None]).astype(np.float32)
-            deposits += [along_x @ weights, along_y @ weights, along_x @ moved[0] + along_y @ moved[1]]
+            deposits.append(along_x @ moved[0] + along_y @ moved[1])
+        if rates is not None and rates.shape[1]:
+            deposits.append(splines[0] @ rates.astype(np.float32))
         spectra = fft.rfft2(np.concatenate(deposits, axis=1).reshape(*self._size, -1), axes=(0, 1))
         turbulence = np.exp(-self._exponent * unknowns[STRENGTH] ** (5.0 / 3.0))
         spectra *= (self._detector * turbulence).astype(np.float32)[..., None]
@@ -216,6 +236,6 @@ class ImageGrid:
 
 
 # Cubic B-spline at t - 1 ... t + 2 by powers of t, 0 <= t < 1, and its derivatives with respect to the point's place.
-_SPLINES = [np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6.0]
+_SPLINES = [np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], dtype=np.float32) / np.float32(6.0)]
 for _ in range(3):
-    _SPLINES.append(_SPLINES[-1][1:] * np.arange(1, len(_SPLINES[-1]))[:, None])
+    _SPLINES.append(_SPLINES[-1][1:] * np.arange(1, len(_SPLINES[-1]), dtype=np.float32)[:, None])

@@ -13,6 +13,7 @@ from ...design.metrics.field_zernikes import wavefront_zernikes
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...models.zernike_polynomials import annular_zernikes
 from .degrees import FreedomRays
+from .donut_rays import ZernikeRays
 from .fit_star import StarFit
 from .image_model import STRENGTH
 from .light import Instrument
@@ -64,9 +65,18 @@ def fit_field(
     maps = np.stack([np.kron(row, np.eye(n_noll)) for row in terms])
     precision = np.tile(instrument.precision, terms.shape[1])
     start = _start(stars, maps, precision)
-    group = Group(tuple(s.stamp for s in stars if s.stamp), maps, precision, fixed)
+    held = [_with_held_rims(star) for star in stars]
+    group = Group(tuple(s.stamp for s in held if s.stamp), maps, precision, fixed)
     solution = solve(group, _star_unknowns(stars), start, pool=pool)
-    return JointFit(tuple(stars), solution, np.array(solution.waves), maps)
+    return JointFit(tuple(held), solution, np.array(solution.waves), maps)
+
+
+def _with_held_rims(star: StarFit) -> StarFit:
+    """Return a star whose rims stand where its own fit has them."""
+    stamp, solution = star.stamp, star.solution
+    if stamp is None or solution is None or not isinstance(stamp.rays, ZernikeRays):
+        return star
+    return replace(star, stamp=replace(stamp, rays=stamp.rays.at_shifts(solution.waves[0])))
 
 
 def fit_freedoms(
@@ -111,7 +121,8 @@ def _with_freedoms(instrument: Instrument, star: StarFit, freedoms: DegreesOfFre
     if light is None or stamp is None or solution is None:
         return star
     fwhm = float(instrument.seeing.fwhm(solution.stars[0][STRENGTH]))
-    across = instrument.sampling(light, Pixels(stamp.image, stamp.variance, stamp.used), fwhm).across
+    pixels = Pixels(stamp.image, stamp.variance, stamp.used, round(stamp.grid.scale))
+    across = instrument.sampling(light, pixels, fwhm).across
     cells = pupil_cells(freedoms.apply(light.telescope, at), light.direction, instrument.middle, across)
     waves = (instrument.wavelengths, instrument.wavelength_weights)
     rays = FreedomRays(light.telescope, light.direction, *waves, cells, freedoms, at, stamp.grid.footprint)
@@ -127,7 +138,9 @@ def _start(stars: Sequence[StarFit], maps: np.ndarray, precision: np.ndarray) ->
     curvature, gradient = np.diag(precision), np.zeros(len(precision))
     for star, one in zip(stars, maps, strict=True):
         if star.solution is not None and len(star.solution.shared):
-            information = np.linalg.pinv(star.solution.shared_covariance, hermitian=True)
+            # Shifts of rims of its own stand after the wavefront.
+            n = len(one)
+            information = np.linalg.pinv(star.solution.shared_covariance[:n, :n], hermitian=True)
             curvature = curvature + one.T @ information @ one
-            gradient = gradient + one.T @ information @ star.solution.shared
+            gradient = gradient + one.T @ information @ star.solution.shared[:n]
     return np.linalg.lstsq(curvature, gradient, rcond=1e-14)[0]

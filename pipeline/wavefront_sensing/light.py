@@ -11,22 +11,24 @@ from ...core.errors import DomainError
 from ...models.camera.focal_plane import FocalPlane
 from ...models.telescope import Telescope
 from ...raytrace.launch import launch_bundles
-from ...raytrace.rays import parallel_rays
+from ...raytrace.rays import RayStatus
 from ...raytrace.trace import trace
 from ...wavefront.chief_rays import image_jacobians
 from .donut_rays import ZernikeRays, chief_landing
 from .image_model import ImageGrid
 from .likelihood import Stamp
-from .pupil_cells import pupil_cells
 from .seeing import Seeing
 from .stamps import Pixels
+from .vignetting import cells_with_rims, movable_rims, shift_spread
 
-#: Cells across the pupil for the size of an image, and the least and most for its model.
-_SURVEY, _FEWEST, _MOST = 24, 48, 400
+#: Points across the pupil for the size of an image, and the least and most cells for its model.
+_SURVEY, _FEWEST, _MOST = 48, 48, 400
 #: Spacing of landing points over the FWHM of the blur, which smooths what cells on rims leave.
 _SPACING = 0.5
 #: FWHM of the blur in cells of the grid beyond which the cells resolve it; finest grid, in cells along a pixel.
-_RESOLVED, _FINEST = 2.2, 3
+_RESOLVED, _FINEST = 1.9, 3
+#: FWHM of the blur in binned pixels, most pixels along a binned one, least part of the pixels that binning keeps.
+_BINNED, _MOST_BINNED, _KEPT = 1.95, 4, 0.95
 _FWHM_PER_RMS = 2.354820045
 
 
@@ -78,18 +80,22 @@ class Instrument:
         A chief ray that reaches no CCD, and a dark pupil, are a DomainError.
         """
         telescope = self._with_detector(direction, defocus)
-        cells = pupil_cells(telescope, direction, self.middle, _SURVEY)
-        if not len(cells):
+        along = (np.arange(_SURVEY) - 0.5 * (_SURVEY - 1)) * telescope.pupil_diameter / _SURVEY
+        points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+        ends = trace(telescope, launch_bundles(telescope, direction[None], self.middle, points), "all", threads=1)
+        end, lit = ends[-1], ends[-1].status == RayStatus.OK
+        if not lit.any():
             raise DomainError("no light passes the telescope")
-        end = trace(telescope, parallel_rays(telescope, direction[None], self.middle, cells.points), threads=1)
         detector = telescope.surfaces[-1]
-        place, travel = detector.to_local(end.position)[:, :2], end.direction @ detector.matrix
+        place, travel = detector.to_local(end.position[lit])[:, :2], end.direction[lit] @ detector.matrix
         slopes = travel[:, :2] / travel[:, 2:]
-        place, slopes = (v - cells.weights @ v for v in (place, slopes))
+        place, slopes = (v - v.mean(axis=0) for v in (place, slopes))
         # The rays are closest to each other where the detector moved by this distance would be.
-        depth = -float(cells.weights @ (place * slopes).sum(axis=1) / (cells.weights @ (slopes**2).sum(axis=1)))
+        depth = -float((place * slopes).sum() / max((slopes**2).sum(), 1e-300))
         jacobian = image_jacobians(telescope, direction[None], self.middle, 1)[0]
-        return Light(telescope, direction, 2.0 * float(np.hypot(*place.T).max()), depth, jacobian)
+        # Light passes up to half a cell beyond the outermost points.
+        diameter = 2.0 * float(np.hypot(*place.T).max()) * (1.0 + 1.0 / _SURVEY)
+        return Light(telescope, direction, diameter, depth, jacobian, movable_rims(telescope, ends))
 
     def _with_detector(self, direction: np.ndarray, defocus: float) -> Telescope:
         """Return the telescope with its detector in the tangent plane of the chief ray's CCD, moved by a defocus."""
@@ -113,8 +119,7 @@ class Instrument:
 
     def sampling(self, light: Light, pixels: Pixels, fwhm: float) -> Sampling:
         """Return how finely images of a star in a seeing [rad] are sampled on given pixels."""
-        rms = math.hypot(self.diffusion, pixels.blur * self.pixel)
-        width = math.hypot(fwhm * light.scale, _FWHM_PER_RMS * rms)
+        width = self._width(light, pixels, fwhm)
         distance = pixels.side * self.pixel
         oversampling = min(max(math.ceil(_RESOLVED * distance / max(width, 1e-12)), 1), _FINEST)
         # A lattice as fine as the grid leaves no pattern where nothing else blurs it.
@@ -122,23 +127,36 @@ class Instrument:
         across = self.n_pupil or min(max(math.ceil(light.diameter / spacing), _FEWEST), _MOST)
         return Sampling(oversampling, across)
 
-    def stamp(self, light: Light, pixels: Pixels, fwhm: float, reach: float = 0.0) -> Stamp:
-        """Return a stamp with its model: seeing of about a width [rad], light within a reach [m] beside the stamp."""
-        sampling = self.sampling(light, pixels, fwhm)
-        cells = pupil_cells(light.telescope, light.direction, self.middle, sampling.across)
-        waves = (self.wavelengths, self.wavelength_weights)
-        rays = ZernikeRays(light.telescope, light.direction, *waves, cells, self.noll)
-        grid = ImageGrid(
-            (pixels.image.shape[0], pixels.image.shape[1]),
-            self.pixel * pixels.side,
-            self.pixel,
-            self.seeing,
-            light.jacobian,
-            math.hypot(self.diffusion, pixels.blur * self.pixel),
-            rays.footprint,
-            sampling.oversampling,
-            reach,
+    def binning(self, light: Light, pixels: Pixels, fwhm: float) -> int:
+        """Return how many pixels along each axis are summed for the fit of a star in a seeing [rad].
+
+        Pixels of half the width of the blur leave the errors as they are to a hundredth.
+        """
+        most = min(int(self._width(light, pixels, fwhm) / (_BINNED * self.pixel)), _MOST_BINNED)
+        if pixels.used.all():
+            return max(most, 1)
+        used = int(pixels.used.sum())
+        for side in range(max(most, 1), 1, -1):
+            if side**2 * int(pixels.binned(side).used.sum()) > _KEPT * used:
+                return side
+        return 1
+
+    def _width(self, light: Light, pixels: Pixels, fwhm: float) -> float:
+        """Return the FWHM of what blurs the images of a star in a seeing [rad], before the pixels [m]."""
+        rms = math.hypot(self.diffusion, pixels.blur * self.pixel)
+        return math.hypot(fwhm * light.scale, _FWHM_PER_RMS * rms)
+
+    def rays(self, light: Light, across: int) -> ZernikeRays:
+        """Return the light of a star through so many cells across the pupil."""
+        cells = cells_with_rims(light.telescope, light.direction, self.middle, across, light.rims)
+        return ZernikeRays(
+            light.telescope, light.direction, self.wavelengths, self.wavelength_weights, cells, self.noll
         )
+
+    def stamp(self, light: Light, pixels: Pixels, rays: ZernikeRays, oversampling: int, reach: float = 0.0) -> Stamp:
+        """Return a stamp with its model: light within a reach [m] beside it does not wrap around."""
+        blur = math.hypot(self.diffusion, pixels.blur * self.pixel)
+        grid = ImageGrid(pixels, self.pixel, self.seeing, light.jacobian, blur, rays.footprint, oversampling, reach)
         return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
 
 
@@ -148,6 +166,10 @@ class Sampling:
 
     oversampling: int
     across: int
+
+    def finer_than(self, other: Sampling) -> bool:
+        """Return whether the grid or the cells are smaller."""
+        return self.oversampling > other.oversampling or self.across > other.across
 
 
 @dataclass(frozen=True)
@@ -166,6 +188,8 @@ class Light:
         Distance from the detector to the best focus along the detector's z [m].
     jacobian : ndarray, shape [2, 2]
         Derivative of the chief ray's landing point by direction cosines [m].
+    rims : dict
+        Surfaces whose rims stand aside by an unknown amount, with the diameter of the beam there [m].
     """
 
     telescope: Telescope
@@ -173,6 +197,12 @@ class Light:
     diameter: float
     depth: float
     jacobian: np.ndarray
+    rims: dict[str, float]
+
+    @property
+    def shift_precision(self) -> np.ndarray:
+        """Inverse variances of the shifts of the rims along x and y [1/m^2], shape [n_shift]."""
+        return np.full(2 * len(self.rims), shift_spread(self.telescope) ** -2.0)
 
     @property
     def scale(self) -> float:

@@ -69,11 +69,13 @@ class NormalEquations:
 def normal_equations(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> NormalEquations:
     """Return the normal equations of one star; unknowns are those of the star, then of its wavefront."""
     response = stamp.rays.response(wave)
-    model, columns, scales = stamp.grid.derivatives(unknowns, _landed(stamp, wave), response)
-    variance = _variance(stamp, model)[stamp.used]
-    residual = (stamp.image - model)[stamp.used]
-    root = 1.0 / np.sqrt(variance)
-    scaled = np.multiply(columns[stamp.used], root[:, None])
+    model, columns, scales = stamp.grid.derivatives(unknowns, _landed(stamp, wave), response, stamp.rays.rates)
+    # A slice where all pixels are used, since that is no copy.
+    used = stamp.used if not stamp.used.all() else np.s_[:, :]
+    variance = _variance(stamp, model)[used].ravel()
+    residual = (stamp.image - model)[used].ravel()
+    root = (1.0 / np.sqrt(variance)).astype(np.float32)
+    scaled = columns[used].reshape(len(root), -1) * root[:, None]
     curvature = scaled.T @ scaled * np.outer(scales, scales)
     gradient = scaled.T @ (residual * root) * scales
     return NormalEquations(curvature, gradient, _loss(residual, variance), float(residual @ (residual / variance)))
@@ -86,7 +88,7 @@ def model_image(stamp: Stamp, unknowns: np.ndarray, wave: np.ndarray) -> np.ndar
 
 def _landed(stamp: Stamp, wave: np.ndarray) -> LandedLight:
     landing = stamp.rays.landing(wave)
-    return LandedLight(landing, stamp.rays.weights, stamp.rays.spread(landing))
+    return LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
 
 
 def pulls(stamp: Stamp, model: np.ndarray) -> np.ndarray:

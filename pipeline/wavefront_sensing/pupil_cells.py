@@ -22,8 +22,8 @@ from ...raytrace.trace import trace
 
 #: Side of the lattice over the diameter of the pupil: light off the axis may cross the plane of the stop just outside.
 _MARGIN = 1.02
-#: Chords of a cell on a rim, nodes along each, and halvings of a piece with a rim: to a 500th of a cell.
-_CHORDS, _NODES, _BISECTIONS = 8, 5, 6
+#: Chords of a cell on a rim, nodes along each, and divisions of a piece with a rim into parts: to a 500th of a cell.
+_CHORDS, _NODES, _DIVISIONS, _PARTS = 8, 5, 3, 4
 #: Points of the rim that the width of an aimed beam is taken from.
 _RIM = 48
 #: Degree of the polynomials that landing points are differentiated by.
@@ -46,6 +46,8 @@ class PupilCells:
         Side of a cell [m].
     center : ndarray, shape [2]
         Middle of the lattice [m].
+    rates : ndarray, shape [n, n_shift], optional
+        Derivatives of the weights by shifts of rims [1/m]; cells of zero weight may have them.
     """
 
     points: np.ndarray
@@ -53,29 +55,30 @@ class PupilCells:
     moments: np.ndarray
     side: float
     center: np.ndarray
+    rates: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.weights)
 
     @cached_property
-    def _smooth(self) -> tuple[np.ndarray, np.ndarray]:
-        """Orthonormal polynomials at the points, [n, m], and their derivatives along x and y [1/m], [2, n, m]."""
+    def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Polynomials at the points [n, m], their products [m, m], their derivatives along x and y [1/m], [2, n, m]."""
         away = self.points - self.center
         radius = max(float(np.abs(away).max()), self.side)
         x, y = away.T / radius
         p, q = np.array([(a, b) for a in range(_DEGREE + 1) for b in range(_DEGREE + 1 - a)]).T
-        powers_x, powers_y = (v[:, None] ** np.arange(_DEGREE + 1) for v in (x, y))
-        basis, triangle = np.linalg.qr(powers_x[:, p] * powers_y[:, q])
-        along_x = p * powers_x[:, np.maximum(p - 1, 0)] * powers_y[:, q]
-        along_y = q * powers_x[:, p] * powers_y[:, np.maximum(q - 1, 0)]
-        return basis, np.linalg.solve(triangle.T, np.stack([along_x, along_y]).transpose(0, 2, 1)).transpose(
-            0, 2, 1
-        ) / radius
+        powers_x, powers_y = (np.vander(v, _DEGREE + 1, increasing=True) for v in (x, y))
+        values = powers_x[:, p] * powers_y[:, q]
+        along_x = (p / radius) * powers_x[:, np.maximum(p - 1, 0)] * powers_y[:, q]
+        along_y = (q / radius) * powers_x[:, p] * powers_y[:, np.maximum(q - 1, 0)]
+        return values, values.T @ values, np.stack([along_x, along_y])
 
     def magnification(self, landing: np.ndarray) -> np.ndarray:
         """Return the derivative of landing points [n, 2] along the pupil, shape [n, 2, 2], by smooth polynomials."""
-        basis, slopes = self._smooth
-        return np.moveaxis(slopes @ (basis.T @ landing), 0, -1)
+        values, products, slopes = self._smooth
+        # Monomials up to the eighth degree: products keep seven digits. Too few points determine some of them.
+        fitted = np.linalg.lstsq(products, values.T @ landing, rcond=1e-13)[0]
+        return np.moveaxis(slopes @ fitted, 0, -1)
 
     def footprint(self, landing: np.ndarray) -> np.ndarray:
         """Return the sides of the mean image of a cell [m], columns of a matrix [2, 2], from landing points [n, 2]."""
@@ -83,9 +86,13 @@ class PupilCells:
 
     def spread(self, landing: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         """Return second moments of the images of the cells minus those of a footprint [m^2], shape [n, 2, 2]."""
-        magnification = self.magnification(landing)
-        image = magnification @ self.moments @ magnification.transpose(0, 2, 1)
-        return np.asarray(image - footprint @ footprint.T / 12.0)
+        # Component by component: products of many matrices of two by two take ten times as long.
+        (xx, xy), (yx, yy) = np.moveaxis(self.magnification(landing), 0, -1)
+        (uu, uv), (_, vv) = np.moveaxis(self.moments, 0, -1)
+        across = xx * (yx * uu + yy * uv) + xy * (yx * uv + yy * vv)
+        along = xx * (xx * uu + 2.0 * xy * uv) + xy * xy * vv, yx * (yx * uu + 2.0 * yy * uv) + yy * yy * vv
+        image = np.array([[along[0], across], [across, along[1]]])
+        return np.moveaxis(image, -1, 0) - footprint @ footprint.T / 12.0
 
 
 def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, across: int) -> PupilCells:
@@ -104,14 +111,18 @@ def pupil_cells(telescope: Telescope, direction: np.ndarray, wavelength: float, 
         return (trace(telescope, rays, threads=1).status == RayStatus.OK).reshape(points.shape[:-1])
 
     centers = np.stack(np.meshgrid(middle, middle), axis=-1) + center
-    quarter = 0.25 * side * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
-    area = lit(centers[:, :, None] + quarter).mean(axis=2)
+    # Four points of each cell; a rim passes cells where these or those next to them differ.
+    along = (np.arange(2 * across) - 0.5 * (2 * across - 1)) * 0.5 * side
+    status = lit(np.stack(np.meshgrid(along, along), axis=-1) + center)
+    differ = maximum_filter(status, 3, mode="constant") != minimum_filter(status, 3, mode="constant")
+    quarters = (across, 2, across, 2)
+    area, rim = status.reshape(quarters).mean(axis=(1, 3)), differ.reshape(quarters).any(axis=(1, 3))
     moments = np.tile(side**2 / 12.0 * np.eye(2), (across, across, 1, 1))
-    rim = (maximum_filter(area, 3, mode="constant") > 0.0) & (minimum_filter(area, 3, mode="constant") < 1.0)
     if rim.any():
         smooth = uniform_filter(area, 3, mode="constant")
-        along = np.stack(np.gradient(smooth)[::-1], axis=-1)[rim]
-        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, np.abs(along[:, 1]) > np.abs(along[:, 0]))
+        down, across_rim = np.gradient(smooth)
+        upright = np.abs(down[rim]) > np.abs(across_rim[rim])
+        area[rim], offset, moments[rim] = _lit_parts(lit, centers[rim], side, upright)
         centers[rim] += offset
     some = area > 0.0
     return PupilCells(centers[some], area[some] / max(area.sum(), 1e-300), moments[some], side, center)
@@ -151,10 +162,13 @@ def _lit_parts(
     low, high = start * np.ones(1), end * np.ones(start.shape)
     cell, chord, piece = np.nonzero(status[:, :, 1:] != status[:, :, :-1])
     first, last, begins = node[piece], node[piece + 1], status[cell, chord, piece]
-    for _ in range(_BISECTIONS):
-        half = 0.5 * (first + last)
-        same = lit(places(half, row[chord], cell)) == begins
-        first, last = np.where(same, half, first), np.where(same, last, half)
+    for _ in range(_DIVISIONS):
+        part = (last - first) / _PARTS
+        inner = first[:, None] + part[:, None] * np.arange(1, _PARTS)
+        # Parts before the first change of status; of several rims, the first.
+        same = lit(places(inner, row[chord][:, None], cell)) == begins[:, None]
+        first = first + part * np.cumprod(same, axis=1).sum(axis=1)
+        last = first + part
     rim = 0.5 * (first + last)
     low[cell, chord, piece] = np.where(begins, low[cell, chord, piece], rim)
     high[cell, chord, piece] = np.where(begins, rim, high[cell, chord, piece])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import brentq
@@ -37,23 +38,16 @@ class Seeing:
     wavelength: float
     outer_scale: float
 
-    def __post_init__(self) -> None:
-        width = _STRENGTHS * _KOLMOGOROV_FWHM * self.wavelength / fried_parameter(1.0, self.wavelength)
-        if math.isfinite(self.outer_scale):
-            width = np.array([long_exposure_fwhm(self.wavelength, 1.0 / s, self.outer_scale) for s in _STRENGTHS])
-        object.__setattr__(self, "_widths", width)
-
     def exponent(self, baseline: np.ndarray) -> np.ndarray:
         """Return minus the logarithm of the transfer function at strength 1/m, at baselines [m]."""
         if math.isinf(self.outer_scale):
             return 0.5 * _KOLMOGOROV * (REFERENCE_WAVELENGTH / self.wavelength) ** 2 * baseline ** (5.0 / 3.0)
-        table = np.linspace(0.0, float(baseline.max()) ** 0.5, _TABLE_POINTS) ** 2
-        phase = 0.5 * (2.0 * math.pi / self.wavelength) ** 2 * structure_function(table, 1.0, self.outer_scale)
-        return np.interp(baseline, table, phase)
+        roots, structure = _structure_table(self.outer_scale, math.ceil(math.log2(float(baseline.max()))))
+        return 0.5 * (2.0 * math.pi / self.wavelength) ** 2 * np.interp(np.sqrt(baseline), roots, structure)
 
     def fwhm(self, strength: np.ndarray) -> np.ndarray:
         """Return the full width at half maximum [rad] of strengths [1/m]."""
-        widths: np.ndarray = self._widths  # type: ignore[attr-defined]
+        widths = _widths(self.wavelength, self.outer_scale)
         inside = np.clip(strength, _STRENGTHS[0], _STRENGTHS[-1])
         scale = np.interp(np.log(inside), np.log(_STRENGTHS), widths / _STRENGTHS)
         return np.asarray(strength * scale)
@@ -63,3 +57,18 @@ class Seeing:
         if fwhm == 0.0:
             return 0.0
         return float(brentq(lambda s: float(self.fwhm(np.asarray(s))) - fwhm, 0.0, 100.0 * fwhm / ARCSEC))
+
+
+@lru_cache(maxsize=16)
+def _structure_table(outer_scale: float, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return roots of baselines [m^0.5] up to 2^size m and structure functions there at strength 1/m."""
+    roots = np.linspace(0.0, 2.0 ** (0.5 * size), _TABLE_POINTS)
+    return roots, structure_function(roots**2, 1.0, outer_scale)
+
+
+@lru_cache(maxsize=16)
+def _widths(wavelength: float, outer_scale: float) -> np.ndarray:
+    """Return the full widths at half maximum [rad] of the tabulated strengths."""
+    if math.isfinite(outer_scale):
+        return np.array([long_exposure_fwhm(wavelength, 1.0 / s, outer_scale) for s in _STRENGTHS])
+    return np.asarray(_STRENGTHS * _KOLMOGOROV_FWHM * wavelength / fried_parameter(1.0, wavelength))

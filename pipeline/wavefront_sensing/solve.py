@@ -14,8 +14,8 @@ from .image_model import FLUX, RATIO, STRENGTH
 from .likelihood import NormalEquations, Stamp, normal_equations
 
 #: A step that is to lower twice the negative logarithm of the likelihood by less, per unit of chi-square a pixel, is
-#: the last: a tenth of a standard deviation, of which the step leaves next to nothing.
-FINE, COARSE = 1e-2, 0.3
+#: the last: a fifth of a standard deviation, of which the step leaves a hundredth.
+FINE, COARSE = 5e-2, 0.3
 #: The same for a search that ran out of steps and is near enough to its end.
 _NEAR = 1.0
 _DAMPING = 1e-3

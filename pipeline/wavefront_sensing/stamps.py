@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter, median_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.signal import fftconvolve
 
 #: A pixel this many standard deviations above its neighbours, and this much brighter, is no part of a donut.
@@ -30,6 +30,8 @@ class Pixels:
         Pixels that count.
     side : int
         Distance between pixels, in those of the detector.
+    width : int
+        Side of the squares that they are integrals over, in pixels of the detector.
     blur : float
         Rms of the Gaussian that they were smoothed with, in pixels of the detector.
     offset : tuple of float
@@ -40,6 +42,7 @@ class Pixels:
     variance: np.ndarray
     used: np.ndarray
     side: int = 1
+    width: int = 1
     blur: float = 0.0
     offset: tuple[float, float] = (0.0, 0.0)
 
@@ -67,11 +70,28 @@ class Pixels:
         # Near the edges of the stamp and of masked regions values are those of places farther in.
         used = (weight > _MOSTLY_USED)[rows, columns]
         offset = (lost[1], lost[0])
-        return Pixels(sampled(self.image), sampled(self.variance), used, side, blur, offset)
+        return Pixels(sampled(self.image), sampled(self.variance), used, side, 1, blur, offset)
+
+    def binned(self, side: int) -> Pixels:
+        """Return sums over squares of so many pixels; a square with an unused pixel is unused."""
+        if side == 1:
+            return self
+        ny, nx = (n // side for n in self.image.shape)
+        image, variance, unused = (
+            v[: ny * side, : nx * side].reshape(ny, side, nx, side).sum(axis=(1, 3))
+            for v in (self.image, self.variance, (~self.used).astype(np.int64))
+        )
+        # Pixels that are left over at the end move the centre.
+        offset = tuple(0.5 * (n % side) / side for n in self.image.shape[::-1])
+        return Pixels(image, variance, unused == 0, side, side, 0.0, (offset[0], offset[1]))
 
 
 def without_cosmic_rays(pixels: Pixels) -> Pixels:
     """Return the pixels of a donut without those far above all of their neighbourhood."""
+    # A median is no less than the least value: where nothing stands out beyond that, there is no cosmic ray.
+    least = np.maximum(maximum_filter(minimum_filter(pixels.image, 5, mode="nearest"), 5), 0.0)
+    if not (pixels.image > (1.0 + _CONTRAST) * least + _SIGMA * np.sqrt(least + pixels.variance)).any():
+        return pixels
     middle = median_filter(pixels.image, 5, mode="nearest")
     # A donut is as bright nearby as here; a median over its edge is fainter.
     level = np.maximum(maximum_filter(middle, 5), 0.0)

@@ -103,4 +103,9 @@ def refractive_indices(telescope: Telescope, wavelength: float) -> np.ndarray:
     """Return the index before the first surface and after each, [n_surface + 1]: [-2] is that before the detector."""
     telescope.check_wavelength(wavelength)
     media = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]
-    return np.array([medium.index(wavelength) for medium in media], dtype=np.float64)
+    return np.array([_index(medium, float(wavelength)) for medium in media], dtype=np.float64)
+
+
+@lru_cache(maxsize=256)
+def _index(medium: Medium, wavelength: float) -> float:
+    return float(medium.index(wavelength))

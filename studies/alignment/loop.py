@@ -12,12 +12,12 @@ from ...core.progress import Reporter
 from ...core.random_streams import stream
 from ...core.result import Result
 from ...core.threads import one_blas_thread
-from ...pipeline.wavefront_sensing.result import DonutFit
 from .config import AlignConfig
 from .estimator import estimate_state, steady_covariance
 from .exposure import expose, fit
 from .field_quality import FieldMeans
 from .scene import NOLL, AlignmentScene
+from .store import VisitRecord, VisitStore
 
 # Visits after which the expected state no longer changes.
 _STEADY = 100
@@ -45,7 +45,7 @@ class Alignment(Result):
         The same for a loop that has run for long: drift of one visit, photons and turbulence [m].
     donuts : ndarray of int, shape [n_visit]
         Donuts that were used.
-    first, last : DonutFit
+    first, last : VisitRecord
         Donuts of the first and the last visit.
     """
 
@@ -60,8 +60,8 @@ class Alignment(Result):
     expected: np.ndarray
     floor: float
     donuts: np.ndarray
-    first: DonutFit
-    last: DonutFit
+    first: VisitRecord
+    last: VisitRecord
 
 
 @check_arguments
@@ -69,6 +69,8 @@ def align(
     config: AlignConfig,
     *,
     folder: Path | None = None,
+    store: Path | None = None,
+    resume: bool = False,
     threads: int | None = None,
     reporter: Reporter | None = None,
 ) -> Alignment:
@@ -80,6 +82,10 @@ def align(
         All that decides the loop.
     folder : Path, optional
         Folder that relative paths in the configuration start from; the current one by default.
+    store : Path, optional
+        Folder for a file of each visit, from which a loop goes on that was killed, or that is to be longer.
+    resume : bool
+        Whether to go on with the visits of `store`; a folder with visits is an error otherwise.
     threads : int, optional
         Number of threads; all processors by default. No byte depends on it.
     reporter : Reporter, optional
@@ -88,10 +94,12 @@ def align(
     Raises
     ------
     PachonError
-        If a name does not exist, the models do not fit together, or donuts do not fit on their stamps.
+        If a name does not exist, the models do not fit together, donuts do not fit on their stamps, or `store` holds
+        visits of another configuration.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     scene = AlignmentScene.of(config, folder)
+    kept = None if store is None else VisitStore.claimed(store, config, resume=resume)
     errors, n = config.errors, len(scene.freedoms)
     drift = np.diag(scene.steps**2)
     covariance = errors.initial**2 * np.eye(n)
@@ -102,10 +110,16 @@ def align(
     with one_blas_thread(), reporter.stage("visits", config.visits) as stage:
         for visit in range(config.visits):
             telescope = scene.freedoms.apply(scene.telescope, state * scene.tolerances)
-            quality.append(scene.quality.means(telescope, threads))
+            found = None if kept is None else kept.read(visit)
+            # The last visit of a shorter loop has no stamps where that is not its last one.
+            if found is None or (len(found.images) == 0 and visit == config.visits - 1):
+                fitted = fit(scene, expose(scene, telescope, visit, threads), threads)
+                found = VisitRecord.of(scene.quality.means(telescope, threads), fitted)
+                if kept is not None:
+                    kept.write(visit, found)
+            quality.append(found.quality)
             expected.append(scene.expected_wavefront(covariance))
             spreads.append(np.sqrt(np.diag(covariance)))
-            found = fit(scene, expose(scene, telescope, visit, threads), threads)
             rows = np.repeat(found.usable, len(NOLL))
             noise = scene.turbulence + _photon_noise(found)
             estimate = estimate_state(
@@ -148,7 +162,7 @@ def _normals(seed: int, what: str, visit: int, count: int) -> np.ndarray:
     return stream(seed, "alignment", what, visit).standard_normal(count)
 
 
-def _photon_noise(found: DonutFit) -> np.ndarray:
+def _photon_noise(found: VisitRecord) -> np.ndarray:
     """Return the covariance of the Zernikes of all donuts by photons [m^2], shape [n_data, n_data]."""
     n_star, n_noll = found.zernikes.shape
     out = np.zeros((n_star, n_noll, n_star, n_noll))

@@ -12,6 +12,7 @@ from ...core.products import Columns, write_ecsv
 from ...core.version import VERSION
 from .loop import Alignment
 from .plots import donut_picture, quality_picture, state_picture
+from .store import CONFIG_NAME
 
 #: A loop has converged where misalignment adds at most so many times the floor.
 CONVERGED = 1.2
@@ -73,8 +74,8 @@ def write_alignment(found: Alignment, folder: Path) -> tuple[str, ...]:
     for file, draw in pictures.items():
         write_bytes(folder / file, draw(found))
     write_json(folder / "summary.json", {**alignment_summary(found), **meta})
-    write_bytes(folder / "config.yaml", config.to_yaml().encode())
-    return *tables, *pictures, "summary.json", "config.yaml"
+    write_bytes(folder / CONFIG_NAME, config.to_yaml().encode())
+    return *tables, *pictures, "summary.json", CONFIG_NAME
 
 
 def _by_freedom(found: Alignment, values: np.ndarray) -> Columns:

@@ -99,6 +99,25 @@ def test_large_aberrations_are_found(behind_focus):
 
 
 @pytest.mark.long
+def test_errors_have_the_terms_that_are_left_out(behind_focus, wave, clean):
+    """Light with Z4 to Z22 of which Z4 to Z8 are asked for; without noise, so that the error is what is left out."""
+    options = {"sky_variance": 500.0, "noll": range(4, 9), "fwhm": 0.0, "diffusion": PIXEL, **OPTIONS}
+    honest, bare = (
+        pachon.fit_donuts(behind_focus, clean[None], [FIELD], WAVELENGTH, left_out=rms, **options)
+        for rms in (200e-9, 0.0)
+    )
+
+    def chi2(fit):
+        error = fit.zernikes[0] - wave[3:8]
+        return float(error @ np.linalg.solve(fit.covariance[0], error))
+
+    assert honest.zernikes.shape == (1, 5)
+    # Without noise, a part of the five that noise would make; 1500 where the rest is taken to be zero.
+    assert chi2(honest) < 5.0
+    assert chi2(bare) > 100.0
+
+
+@pytest.mark.long
 def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
     wave = np.zeros(23)
     wave[22] = 60e-9
@@ -127,6 +146,8 @@ def test_missing_terms_do_no_harm_where_they_are_expected(behind_focus):
         pytest.param(0.14, (14.0, 9.0), marks=pytest.mark.long),
         pytest.param(1.0, (-20.0, 12.0), marks=pytest.mark.slow),
         pytest.param(0.3, (35.0, -20.0), marks=pytest.mark.slow),
+        # Most of the two overlap.
+        pytest.param(0.8, (0.7, -6.4), marks=pytest.mark.slow),
     ],
 )
 def test_second_stars_are_survived(behind_focus, wave, ratio, offset):

@@ -9,6 +9,7 @@ from pachon.pipeline.wavefront_sensing.image_model import ImageGrid, LandedLight
 from pachon.pipeline.wavefront_sensing.likelihood import Stamp, model_image, normal_equations
 from pachon.pipeline.wavefront_sensing.pupil_cells import pupil_cells
 from pachon.pipeline.wavefront_sensing.seeing import Seeing
+from pachon.pipeline.wavefront_sensing.stamps import Pixels
 from pachon.raytrace.rays import field_direction
 from pachon.wavefront.atmosphere.turbulence import long_exposure_fwhm
 from pachon.wavefront.chief_rays import image_jacobians
@@ -17,15 +18,16 @@ NOLL = np.arange(4, 12)
 FIELD = np.deg2rad([1.2, 0.4])
 
 
-def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, reach=0.0):
+def stamp_of(tel, across, *, blur=0.0, size=SIZE, outer_scale=25.0, image=None, reach=0.0, side=1):
     direction = field_direction(*FIELD)
     cells = pupil_cells(tel, direction, WAVELENGTH, across)
     rays = ZernikeRays(tel, direction, np.array([WAVELENGTH]), np.ones(1), cells, NOLL)
     jacobian = image_jacobians(tel, direction[None], WAVELENGTH)[0]
     seeing = Seeing(WAVELENGTH, outer_scale)
-    grid = ImageGrid((size, size), PIXEL, PIXEL, seeing, jacobian, blur, rays.footprint, 1, reach)
     image = np.zeros((size, size)) if image is None else image
-    return Stamp(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool), grid, rays)
+    pixels = Pixels(image, np.full(image.shape, 500.0), np.ones(image.shape, dtype=bool)).binned(side)
+    grid = ImageGrid(pixels, PIXEL, seeing, jacobian, blur, rays.footprint, 1, reach)
+    return Stamp(pixels.image, pixels.variance, pixels.used, grid, rays)
 
 
 @pytest.mark.slow
@@ -51,6 +53,22 @@ def test_coarse_cells_give_the_image_of_fine_ones(behind_focus):
     np.testing.assert_allclose(coarse, fine, atol=6e-3 * fine.max())
 
 
+@pytest.mark.parametrize("side", [2, 3])
+@pytest.mark.parametrize("companion", [(), (0.3, 12.0, -7.5)])
+def test_summed_pixels_have_the_model_of_the_sums(behind_focus, side, companion):
+    """The unknowns stay those of the detector's pixels, also where pixels are left over at the end."""
+    star, wave = np.array([1e6, 1.2, -0.7, 3.0, 5.0, *companion]), 60e-9 * np.cos(np.arange(len(NOLL)))
+    # FWHM of two sums, as the fit has it.
+    blur = 0.85 * side * PIXEL
+    single, summed = (
+        model_image(stamp_of(behind_focus, 60, side=k, blur=blur, reach=60 * PIXEL), star, wave) for k in (1, side)
+    )
+    n = SIZE // side
+    expected = single[: n * side, : n * side].reshape(n, side, n, side).sum(axis=(1, 3))
+    # The spline of the coarser grid leaves 1e-3 beyond its Nyquist frequency.
+    np.testing.assert_allclose(summed, expected, atol=2e-3 * expected.max())
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("companion", [(), (0.3, 12.0, -7.5)])
 def test_derivatives_are_central_differences(behind_focus, companion):
@@ -59,8 +77,8 @@ def test_derivatives_are_central_differences(behind_focus, companion):
     joined = np.concatenate([star, wave])
     steps = np.concatenate([[1e3, 3e-2, 3e-2, 1.0, 0.05], np.full(len(companion), 0.02), np.full(len(NOLL), 5e-9)])
     landing = stamp.rays.landing(wave)
-    light = LandedLight(landing, stamp.rays.weights, stamp.rays.spread(landing))
-    image, columns, scales = stamp.grid.derivatives(star, light, stamp.rays.response(wave))
+    light = LandedLight(landing, stamp.rays.weights(wave), stamp.rays.spread(landing))
+    image, columns, scales = stamp.grid.derivatives(star, light, stamp.rays.response(wave), stamp.rays.rates)
     np.testing.assert_allclose(image, model_image(stamp, star, wave), atol=1e-6 * image.max())
     for k, step in enumerate(steps):
         ends = []

@@ -8,9 +8,10 @@ from astropy.table import QTable
 
 import pachon
 from pachon.commands.cli import main
-from pachon.core.errors import ConfigError, UnknownNameError
+from pachon.core.errors import ConfigError, ProductError, UnknownNameError
 from pachon.pipeline.config_hash import hashed_states
 from pachon.pipeline.experiment import Experiment
+from pachon.studies.alignment import loop
 from pachon.studies.alignment.config import AlignConfig, load_align_configuration
 from pachon.studies.alignment.loop import align
 from pachon.studies.alignment.product import write_alignment
@@ -68,6 +69,43 @@ def test_bytes_do_not_depend_on_threads_or_later_visits(aligned, traced_donuts):
     assert again.visits == aligned.visits[:2]
 
 
+@pytest.mark.long
+def test_a_killed_loop_goes_on_to_the_same_bytes(traced_donuts, tmp_path, monkeypatch):
+    class Killed(BaseException):
+        """What ends a process."""
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    align(config(visits=2), store=whole)
+    original = loop.fit
+    calls = []
+
+    def fit(*arguments):
+        calls.append(1)
+        if len(calls) == 2:
+            raise Killed
+        return original(*arguments)
+
+    monkeypatch.setattr(loop, "fit", fit)
+    with pytest.raises(Killed):
+        align(config(visits=2), store=killed)
+    with pytest.raises(ProductError, match="go on with --resume"):
+        align(config(visits=2), store=killed)
+    with pytest.raises(ProductError, match=r"another configuration \(seed: 1"):
+        align(config(visits=2, seed=2), store=killed, resume=True)
+    # One visit stands; the second alone is exposed.
+    align(config(visits=2), store=killed, resume=True)
+    assert len(calls) == 3
+    names = sorted(path.name for path in whole.iterdir())
+    assert names == sorted(path.name for path in killed.iterdir())
+    assert len(names) == 3
+    for name in names:
+        assert (whole / name).read_bytes() == (killed / name).read_bytes()
+    damaged = killed / "visit_00000.npz"
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    with pytest.raises(ProductError, match=r"visit_00000\.npz: expected a visit of a loop"):
+        align(config(visits=2), store=killed, resume=True)
+
+
 @pytest.mark.slow
 def test_files_have_the_loop_and_states_go_into_runs(aligned, tmp_path):
     names = write_alignment(aligned, tmp_path)
@@ -109,6 +147,10 @@ def test_the_command_shows_the_loop(traced_donuts, tmp_path, capsys):
     (tmp_path / "loop.yaml").write_text("air: {wavefront: false}\nvisits: 9\n")
     arguments = ["align", str(tmp_path / "loop.yaml"), "-n", "1", "-o", str(tmp_path / "out"), "--quiet", "--json"]
     assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["visits"] == 1
+    assert main(arguments) == 2
+    assert "go on with --resume" in capsys.readouterr().err
+    assert main([*arguments, "--resume"]) == 0
     assert json.loads(capsys.readouterr().out)["visits"] == 1
     (tmp_path / "loop.yaml").write_text("donuts: {heights: flat}\n")
     assert main(arguments) == 2

@@ -1,0 +1,123 @@
+"""Visits of a loop on disk: what was exposed and fitted in each, so that a loop that was killed goes on."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from ...core.errors import PachonError, ProductError
+from ...core.files import claim_folder, write_bytes
+from ...pipeline.config import differences
+from ...pipeline.wavefront_sensing.result import DonutFit
+from .config import AlignConfig, load_align_configuration
+from .field_quality import FieldMeans
+
+CONFIG_NAME = "config.yaml"
+_PATTERN = "visit_*.npz"
+_ARRAYS = ("zernikes", "covariance", "usable", "images", "model")
+
+
+@dataclass(frozen=True, eq=False)
+class VisitRecord:
+    """Quality of the telescope in a visit, and its donuts.
+
+    Attributes
+    ----------
+    quality : FieldMeans
+        Means over the field.
+    zernikes, covariance : ndarray, shapes [n_star, n_noll], [n_star, n_noll, n_noll]
+        Wavefronts of the donuts beyond the telescope as designed [m], NaN where there is none, and their covariance.
+    usable : ndarray of bool, shape [n_star]
+        Donuts with a result.
+    images, model : ndarray of float32, shape [n_star, ny, nx]
+        Donuts and their best models [electrons]; without stamps between the first and the last visit.
+    """
+
+    quality: FieldMeans
+    zernikes: np.ndarray
+    covariance: np.ndarray
+    usable: np.ndarray
+    images: np.ndarray
+    model: np.ndarray
+
+    @classmethod
+    def of(cls, quality: FieldMeans, fit: DonutFit) -> VisitRecord:
+        """Keep what a loop needs of the fit of a visit."""
+        images, model = (v.astype(np.float32) for v in (fit.images, fit.model))
+        return cls(quality, fit.zernikes, fit.covariance, np.asarray(fit.usable), images, model)
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """Donuts minus their models [electrons]."""
+        return self.images - self.model
+
+    def without_images(self) -> VisitRecord:
+        """Return the record without its stamps."""
+        return replace(self, images=self.images[:0], model=self.model[:0])
+
+    def to_bytes(self) -> bytes:
+        """Return the record as the content of a file, the same bytes for the same record."""
+        content = io.BytesIO()
+        np.savez(content, quality=np.array(astuple(self.quality)), **{name: getattr(self, name) for name in _ARRAYS})
+        return content.getvalue()
+
+
+@dataclass(frozen=True)
+class VisitStore:
+    """Folder with a file for each visit; of all but the first and the last without stamps."""
+
+    folder: Path
+
+    @classmethod
+    def claimed(cls, folder: Path, config: AlignConfig, *, resume: bool) -> VisitStore:
+        """Write the configuration into a folder, or check that its visits are of the same, but for their number.
+
+        Raises
+        ------
+        ProductError
+            If the folder holds visits of another configuration, or of this one without ``resume``.
+        """
+        path, choose = folder / CONFIG_NAME, "choose another --out"
+
+        def check() -> None:
+            if not any(folder.glob(_PATTERN)):
+                return
+            try:
+                before = load_align_configuration(path)
+            except PachonError as error:
+                raise ProductError(f"{folder} holds visits that cannot be read ({error}); {choose}") from None
+            if not resume:
+                raise ProductError(f"{folder} holds visits already; go on with --resume, or {choose}")
+            old, new = (c.model_dump(mode="json", exclude={"visits"}) for c in (before, config))
+            found = differences(old, new)
+            if found:
+                raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])}); {choose}")
+
+        claim_folder(path, config.to_yaml().encode(), products=_PATTERN, check=check)
+        return cls(folder)
+
+    def _path(self, visit: int) -> Path:
+        return self.folder / f"visit_{visit:05d}.npz"
+
+    def read(self, visit: int) -> VisitRecord | None:
+        """Return a visit, or None where it is not there; a damaged file is a ProductError."""
+        path = self._path(visit)
+        try:
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
+                quality = FieldMeans(*(float(v) for v in content["quality"]))
+                return VisitRecord(quality, *(content[name] for name in _ARRAYS))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            raise ProductError(f"{path}: expected a visit of a loop ({error}); delete it, and go on") from None
+
+    def write(self, visit: int, record: VisitRecord) -> None:
+        """Write a visit, and take the stamps off the one before."""
+        write_bytes(self._path(visit), record.to_bytes())
+        before = self.read(visit - 1) if visit > 1 else None
+        if before is not None and len(before.images):
+            write_bytes(self._path(visit - 1), before.without_images().to_bytes())
