@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from ...core.errors import DomainError
+from ...core.errors import DomainError, error_context
 from ...core.progress import Reporter
 from ...core.units import ARCSEC
 from ...models.telescope import Telescope
@@ -26,6 +27,7 @@ from ...pipeline.simulate.photometry import (
     saturation_magnitude,
     signal_to_noise,
 )
+from ...pipeline.simulate.screen_cover import check_screens
 from ...pipeline.simulate.star_field import StarField, magnitudes_at
 from .plan import Visit
 from .resample import resample_stamps
@@ -94,6 +96,15 @@ def visit_telescope(experiment: Experiment, visit: Visit) -> Telescope:
     if visit.rotator_deg is None:
         return experiment.telescope
     return experiment.telescope.with_rotator(np.deg2rad(visit.rotator_deg - experiment.config.rotator_deg))
+
+
+def check_rotators(experiment: Experiment, visits: Sequence[Visit]) -> None:
+    """Raise ConfigError if screens are too short for the camera at the angle of a visit."""
+    for visit in visits:
+        if visit.rotator_deg is not None:
+            telescope = visit_telescope(experiment, visit)
+            with error_context(subject=f"visit {visit.number}, rotator {visit.rotator_deg:g} deg"):
+                check_screens(experiment.config, telescope, experiment.camera, experiment.site)
 
 
 def visit_psfs(

@@ -23,7 +23,7 @@ from .config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from .measures import Correlated, correlated, stack_metrics
 from .plan import Visit
 from .plots import correlation_picture, ellipticity_picture
-from .psf_visit import StackFrame, visit_experiment, visit_psfs
+from .psf_visit import StackFrame, check_rotators, visit_experiment, visit_psfs
 from .sky_points import SkyPoints, draw_points
 from .stack import PsfStack, PsfSums
 
@@ -102,6 +102,7 @@ def stack_visits(
     frame = StackFrame.of(experiment, STACK_STAMP)
     points = sky_points_of(experiment, config, frame)
     visits = config.plan(experiment.config.seed)
+    check_rotators(experiment, visits)
     make_folder(folder)
     _check_room(folder, points, len(config.kept))
     _claim(folder, config, resume)

@@ -32,7 +32,7 @@ def _made_by_hand(made):
     three, shapes = np.zeros(3), PsfShapes(np.zeros(3), np.zeros(3), np.full(3, 1e-6))
     stack = dict.fromkeys(("xi", "eta", "x", "y", "e1", "e2", "size", "model_e1", "model_e2", "model_size"), three)
     stamps = np.ones((3, 5, 5), dtype=np.float32)
-    shims = {"merit": "fwhm", "parts": "rafts", "fitted": {}, "checked": {}, "focused": made.plane}
+    shims = {"merit": "fwhm", "parts": "rafts", "fitted": {}, "checked": {}, "correlations": {}, "focused": made.plane}
     aligned = {"scene": None, "designed": None, "visits": (), "floor": 0.0, "first": None, "last": None}
     visits = {name: np.zeros((3, 2)) for name in ("states", "estimates", "errors")}
     loose = Deviation("spot", "um", 1.0, 0.1, 1.2, None)

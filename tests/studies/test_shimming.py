@@ -142,7 +142,7 @@ def test_no_motion_of_a_grid_has_a_smaller_correlation(built):
     best = correlation(heights)
     # Single precision of TreeCorr, and a series that spans other heights.
     assert found.fitted["shimmed"].rms_xi == pytest.approx(best, rel=2e-3)
-    assert best < 0.95 * shim(built, merit="ellipticity", threads=1).fitted["shimmed"].rms_xi
+    assert best < correlation(fit.heights(shim(built, merit="ellipticity", threads=1).focal_plane))
     x, y = (fit.position - fit.position.mean(axis=0)).T
     steps = np.array([-6.0, -2.0, 0.0, 2.0, 6.0]) * 1e-6
     others = [correlation(heights + dz + rx * y / 0.04 + ry * x / 0.04) for dz in steps for rx in steps for ry in steps]

@@ -38,7 +38,7 @@ def image_points(images: Sequence[Any], primary: Any, file: Path) -> dict[str, n
         with error_context(file=file, place=name):
             own = _points(hdu.data, hdu.header)
         frame = frame_of(hdu.header, frame_of(primary, "telescope", file), file)
-        points[name] = in_telescope_frame(own, frame)
+        points[name] = in_telescope_frame(list(own), frame)
     return points
 
 

@@ -31,7 +31,15 @@ from ....pipeline.simulate.star_field import magnitudes_at
 from ....sky.population import GalaxyPopulation
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit
-from ..psf_visit import StackFrame, magnitude_limits, middle_wavelength, stack_limit, visit_experiment, visit_telescope
+from ..psf_visit import (
+    StackFrame,
+    check_rotators,
+    magnitude_limits,
+    middle_wavelength,
+    stack_limit,
+    visit_experiment,
+    visit_telescope,
+)
 from ..visits import pixel_scale_of, sky_points_of
 from .config import ImageStackConfig, load_image_stack_configuration
 from .resample import add_resampled
@@ -188,6 +196,7 @@ def stack_images(
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     stack = ImageStack.of(folder, settings)
+    check_rotators(stack.experiment, stack.plan)
     _claim(stack, resume)
     _check_room(stack, threads)
     plan = stack.plan

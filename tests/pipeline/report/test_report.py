@@ -93,6 +93,15 @@ def test_text_of_a_user_is_escaped(finished_run, tiny):
     assert "&lt;b&gt;mine&lt;/b&gt; &amp; yours" in page
 
 
+def test_the_page_says_what_the_camera_is_where_it_is_not_the_plain_one(finished_run, tiny):
+    summary = json.loads((finished_run / "summary.json").read_text())
+    options = {"detector__silicon": True, "rotator_deg": 90.0}
+    plain, other = (build_report(Experiment.from_config(tiny(**o)), summary, []) for o in ({}, options))
+    assert "engine, seed 1. PSF" in plain
+    words = " ".join(other.split())
+    assert "engine, 100 &micro;m of silicon at 173 K, camera rotated by 90&deg;, seed 1. PSF" in words
+
+
 def test_a_whisker_lies_along_the_elongation_with_its_length():
     # e1 > 0: along x; e1 < 0: along y; e2 > 0: along x = y.
     e1, e2 = np.array([0.1, -0.1, 0.0, np.nan]), np.array([0.0, 0.0, 0.2, 0.0])

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from pachon.commands.cli import main
-from pachon.core.errors import PachonError
+from pachon.core.errors import ConfigError, PachonError
 from pachon.core.progress import Reporter
 from pachon.core.units import ARCSEC
-from pachon.pipeline.config import digest, with_options
+from pachon.models.camera.lsst import lsst_camera
+from pachon.pipeline.config import Configuration, digest, with_options
 from pachon.pipeline.experiment import Experiment
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.simulate.ccd_exposure import expose_positions
-from pachon.studies.visits.config import load_visits_configuration
+from pachon.studies.visits.config import VisitsConfig, VisitsSection, load_visits_configuration
 from pachon.studies.visits.plan import Visit
 from pachon.studies.visits.psf_visit import StackFrame, visit_experiment, visit_psfs, visit_telescope
 from pachon.studies.visits.sky_points import draw_points
@@ -220,4 +221,14 @@ def test_angles_of_the_command_line(capsys, tmp_path):
     assert "visits.rotator_deg: 2 angles for 3 visits, expected one for each" in capsys.readouterr().err
     assert main(["visits", "--roll", "north", "-o", str(tmp_path / "b")]) == 2
     assert "--roll = north: expected random, or angles in degrees with commas between" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_screens_too_short_for_a_rotated_camera_are_refused_before_any_visit(tmp_path):
+    # The diagonal of the focal plane along x: 3.5 degrees at 20 km, and more than the side of 3.1 degrees needs.
+    run = Configuration(ccds=tuple(lsst_camera().ccd_names))
+    config = VisitsConfig(run=run, visits=VisitsSection(count=3, rotator_deg=(0.0, 90.0, 45.0)))
+    expected = r"^visit 2, rotator 45 deg: atmosphere\.exposure_s = 15: .* at least 1[34]\d\d "
+    with pytest.raises(ConfigError, match=expected):
+        stack_visits(config, tmp_path / "visits")
     assert not list(tmp_path.iterdir())
