@@ -39,7 +39,8 @@ def diagnose_command(
         Path, Argument(metavar="RUN_FOLDER", help="Folder of a run, finished or not; with --piff a table of stars.")
     ],
     out: Annotated[
-        Path | None, Option(help="Folder to write to; by default diagnostics, in that of the run, or STARS_piff.")
+        Path | None,
+        Option("--out", "-o", help="Folder to write to; by default diagnostics, in that of the run, or STARS_piff."),
     ] = None,
     strict: Annotated[bool, Option("--strict", help="End at the first CCD without a readable product.")] = False,
     piff: Annotated[Path | None, Option(help="File of Piff, to be compared with our model at the stars.")] = None,
@@ -123,7 +124,7 @@ def attribute_command(
         ),
     ] = None,
     average: Annotated[bool, Option("--average", help="Average over all turbulence; quick.")] = False,
-    out: Annotated[Path, Option(help="Folder to write to.")] = Path("pachon_attribution"),
+    out: Annotated[Path, Option("--out", "-o", help="Folder to write to.")] = Path("pachon_attribution"),
     truth_stars: TruthStars = None,
     observed_stars: ObservedStars = None,
     threads: Threads = None,

@@ -24,7 +24,7 @@ def reproduce_command(
     scale: Annotated[
         str, Option(help="small (two minutes) or paper (189 CCDs: an hour; with 100 visits, half a day).")
     ] = "small",
-    out: Annotated[Path, Option(help="Folder of the figures.")] = Path("pachon_figures"),
+    out: Annotated[Path, Option("--out", "-o", help="Folder of the figures.")] = Path("pachon_figures"),
     seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 1,
     threads: Threads = None,
     quiet: Quiet = False,

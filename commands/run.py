@@ -25,7 +25,7 @@ def run_command(
     ccds: Ccds = None,
     raft: Raft = None,
     all_ccds: Annotated[bool, Option("--all", help="All CCDs of the camera.")] = False,
-    out: Annotated[Path, Option(help="Folder of the run.")] = Path("pachon_run"),
+    out: Annotated[Path, Option("--out", "-o", help="Folder of the run.")] = Path("pachon_run"),
     seed: Annotated[int | None, Option(help="Seed of all random numbers.")] = None,
     resume: Annotated[bool, Option("--resume", help="Keep the CCDs that are finished, compute the others.")] = False,
     strict: Annotated[bool, Option("--strict", help="End at the first CCD that cannot be modelled.")] = False,

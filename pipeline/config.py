@@ -305,7 +305,10 @@ def load_configuration(path: Path) -> Configuration:
     ConfigError
         If the file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    return configuration_of(read_mapping(path, ConfigError), str(path))
+    content = read_mapping(path, ConfigError)
+    if {"surfaces", "opticalSystem"}.intersection(content):
+        raise ConfigError(f"a prescription; expected a configuration, with the line telescope: {path.name}", file=path)
+    return configuration_of(content, str(path))
 
 
 def with_run(content: dict[str, Any], path: Path) -> dict[str, Any]:

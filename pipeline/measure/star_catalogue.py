@@ -77,7 +77,9 @@ def load_stars(
         hdus = _fits(path, data)
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU) and not isinstance(hdu, fits.CompImageHDU)]
         if not tables:
-            raise ProductError(f"has no table, expected one with columns {x}, {y}", file=path)
+            raise ProductError(
+                f"has no table, expected one of stars with columns {x}, {y} and their stamps, {stamp}", file=path
+            )
         with parsing(path, "damaged or not FITS", ProductError):
             # SExtractor's LDAC files have a table of the image's header before that of the objects.
             table = next((t for t in tables if _known_as(x, t.columns.names)), tables[0])
@@ -102,6 +104,7 @@ def load_stars(
         also = " and no image of three axes" if stamp in missing and hdus is not None else ""
         raise ProductError(
             f"{path}: no column {', '.join(map(repr, missing))}{also}; its columns are {', '.join(columns) or 'none'}"
+            + "; stamps are images [n, ny, nx], as SExtractor's VIGNET" * (stamp in missing)
         )
     positions = np.stack([_numbers(path, name, columns[names[name.lower()]], 1) for name in (x, y)], axis=1)
     stamps = _numbers(path, stamp, columns[names[stamp.lower()]], 3) if cube is None else cube

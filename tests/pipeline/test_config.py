@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pachon
 from pachon.core.errors import ConfigError, PachonError
 from pachon.models.camera.focal_plane import FocalPlane
 from pachon.models.camera.silicon import Silicon
@@ -270,3 +271,11 @@ def test_the_digest_does_not_depend_on_the_order_of_keys():
     assert digest({"a": 1, "b": 2.5}) == digest({"b": 2.5, "a": 1})
     # sha256sum of the canonical text, by coreutils: printf '{"a":1}' | sha256sum
     assert digest({"a": 1}) == "015abd7f5cc57a2dd94b7590f04ad8084273905ee33ec5cebeae62276a97f862"
+
+
+@pytest.mark.parametrize("format", ["pachon", "batoid"])
+def test_a_prescription_in_place_of_a_configuration_is_told_where_it_goes(tmp_path, format):
+    path = tmp_path / "mine.yaml"
+    pachon.save_telescope(pachon.load_telescope("hsc"), path, format=format)
+    with pytest.raises(ConfigError, match=r"mine.yaml: a prescription; expected .* the line telescope: mine.yaml"):
+        load_configuration(path)

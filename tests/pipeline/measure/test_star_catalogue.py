@@ -86,7 +86,7 @@ def test_files_that_cannot_be_used(tmp_path):
     path.write_text("x,y\n1,2\n")
     refused(r"stars\.fits: neither FITS nor ECSV")
     fits.HDUList([fits.PrimaryHDU(stamps)]).writeto(path, overwrite=True)
-    refused("has no table, expected one with columns x, y")
+    refused("has no table, expected one of stars with columns x, y and their stamps, stamp")
     ecsv = catalogue(tmp_path / "stars.ecsv", stamps, positions, ("x", "flux"))
     refused("no column 'y', 'stamp'; its columns are x, flux", ecsv)
     ecsv.write_text("".join(ecsv.read_text().splitlines(keepends=True)[:6]))
