@@ -92,7 +92,11 @@ def validate_command(
 @app.command("schema")
 def schema_command(
     kind: Annotated[
-        str, Argument(help="prescription, run, sweep, images, visits, align, site, coatings or degrees_of_freedom.")
+        str,
+        Argument(
+            help="prescription, run, sweep, images, visits, align, site, coatings, tolerances, optimization or "
+            "degrees_of_freedom."
+        ),
     ],
 ) -> None:
     """Print the JSON schema of a kind of file, with which editors complete and check YAML.

@@ -18,6 +18,7 @@ from ..core.json_schema import json_schema
 from ..core.schema import problems_of
 from ..core.yaml_reader import line_of, read_mapping
 from ..design.analyses.coatings import Coatings, CoatingsFile
+from ..design.optimize.optimize_file import OptimizeFile, load_optimization
 from ..design.parameters.degrees_of_freedom_file import DegreesOfFreedomFile, load_degrees_of_freedom
 from ..imaging.config import ImagesConfig, load_images_configuration
 from ..models.camera.focal_plane import FocalPlane
@@ -28,6 +29,7 @@ from ..pipeline.config import Configuration, load_configuration, with_run
 from ..pipeline.experiment import Experiment
 from .alignment.config import AlignConfig, load_align_configuration
 from .sweep.file import SweepFile, load_sweep
+from .tolerance.file import ToleranceFile, load_tolerances
 from .visits.config import VisitsConfig, load_visits_configuration
 
 #: Endings of YAML files, and of tables of heights.
@@ -49,6 +51,11 @@ def _load_run(path: Path) -> None:
     Experiment.from_config(load_configuration(path), path.parent)
 
 
+def _load_tolerances(path: Path) -> None:
+    # The command gives the telescope where the file does not.
+    load_tolerances(path, "telescope")
+
+
 #: In the order in which they are chosen where a file could be of two kinds.
 KINDS = (
     FileKind("prescription", Prescription, load_telescope, PrescriptionError),
@@ -59,6 +66,8 @@ KINDS = (
     FileKind("align", AlignConfig, load_align_configuration),
     FileKind("site", SiteFile, load_site, PrescriptionError),
     FileKind("coatings", CoatingsFile, Coatings.read),
+    FileKind("tolerances", ToleranceFile, _load_tolerances),
+    FileKind("optimization", OptimizeFile, load_optimization),
     FileKind("degrees_of_freedom", DegreesOfFreedomFile, load_degrees_of_freedom, PrescriptionError),
 )
 
@@ -95,7 +104,8 @@ def validate_file(path: str | os.PathLike[str]) -> Validation:
     """Find all problems of a file.
 
     Prescriptions (YAML, Zemax, CODE V), run configurations, sweeps, configurations of images, visits and alignment,
-    sites, coatings, degrees of freedom, and tables of CCD heights; which of them it is, its ending and its keys tell.
+    sites, coatings, tolerances, optimisations, degrees of freedom, and tables of CCD heights; which of them it is, its
+    ending and its keys tell.
     Values that contradict one another are reported once everything else is in order.
 
     Parameters
@@ -126,7 +136,8 @@ def file_schema(kind: str) -> dict[str, Any]:
     Parameters
     ----------
     kind : str
-        "prescription", "run", "sweep", "images", "visits", "align", "site", "coatings" or "degrees_of_freedom".
+        "prescription", "run", "sweep", "images", "visits", "align", "site", "coatings", "tolerances",
+        "optimization" or "degrees_of_freedom".
 
     Raises
     ------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, PachonError, shown
 from ...core.threads import one_blas_thread
 from ...core.units import require_count
+from ...models.paraxial import stop_makes_pupil
 from ...models.telescope import Telescope
 from ...raytrace.rays import RayStatus
 from ...wavefront.pupil_sampling import PupilSampling
-from ..parameters.parameters import Parameter
+from ..parameters.parameters import Parameter, resolved
 from .configuration import DesignConfiguration, configurations
 from .jacobian import ParameterColumns
 from .merit import Beams, Merit, SpotMerit, WavefrontMerit
@@ -150,7 +152,7 @@ def optimize(
     covariance, collinear = _covariance(values, slopes, chosen, rate)
     changes = np.array([v.change(x) for v, x in zip(chosen, solved, strict=True)])
     start_values = np.array([v.start for v in chosen])
-    ended = problem.telescopes(solved)
+    ended = [_as_stated(before, after) for before, after in zip(telescopes, problem.telescopes(solved), strict=True)]
     return Optimum(
         telescopes=tuple(ended),
         start_telescopes=tuple(telescopes),
@@ -174,6 +176,14 @@ def optimize(
         collinear=collinear,
         message=str(done.message),
     )
+
+
+def _as_stated(before: Telescope, after: Telescope) -> Telescope:
+    """Return a telescope that states the diameter of its pupil, which stays, where another size is true no longer."""
+    data = after.design_data
+    if data.aperture not in ("f_number", "working_f_number") or not stop_makes_pupil(before) or stop_makes_pupil(after):
+        return after
+    return after.with_design(aperture="entrance_pupil", aperture_value=after.pupil_diameter)
 
 
 def _solve(
@@ -240,7 +250,7 @@ def _states(
     if len(found) > 1 and (goal is not None or not isinstance(merit, str)):
         raise ConfigError(f"{len(found)} configurations: expected no goal, and the merit 'spots' or 'wavefront'")
     total, states, beams = sum(one.weight for one in found), [], []
-    for one in found:
+    for one in (replace(c, telescope=resolved(c.telescope)) for c in found):
         weights: dict[str, Any] = dict(field_weights=one.field_weights, wavelength_weights=one.wavelength_weights)
         rays = Beams.of(one.telescope, one.fields, one.wavelengths, **weights, **options)
         wanted = merit if not isinstance(merit, str) else _merit(merit, one.telescope, rays, reference, goal)

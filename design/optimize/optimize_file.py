@@ -201,6 +201,9 @@ def optimization_arguments(file: OptimizeFile, telescope: Telescope, path: Path)
             with error_context(key=f"configurations.{i}"):
                 beside = path.parent / section.telescope
                 other = load_telescope(beside if beside.is_file() else section.telescope)
+                if other.name in [s.telescope.name for s in states] and beside.is_file():
+                    # Positions of a zoom lens, saved from one telescope, have its name.
+                    other = dataclasses.replace(other, name=beside.stem)
                 rays = {k: common[k] if v is None else v for k, v in section.rays().items()}
                 states.append(
                     DesignConfiguration(other, **rays, weight=section.weight, operands=section.operand_list())

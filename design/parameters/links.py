@@ -77,7 +77,8 @@ def with_followers(
             found.solve(solve, len(parameters))
             # Thicknesses that follow a solved one.
             found.pick_up([p for p in data.pickups if p.quantity == "thickness" and p.source == solve.surface])
-    return Followers(tuple(found.parameters), np.array(found.values), np.array(found.rates).reshape(-1, len(values)))
+    rates = np.array(found.rates).reshape(len(found.parameters), len(parameters))
+    return Followers(tuple(found.parameters), np.array(found.values), rates)
 
 
 def followers(telescope: Telescope) -> set[tuple[str, str]]:

@@ -244,19 +244,23 @@ def apply(telescope: Telescope, values: Mapping[str, float] | Mapping[Parameter,
     """
     parameters = [p if isinstance(p, Parameter) else Parameter.parse(p, telescope) for p in values]
     changes = [float(v) for v in values.values()]
-    for parameter, change in zip(parameters, changes, strict=True):
-        if not np.isfinite(change):
-            raise DomainError(f"{parameter.address} = {change!r}: expected a finite change")
+    if wrong := [f"{p.address} = {c!r}" for p, c in zip(parameters, changes, strict=True) if not np.isfinite(c)]:
+        raise DomainError(f"{wrong[0]}: expected a finite change")
     if has_links(telescope):
         found = linked(telescope, parameters, changes)
         parameters, changes = list(found.parameters), found.values.tolist()
     return _apply_alone(telescope, dict(zip(parameters, changes, strict=True)))
 
 
+def resolved(telescope: Telescope) -> Telescope:
+    """Return a telescope whose solved thicknesses meet their solves; DomainError where one cannot be met."""
+    return apply(telescope, {}) if has_links(telescope) else telescope
+
+
 def linked(telescope: Telescope, parameters: Iterable[Parameter], changes: Iterable[float]) -> Followers:
     """Return parameters and changes with those of all that follows them, and the derivatives."""
-    parse = partial(Parameter.parse, telescope=telescope)
-    return with_followers(telescope, tuple(parameters), tuple(changes), parse, _apply_alone)
+    found, values, parse = tuple(parameters), tuple(changes), partial(Parameter.parse, telescope=telescope)
+    return with_followers(telescope, found, values, parse, _apply_alone)
 
 
 def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Telescope:

@@ -211,6 +211,17 @@ def figure_rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
+def _link_text(link: dict[str, Any], unit: float, name: str) -> str:
+    """Return a pickup or solve as text."""
+    if "kind" in link:
+        at = f" at {link['radius'] / unit:.6g} {name}" if link["radius"] else ""
+        return f"{link['surface']} thickness: {link['kind'].replace('_', ' ')} {link['value'] / unit:.6g} {name}{at}"
+    offset = link["offset"] if link["quantity"] == "conic" else link["offset"] / unit
+    factor = f"{link['scale']:.6g} times " if link["scale"] != 1.0 else ""
+    more = f" {'+-'[offset < 0]} {abs(offset):.6g}" if offset else ""
+    return f"{link['surface']} {link['quantity']}: {factor}that of {link['source']}{more}"
+
+
 def _stated_rows(design: dict[str, Any], unit: float, name: str) -> list[tuple[str, str]]:
     """Return what the design data state, as text."""
     rows = []
@@ -220,6 +231,7 @@ def _stated_rows(design: dict[str, Any], unit: float, name: str) -> list[tuple[s
         rows.append(("aperture as stated", f"{design['aperture'].replace('_', ' ')} {value}"))
     if design["stop"] is not None:
         rows.append(("stop", f"{design['stop']}, ray aiming {design['aiming']}"))
+    rows += [("follows", _link_text(link, unit, name)) for link in (*design["pickups"], *design["solves"])]
     if design["fields"]:
         angles = design["field_type"] == "angle"
         size, of = (math.radians(1.0), "°") if angles else (unit, f" {name}")

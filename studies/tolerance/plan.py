@@ -14,7 +14,7 @@ from ...design.parameters.changes import ANGLES, LENGTHS, parse_change
 from ...design.parameters.degrees_of_freedom import DegreeOfFreedom, DegreesOfFreedom, SurfaceDeformation
 from ...design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
 from ...design.parameters.links import followers
-from ...design.parameters.parameters import Parameter
+from ...design.parameters.parameters import Parameter, resolved
 from ...design.parameters.tolerances import Tolerance
 from ...models.media.medium import abbe_number
 from ...models.shapes.freeform import ZernikeSag
@@ -60,7 +60,7 @@ def tolerance_plan(file: ToleranceFile, telescope: Telescope) -> TolerancePlan:
     UnknownNameError, ConfigError, DomainError
         If a name does not exist, one is tolerance and compensator, or there is no tolerance.
     """
-    telescope, elements = with_elements(telescope)
+    telescope, elements = with_elements(resolved(telescope))
     maker = _Maker(telescope, file)
     chosen: dict[str, tuple[DegreeOfFreedom, Tolerance]] = {}
     for section in _common(file, telescope, elements):

@@ -72,6 +72,9 @@ def test_values_that_contradict_one_another(tmp_path):
         ("name: s\nparameters: {}\nmetrics: [fwhm]\ndesign: {kind: grit}\n", "sweep", ["design.kind"]),
         ("name: s\nparameters: {}\nmetrics: [fwhm]\n", "sweep", [None]),
         ("coatings: {a: {wavelength_nm: [5, 4]}}\nsurfaces: {M1: a}\n", "coatings", ["coatings.a.efficiency"]),
+        ("tolerances: [{name: S1.radius_mm, size: 1}]\nloss: 3\n", "tolerances", ["loss"]),
+        ("tolerances: [{name: S1.radius_mm, size: 1}]\ndraws: 20\n", "tolerances", []),
+        ("variables: [S1.radius]\nbounds: {S1.radius: 3}\n", "optimization", ["bounds.S1.radius"]),
         ("name: 'a", "YAML", [None]),
     ],
 )

@@ -22,6 +22,7 @@ from ....core.errors import PrescriptionError
 from ...media.medium import Medium
 from ...media.tabulated import TabulatedIndex
 from ..zemax.file import Block, Findings, ZemaxFile
+from ..zemax.placed import made_record
 from ..zemax.text import Record, read_text
 
 UNITS = {"M": "MM", "MM": "MM", "C": "CM", "CM": "CM", "I": "IN", "IN": "IN"}
@@ -132,7 +133,7 @@ class _Translation:
         self._check_solves()
         if not any(line.keyword == "STOP" for block in self.surfaces for line in block.lines):
             # Where a file names no stop, it is the first surface.
-            self.surfaces[1].lines.append(self._record(1, "STOP"))
+            self.surfaces[1].lines.append(made_record(self.path, "surface 1", ("STOP",)))
         # Chief rays pass the middle of the stop.
         self._header_line("RAIM", 0, 1)
         weights = self.lists.get("WTW", [])
@@ -146,12 +147,11 @@ class _Translation:
                 # The pupil reaches from lower - 1 to 1 - upper.
                 self._header_line(f"VD{axis}N", *(0.5 * (low - up) for up, low in both))
                 self._header_line(f"VC{axis}N", *(0.5 * (low + up) for up, low in both))
-        words = (repr(self.field_type), "0", "0", str(len(self.waves)))
-        self.header.lines.append(Record(str(self.path), 1, "", "FTYP", words, ""))
+        self._header_line("FTYP", self.field_type, 0, 0, len(self.waves))
         return ZemaxFile(self.path, self.header, self._blocks(), Block(str(self.path)), self.private, program="CODE V")
 
     def _header_line(self, keyword: str, *values: float) -> None:
-        self.header.lines.append(Record(str(self.path), 1, "", keyword, tuple(map(repr, values)), ""))
+        self.header.lines.append(made_record(self.path, "", (keyword, *values)))
 
     def _number(self, command: Record) -> int:
         word = command.words[0][1:].upper()
@@ -349,16 +349,14 @@ class _Translation:
             if moved and not values.get("REV"):
                 blocks += [self._break(number, [0.0] * 6, depth), self._break(number, [*shift, *tilts, 0], 0.0)]
             if not last and not block.all("COMM"):
-                block.lines.append(self._record(number, "COMM", f"S{number}"))
-            block.lines += [self._record(number, *line) for line in (*lines, ("DISZ", distance))]
+                block.lines.append(made_record(self.path, f"surface {number}", ("COMM", f"S{number}")))
+            block.lines += [made_record(self.path, f"surface {number}", line) for line in (*lines, ("DISZ", distance))]
             blocks += [block, *after]
         return blocks
 
     def _break(self, number: int, parameters: Iterable[float], thickness: float) -> Block:
         lines: list[tuple[Any, ...]] = [("TYPE", "COORDBRK"), ("DISZ", thickness)]
         lines += [("PARM", i, v) for i, v in enumerate(parameters, start=1)]
-        return Block(str(self.path), f"surface {number}", [self._record(number, *line) for line in lines])
-
-    def _record(self, number: int, keyword: str, *values: object) -> Record:
-        words = tuple(repr(v) if isinstance(v, float) else str(v) for v in values)
-        return Record(str(self.path), 1, f"surface {number}", keyword, words, " ".join(words))
+        return Block(
+            str(self.path), f"surface {number}", [made_record(self.path, f"surface {number}", line) for line in lines]
+        )

@@ -48,7 +48,7 @@ class PlacedSurfaces:
 
     def head(self, keyword: str, *words: str | float) -> None:
         """Add a line to the header."""
-        self.header.lines.append(_record(self.path, "", (keyword, *words)))
+        self.header.lines.append(made_record(self.path, "", (keyword, *words)))
 
     def constant_glass(self, index: float) -> list[Line]:
         """Return the line of a medium of constant index, or none for air."""
@@ -90,7 +90,7 @@ class PlacedSurfaces:
         for number, block in enumerate(self._surfaces[:-1], start=1):
             if block.last("COMM") is None:
                 # Names count surfaces and no coordinate breaks; the last is the image.
-                block.lines.append(_record(self.path, block.place, ("COMM", f"S{number}")))
+                block.lines.append(made_record(self.path, block.place, ("COMM", f"S{number}")))
         return ZemaxFile(self.path, self.header, self._blocks, Block(str(self.path)), self.glasses, self.program)
 
     def _finish(self, place: str, position: np.ndarray) -> None:
@@ -116,10 +116,10 @@ class PlacedSurfaces:
         self._sign = -self._sign
 
     def _add(self, place: str, lines: Iterable[Line]) -> None:
-        self._blocks.append(Block(str(self.path), place, [_record(self.path, place, line) for line in lines]))
+        self._blocks.append(Block(str(self.path), place, [made_record(self.path, place, line) for line in lines]))
 
     def _last(self, line: Line) -> None:
-        self._blocks[-1].lines.append(_record(self.path, self._blocks[-1].place, line))
+        self._blocks[-1].lines.append(made_record(self.path, self._blocks[-1].place, line))
 
 
 def numbered(keyword: str, values: Mapping[int, float] | Iterable[float]) -> list[Line]:
@@ -128,7 +128,8 @@ def numbered(keyword: str, values: Mapping[int, float] | Iterable[float]) -> lis
     return [(keyword, i, v) for i, v in items if v]
 
 
-def _record(path: Path, place: str, line: Line) -> Record:
+def made_record(path: Path, place: str, line: Line) -> Record:
+    """Return a line of a translated file; `place` is that of its block."""
     words = tuple(number_text(v) if isinstance(v, float) else str(v) for v in line)
     return Record(str(path), 1, place, words[0], words[1:], " ".join(words[1:]))
 
