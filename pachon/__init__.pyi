@@ -18,6 +18,8 @@ from .design.analyses.field_curvature import FieldCurvature as FieldCurvature
 from .design.analyses.field_curvature import field_curvature as field_curvature
 from .design.analyses.illumination import RelativeIllumination as RelativeIllumination
 from .design.analyses.illumination import relative_illumination as relative_illumination
+from .design.analyses.layer_stack import CoatingTable as CoatingTable
+from .design.analyses.layer_stack import LayerStack as LayerStack
 from .design.analyses.ray_fans import OpdFans as OpdFans
 from .design.analyses.ray_fans import RayFans as RayFans
 from .design.analyses.ray_fans import opd_fans as opd_fans

@@ -160,6 +160,10 @@ def ghosts(
         ),
     ] = None,
     detector_reflectivity: Annotated[float, Option(min=0.0, max=1.0, help="Of the detector.")] = 0.15,
+    coatings: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput."),
+    ] = None,
     rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
 ) -> Study:
     """Trace every ghost that two reflections make: its light, irradiance, size and focus, the brightest first.
@@ -176,7 +180,9 @@ def ghosts(
     lenses = _reflectivities(reflectivity or [])
     field = None if given.fields is None else given.fields[0]
     with given.stage("ghosts", max(len(ghost_pairs(given.telescope)), 1)) as progress:
-        how = dict(detector_reflectivity=detector_reflectivity, n_pupil=rays, progress=progress, **given.how)
+        how = dict(
+            detector_reflectivity=detector_reflectivity, coatings=coatings, n_pupil=rays, progress=progress, **given.how
+        )
         return compute(given.telescope, field, given.wavelength, reflectivity=lenses, **how)
 
 

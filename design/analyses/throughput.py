@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.arguments import check_arguments
-from ...core.errors import DomainError, unknown_name
+from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.plotting import BLUE, plain_text
 from ...core.units import pure_numbers
 from ...models.surface import Interaction, Surface
@@ -33,6 +33,7 @@ from ...wavefront.request import Request
 from ..drawing import field_colors, finish_axes
 from .analysis import Analysis, Columns, band_wavelengths
 from .coatings import Coatings
+from .layer_stack import LayerStack
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,11 +134,11 @@ def throughput(
     Raises
     ------
     ConfigError
-        If the file is malformed.
+        If the file is malformed, or layers stand on what is not a lens surface.
     UnknownNameError
         If a coating belongs to no surface, or absorption to no glass.
     DomainError
-        If a table does not cover a wavelength.
+        If a table does not cover a wavelength, or the angle of a ray that is lit.
     """
     known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
     names = telescope.surface_names
@@ -145,6 +146,9 @@ def throughput(
     for name in known.surfaces:
         if name not in names:
             raise unknown_name(f"surface of {telescope.name}", name, names)
+        surface = telescope.surface(name)
+        if isinstance(known.surfaces[name], LayerStack) and surface.interaction != Interaction.REFRACT:
+            raise ConfigError(f"coating of {name}: layers are those of lens surfaces; expected a table")
     for name in known.glasses:
         if name not in glasses:
             raise unknown_name(f"glass of {telescope.name}", name, dict.fromkeys(glasses) or ("none",))
@@ -192,7 +196,10 @@ def _passed(
             found[f"in {glass} before {surface.name}"] = known.glasses[glass].through(path, wavelength)
         direction = rays.direction if before is None else before.direction
         if surface.name in known.surfaces:
-            found[surface.name] = np.full(len(rays), known.surfaces[surface.name].at(wavelength))
+            incidence = _incidence(surface, result, direction)
+            coating = known.surfaces[surface.name]
+            found[surface.name] = coating.efficiency(wavelength, incidence, float(index[k]), float(index[k + 1]))
+            _check_angles(surface.name, found[surface.name], incidence, lit.ravel())
         elif surface.interaction == Interaction.REFRACT and index[k] != index[k + 1]:
             found[surface.name] = fresnel_transmission(_incidence(surface, result, direction), index[k], index[k + 1])
         for name, efficiency in found.items():
@@ -202,6 +209,14 @@ def _passed(
                 steps[name] = (weight * each).sum(axis=1) / fraction
         before = result
     return (weight * left).sum(axis=1), fraction, steps
+
+
+def _check_angles(name: str, efficiency: np.ndarray, cosine: np.ndarray, lit: np.ndarray) -> None:
+    """Raise a DomainError where the coating of a surface has no efficiency for a ray that is lit."""
+    beyond = lit & np.isnan(efficiency)
+    if beyond.any():
+        steepest = np.rad2deg(np.arccos(cosine[beyond].min()))
+        raise DomainError(f"coating of {name}: rays of {steepest:.4g} deg: expected a table that reaches them")
 
 
 def _incidence(surface: Surface, result: TraceResult, direction: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
 from ...raytrace.rays import Rays, RayStatus
 from ...raytrace.trace import trace
+from ..analyses.coatings import Coatings
 
 
 def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
@@ -62,10 +63,20 @@ def refracted_reflectivity(turn: np.ndarray, before: float, after: float) -> np.
     return np.asarray((across * across + along * along) * (0.5 / (after * after - before * before) ** 2))
 
 
-class Coatings:
-    """Reflectivity of every surface that is not a mirror."""
+class Reflectivities:
+    """Reflectivity of every surface that is not a mirror, at a wavelength [m].
 
-    def __init__(self, telescope: Telescope, given: float | Mapping[str, float] | None, detector: float) -> None:
+    It is the one that is given; else what the coating of the surface does not transmit; else that of bare glass.
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        given: float | Mapping[str, float] | None,
+        detector: float,
+        coatings: Coatings,
+        wavelength: float,
+    ) -> None:
         lenses = [s.name for s in telescope.surfaces if s.interaction == Interaction.REFRACT]
         if isinstance(given, Mapping):
             for name in given:
@@ -80,18 +91,39 @@ class Coatings:
         for name, value in table.items():
             if not 0.0 <= value <= 1.0:
                 raise DomainError(f"reflectivity of {name} = {value!r}: expected a number from 0 to 1")
+        for name in coatings.surfaces:
+            if name not in telescope.surface_names:
+                raise unknown_name(f"surface of {telescope.name}", name, telescope.surface_names)
         self._fixed = {i: table[s.name] for i, s in enumerate(telescope.surfaces) if s.name in table}
+        self._coated = {i: s.name for i, s in enumerate(telescope.surfaces) if s.name in coatings.surfaces}
+        self._coatings, self._wavelength = coatings, wavelength
 
     def reflected(self, place: int, turn: np.ndarray, before: float, after: float) -> np.ndarray | float:
         """Return the reflectivity for light that is reflected, from the cosine of the angle by which that turns it."""
         if place in self._fixed:
             return self._fixed[place]
         cosine = np.sqrt(np.maximum(0.5 * (1.0 - turn), 0.0))
+        if place in self._coated:
+            return self._coating(place, cosine, before, after)
         return fresnel_reflectivity(cosine, before, after)
 
     def refracted(self, place: int, turn: np.ndarray, before: float, after: float) -> np.ndarray | float:
         """Return the reflectivity for light that is refracted, from the cosine of the angle by which that turns it."""
-        return self._fixed[place] if place in self._fixed else refracted_reflectivity(turn, before, after)
+        if place in self._fixed:
+            return self._fixed[place]
+        if place in self._coated:
+            # As in refracted_reflectivity; without a refraction the angle of incidence cannot be told from the turn.
+            length = np.sqrt(before * before + after * after - 2.0 * before * after * turn)
+            return self._coating(place, np.abs(after * turn - before) / length, before, after)
+        return refracted_reflectivity(turn, before, after)
+
+    def _coating(self, place: int, cosine: np.ndarray, before: float, after: float) -> np.ndarray:
+        """Return what a coating does not transmit, from the cosine of the angle of incidence."""
+        name = self._coated[place]
+        found = 1.0 - self._coatings.surfaces[name].efficiency(self._wavelength, cosine, before, after)
+        if (np.isnan(found) & ~np.isnan(cosine)).any():
+            raise DomainError(f"coating of {name}: expected a table that reaches the angles of all ghosts")
+        return np.asarray(np.clip(found, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -129,7 +161,7 @@ class _Beam:
 class GhostTrace:
     """Light of one star along its own path and those of its ghosts."""
 
-    def __init__(self, telescope: Telescope, start: Rays, coatings: Coatings, threads: int | None) -> None:
+    def __init__(self, telescope: Telescope, start: Rays, coatings: Reflectivities, threads: int | None) -> None:
         self._telescope, self._coatings, self._threads = telescope, coatings, threads
         self._wavelength = start.wavelength
         self._media: list[Medium] = [telescope.medium_before, *(s.medium_after for s in telescope.surfaces)]

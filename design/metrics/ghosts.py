@@ -6,6 +6,7 @@ Reflectivities are Fresnel's for bare glass at the angle of each ray, mean of bo
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,9 +26,10 @@ from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
 from ...wavefront.request import Request
+from ..analyses.coatings import Coatings
 from ..drawing import draw_circle, field_text, panels_of
 from ..result import FieldResult
-from .ghost_paths import Coatings, GhostLight, GhostTrace, ghost_pairs
+from .ghost_paths import GhostLight, GhostTrace, Reflectivities, ghost_pairs
 from .principal_rays import principal_rays_of
 from .spots import holding_radius
 
@@ -186,6 +188,7 @@ def ghosts(
     *,
     reflectivity: float | Mapping[str, float] | None = None,
     detector_reflectivity: float = DETECTOR_REFLECTIVITY,
+    coatings: Coatings | str | os.PathLike[str] | None = None,
     n_pupil: int = 40000,
     projection: str = "zemax",
     threads: int | None = None,
@@ -203,6 +206,9 @@ def ghosts(
         Reflectivity of the lens surfaces at every angle, one for all or by name; bare glass by default.
     detector_reflectivity : float
         Fraction of the light that the detector reflects.
+    coatings : Coatings or path, optional
+        Coatings of lens surfaces, or their file, as in :func:`pachon.throughput`, for surfaces whose reflectivity is
+        not given: what they do not transmit is reflected. Absorption of glasses is left out.
     n_pupil : int
         Rays of the star in the entrance pupil, at least 400.
     progress : callable, optional
@@ -211,7 +217,7 @@ def ghosts(
     Raises
     ------
     UnknownNameError
-        If a reflectivity is given for a surface that does not exist.
+        If a reflectivity or coating is given for a surface that does not exist.
     DomainError
         If a number is out of range, no surface can make a ghost, or the star itself does not reach the detector.
     """
@@ -228,12 +234,13 @@ def ghosts(
         threads=threads,
         one_wavelength=True,
     )
-    coatings = Coatings(telescope, reflectivity, detector_reflectivity)
+    known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
+    surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, known, request.wavelength)
     if not ghost_pairs(telescope):
         raise DomainError(
             f"{telescope.name}: expected at least one lens surface and another, or a detector, for ghosts"
         )
-    light = GhostTrace(telescope, request.launch(request.wavelength), coatings, threads)
+    light = GhostTrace(telescope, request.launch(request.wavelength), surfaces, threads)
     image = light.star()
     if not image.weight.sum() > 0:
         raise DomainError(f"{field_label(request.fields[0])}: the star does not reach the detector")

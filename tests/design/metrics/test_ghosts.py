@@ -7,9 +7,11 @@ import pytest
 
 import pachon
 from pachon.core.errors import DomainError, UnknownNameError
+from pachon.design.analyses.coatings import Coatings
+from pachon.design.analyses.layer_stack import LayerStack
 from pachon.design.metrics.ghost_paths import (
-    Coatings,
     GhostTrace,
+    Reflectivities,
     fresnel_reflectivity,
     ghost_pairs,
     refracted_reflectivity,
@@ -90,6 +92,17 @@ def test_the_ghost_of_a_plate(with_plate):
     area = 0.25 * np.pi * (2.0 * THICKNESS / 1.5 / F_NUMBER) ** 2
     assert plate.peak == pytest.approx(plate.flux / area, rel=0.08)
     assert plate.centroid == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+def test_the_ghost_of_a_coated_plate(with_plate):
+    """A quarter wave of MgF2 on both sides, by its closed form at normal incidence."""
+    film = LayerStack((1.38,), (5e-7 / 4 / 1.38,))
+    found = ghosts(with_plate, (0.0, 0.0), detector_reflectivity=0.0, coatings=Coatings({"front": film, "back": film}))
+    quarter = ((1.5 - 1.38**2) / (1.5 + 1.38**2)) ** 2
+    # Rays of a slow cone: the square of some degrees.
+    assert found.ghosts[0].flux == pytest.approx(quarter**2, rel=5e-3)
+    with pytest.raises(UnknownNameError, match="nowhere"):
+        ghosts(with_plate, coatings=Coatings({"nowhere": film}))
 
 
 def test_ghosts_by_the_detector(with_plate):
@@ -182,7 +195,7 @@ def test_stretches_of_a_path_are_the_path(lsst_r):
     telescope = lsst_r.perturbed("Filter", tilt=(2e-3, -1e-3, 0.0)).perturbed("L2", shift=(1e-3, 2e-3, 0.0))
     rng = np.random.default_rng(1)
     rays = pachon.launch_rays(telescope, np.deg2rad([0.4, -0.9]), 622e-9, rng.uniform(-4.0, 4.0, (2, 300)))
-    traced = GhostTrace(telescope, rays, Coatings(telescope, None, 0.2), None)
+    traced = GhostTrace(telescope, rays, Reflectivities(telescope, None, 0.2, Coatings(), rays.wavelength), None)
     found = list(traced.ghosts())
     pairs = ghost_pairs(telescope)
     assert len(found) == len(pairs) == 36
@@ -209,7 +222,8 @@ def test_obstructions_lie_on_their_stretch_of_the_path(with_plate):
     )
     rays = pachon.launch_rays(with_plate, (0.0, 0.0), 5e-7, np.random.default_rng(1).uniform(-0.03, 0.03, (2, 400)))
     blocked = with_plate.with_obstructions(pachon.Obstruction("wall", wall, ("front",)))
-    lights = [GhostTrace(t, rays, Coatings(t, None, 0.1), None) for t in (with_plate, blocked)]
+    bare = (None, 0.1, Coatings(), rays.wavelength)
+    lights = [GhostTrace(t, rays, Reflectivities(t, *bare), None) for t in (with_plate, blocked)]
     free, half = (len(light.star().weight) for light in lights)
     assert free == 400
     assert 150 < half < 250

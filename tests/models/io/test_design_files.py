@@ -221,3 +221,9 @@ def test_a_telescope_built_by_hand_can_be_read_again(tmp_path):
     again = pachon.load_telescope(tmp_path / "bare.yaml")
     assert again.surfaces == bare.surfaces
     assert again.source == again.version == "not stated"
+
+
+def test_a_name_that_could_not_be_read_again_is_not_written(tmp_path):
+    with pytest.raises(PrescriptionError, match=r"x\.foo: expected a name that ends in \.yaml, \.yml, \.zmx, \.json"):
+        save_telescope(load_telescope("paul_baker"), tmp_path / "x.foo")
+    assert not (tmp_path / "x.foo").exists()

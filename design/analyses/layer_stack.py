@@ -1,0 +1,149 @@
+r"""Coatings that depend on the angle of incidence: tables, and stacks of thin films.
+
+A stack of films without absorption between two media, by characteristic matrices (Macleod, "Thin-Film Optical
+Filters", chapter 2): with the phase :math:`\delta_j = 2 \pi n_j d_j \cos\theta_j / \lambda` and the admittance
+:math:`\eta = n \cos\theta` of s or :math:`n / \cos\theta` of p light,
+
+.. math:: \binom{B}{C} = \prod_j \begin{pmatrix} \cos\delta_j & i \sin\delta_j / \eta_j \\
+          i \eta_j \sin\delta_j & \cos\delta_j \end{pmatrix} \binom{1}{\eta_s}, \quad
+          T = \frac{4 \eta_0 \operatorname{Re} \eta_s}{\lvert \eta_0 B + C \rvert^2}.
+
+Without films this is Fresnel's transmission. Both polarisations are averaged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...core.arguments import check_arguments
+from ...core.errors import ConfigError, DomainError
+from ...models.media.medium import wavelengths_within
+
+
+@check_arguments
+@dataclass(frozen=True)
+class CoatingTable:
+    """Efficiency of a surface against wavelength and angle of incidence, for unpolarised light.
+
+    Parameters
+    ----------
+    wavelengths : tuple of float, shape (n,)
+        Vacuum wavelengths [m], ascending.
+    angles : tuple of float, shape (m,)
+        Angles of incidence from the normal [rad], on the side of lower index, from 0 and ascending.
+    efficiencies : tuple of tuple of float, shape (n, m)
+        Reflectivity or transmission, 0 to 1; interpolated linearly along both.
+    name : str
+        Name for messages.
+    """
+
+    wavelengths: tuple[float, ...]
+    angles: tuple[float, ...]
+    efficiencies: tuple[tuple[float, ...], ...]
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        name = self.name or "a coating"
+        waves, angles = np.array(self.wavelengths), np.array(self.angles)
+        if len(waves) < 2 or not (np.isfinite(waves).all() and (waves > 0).all() and (np.diff(waves) > 0).all()):
+            raise ConfigError(f"wavelengths of {name}: expected two or more, positive, ascending")
+        if len(angles) < 2 or angles[0] != 0 or not ((np.diff(angles) > 0).all() and angles[-1] < 0.5 * np.pi):
+            raise ConfigError(f"angles of {name}: expected two or more, from 0, ascending, below 90 degrees")
+        rows = [np.array(row) for row in self.efficiencies]
+        shapes = len(rows) == len(waves) and all(row.shape == angles.shape for row in rows)
+        if not (shapes and all(((row >= 0) & (row <= 1)).all() for row in rows)):
+            text = f"expected {len(waves)} rows, one a wavelength, of {len(angles)} numbers from 0 to 1, one an angle"
+            raise ConfigError(f"efficiency of {name}: {text}")
+
+    @check_arguments
+    def efficiency(self, wavelength: float, cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
+        """Return the efficiency at cosines of the angle of incidence, NaN beyond the table.
+
+        Parameters
+        ----------
+        wavelength : float
+            Vacuum wavelength [m]; a DomainError outside the table.
+        cosine : array_like
+            Cosine of the angle of incidence.
+        n1, n2 : float
+            Refractive indices before and behind.
+        """
+        ends = (self.wavelengths[0], self.wavelengths[-1])
+        w = wavelengths_within(wavelength, ends, f"coating {self.name}" if self.name else "the coating")
+        table = np.array(self.efficiencies)
+        row = np.array([np.interp(w, self.wavelengths, column) for column in table.T])
+        # The angle on the side of lower index.
+        sine = np.sqrt(np.maximum(1.0 - np.asarray(cosine, dtype=np.float64) ** 2, 0.0)) * max(n1 / n2, 1.0)
+        with np.errstate(invalid="ignore"):
+            return np.interp(np.arcsin(sine), self.angles, row, right=np.nan)
+
+
+@check_arguments
+@dataclass(frozen=True)
+class LayerStack:
+    """Thin films without absorption on a lens surface.
+
+    Parameters
+    ----------
+    indices : tuple of float
+        Refractive indices of the films, from the side of the medium of lower index to the glass.
+    thicknesses : tuple of float
+        Their thicknesses [m].
+    name : str
+        Name for messages.
+
+    Raises
+    ------
+    ConfigError
+        If there are not as many indices as thicknesses, or one is not positive.
+    """
+
+    indices: tuple[float, ...]
+    thicknesses: tuple[float, ...]
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        values = np.array([*self.indices, *self.thicknesses])
+        if len(self.indices) != len(self.thicknesses) or not (np.isfinite(values).all() and (values > 0).all()):
+            raise ConfigError(f"layers of {self.name or 'a coating'}: expected a positive index and thickness of each")
+
+    @check_arguments
+    def efficiency(self, wavelength: float, cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
+        """Return the transmission of unpolarised light, 0 where reflection is total.
+
+        Parameters
+        ----------
+        wavelength : float
+            Vacuum wavelength [m].
+        cosine : array_like
+            Cosine of the angle of incidence.
+        n1, n2 : float
+            Refractive indices before and behind.
+
+        Raises
+        ------
+        DomainError
+            If an index is not positive.
+        """
+        if not (n1 > 0 and n2 > 0):
+            raise DomainError(f"n1 = {n1!r}, n2 = {n2!r}: expected positive refractive indices")
+        first = np.asarray(cosine, dtype=np.complex128)
+        order = 1 if n1 <= n2 else -1
+        films = list(zip(self.indices, self.thicknesses, strict=True))[::order]
+        # Beyond the angle of total reflection cosines are imaginary.
+        behind, *inside = (np.sqrt(1.0 - (n1 / n) ** 2 * (1.0 - first**2)) for n in (n2, *(n for n, _ in films)))
+        found = np.zeros(first.shape)
+        for power in (1, -1):
+            entry, end = n1 * first**power, n2 * behind**power
+            b, c = np.ones_like(first), end
+            for (n, thickness), cos in reversed(list(zip(films, inside, strict=True))):
+                phase, admittance = 2.0 * np.pi / wavelength * n * thickness * cos, n * cos**power
+                b, c = (
+                    np.cos(phase) * b + 1j * np.sin(phase) / admittance * c,
+                    1j * admittance * np.sin(phase) * b + np.cos(phase) * c,
+                )
+            found += 0.5 * 4.0 * entry.real * end.real / np.abs(entry * b + c) ** 2
+        return found
