@@ -9,6 +9,7 @@ Exit status 0: done; 1: a check failed; 2: bad input or a file that cannot be wr
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -57,6 +58,8 @@ _INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line with arguments, by default those of the process, and return its exit status."""
+    # It reports a cache that it cannot write, and then uses a temporary one.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         status = app(args=None if arguments is None else list(arguments), prog_name="pachon", standalone_mode=False)
         sys.stdout.flush()

@@ -11,6 +11,7 @@ from typer import Argument, Option
 from .interrupt import interruptible
 from .options import Ccds, Json, Quiet, Raft, Threads, one_name_list
 from .tables import Rows, print_json
+from .workers import DaskWorkers, Processes, Scheduler, chosen_workers
 
 app = typer.Typer()
 
@@ -35,6 +36,9 @@ def images_command(
         bool, Option("--quick", help="The middle of each CCD, galaxies to magnitude 26, long-exposure PSF: seconds.")
     ] = False,
     resume: Annotated[bool, Option("--resume", help="Keep the CCDs that are finished, draw the others.")] = False,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    workers: DaskWorkers = None,
     threads: Threads = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -53,6 +57,7 @@ def images_command(
     - `pachon images --ccds R22_S11 --exposures 400 -o deep`: 400 exposures of 15 s
     - `pachon images --ccds R22_S11 --no-noise --way eigen -o expected`
     - `pachon images my_images.yaml -o field --resume`: go on where it was stopped
+    - `pachon images my_images.yaml -o field --scheduler tcp://login1:8786`: on a Dask cluster, or `--processes 4`
 
     my_images.yaml may read
 
@@ -76,9 +81,12 @@ def images_command(
     }
     settings = with_options(with_options(base, **(_QUICK if quick else {})), **options)
     experiment = settings.experiment(None if config is None else config.parent)
-    with interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter:
+    with (
+        interruptible(quiet, f"finished CCDs are in {out}, and --resume goes on from there") as reporter,
+        chosen_workers(processes, scheduler, workers, threads, reporter.line) as maker,
+    ):
         result = simulate_images(
-            settings, out, experiment=experiment, resume=resume, threads=threads, reporter=reporter
+            settings, out, experiment=experiment, resume=resume, workers=maker, threads=threads, reporter=reporter
         )
     images = {name: str(path.resolve()) for name, path in result.images.items()}
     if as_json:

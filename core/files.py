@@ -13,6 +13,7 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
@@ -120,6 +121,16 @@ def marked_folder(folder: Path) -> Iterator[str]:
     finally:
         with suppress(OSError):
             mark.unlink()
+
+
+@contextmanager
+def folder_of_worker(folder: Path, mark: str) -> Iterator[Path]:
+    """Yield a folder where a worker sees its mark (:func:`marked_folder`), and a temporary one where it does not."""
+    if (folder / mark).is_file():
+        yield folder
+        return
+    with TemporaryDirectory(prefix="pachon_") as own:
+        yield Path(own)
 
 
 def remove_leftovers(folder: Path) -> None:

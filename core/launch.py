@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import platform
+import shutil
 import sys
+import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +50,13 @@ def start_warp() -> None:
         void = os.open(os.devnull, os.O_WRONLY)
         try:
             os.dup2(void, 2)
-            with _kernel_cache():
-                wp.init()
+            told = _with_kernel_cache(wp.init)
         finally:
             os.dup2(kept, 2)
             os.close(kept)
             os.close(void)
+        if told:
+            print(told, file=sys.stderr, flush=True)
         _started.append(True)
 
 
@@ -71,19 +74,28 @@ def load_kernels(kernel: wp.Kernel, device: str = "cpu") -> None:
         if not (Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block)).exists():
             name = kernel.module.name.rpartition(".")[2]
             print(f"compiling {name} for this machine (once)", file=sys.stderr, flush=True)
-        with _kernel_cache():
-            wp.load_module(kernel.module, device=device, block_dim=block)
+        told = _with_kernel_cache(lambda: wp.load_module(kernel.module, device=device, block_dim=block))
+        if told:
+            print(told, file=sys.stderr, flush=True)
         _loaded.add(key)
 
 
-@contextmanager
-def _kernel_cache() -> Iterator[None]:
-    """Raise a ProductError with the remedy where the folder of compiled kernels cannot be made or written."""
+def _with_kernel_cache(use: Callable[[], Any]) -> str:
+    """Do what writes compiled kernels, in a temporary folder where theirs cannot be written; return what to tell."""
     try:
-        yield
+        use()
     except OSError as error:
         text = f"cannot write compiled kernels to {error.filename}: {error.strerror}"
+    else:
+        return ""
+    try:
+        folder = tempfile.mkdtemp(prefix="pachon_kernels_")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        wp.config.kernel_cache_dir = folder
+        use()
+    except OSError:
         raise ProductError(f"{text}; WARP_CACHE_PATH names another folder") from None
+    return f"{text}; they last for this command only (WARP_CACHE_PATH names another folder)"
 
 
 def launch(

@@ -6,15 +6,13 @@ that folder, and sends them back where it does not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ..core.errors import PachonError, ProductError
-from ..core.files import marked_folder, write_bytes
+from ..core.files import folder_of_worker, marked_folder, write_bytes
 from ..core.progress import Reporter
 from ..core.workers import MakeWorkers
 from .ccd_product import product_path
@@ -58,7 +56,7 @@ class CcdComputation:
     def __call__(self, job: CcdJob, threads: int) -> CcdResult:
         """Compute one CCD."""
         try:
-            with self._place() as place:
+            with folder_of_worker(self.folder, self.mark) as place:
                 reason = self._write(job.name, place, threads)
                 sent = (
                     None if reason is not None or place == self.folder else product_path(place, job.name).read_bytes()
@@ -73,15 +71,6 @@ class CcdComputation:
         experiment.make_screens(threads)
         write = partial(write_ccd, experiment, folder)
         return simulate_ccds(experiment, write, (name,), strict=False, threads=threads).not_modelled.get(name)
-
-    @contextmanager
-    def _place(self) -> Iterator[Path]:
-        """Yield the folder of the run, or one of this worker where it does not see that."""
-        if (self.folder / self.mark).is_file():
-            yield self.folder
-            return
-        with TemporaryDirectory(prefix="pachon_") as own:
-            yield Path(own)
 
 
 def compute_ccds(

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...core.errors import ConfigError
-from ...core.files import parsing
 from ..options import degrees_pair
 from ..tables import FIELD, Column, Rows
 from .command import Given, Outcome, Study, design_command
@@ -128,6 +127,8 @@ def target(
 def _grey(path: Path) -> Any:
     """Return a picture as brightness, rows upwards."""
     from matplotlib.image import imread
+
+    from ...core.files import parsing
 
     with parsing(path, "--image: expected a picture, .png", ConfigError):
         values = imread(path)

@@ -67,7 +67,7 @@ def test_a_kernel_cache_that_cannot_be_written_is_one_line(tmp_path):
     )
     where = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file" / "kernels")}
     done = subprocess.run([sys.executable, "-c", code], env=where, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("cannot write compiled kernels to")
+    assert done.stdout == "1\n"
     assert "WARP_CACHE_PATH names another folder" in done.stdout
     assert len(done.stdout.splitlines()) == 1
     assert done.stderr == ""
