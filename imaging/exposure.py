@@ -86,8 +86,8 @@ class Exposure:
         return cls(band.name, experiment.config.atmosphere.exposure_s, exposures, photometry=band, **(own | settings))
 
     def __post_init__(self) -> None:
-        if self.photometry is None:
-            object.__setattr__(self, "photometry", band_named(self.band))
+        if self._band.name != self.band:
+            raise DomainError(f"band = {self.band}: expected {self._band.name}, the band of photometry")
         for name in ("time", "gain", "full_well", "pixel_scale"):
             require_positive(getattr(self, name), name)
         if self.exposures < 1:

@@ -145,3 +145,10 @@ def test_what_is_wrong_is_one_line(tmp_path, photometry, changes, words):
 def test_the_lsst_is_as_it_was():
     experiment = Experiment.from_config(with_options(Configuration(), ccds=("R22_S11",)))
     assert experiment.band == BANDS["r"]
+
+
+def test_an_exposure_has_one_band():
+    exposure = pachon.Exposure("r", photometry=BANDS["r"])
+    assert exposure.zero_point == pachon.Exposure("r").zero_point
+    with pytest.raises(PachonError, match="band = i: expected r, the band of photometry"):
+        pachon.Exposure("i", photometry=BANDS["r"])
