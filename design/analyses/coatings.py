@@ -72,7 +72,17 @@ class Coating:
 
     @check_arguments
     def efficiency(self, wavelength: float, cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-        """Return the efficiency at a wavelength [m], the same at all cosines of the angle of incidence."""
+        """Return the efficiency at a wavelength, the same at all angles of incidence.
+
+        Parameters
+        ----------
+        wavelength : float
+            Vacuum wavelength [m]; a DomainError outside the table.
+        cosine : array_like
+            Cosine of the angle of incidence.
+        n1, n2 : float
+            Refractive indices before and behind.
+        """
         return np.full(np.shape(cosine), self.at(wavelength))
 
     def at(self, wavelength: ArrayLike) -> np.ndarray:

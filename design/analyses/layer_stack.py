@@ -14,6 +14,7 @@ Without films this is Fresnel's transmission. Both polarisations are averaged.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -138,7 +139,8 @@ class LayerStack:
         found = np.zeros(first.shape)
         for power in (1, -1):
             entry, end = n1 * first**power, n2 * behind**power
-            b, c = np.ones_like(first), end
+            b: Any = 1.0
+            c: Any = end
             for (n, thickness), cos in reversed(list(zip(films, inside, strict=True))):
                 phase, admittance = 2.0 * np.pi / wavelength * n * thickness * cos, n * cos**power
                 b, c = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -37,8 +38,7 @@ class AimedRays:
         here = request if telescope is request.telescope else replace(request, telescope=telescope)
         #: Points of the plane of the entrance pupil [m], [n_pupil, 2] or [n_field, n_pupil, 2].
         self.points = here.entrance_points(wavelength, pupil)
-        self.rays = straight_bundles(telescope, here.directions, wavelength, self.points)
-        self._columns = columns
+        self._columns, self._directions, self._wavelength = columns, here.directions, wavelength
         #: [n, 2, n_parameter] motion of the points with the parameters; None where they stay.
         self.motion = None
         if telescope.design_data.aiming != "off" and columns.parameters:
@@ -46,10 +46,14 @@ class AimedRays:
             relative = np.broadcast_to(relative, (len(here.fields), *pupil.shape)).reshape(-1, 2)
             self.motion = _motion(columns, self.rays, relative)
 
+    @cached_property
+    def rays(self) -> Rays:
+        """The rays, field by field."""
+        return straight_bundles(self._columns.telescope, self._directions, self._wavelength, self.points)
+
     def part(self, rays: slice) -> AimedRays:
         """Return some of the rays."""
-        some = copy(self)
-        every = self.rays
+        some, every = copy(self), self.rays
         some.rays = Rays(every.position[rays], every.direction[rays], every.path_length[rays], every.wavelength)
         some.motion = None if self.motion is None else self.motion[rays]
         return some

@@ -143,9 +143,10 @@ class FieldWavefronts:
 
     def _by_aim(self, part: slice, status: np.ndarray) -> np.ndarray | None:
         """Return the change of wavefronts by the motion of aimed rays, [n_field, n_pupil, n_parameter]."""
-        aimed = self._aimed.part(slice(part.start * self._size[1], part.stop * self._size[1]))
-        if aimed.motion is None:
+        if self._aimed.motion is None:
             return None
+        aimed = self._aimed.part(slice(part.start * self._size[1], part.stop * self._size[1]))
+        assert aimed.motion is not None
         forward = aimed.forward(threads=1)
         centers = np.repeat(self._centers[:, part], self._size[1], axis=1)
         gradient, _ = sphere_gradient(forward, centers, self._columns.telescope.reference_sphere_radius)
