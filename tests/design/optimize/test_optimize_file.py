@@ -82,6 +82,12 @@ def test_configurations(arguments, tmp_path, triplet):
     assert [(o.configuration, o.operand.kind) for o in result.operands] == [("near", "f_number")]
 
 
+def test_a_zoom_position_of_the_same_name_is_named_by_its_file(arguments, tmp_path, triplet):
+    pachon.save_telescope(triplet, tmp_path / "tele.yaml")
+    found = arguments('{variables: [S1.curvature, "tele:S7.thickness"], configurations: [{telescope: tele.yaml}]}')
+    assert [c.telescope.name for c in found["telescope"]] == ["lens1", "tele"]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -114,6 +114,7 @@ def test_an_edge_and_a_chief_ray_are_solved_for(lens):
         apply(linked(lens, pachon.Solve("S1", "edge_thickness", 8e-4, radius=1.0)), {"S1.radius": 2e-4})
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_differences(lens):
     radii = {n: lens.surface(n).shape.radius for n in ("S1", "S7")}
     telescope = linked(

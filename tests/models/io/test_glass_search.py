@@ -64,6 +64,10 @@ def test_a_glass_is_looked_up_at_its_makers(tmp_path):
     # Schott comes before Hikari, which has an SF15 of its own; Sumita's name is its alone.
     assert find_glass("K-SSK1") == GlassCatalogue.of_maker("sumita")["K-SSK1"]
     assert find_glass("NOGLASS") is None
+    # What a user can do about it, with the nearest names of all makers.
+    with pytest.raises(PrescriptionError, match=r"no catalogue: expected .*--glass-catalogue .*L-TIM28 or") as found:
+        pachon.load_telescope(lens(tmp_path, "L-TIM28_MOLD"))
+    assert "\n" not in str(found.value)
     telescope = pachon.load_telescope(lens(tmp_path, "L-TIM28"))
     # Ohara's data sheet: 1.68948.
     assert float(telescope.surfaces[0].medium_after.index(587.56e-9)) == pytest.approx(1.68948, abs=5e-6)

@@ -1,9 +1,11 @@
 """Description of telescopes that are not centred, and of apertures that are not discs."""
 
 import json
+from pathlib import Path
 
 import pytest
 
+import pachon
 from pachon.models.first_order import first_order
 from pachon.models.io.bundled import BUNDLED
 from pachon.models.io.prescription import load_telescope
@@ -35,3 +37,24 @@ def test_apertures_of_every_kind_are_named():
     assert text["PM"] == "0.6684 to 2.005"
     assert text["CAGE_MID"] == "from 0.7896"
     assert text["SPIDER"] == "another region"
+
+
+def test_what_follows_other_values_is_shown():
+    lens = load_telescope(Path(__file__).parents[2] / "data" / "zmx" / "lens1.zmx")
+    lens = lens.with_design(
+        pickups=(
+            pachon.Pickup("S7", "radius", "S1", -1.0),
+            pachon.Pickup("S6", "thickness", "S1", 2.0, -1e-3),
+            pachon.Pickup("S6", "conic", "S1", offset=0.5),
+            pachon.Pickup("S6", "glass", "S1"),
+        ),
+        solves=(pachon.Solve("S7", "marginal_height"), pachon.Solve("S3", "edge_thickness", 1e-3, radius=4e-3)),
+    )
+    assert [text for name, text in figure_rows(describe(lens)) if name == "follows"] == [
+        "S7 radius: -1 times that of S1",
+        "S6 thickness: 2 times that of S1 - 1",
+        "S6 conic: that of S1 + 0.5",
+        "S6 glass: that of S1",
+        "S7 thickness: marginal height 0 mm",
+        "S3 thickness: edge thickness 1 mm at 4 mm",
+    ]
