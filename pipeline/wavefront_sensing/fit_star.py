@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -194,16 +195,18 @@ class _StarFitter:
             pixels, sampling = self._sampling(self._fwhm, self._side(self._fwhm))
         else:
             fwhm = float(instrument.seeing.fwhm(found.stars[0][STRENGTH]))
-            if not self._sampling(_ENOUGH * fwhm, last.pixels.side)[1].finer_than(last.sampling):
+            wave = slice(len(instrument.noll)) if len(found.shared) else slice(0)
+            error = math.sqrt(np.trace(found.shared_covariance[wave, wave])) or math.inf
+            if not self._sampling(_ENOUGH * fwhm, last.pixels.side, _ENOUGH * error)[1].finer_than(last.sampling):
                 return last
-            pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side))
+            pixels, sampling = self._sampling(fwhm, min(self._side(fwhm), last.pixels.side), error)
         rays = self._of(light, sampling.across)
         stamp = instrument.stamp(light, pixels, rays, sampling.oversampling, light.diameter if blended else 0.0)
         return _Fine(stamp, pixels, sampling)
 
-    def _sampling(self, fwhm: float, side: int) -> tuple[Pixels, Sampling]:
+    def _sampling(self, fwhm: float, side: int, error: float = math.inf) -> tuple[Pixels, Sampling]:
         pixels = self._clean.binned(side)
-        return pixels, self._instrument.sampling(self._light, pixels, fwhm)
+        return pixels, self._instrument.sampling(self._light, pixels, fwhm, error)
 
     def every_pixel(self, fine: _Fine) -> Stamp:
         """Return the stamp with all pixels of the detector."""
