@@ -30,25 +30,31 @@ MAX_DEPTH = 50
 MAX_DIGITS = 100
 #: Longest reason of a problem in an error message: some hold a name of the file's.
 _MAX_REASON = 200
-_PARSERS: tuple[type, ...] = (
-    (yaml.cyaml.CParser,) if yaml.__with_libyaml__ else (yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser)
-)
 _MERGE = "tag:yaml.org,2002:merge"
 
 
-class _Events(*_PARSERS):  # type: ignore[misc]
-    """Events of a YAML text; by libyaml, where PyYAML was built with it, in a tenth of the time."""
+def _parser() -> Any:
+    """Return the class of the parser; libyaml's, where PyYAML has it, takes a tenth of the time."""
+    if yaml.__with_libyaml__:
+        return yaml._yaml.CParser
 
-    def __init__(self, text: str) -> None:
-        for parser in _PARSERS:
-            parser.__init__(self, *([text] if parser is _PARSERS[0] else []))
+    class PythonParser(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
+        def __init__(self, text: str) -> None:
+            yaml.reader.Reader.__init__(self, text)
+            yaml.scanner.Scanner.__init__(self)
+            yaml.parser.Parser.__init__(self)
+
+    return PythonParser
 
 
-class _StrictLoader(yaml.composer.Composer, _Events, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
+_Parser: Any = _parser()
+
+
+class _StrictLoader(yaml.composer.Composer, _Parser, yaml.constructor.SafeConstructor, yaml.resolver.Resolver):
     """Safe loader of bounded content, checked before any value is made."""
 
     def __init__(self, text: str, max_size: int) -> None:
-        _Events.__init__(self, text)
+        _Parser.__init__(self, text)
         yaml.composer.Composer.__init__(self)
         yaml.constructor.SafeConstructor.__init__(self)
         yaml.resolver.Resolver.__init__(self)
