@@ -60,17 +60,15 @@ def test_a_sweep_on_a_full_disk_keeps_its_results(tmp_path):
 @pytest.mark.slow
 def test_a_kernel_cache_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
-    code = (
-        "import pachon\n"
-        "try: pachon.spots(pachon.paul_baker(), [(0.0, 0.0)], n_pupil=3)\n"
-        "except pachon.ProductError as error: print(error)\n"
-    )
+    code = "import pachon; print(len(pachon.spots(pachon.paul_baker(), [(0.0, 0.0)], n_pupil=3).fields))"
     where = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file" / "kernels")}
     done = subprocess.run([sys.executable, "-c", code], env=where, capture_output=True, text=True, check=True)
+    # The kernels go to a temporary folder, where they are compiled.
     assert done.stdout == "1\n"
-    assert "WARP_CACHE_PATH names another folder" in done.stdout
-    assert len(done.stdout.splitlines()) == 1
-    assert done.stderr == ""
+    told = [line for line in done.stderr.splitlines() if not line.startswith("compiling ")]
+    assert len(told) == 1
+    assert told[0].startswith("cannot write compiled kernels to")
+    assert "WARP_CACHE_PATH names another folder" in told[0]
 
 
 @pytest.mark.slow
