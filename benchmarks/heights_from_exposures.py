@@ -41,6 +41,8 @@ RAFTS = ("R22", "R23", "R33")
 STARS, SEED, ALIGNMENT_UM = 40, 1, 0.2
 # Light to three rafts crosses 690 m of the highest layer in 15 s; samples are those of a whole run, 0.16 m.
 SCREEN_M, SCREEN_SAMPLES = 691.2, 4320
+# Numbers of exposures for which the error is predicted from those that are there.
+BEYOND = (30, 100)
 # Nodes along a side of a CCD at which errors are taken, and the goal.
 NODES, GOAL_UM = 10, 0.3
 
@@ -147,12 +149,13 @@ class Kept:
             self.parts.append(part)
             yield part
 
-    def predicted(self, prior: HeightPrior, places: Places) -> np.ndarray:
-        """Return a root of the covariance of the heights at places less a plane, shape [n, n_parameter]."""
+    def predicted(self, prior: HeightPrior, places: Places, times: float = 1.0) -> np.ndarray:
+        """Return a root of the covariance of heights at places less a plane, [n, n_parameter], of `times` as many."""
         matrix = np.zeros((prior.n_parameter, prior.n_parameter))
-        prior.add_to(matrix)
         for part in self.parts:
             part.add_to(matrix, np.zeros(prior.n_parameter))
+        matrix *= times
+        prior.add_to(matrix)
         scale = 1.0 / np.sqrt(np.diagonal(matrix))
         root = np.linalg.cholesky(matrix * scale[:, None] * scale)
         own = np.repeat(np.eye(len(prior.camera)), NODES**2, axis=0)[:, :, None] * prior.own_terms(places)[:, None]
@@ -215,7 +218,14 @@ def one_row(
         "slope": float((left + truth) @ truth / (truth @ truth)),
         "median": 1e6 * float(np.median(np.sqrt((left.reshape(len(camera), -1) ** 2).mean(axis=1)))),
         "seconds": seconds,
+        **{f"predicted_{n}": predicted_of(kept, prior, places, n / len(paths)) for n in BEYOND},
     }
+
+
+def predicted_of(kept: Kept, prior: HeightPrior, places: Places, times: float) -> float:
+    """Return the predicted error of `times` as many exposures that say as much each [um]."""
+    root = kept.predicted(prior, places, times)
+    return rms(root) * float(np.sqrt(root.shape[1]))
 
 
 def draw(table: Table, path: Path) -> None:
@@ -231,11 +241,17 @@ def draw(table: Table, path: Path) -> None:
         ("predicted_means", "predicted", "C1--"),
     ):
         axes.loglog(count, table[column], style, label=label)
+    further = {n: table[f"predicted_{n}"][-1] for n in BEYOND if n > count[-1]}
+    last = [count[-1], *further], [table["predicted"][-1], *further.values()]
+    axes.loglog(*last, "C0:", label="predicted for more exposures like these")
+    count = np.concatenate([count, list(further)])
     axes.axhline(GOAL_UM, color="0.5", linewidth=0.8, label="goal after 100 exposures")
-    axes.axhline(table["heights"][0], color="0.5", linewidth=0.8, linestyle=":", label="heights themselves")
+    axes.axhline(table["heights"][0], color="0.5", linewidth=0.8, linestyle="-.", label="heights themselves")
     axes.set(xlabel="exposures", ylabel="rms [um]", xticks=count, xticklabels=[str(c) for c in count])
+    ticks = [0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0]
+    axes.set(ylim=(0.04, 6.0), yticks=ticks, yticklabels=[f"{v:g}" for v in ticks])
     axes.minorticks_off()
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="x-small", loc="lower left")
     figure.tight_layout()
     figure.savefig(path, dpi=150)
 
