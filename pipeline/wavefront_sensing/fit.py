@@ -104,7 +104,8 @@ def fit_donuts(
         Noll indices of the wavefront, from 4.
     left_out : float or Quantity
         Rms of each term from Z4 to Z22 that `noll` leaves out [m]. These are fitted too, with that prior, those up to
-        Z28 with a tenth of it, and not returned: errors of `zernikes` have what is not known of them. 0 is none.
+        Z28 with a tenth of it, and not returned: errors of `zernikes` have what is not known of them. 0 is none, and so
+        are joint fits.
     higher_order : float or Quantity
         Rms of each further Zernike, of the next radial degree at every azimuthal order of `noll` [m]: 10 nm, say, for
         what turbulence leaves in 15 s. They are fitted too, with that prior, and not returned. Without them (0, the
@@ -169,7 +170,9 @@ def fit_donuts(
     waves = wavelength_points(telescope, wavelength)
     terms = noll_indices(noll, "noll", 4)
     left, size = (small_length(v, n) for v, n in ((left_out, "left_out"), (higher_order, "higher_order")))
-    further, precision = further_terms(terms, *((left, size) if degrees_of_freedom is None else (0.0, 0.0)))
+    # Joint fits share their terms: those of single donuts would have a prior of their own at every field term.
+    spare = left if field_noll is None else 0.0
+    further, precision = further_terms(terms, *((spare, size) if degrees_of_freedom is None else (0.0, 0.0)))
     field_indices = None if field_noll is None else noll_indices(field_noll, "field_noll", 1)
     shifts = one_for_each(metres(defocus, "defocus"), count, "defocus")
     if (np.abs(shifts) > _MOST_DEFOCUS).any():
