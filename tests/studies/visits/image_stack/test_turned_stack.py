@@ -8,7 +8,6 @@ from pachon.imaging.exposure import ExposedImage
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.config import VisitsConfig, VisitsSection
-from pachon.studies.visits.image_stack import stack_images as module
 from pachon.studies.visits.image_stack.config import ImageStackConfig
 from pachon.studies.visits.image_stack.resample import add_resampled
 from pachon.studies.visits.image_stack.stack_images import stack_images
@@ -38,11 +37,10 @@ def stack(tiny, round_galaxies, tmp_path_factory):
         psf__stamp=49,
         focal_plane__budget="flat",
     )
-    visits = VisitsConfig(run=run, visits=VisitsSection(count=2, stars=25, places=40, snapshots=(1,)))
+    section = VisitsSection(count=2, stars=25, places=40, snapshots=(1,))
+    visits = VisitsConfig(run=run, visits=section, galaxies=round_galaxies)
     (folder / CONFIG_NAME).write_text(visits.resolved(visits.experiment()).to_yaml())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "GalaxyPopulation", round_galaxies)
-        return stack_images(folder, ImageStackConfig(faintest=25.0, side=900, noise=False))
+    return stack_images(folder, ImageStackConfig(faintest=25.0, side=900, noise=False))
 
 
 @pytest.mark.long
