@@ -8,28 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..core.errors import ConfigError, PachonError, ProductError, error_context
 from ..core.files import folder_of_worker, marked_folder, write_bytes
 from ..core.products import Stamp
 from ..core.progress import Reporter
-from ..core.units import ARCMIN, ARCSEC
 from ..core.workers import MakeWorkers
 from ..pipeline.experiment import Experiment
 from ..pipeline.kept_screens import with_kept_screens
 from ..pipeline.memory import check_memory
-from ..sky.catalogue import read_galaxies
-from ..sky.mosaic import GalaxyStamps
-from ..sky.population import GalaxyPopulation, counts
 from .config import ImagesConfig
 from .draw import Window
 from .exposure import Exposure
+from .galaxies import GalaxySource, SkyGalaxies
 from .preview import cutouts_png, preview_png
-from .scene import check_density, draw_ccd, stamped
-
-#: Limits of the bins over which the light of a population is summed.
-_MAGNITUDES = 200
+from .scene import draw_ccd, stamped
 
 
 @dataclass(frozen=True)
@@ -180,29 +172,14 @@ def exposure_of(config: ImagesConfig, experiment: Experiment) -> Exposure:
         return Exposure.of_run(experiment, image.exposures, **settings)
 
 
-def galaxies_of(config: ImagesConfig, experiment: Experiment) -> Any:
-    """Return the galaxies of the configuration, or the function that draws those of a part of the sky."""
-    wanted, pointing, exposure = config.galaxies, config.pointing, exposure_of(config, experiment)
-    if wanted.catalogue is not None:
-        return read_galaxies(wanted.catalogue, pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)))
-    if wanted.mosaic is not None:
-        seed = experiment.config.seed
-        stamps = GalaxyStamps.from_mosaic(
-            wanted.mosaic,
-            zero_point=wanted.mosaic_zero_point,
-            psf_radius=None if wanted.mosaic_psf_arcsec is None else wanted.mosaic_psf_arcsec * ARCSEC,
-            finest_pixel=exposure.pixel_scale,
-            seed=seed,
-        )
-        with error_context(key="galaxies"):
-            planted = wanted.density * stamps.surface_density
-            mean = planted * exposure.pixel_scale**2 * float(exposure.electrons(stamps.magnitude).mean())
-            check_density(mean, exposure, f"density = {wanted.density:g}: ")
-            return stamps.population(seed, density=planted * ARCMIN**2).galaxies_in
-    with error_context(key="galaxies"):
-        population = GalaxyPopulation(wanted.faintest, experiment.config.seed, wanted.brightest, wanted.density)
-        magnitude = np.linspace(wanted.brightest, wanted.faintest, _MAGNITUDES)
-        number = wanted.density * np.diff(counts(magnitude)) * (exposure.pixel_scale / ARCMIN) ** 2
-        light = number * exposure.electrons(0.5 * (magnitude[:-1] + magnitude[1:]))
-        check_density(float(light.sum()), exposure, f"density = {wanted.density:g}: ")
-    return population.galaxies_in
+def galaxies_of(config: ImagesConfig, experiment: Experiment) -> SkyGalaxies:
+    """Return the function that gives the galaxies of a part of the sky."""
+    wanted, pointing = config.galaxies, config.pointing
+    source = GalaxySource.read(
+        wanted,
+        exposure_of(config, experiment),
+        pointing=(math.radians(pointing.ra_deg), math.radians(pointing.dec_deg)),
+        seed=experiment.config.seed,
+    )
+    # Catalogues and mosaics are drawn to their own depth.
+    return source.down_to(wanted.faintest if source.given is None else math.inf)

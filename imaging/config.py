@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field
 
 from ..core.arguments import check_arguments
-from ..core.errors import ConfigError, error_context
+from ..core.errors import ConfigError, ProductError, error_context
+from ..core.files import read_bytes
 from ..core.schema import Count, Positive, Real, Section, Switch, plain_number, validated
 from ..core.yaml_reader import read_mapping
 from ..pipeline.config import Configuration, PointingConfig, digest, section_yaml, with_options, with_run
@@ -25,14 +26,13 @@ from ..pipeline.experiment import Experiment
 
 #: Pixels along a side of the PSF's stamps where the run leaves them open: wings down to 1e-6 of the light.
 PSF_STAMP = 63
+# Keys of galaxies that are paths of files.
+_FILES = ("catalogue", "mosaic")
 
 
-class GalaxiesConfig(Section):
-    """Which galaxies there are."""
+class GalaxySourceConfig(Section):
+    """Which galaxies there are, to any depth."""
 
-    faintest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=15, le=30)] = Field(
-        29.0, description="faintest galaxy [AB mag]"
-    )
     brightest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=10, le=30)] = Field(
         20.0, description="brightest galaxy of the population [AB mag]"
     )
@@ -44,6 +44,33 @@ class GalaxiesConfig(Section):
     )
     mosaic_psf_arcsec: Positive | None = Field(
         None, description="half-light radius of the mosaic's PSF [arcsec]; by default that of its stars"
+    )
+
+    def with_files(self, folder: Path) -> Self:
+        """Return the section with the absolute path of its file, which starts from `folder` and must be there."""
+        given = {key: path for key in _FILES if (path := getattr(self, key)) is not None}
+        if len(given) > 1:
+            raise ConfigError("galaxies.catalogue and galaxies.mosaic: expected one of them")
+        for key, path in given.items():
+            given[key] = str((folder / path).resolve())
+            if not Path(given[key]).is_file():
+                raise ConfigError(f"galaxies.{key} = {path}: no such file", key=f"galaxies.{key}")
+        return self.model_copy(update=given)
+
+    def content(self) -> dict[str, Any]:
+        """Return what a digest is made of: a file counts by its content."""
+        content = self.model_dump(mode="json")
+        for key in _FILES:
+            if content[key] is not None:
+                content[key] = hashlib.sha256(read_bytes(Path(content[key]), ProductError)).hexdigest()
+        return content
+
+
+class GalaxiesConfig(GalaxySourceConfig):
+    """Which galaxies images have."""
+
+    faintest: Annotated[float, BeforeValidator(plain_number), Field(strict=True, ge=15, le=30)] = Field(
+        29.0, description="faintest galaxy of the population [AB mag]"
     )
 
 
@@ -92,11 +119,7 @@ class ImagesConfig(Section):
 
     def digest(self, experiment: Experiment) -> str:
         """SHA-256 of all settings that affect the image of a CCD; files count by their content."""
-        content = self.model_dump(mode="json", exclude={"run"})
-        for key in ("catalogue", "mosaic"):
-            path = content["galaxies"][key]
-            if path is not None:
-                content["galaxies"][key] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        content = self.model_dump(mode="json", exclude={"run"}) | {"galaxies": self.galaxies.content()}
         for key in ("preview", "cutouts"):
             del content["image"][key]
         if self.image.gain is None:
@@ -127,15 +150,8 @@ def load_images_configuration(path: Path) -> ImagesConfig:
 def with_files(config: ImagesConfig, folder: Path) -> ImagesConfig:
     """Return the configuration with absolute paths of the files of galaxies, which must be there."""
     galaxies = config.galaxies
-    given = {key: path for key in ("catalogue", "mosaic") if (path := getattr(galaxies, key)) is not None}
-    if len(given) > 1:
-        raise ConfigError("galaxies.catalogue and galaxies.mosaic: expected one of them")
     if galaxies.brightest >= galaxies.faintest:
         raise ConfigError(
             f"galaxies.faintest = {galaxies.faintest:g}: expected more than galaxies.brightest = {galaxies.brightest:g}"
         )
-    for key, path in given.items():
-        given[key] = str((folder / path).resolve())
-        if not Path(given[key]).is_file():
-            raise ConfigError(f"galaxies.{key} = {path}: no such file", key=f"galaxies.{key}")
-    return config.model_copy(update={"galaxies": galaxies.model_copy(update=given)})
+    return config.model_copy(update={"galaxies": galaxies.with_files(folder)})

@@ -4,12 +4,13 @@
 
     run: {band: r, seed: 3, active_optics: {residual_um: 0.2}}     # a run's configuration, or the path of its file
     visits: {count: 100, dither_deg: 0.2}
+    galaxies: {mosaic: udf.fits}    # or {catalogue: galaxies.ecsv}; by default a population as in the Ultra Deep Field
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -18,6 +19,9 @@ from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, error_context
 from ...core.schema import Count, Real, Section, Whole, plain_number, validated
 from ...core.yaml_reader import read_mapping
+from ...imaging.config import GalaxySourceConfig
+from ...imaging.exposure import Exposure
+from ...imaging.galaxies import GalaxySource
 from ...pipeline.config import Configuration, digest, section_yaml, with_options, with_run
 from ...pipeline.defaults import require_drawn_stars
 from ...pipeline.experiment import Experiment
@@ -59,6 +63,7 @@ class VisitsConfig(Section):
 
     run: Configuration = Configuration()
     visits: VisitsSection = VisitsSection()
+    galaxies: GalaxySourceConfig = GalaxySourceConfig()
 
     def experiment(self, folder: Path | None = None) -> Experiment:
         """Return the experiment of all visits; relative paths in its configuration start from `folder`.
@@ -79,11 +84,34 @@ class VisitsConfig(Section):
         return self.model_copy(update={"run": experiment.config})
 
     def digest(self, experiment: Experiment) -> str:
-        """SHA-256 of all settings that affect a visit; their number does not, nor which stacks are kept."""
+        """SHA-256 of all settings that affect the PSFs of a visit; galaxies, visits' number and kept stacks do not."""
         visits = self.visits.model_dump(mode="json", exclude={"count", "snapshots"})
         # Angles that are left as they were before there were these keys leave the products of then usable.
         visits = {key: value for key, value in visits.items() if key not in _ANGLES or value != _ANGLES[key]}
         return digest({"run": experiment.config_hash, "ccds": experiment.config.ccds, "visits": visits})
+
+    def galaxies_digest(self, experiment: Experiment, **content: Any) -> str:
+        """SHA-256 of the visits, of what else decides products, and of galaxies that are not the usual ones."""
+        own = {} if self.galaxies == GalaxySourceConfig() else {"galaxies": self.galaxies.content()}
+        return digest({"visits": self.digest(experiment), **content, **own})
+
+    def galaxy_source(self, experiment: Experiment, exposure: Exposure) -> GalaxySource:
+        """Read the galaxies about the common pointing, which is that of the run for a catalogue with ra and dec.
+
+        Raises
+        ------
+        PachonError
+            If their file cannot be read or has no such galaxies, or they would bury the sky.
+        """
+        pointing = experiment.config.pointing
+        at = None if pointing is None else (np.deg2rad(pointing.ra_deg), np.deg2rad(pointing.dec_deg))
+        try:
+            return GalaxySource.read(self.galaxies, exposure, pointing=at, seed=experiment.config.seed)
+        except DomainError as error:
+            if at is None and error.key == "pointing":
+                text = f"galaxies.catalogue = {self.galaxies.catalogue}: expected run.pointing, for its ra and dec"
+                raise ConfigError(text, key="run.pointing") from None
+            raise
 
     def plan(self, seed: int) -> tuple[Visit, ...]:
         """Return the visits."""
@@ -120,9 +148,13 @@ class VisitsConfig(Section):
 def load_visits_configuration(path: Path) -> VisitsConfig:
     """Read a configuration of visits, and that of the run that it names.
 
+    Relative paths in both start from the folder of the first.
+
     Raises
     ------
     ConfigError
         If a file cannot be read, is not YAML, or has an unknown key or a value out of range.
     """
-    return validated(VisitsConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+    config = validated(VisitsConfig, with_run(read_mapping(path, ConfigError), path), str(path))
+    with error_context(file=path):
+        return config.model_copy(update={"galaxies": config.galaxies.with_files(path.parent)})

@@ -15,10 +15,10 @@ from scipy import fft
 from scipy.spatial import cKDTree
 
 from ...core.random_streams import stream
+from ...imaging.draw import Sources
 from ...imaging.exposure import Exposure
 from ...pipeline.catalogue.fit_galaxies import fit_galaxy_stamps
 from ...pipeline.catalogue.galaxy_fits import GalaxyFits, usable_galaxies
-from ...sky.galaxies import Galaxies
 from .stack import PsfStack
 
 #: Sides of stamps [pixel], each drawn on a grid of twice the side, and the half-light radii on the image over which a
@@ -71,7 +71,7 @@ class GalaxyShapes:
 def measure_galaxies(
     stack: PsfStack,
     axes: np.ndarray,
-    galaxies: Galaxies,
+    galaxies: Sources,
     exposure: Exposure,
     seed: int,
     *key: str | int,
@@ -86,7 +86,7 @@ def measure_galaxies(
         PSFs.
     axes : ndarray, shape [2, 2]
         d(x, y of the stack [pixel])/d(xi, eta).
-    galaxies : Galaxies
+    galaxies : Sources
         Galaxies about the common pointing.
     exposure : Exposure
         Depth and noise of the stack.
@@ -154,7 +154,7 @@ def _half_light(psfs: np.ndarray) -> np.ndarray:
 
 
 def _shapes(
-    galaxies: Galaxies,
+    galaxies: Sources,
     near: np.ndarray,
     positions: np.ndarray,
     width: np.ndarray,

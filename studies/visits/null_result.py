@@ -131,7 +131,7 @@ def shot_noise(result: NullTest) -> float:
 
 
 def density_slope(density: np.ndarray, values: np.ndarray) -> float | None:
-    """Return the slope of log amplitude against log density; None of less than two stacks."""
-    if len(density) < 2:
+    """Return the slope of log amplitude against log density; None of less than two densities."""
+    if len(np.unique(density)) < 2:
         return None
     return float(np.polyfit(np.log(density), np.log(values), 1)[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from ...core.progress import Reporter
 from ...core.random_streams import natural
 from ...core.units import ARCMIN
 from ...imaging.exposure import Exposure
-from ...pipeline.config import digest
+from ...imaging.galaxies import SkyGalaxies
 from ...pipeline.measure.correlation import Correlation
 from ...pipeline.run_folder import CONFIG_NAME
 from ...sky.galaxies import Galaxies
-from ...sky.population import GalaxyPopulation
+from ...sky.mosaic import PlantedGalaxies
 from .config import STACK_STAMP, load_visits_configuration
 from .galaxy_shapes import GalaxyShapes, measure_galaxies
 from .measures import correlations
@@ -50,7 +51,8 @@ def null_test(
 ) -> dict[int, NullTest]:
     """Measure galaxies in the stacks of a folder of visits, and correlate their ellipticities.
 
-    The sky is cut into tiles of the size of a CCD; each leaves a table of its galaxies. Products are these tables,
+    Galaxies are those of the configuration of the visits, down to the depth of each stack. The sky is cut into tiles of
+    the size of a CCD; each leaves a table of its galaxies. Products are these tables,
     ``null_test.json`` and two pictures; they have the same bytes on any number of threads.
 
     Parameters
@@ -71,7 +73,8 @@ def null_test(
     Raises
     ------
     PachonError
-        If the folder holds no stacks, or a product cannot be written.
+        If the folder holds no stacks, galaxies cannot be read, fewer than two are usable, or a product cannot be
+        written.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     if not (folder / CONFIG_NAME).exists():
@@ -82,13 +85,14 @@ def null_test(
     cell, scale = cell_of(experiment, frame), pixel_scale_of(frame)
     seed = experiment.config.seed
     reach = REACH * float(cell / np.sqrt(config.visits.places))
+    source = config.galaxy_source(experiment, Exposure.of_run(experiment, gain=1.0, pixel_scale=scale))
     make_folder(folder / "galaxies")
     results = {}
     for visits in config.kept:
-        stamp = Stamp(digest({"visits": config.digest(experiment), "stack": visits}), seed)
+        stamp = Stamp(config.galaxies_digest(experiment, stack=visits), seed)
         stack = PsfStack.read(stack_path(folder, visits), Stamp(config.digest(experiment), seed))
         exposure = Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=scale)
-        population = GalaxyPopulation(stack_limit(experiment, _FAINTEST_SNR, visits), seed)
+        galaxies_in = source.down_to(faintest := stack_limit(experiment, _FAINTEST_SNR, visits))
         chosen = _tiles(stack, cell, config.visits.places)[:tiles]
         if not chosen:
             raise DomainError(f"{folder}: no part of the sky as large as a CCD was seen by half of {visits} visits")
@@ -100,7 +104,7 @@ def null_test(
                     measured = measure_galaxies(
                         stack,
                         frame.matrix,
-                        population.galaxies_in(*_ranges((i, j), cell)),
+                        galaxies_in(*_ranges((i, j), cell)),
                         exposure,
                         seed,
                         "null test",
@@ -115,11 +119,13 @@ def null_test(
                 stage.advance()
                 stage.step(path.stem, number, len(chosen))
         galaxies = GalaxyShapes.joined(parts)
+        if (n := int((galaxies.usable & galaxies.true_usable).sum())) < 2:
+            text = f"{n} of {len(galaxies)} galaxies to magnitude {faintest:.2f} are usable in {visits} visits"
+            raise DomainError(f"{folder}: {text}; expected two or more, of the galaxies of {CONFIG_NAME}")
         patch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         with reporter.stage(f"correlations and shear calibration in {visits} visits"):
             area = len(chosen) * (cell / ARCMIN) ** 2
-            some = population.galaxies_in(*_ranges(chosen[0], cell))
-            some = some.take(np.arange(min(rings, len(some))))
+            some = _ring_galaxies(galaxies_in, chosen, cell, rings)
             results[visits] = NullTest(
                 visits,
                 galaxies,
@@ -147,6 +153,20 @@ def _ranges(tile: tuple[int, int], cell: float) -> list[tuple[float, float]]:
     return [(cell * (k - 0.5), cell * (k + 0.5)) for k in tile]
 
 
+def _ring_galaxies(
+    galaxies_in: SkyGalaxies, tiles: list[tuple[int, int]], cell: float, rings: int
+) -> Galaxies | PlantedGalaxies:
+    """Return galaxies for so many rings, those of the first tiles that have them."""
+    parts = [galaxies_in(*_ranges(tiles[0], cell))]
+    for tile in tiles[1:]:
+        if sum(map(len, parts)) >= rings:
+            break
+        parts.append(galaxies_in(*_ranges(tile, cell)))
+    kind: Any = type(parts[0])
+    galaxies = kind.concatenate(parts)
+    return galaxies.take(np.arange(min(rings, len(galaxies))))
+
+
 def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correlation]:
     both = galaxies.usable & galaxies.true_usable
     kinds = {
@@ -160,7 +180,7 @@ def _correlations(galaxies: GalaxyShapes, patch: np.ndarray) -> dict[str, Correl
 def _calibration(
     stack: PsfStack,
     axes: np.ndarray,
-    galaxies: Galaxies,
+    galaxies: Galaxies | PlantedGalaxies,
     exposure: Exposure,
     seed: int,
     reach: float,

@@ -159,7 +159,7 @@ def sky_points_of(experiment: Experiment, config: VisitsConfig, frame: StackFram
 
 
 def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
-    """Write the configuration, or check that the visits of the folder are of the same, but for their number."""
+    """Write the configuration, or check that the folder is of the same, but for galaxies and number of visits."""
     path = folder / CONFIG_NAME
 
     def check() -> None:
@@ -171,6 +171,7 @@ def _claim(folder: Path, config: VisitsConfig, resume: bool) -> None:
             raise ProductError(f"{folder} holds visits already; go on with --resume, or choose another --out")
         old, new = ({**c.model_dump(mode="json", by_alias=True)} for c in (before, config))
         for each in (old, new):
+            del each["galaxies"]
             for key in ("count", "snapshots"):
                 del each["visits"][key]
         found = differences(old, new)

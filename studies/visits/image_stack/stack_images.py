@@ -22,13 +22,12 @@ from ....imaging.scene import ellipticities, object_columns, sky_ranges
 from ....imaging.simulate import BYTES_PER_PIXEL
 from ....imaging.wcs import CcdWcs, ccd_wcs
 from ....models.camera.camera import Camera
-from ....pipeline.config import differences, digest
+from ....pipeline.config import differences
 from ....pipeline.defaults import given
 from ....pipeline.experiment import Experiment
 from ....pipeline.memory import needed_bytes
 from ....pipeline.run_folder import CONFIG_NAME
 from ....pipeline.simulate.star_field import magnitudes_at
-from ....sky.population import GalaxyPopulation
 from ..config import STACK_STAMP, VisitsConfig, load_visits_configuration
 from ..plan import Visit
 from ..psf_visit import (
@@ -105,9 +104,8 @@ class ImageStack:
             raise ProductError(f"{visits_folder}: no images; expected the folder of pachon stack-images")
         settings = _resolved(settings or ImageStackConfig(), before, visits, experiment)
         frame = StackFrame.of(experiment, STACK_STAMP)
-        content = {"visits": visits.digest(experiment), "images": settings.model_dump(mode="json")}
-        seed = experiment.config.seed
-        population = GalaxyPopulation(given(settings.faintest), seed)
+        source = visits.galaxy_source(experiment, _exposure(experiment, frame))
+        galaxies_in = source.down_to(given(settings.faintest))
         return cls(
             folder,
             visits,
@@ -115,15 +113,13 @@ class ImageStack:
             experiment,
             frame,
             choose_tiles(experiment, frame, given(settings.side), settings.tiles, visits),
-            Sky(sky_points_of(experiment, visits, frame), population.galaxies_in),
-            Stamp(digest(content), seed),
+            Sky(sky_points_of(experiment, visits, frame), galaxies_in),
+            Stamp(visits.galaxies_digest(experiment, images=settings.model_dump(mode="json")), experiment.config.seed),
         )
 
     def exposure(self, visits: int = 1) -> Exposure:
         """Return depth and noise of the stack of a number of visits."""
-        # Stacks are in electrons.
-        scale, noise = pixel_scale_of(self.frame), self.settings.noise
-        return Exposure.of_run(self.experiment, visits, gain=1.0, pixel_scale=scale, noise=noise)
+        return _exposure(self.experiment, self.frame, visits, noise=self.settings.noise)
 
     @property
     def plan(self) -> tuple[Visit, ...]:
@@ -320,6 +316,11 @@ def _truth(stack: ImageStack, tile: Tile, wcs: CcdWcs, exposure: Exposure) -> di
         columns |= {"STAR": np.full(len(sky), star), "RADIUS": radius, "E1": e1, "E2": e2}
         tables.append({key: values[own] for key, values in columns.items()})
     return object_columns({key: np.concatenate([table[key] for table in tables]) for key in tables[0]}, wcs)
+
+
+def _exposure(experiment: Experiment, frame: StackFrame, visits: int = 1, *, noise: bool = True) -> Exposure:
+    # Stacks are in electrons.
+    return Exposure.of_run(experiment, visits, gain=1.0, pixel_scale=pixel_scale_of(frame), noise=noise)
 
 
 def _settings_before(folder: Path) -> ImageStackConfig | None:

@@ -2,31 +2,24 @@ import numpy as np
 import pytest
 
 from pachon.core.units import ARCSEC
+from pachon.imaging.config import GalaxySourceConfig
 from pachon.pipeline.run_folder import CONFIG_NAME
+from pachon.sky.catalogue import write_galaxies
 from pachon.sky.galaxies import Galaxies
-from pachon.studies.visits.config import VisitsConfig, VisitsSection
-from pachon.studies.visits.image_stack import stack_images as stack_images_module
+from pachon.studies.visits.config import VisitsConfig, VisitsSection, load_visits_configuration
 from pachon.studies.visits.image_stack.config import ImageStackConfig
 from pachon.studies.visits.image_stack.stack_images import stack_images
 from pachon.studies.visits.stack import PsfStack
 from pachon.studies.visits.visits import stack_path, stack_visits
 
 
-class RoundGalaxies:
-    """Stand-in for the population: 40 round galaxies on the tile."""
-
-    def __init__(self, *_):
-        places = np.random.default_rng(8).uniform(-90.0, 90.0, (2, 40)) * ARCSEC
-        self.all = Galaxies.single(*places, np.full(40, 21.0), np.full(40, 0.4 * ARCSEC))
-
-    def galaxies_in(self, xi, eta):
-        own = (xi[0] <= self.all.xi) & (self.all.xi <= xi[1]) & (eta[0] <= self.all.eta) & (self.all.eta <= eta[1])
-        return self.all.take(np.flatnonzero(own))
-
-
 @pytest.fixture(scope="session")
-def round_galaxies():
-    return RoundGalaxies
+def round_galaxies(tmp_path_factory):
+    """Galaxies of a catalogue: 40 round ones on the tile."""
+    path = tmp_path_factory.mktemp("catalogue") / "round.ecsv"
+    places = np.random.default_rng(8).uniform(-90.0, 90.0, (2, 40)) * ARCSEC
+    write_galaxies(path, Galaxies.single(*places, np.full(40, 21.0), np.full(40, 0.4 * ARCSEC)))
+    return GalaxySourceConfig(catalogue=str(path))
 
 
 @pytest.fixture(scope="package")
@@ -53,11 +46,10 @@ def visit_products(small_visits, tmp_path_factory):
 
 
 @pytest.fixture(scope="package")
-def noise_free(visit_products, tmp_path_factory):
+def noise_free(visit_products, round_galaxies, tmp_path_factory):
     """Stack of two visits without noise, with round galaxies, beside that of the PSFs."""
     folder = tmp_path_factory.mktemp("noise_free")
-    (folder / CONFIG_NAME).write_bytes((visit_products / CONFIG_NAME).read_bytes())
+    config = load_visits_configuration(visit_products / CONFIG_NAME)
+    (folder / CONFIG_NAME).write_text(config.model_copy(update={"galaxies": round_galaxies}).to_yaml())
     psfs = {visits: PsfStack.read(stack_path(visit_products, visits)) for visits in (1, 2)}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stack_images_module, "GalaxyPopulation", RoundGalaxies)
-        return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs
+    return stack_images(folder, ImageStackConfig(faintest=25.0, side=1024, noise=False)), psfs

@@ -8,12 +8,10 @@ from pachon.imaging.exposure import ExposedImage
 from pachon.pipeline.measure.shapes import measure_shapes
 from pachon.pipeline.run_folder import CONFIG_NAME
 from pachon.studies.visits.config import VisitsConfig, VisitsSection
-from pachon.studies.visits.image_stack import stack_images as module
 from pachon.studies.visits.image_stack.config import ImageStackConfig
 from pachon.studies.visits.image_stack.resample import add_resampled
 from pachon.studies.visits.image_stack.stack_images import stack_images
 from pachon.studies.visits.image_stack.tiles import TileSums
-from pachon.studies.visits.image_stack.visit_wcs import VisitWcs
 
 #: Two CCDs beside each other, turned by 30 and 210 degrees.
 CAMERA = """
@@ -38,11 +36,10 @@ def stack(tiny, round_galaxies, tmp_path_factory):
         psf__stamp=49,
         focal_plane__budget="flat",
     )
-    visits = VisitsConfig(run=run, visits=VisitsSection(count=2, stars=25, places=40, snapshots=(1,)))
+    section = VisitsSection(count=2, stars=25, places=40, snapshots=(1,))
+    visits = VisitsConfig(run=run, visits=section, galaxies=round_galaxies)
     (folder / CONFIG_NAME).write_text(visits.resolved(visits.experiment()).to_yaml())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "GalaxyPopulation", round_galaxies)
-        return stack_images(folder, ImageStackConfig(faintest=25.0, side=900, noise=False))
+    return stack_images(folder, ImageStackConfig(faintest=25.0, side=900, noise=False))
 
 
 @pytest.mark.long
@@ -77,11 +74,10 @@ def test_stars_and_galaxies_are_where_the_header_says_with_their_light(stack, vi
 
 def test_the_flux_of_a_star_on_a_turned_ccd_is_conserved(stack):
     tile = stack.tiles[0]
-    for name, own in stack.wcs().items():
-        height, width = own.shape
-        wcs = VisitWcs(own, stack.plan[1])
+    for name, wcs in next(stack.wcs(stack.plan[1:]))[1].items():
+        height, width = wcs.shape
         x0, y0 = wcs.to_pixel([[0.0, 0.0]])[0].clip([80, 80], [width - 80, height - 80])
-        y, x = np.indices(own.shape)
+        y, x = np.indices(wcs.shape)
         # 3 pixels wide: sums over pixels are those over the area to 1e-7, wherever its centre is.
         star = np.exp(-0.5 * ((x - x0) ** 2 + (y - y0) ** 2) / 3.0**2).astype(np.float32)
         exposed = ExposedImage(star, np.ones_like(star), np.zeros(star.shape, np.int16))
