@@ -14,8 +14,9 @@ import yaml
 
 from ....core.errors import PrescriptionError, error_context
 from ...media.medium import Medium
+from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
-from ...telescope import Telescope, rotation_angles
+from ...telescope import Telescope
 from ..writable import report_unheld, require_sequential
 from . import ROOT
 from .apertures import obscuration_items

@@ -22,8 +22,9 @@ from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...paraxial import stop_makes_pupil
+from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
-from ...telescope import VACUUM, Telescope, rotation_angles
+from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
 from ..writable import report_unheld, require_met, require_sequential
 from .apertures import aperture_lines
