@@ -21,7 +21,10 @@ Raft = Annotated[str | None, Option(help="All CCDs of rafts: R22 or R22,R23.")]
 TruthStars = Annotated[int | None, Option(help="Noise-free PSFs on each CCD.")]
 ObservedStars = Annotated[int | None, Option(help="Observed stars on each CCD.")]
 Model = Annotated[str, Argument(help="Bundled model, or path of a prescription.")]
-Lenient = Annotated[bool, Option("--lenient", help="Lens or batoid file: warn about unknown parts and go on.")]
+Lenient = Annotated[
+    bool,
+    Option("--lenient", help="Lens or batoid file: warn about unknown parts, go on."),
+]
 GlassCatalogues = Annotated[
     list[Path] | None,
     Option("--glass-catalogue", metavar="FILE.agf", help="Glass catalogue of a lens file, once for each."),

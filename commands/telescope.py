@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from .inputs import load_model
+from ..core.errors import PrescriptionWarning
+from .inputs import load_model, warnings_shown
 from .options import GlassCatalogues, Json, Lenient, Model
 from .tables import Rows, plain_table, print_json, wide_console
 
@@ -87,6 +88,8 @@ def convert_command(
 ) -> None:
     """Write a telescope in another format: any model as ours, batoid's, Zemax's or optiland's.
 
+    Pickups and solves that the format has no place for are refused, with `--lenient` left out with a warning.
+
     Read are files of Zemax (.zmx, .zar), CODE V (.seq), OSLO (.len), optiland (.json), ray-optics (.roa), and of batoid
     and ours (.yaml). Glasses that a Zemax file needs and the bundled catalogue does not have go to an .agf file beside
     it.
@@ -102,5 +105,6 @@ def convert_command(
     from ..models.io.prescription import save_telescope
 
     telescope = load_model(model, lenient, glass_catalogue or ())
-    save_telescope(telescope, out, format=format)
+    with warnings_shown(PrescriptionWarning):
+        save_telescope(telescope, out, format=format, lenient=lenient)
     print(f"{telescope.name}: {len(telescope.surfaces)} surfaces written to {out}")

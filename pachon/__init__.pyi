@@ -16,6 +16,7 @@ from .design.analyses.color import chromatic_focus as chromatic_focus
 from .design.analyses.color import lateral_color as lateral_color
 from .design.analyses.field_curvature import FieldCurvature as FieldCurvature
 from .design.analyses.field_curvature import field_curvature as field_curvature
+from .design.analyses.fresnel import fresnel_transmission as fresnel_transmission
 from .design.analyses.illumination import RelativeIllumination as RelativeIllumination
 from .design.analyses.illumination import relative_illumination as relative_illumination
 from .design.analyses.layer_stack import CoatingTable as CoatingTable
@@ -34,7 +35,6 @@ from .design.analyses.target_image import TargetImage as TargetImage
 from .design.analyses.target_image import bar_target as bar_target
 from .design.analyses.target_image import target_image as target_image
 from .design.analyses.throughput import Throughput as Throughput
-from .design.analyses.throughput import fresnel_transmission as fresnel_transmission
 from .design.analyses.throughput import throughput as throughput
 from .design.images.diffraction import fft_psf as fft_psf
 from .design.images.diffraction import huygens_psf as huygens_psf

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Option
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, PrescriptionWarning
+from ..inputs import warnings_shown
 from ..options import name_list
 from ..tables import Column
 from .command import Given, Outcome, design_command
@@ -122,11 +124,12 @@ def optimize(
         for name, value in (("merit", merit), ("focal-length", focal_length), ("bounds", bounds)):
             if value is not None:
                 raise ConfigError(f"--{name} is given beside --config: expected it in the file")
-        result = _from_file(given, config)
+        result = _from_file(given, config, out)
     else:
         from ...design.optimize.optimize import optimize as compute
 
         telescope, *where = given.where
+        _check_out(given, out)
         result = compute(
             telescope,
             name_list(variables or "", "--variables"),
@@ -137,16 +140,27 @@ def optimize(
             **given.how,
         )
     found = _optimum(result)
-    several = len(found.telescopes) > 1
-    if several and out is not None:
-        raise ConfigError(f"--out {out}: expected none with several configurations, each is named after its telescope")
     paths = [out or Path(f"optimized_{telescope.name}.yaml") for telescope in found.telescopes]
-    for telescope, path in zip(found.telescopes, paths, strict=True):
-        save_telescope(telescope, path)
+    with warnings_shown(PrescriptionWarning):
+        for telescope, path in zip(found.telescopes, paths, strict=True):
+            save_telescope(telescope, path, lenient=given.lenient)
     return Outcome(result, notes=[*_notes(result), *(f"prescription: {path.resolve()}" for path in paths)])
 
 
-def _from_file(given: Given, path: Path) -> Any:
+def _check_out(given: Given, out: Path | None, *, several: bool = False) -> None:
+    """Raise before a computation what cannot be written after it."""
+    from ...models.io.prescription import prescription_files
+
+    if out is None:
+        return
+    if several:
+        raise ConfigError(f"--out {out}: expected none with several configurations, each is named after its telescope")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PrescriptionWarning)
+        prescription_files(given.telescope, out, lenient=given.lenient)
+
+
+def _from_file(given: Given, path: Path, out: Path | None) -> Any:
     """Return the optimum of a file, or the choice of glasses that it asks for."""
     from ...design.optimize.glass_choice import choose_glasses
     from ...design.optimize.optimize import optimize as compute
@@ -155,6 +169,7 @@ def _from_file(given: Given, path: Path) -> Any:
     if given.fields is not None or given.wavelength is not None:
         raise ConfigError("--field-deg or --wavelength-nm is given beside --config: expected them in the file")
     file = load_optimization(path)
+    _check_out(given, out, several=bool(file.configurations))
     arguments = optimization_arguments(file, given.telescope, path)
     if not file.glasses:
         return compute(**arguments, **given.how)

@@ -1,12 +1,8 @@
 """Throughput: light that reaches the detector, with losses at surfaces, in glass and by vignetting.
 
-A lens surface without a coating transmits after Fresnel (Born & Wolf, Principles of Optics, section 1.5.3), at the
-angle of each ray::
-
-    R_s = ((n1 cos i - n2 cos t) / (n1 cos i + n2 cos t))^2,   R_p = ((n2 cos i - n1 cos t) / (n2 cos i + n1 cos t))^2
-
-Light is taken as unpolarised before each surface, so transmissions are the means of both polarisations. A mirror or
-detector without a coating loses nothing. Light that is reflected twice within a lens is not added (see `ghosts`).
+A lens surface without a coating transmits after :mod:`.fresnel`, at the angle of each ray. Light is taken as
+unpolarised before each surface, so transmissions are the means of both polarisations. A mirror or detector without a
+coating loses nothing. Light that is reflected twice within a lens is not added (see `ghosts`).
 """
 
 from __future__ import annotations
@@ -22,7 +18,6 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, unknown_name
 from ...core.plotting import BLUE, plain_text
-from ...core.units import pure_numbers
 from ...models.surface import Interaction, Surface
 from ...models.telescope import Telescope
 from ...raytrace.pack.surfaces import refractive_indices
@@ -33,6 +28,7 @@ from ...wavefront.request import Request
 from ..drawing import field_colors, finish_axes
 from .analysis import Analysis, Columns, band_wavelengths
 from .coatings import Coatings
+from .fresnel import fresnel_transmission
 from .layer_stack import LayerStack
 
 if TYPE_CHECKING:
@@ -225,35 +221,3 @@ def _incidence(surface: Surface, result: TraceResult, direction: np.ndarray) -> 
     slope_x, slope_y = surface.shape.gradient(x, y)
     normal = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1) / np.sqrt(1.0 + slope_x**2 + slope_y**2)[:, None]
     return np.abs(np.einsum("ni,ni->n", direction @ surface.matrix, normal))
-
-
-@check_arguments
-def fresnel_transmission(cosine: ArrayLike, n1: float, n2: float) -> np.ndarray:
-    """Return the transmission of a bare interface for unpolarised light.
-
-    Parameters
-    ----------
-    cosine : array_like
-        Cosine of the angle of incidence.
-    n1, n2 : float
-        Refractive indices before and behind.
-
-    Returns
-    -------
-    ndarray
-        Transmitted power over incident power, mean of both polarisations; 0 where reflection is total.
-
-    Raises
-    ------
-    DomainError
-        If an index is not positive.
-    """
-    if not (0 < n1 < np.inf and 0 < n2 < np.inf):
-        raise DomainError(f"n1 = {n1!r}, n2 = {n2!r}: expected positive refractive indices")
-    ci = pure_numbers(cosine, "cosine")
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        square = 1.0 - np.square(np.float64(n1) / n2) * (1.0 - ci**2)
-        ct = np.sqrt(np.maximum(square, 0.0))
-        s = ((n1 * ci - n2 * ct) / (n1 * ci + n2 * ct)) ** 2
-        p = ((n2 * ci - n1 * ct) / (n2 * ci + n1 * ct)) ** 2
-    return np.where(square > 0, 1.0 - 0.5 * (s + p), 0.0)

@@ -23,6 +23,7 @@ from ...raytrace.pack.surfaces import refractive_indices
 from ...raytrace.rays import Rays, RayStatus
 from ...raytrace.trace import trace
 from ..analyses.coatings import Coatings
+from ..analyses.fresnel import fresnel_reflectivity, refracted_reflectivity
 
 
 def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
@@ -34,33 +35,6 @@ def ghost_pairs(telescope: Telescope) -> list[tuple[int, int]]:
     last = len(telescope.surfaces) - 1
     ends = [*lenses, last] if telescope.surfaces[last].interaction == Interaction.DETECTOR else lenses
     return [(j, i) for j in ends for i in lenses if i < j]
-
-
-def fresnel_reflectivity(cosine: np.ndarray, before: float, after: float) -> np.ndarray:
-    """Return the reflectivity of a bare interface for unpolarised light (Fresnel's equations); 1 at total reflection.
-
-    The refractive indices are those on the side of the light and on the other.
-    """
-    cosine = np.abs(np.asarray(cosine, dtype=np.float64))
-    square = 1.0 - (before / after) ** 2 * (1.0 - cosine**2)
-    within = np.sqrt(np.maximum(square, 0.0))
-    s = (before * cosine - after * within) / (before * cosine + after * within)
-    p = (after * cosine - before * within) / (after * cosine + before * within)
-    return np.where(square > 0, 0.5 * (s**2 + p**2), 1.0)
-
-
-def refracted_reflectivity(turn: np.ndarray, before: float, after: float) -> np.ndarray:
-    """Return the reflectivity of a bare interface for light that it refracts, from the cosine of the angle of turn.
-
-    Snell's law in vectors, n' d' - n d along the normal, gives both cosines from the cosine t of the angle by which the
-    ray is turned. In Fresnel's ratios their common length cancels: with a = n^2 + n'^2, b = 2 n n' and c = n'^2 - n^2
-    they are (a - b t) / c across the plane of incidence and (a - b / t) / c in it.
-    """
-    if before == after:
-        return np.zeros_like(turn)
-    square, double = before * before + after * after, 2.0 * before * after
-    across, along = square - double * turn, square - double / turn
-    return np.asarray((across * across + along * along) * (0.5 / (after * after - before * before) ** 2))
 
 
 class Reflectivities:

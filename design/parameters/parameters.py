@@ -33,9 +33,10 @@ from numpy.typing import ArrayLike
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, DomainError, check_unique, error_context, unknown_name
 from ...models.media.medium import Medium, abbe_number, with_index_change
+from ...models.rotation import rotation_matrix
 from ...models.shapes.shape import Shape
 from ...models.surface import Interaction
-from ...models.telescope import Telescope, rotation_matrix
+from ...models.telescope import Telescope
 from ...models.thickness import front_surface, light_axis, thickness, with_thicknesses
 from .links import Followers, has_links, with_followers
 from .shape_terms import shape_with_term, term_unit

@@ -184,7 +184,9 @@ def _bundled(name: str) -> Telescope:
 
 
 @check_arguments
-def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format: str = "") -> None:
+def save_telescope(
+    telescope: Telescope, path: str | os.PathLike[str], *, format: str = "", lenient: bool = False
+) -> None:
     """Write a prescription file: YAML, ours or batoid's, a Zemax lens file or a file of optiland.
 
     Glasses of a Zemax file that the bundled catalogue does not have go to a catalogue (.agf) of the same name beside
@@ -198,6 +200,8 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
         File to write; it is replaced as a whole, or left as it was.
     format : {"", "pachon", "batoid", "zemax", "optiland"}
         Format; by default Zemax's where the name ends in ``.zmx``, optiland's for ``.json``, else ours.
+    lenient : bool
+        Of pickups and solves that the format has no place for: warn, and write the values without them.
 
     Raises
     ------
@@ -206,6 +210,14 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     PrescriptionError
         If the name does not end in .yaml, .yml, .zmx or .json, or the file cannot be written or hold the telescope.
     """
+    for file, text in prescription_files(telescope, path, format=format, lenient=lenient).items():
+        write_bytes(file, text.encode(), PrescriptionError)
+
+
+def prescription_files(
+    telescope: Telescope, path: str | os.PathLike[str], *, format: str = "", lenient: bool = False
+) -> dict[Path, str]:
+    """Return the texts of the files that :func:`save_telescope` writes, by their paths; errors are its own."""
     target = Path(path)
     if target.suffix.lower() not in WRITTEN:
         raise PrescriptionError(f"expected a name that ends in {', '.join(WRITTEN)}", file=target)
@@ -214,19 +226,16 @@ def save_telescope(telescope: Telescope, path: str | os.PathLike[str], *, format
     if format == "zemax":
         from .zemax.writer import catalogue_path, telescope_to_zemax
 
-        lens, glasses = telescope_to_zemax(telescope)
-        if glasses:
-            write_bytes(catalogue_path(target), glasses.encode(), PrescriptionError)
-    elif format == "batoid":
+        lens, glasses = telescope_to_zemax(telescope, lenient=lenient)
+        return ({catalogue_path(target): glasses} if glasses else {}) | {target: lens}
+    if format == "batoid":
         from .batoid.writer import telescope_to_batoid
 
-        lens = telescope_to_batoid(telescope)
-    elif format == "optiland":
+        return {target: telescope_to_batoid(telescope, lenient=lenient)}
+    if format == "optiland":
         from .optiland.writer import telescope_to_optiland
 
-        lens = telescope_to_optiland(telescope)
-    else:
-        from .yaml.writer import telescope_to_yaml
+        return {target: telescope_to_optiland(telescope, lenient=lenient)}
+    from .yaml.writer import telescope_to_yaml
 
-        lens = telescope_to_yaml(telescope)
-    write_bytes(target, lens.encode(), PrescriptionError)
+    return {target: telescope_to_yaml(telescope)}

@@ -1,14 +1,16 @@
-"""What files can hold: pickups that the values meet, and telescopes that lens files can be made of."""
+"""What files can hold: pickups that the values meet, links with a place, telescopes that lens files are made of."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from ...core.errors import PrescriptionError
-from ..links import Pickup
+from ..links import Pickup, Solve
 from ..surface import Interaction
 from ..telescope import Telescope
 from ..thickness import thickness
+from .zemax.file import Findings
 
 #: Relative difference from a pickup that rounding in files makes.
 _ROUNDING = 1e-6
@@ -20,6 +22,12 @@ def require_sequential(telescope: Telescope, file: str) -> None:
         raise PrescriptionError(f"{file} needs a detector as its last surface")
     if telescope.obstructions:
         raise PrescriptionError(f"obstruction {telescope.obstructions[0].name}: {file} cannot hold meshes")
+
+
+def report_unheld(links: Iterable[Pickup | Solve], file: str, *, lenient: bool) -> None:
+    """Raise a PrescriptionError, if lenient a warning, for links without a place in `file`."""
+    if names := ", ".join(link.address for link in links):
+        Findings(lenient).report(PrescriptionError(f"{names}: {file} has no place for it"), "left out")
 
 
 def require_met(telescope: Telescope) -> Telescope:

@@ -69,3 +69,24 @@ def test_bad_input_is_one_line(command, words, capsys):
     assert error.startswith("pachon: error: ")
     assert error.count("\n") == 1
     assert words in error
+
+
+def test_what_cannot_be_written_is_refused_before_the_optimisation(tmp_path, capsys, monkeypatch):
+    def never(*args, **options):
+        raise AssertionError("computed before the output was checked")
+
+    monkeypatch.setattr("pachon.design.optimize.optimize.optimize", never)
+    lens = pachon.load_telescope("paul_baker")
+    pachon.save_telescope(lens, tmp_path / "other.yaml")
+    (tmp_path / "two.yaml").write_text("variables: [M2.conic]\nconfigurations: [{telescope: other.yaml}]\n")
+    first, third = (lens.surface(name).shape.parameters.get("conic", 0.0) for name in ("M1", "M3"))
+    follower = pachon.Pickup("M3", "conic", "M1", 1.0, third - first)
+    pachon.save_telescope(lens.with_design(pickups=(follower,)), tmp_path / "linked.yaml")
+    linked = [str(tmp_path / "linked.yaml"), "--variables", "M2.conic"]
+    for given, words in (
+        (["paul_baker", "--config", "two.yaml", "--out", "one.yaml"], "none with several configurations"),
+        ([*linked, "--out", "better.zmx"], "pickup M3.conic: a Zemax file has no place for it"),
+        ([*linked, "--out", "better.foo"], "expected a name that ends in"),
+    ):
+        assert main(["optimize", *given]) == 2
+        assert words in capsys.readouterr().err

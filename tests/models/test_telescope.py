@@ -8,8 +8,8 @@ from astropy import units as u
 import pachon
 from pachon.core.errors import DomainError, PrescriptionError, UnknownNameError
 from pachon.models.io.prescription import load_telescope
+from pachon.models.rotation import rotation_matrix
 from pachon.models.surface import Interaction
-from pachon.models.telescope import rotation_matrix
 
 LSST = load_telescope("lsst_v3.3_r")
 SHIFT, TILT = (1.1e-3, -2.3e-3, 0.7e-3), (3e-3, -5e-3, 7e-3)

@@ -17,7 +17,7 @@ from pydantic import BeforeValidator, Field
 from ....core.schema import Section, Tagged, expected, unknown_key
 from ....core.yaml_reader import as_number
 from ...media.medium import Medium
-from ...telescope import rotation_matrix
+from ...rotation import rotation_matrix
 from ..yaml.reader import FieldSection, GroupSection, WavelengthsSection
 from ..yaml.values import ROWS, Number, OptionalNameOrFile, OptionalText, PositiveNumber, Text
 from . import ROOT

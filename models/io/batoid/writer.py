@@ -14,9 +14,10 @@ import yaml
 
 from ....core.errors import PrescriptionError, error_context
 from ...media.medium import Medium
+from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
-from ...telescope import Telescope, rotation_angles
-from ..writable import require_sequential
+from ...telescope import Telescope
+from ..writable import report_unheld, require_sequential
 from . import ROOT
 from .apertures import obscuration_items
 from .media import medium_items
@@ -34,14 +35,16 @@ _TYPES = {
 }
 
 
-def telescope_to_batoid(telescope: Telescope) -> str:
+def telescope_to_batoid(telescope: Telescope, *, lenient: bool = False) -> str:
     """Return the text of a batoid file.
 
-    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in batoid.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in batoid; pickups and
+    solves have none, and are left out with a warning where `lenient`.
     """
     t = telescope
     with error_context(subject=t.name):
         require_sequential(t, "a batoid file")
+        report_unheld((*t.design_data.pickups, *t.design_data.solves), "a batoid file", lenient=lenient)
         if math.isfinite(t.object_distance):
             raise PrescriptionError(f"object_distance = {t.object_distance!r}: a batoid file has no object but the sky")
         nested = _nested_groups(t)

@@ -17,7 +17,7 @@ from ....core.errors import PrescriptionError, error_context
 from ...aperture import Annulus, Aperture, Circle, Complement, Rectangle
 from ...surface import Interaction, Surface
 from ...telescope import Telescope
-from ..writable import require_sequential
+from ..writable import report_unheld, require_sequential
 from ..zemax.frame import HALF_TURN, rotated_aperture, rotated_shape
 from ..zemax.reader import PUPIL_COMMENT
 from .design import MM, own_stop, system_items
@@ -25,14 +25,16 @@ from .media import material_items
 from .shapes import geometry_items
 
 
-def telescope_to_optiland(telescope: Telescope) -> str:
+def telescope_to_optiland(telescope: Telescope, *, lenient: bool = False) -> str:
     """Return the text of a file of optiland.
 
-    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in optiland.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in optiland; pickups and
+    solves have none, and are left out with a warning where `lenient`.
     """
     t = telescope
     with error_context(subject=t.name):
         require_sequential(t, "a file of optiland")
+        report_unheld((*t.design_data.pickups, *t.design_data.solves), "a file of optiland", lenient=lenient)
         stop, system = own_stop(t), system_items(t)
         first = -t.surfaces[0].vertex[2]
         before = material_items(t.medium_before)

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ....core.errors import PrescriptionError
-from ...telescope import rotation_matrix
+from ...rotation import rotation_matrix
 
 Frame = tuple[np.ndarray, np.ndarray]
 

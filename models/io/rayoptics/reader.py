@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...telescope import rotation_matrix
+from ...rotation import rotation_matrix
 from ..json_items import JsonObject
 from ..zemax.file import Findings, ZemaxFile
 from ..zemax.placed import INFINITE, Line, PlacedSurfaces

@@ -14,8 +14,9 @@ from ....core.schema import Section, Tagged, expected, one_of, validated
 from ....core.yaml_reader import read_mapping
 from ...media.medium import Medium
 from ...obstruction import Obstruction
+from ...rotation import rotation_matrix
 from ...surface import IDENTITY, Interaction, Matrix, Surface
-from ...telescope import VACUUM, Telescope, rotation_matrix
+from ...telescope import VACUUM, Telescope
 from ..writable import require_met
 from .apertures import ApertureKeys, ObstructionSection
 from .design import DesignSection

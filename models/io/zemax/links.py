@@ -6,17 +6,23 @@ passed over: their solution stands in the file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
-from ...design_data import DesignData
+import numpy as np
+
 from ...links import Pickup, Solve
+from ...surface import Interaction
 from ...telescope import Telescope
+from ...thickness import thickness
 from ..writable import unmet_pickup
 from .file import Block, Findings
 from .text import number_text
 
 #: Solve types of a curvature and of a glass that take over that of another surface.
 _CURVATURE, _GLASS = 4, 2
+#: Lines that pickups of Zemax files stand in, by the quantity; a thickness has one of its own.
+_LINES = {"radius": "CURV", "glass": "GLAS"}
 
 
 def with_links(
@@ -24,19 +30,24 @@ def with_links(
 ) -> Telescope:
     """Return a telescope with the pickups and solves of its file; `names` are those of surfaces by their numbers.
 
-    Pickups that the values of the file do not meet, or of values that a telescope has not, are left out with a warning.
+    Pickups that the values of the file do not meet, or of values that a telescope has not, are left out with a warning,
+    as are heights of real marginal rays, those of a zone other than 0.
     """
     pickups, solves = [], []
     for number, block in enumerate(blocks):
-        for choices in _pickups(block, number, names, unit):
+        for choices in _pickups(telescope, block, number, names, unit):
             kept = next((one for one in choices if unmet_pickup(telescope, one) is None), None)
             if kept is not None:
                 pickups.append(kept)
             else:
                 findings.note(block.problem(f"{choices[0].address}: the file has another value"), "it is not kept")
         line = block.last("MAZH")
-        # A zone other than 0 is that of a real ray.
-        if line is not None and line.number(1, 0.0) == 0.0 and number in names and names[number] != _last_name(names):
+        if line is None or number not in names or names[number] == _last_name(names):
+            continue
+        if zone := line.number(1, 0.0):
+            text = f"MAZH: zone {zone:g} of the pupil: expected 0, the paraxial ray; its solution stands in the file"
+            findings.note(block.problem(text), "it is not kept")
+        else:
             solves.append(Solve(names[number], "marginal_height", line.number(0, 0.0) * unit))
     if not (pickups or solves):
         return telescope
@@ -48,7 +59,9 @@ def _last_name(names: Mapping[int, str]) -> str:
     return names[max(names)]
 
 
-def _pickups(block: Block, number: int, names: Mapping[int, str], unit: float) -> Iterator[tuple[Pickup, ...]]:
+def _pickups(
+    t: Telescope, block: Block, number: int, names: Mapping[int, str], unit: float
+) -> Iterator[tuple[Pickup, ...]]:
     """Yield the pickups of a surface, each with the meanings that it may have."""
     if number not in names:
         return
@@ -66,27 +79,65 @@ def _pickups(block: Block, number: int, names: Mapping[int, str], unit: float) -
             and scale
             and _last_name(names) not in (source, names[number])
         ):
-            yield (Pickup(names[number], "thickness", source, scale, gap.number(2, 0.0) * unit),)
+            scale, offset = _signed(t, names[number], source, scale, gap.number(2, 0.0) * unit)
+            yield (Pickup(names[number], "thickness", source, scale, offset),)
     if glass is not None and glass.number(1, 0.0) == _GLASS:
         source = names.get(int(glass.number(2, 0.0)))
         if source is not None and source != names[number]:
             yield (Pickup(names[number], "glass", source),)
 
 
-def add_link_lines(data: DesignData, own: Mapping[str, tuple[int, list[str]]], unit: float) -> None:
-    """Add pickups and solves to the lines of surfaces, which are given with their numbers by name.
+def add_link_lines(t: Telescope, own: Mapping[str, tuple[int, list[str]]], unit: float) -> list[Pickup | Solve]:
+    """Add links to the lines of surfaces, given with their numbers by name; return those without a place.
 
-    Conic constants, heights of chief rays, edges and radii with a factor have no place in such a file.
+    Conic constants, heights of chief rays, edges and radii with a factor have none; nor has a thickness that coordinate
+    breaks stand in, nor the glass of a mirror that is also that of a lens surface.
     """
-    for pickup in data.pickups:
-        lines, source = own[pickup.surface][1], own[pickup.source][0]
+    left_out: list[Pickup | Solve] = []
+    for pickup in t.design_data.pickups:
+        (number, there), lines = own[pickup.source], own[pickup.surface][1]
+        here, source = (_line(ls, _LINES.get(pickup.quantity, "")) for ls in (lines, there))
         if pickup.quantity == "thickness":
-            lines.append(f"PZUP {source} {number_text(pickup.scale)} {number_text(pickup.offset / unit)} 0")
-        for i, line in enumerate(lines):
-            if pickup.quantity == "glass" and line.startswith("GLAS "):
-                lines[i] = line.replace(" 0 0 ", f" {_GLASS} {source} ", 1)
-            elif pickup.quantity == "radius" and line.startswith("CURV ") and abs(pickup.scale) == 1.0:
-                lines[i] = f"{line} {_CURVATURE} {source} {number_text(pickup.scale)}" * (not pickup.offset) or line
-    for solve in data.solves:
-        if solve.kind == "marginal_height":
-            own[solve.surface][1].append(f"MAZH {number_text(solve.value / unit)} 0")
+            held = all(_is_one_line(t, name, own[name][1], unit) for name in (pickup.surface, pickup.source))
+            scale, offset = _signed(t, pickup.surface, pickup.source, pickup.scale, pickup.offset)
+            new = f"PZUP {number} {number_text(scale)} {number_text(offset / unit)} 0"
+        elif pickup.quantity == "glass":
+            held = bool(here) and here.split()[1:2] == source.split()[1:2]
+            new = here.replace(" 0 0 ", f" {_GLASS} {number} ", 1)
+        else:
+            held = bool(here and source) and abs(pickup.scale) == 1.0 and not pickup.offset
+            new = f"{here} {_CURVATURE} {number} {number_text(pickup.scale)}"
+        if not held:
+            left_out.append(pickup)
+        elif pickup.quantity == "thickness":
+            lines.append(new)
+        else:
+            lines[lines.index(here)] = new
+    for solve in t.design_data.solves:
+        lines = own[solve.surface][1]
+        if solve.kind == "marginal_height" and _is_one_line(t, solve.surface, lines, unit):
+            lines.append(f"MAZH {number_text(solve.value / unit)} 0")
+        else:
+            left_out.append(solve)
+    return left_out
+
+
+def _line(lines: list[str], keyword: str) -> str:
+    """Return the line with a keyword, empty where there is none."""
+    return next((line for line in lines if line.split()[0] == keyword), "")
+
+
+def _is_one_line(t: Telescope, name: str, lines: list[str], unit: float) -> bool:
+    """Return whether the thickness of a surface is that of its own line, no coordinate breaks between."""
+    written = float(_line(lines, "DISZ").split()[1]) * unit
+    return math.isclose(abs(written), abs(thickness(t, t.surface_names.index(name))), rel_tol=1e-12, abs_tol=1e-15)
+
+
+def _signed(t: Telescope, surface: str, source: str, scale: float, offset: float) -> tuple[float, float]:
+    """Return scale and offset of thicknesses with the signs of a file, where they are negative behind odd mirrors.
+
+    The other way round it is the same.
+    """
+    mirrors = np.cumsum([s.interaction == Interaction.MIRROR for s in t.surfaces])
+    here, there = (-1.0 if mirrors[t.surface_names.index(name)] % 2 else 1.0 for name in (surface, source))
+    return here * there * scale, here * offset

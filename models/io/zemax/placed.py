@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ...media.medium import ConstantIndex, Medium
-from ...telescope import rotation_angles
+from ...rotation import rotation_angles
 from .file import Block, ZemaxFile
 from .text import Record, number_text
 

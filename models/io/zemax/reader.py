@@ -25,9 +25,10 @@ from ...element_groups import element_groups
 from ...media.dispersion import model_glass
 from ...media.medium import Medium, RelativeToAir
 from ...paraxial import ParaxialSurfaces
+from ...rotation import rotation_matrix
 from ...shapes.shape import Plane
 from ...surface import Interaction, Surface
-from ...telescope import VACUUM, Telescope, rotation_matrix
+from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import GlassCatalogue
 from ..glass_search import find_glass, glass_hint
 from .apertures import read_aperture

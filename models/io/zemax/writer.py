@@ -22,10 +22,11 @@ from ...design_data import FIELD_TYPES, DesignData
 from ...media.dispersion import Dispersion
 from ...media.medium import ConstantIndex, Medium, Sellmeier
 from ...paraxial import stop_makes_pupil
+from ...rotation import rotation_angles
 from ...surface import Interaction, Surface
-from ...telescope import VACUUM, Telescope, rotation_angles
+from ...telescope import VACUUM, Telescope
 from ..glass_catalogue import NUMBERED, SELLMEIER_TERMS, GlassCatalogue
-from ..writable import require_met, require_sequential
+from ..writable import report_unheld, require_met, require_sequential
 from .apertures import aperture_lines
 from .design import design_lines, stop_lines
 from .frame import HALF_TURN, rotated_aperture, rotated_shape
@@ -41,10 +42,11 @@ UNIT_NAMES = {1e-3: "MM", 1e-2: "CM", 0.0254: "IN", 1.0: "METER"}
 CONSTANT_FORMULA = 1
 
 
-def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
+def telescope_to_zemax(telescope: Telescope, *, lenient: bool = False) -> tuple[str, str]:
     """Return the text of a lens file, and that of the glass catalogue that it needs; empty where it needs none.
 
-    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file.
+    PrescriptionError, with surface and part, if a part of the telescope has no counterpart in a Zemax file; pickups and
+    solves without one are left out with a warning where `lenient`.
     """
     t = require_met(telescope)
     with error_context(subject=t.name):
@@ -102,7 +104,9 @@ def telescope_to_zemax(telescope: Telescope) -> tuple[str, str]:
         before = surface.medium_after
     if not blocks[-1][-1].startswith("DISZ"):
         blocks[-1].append("DISZ 0")
-    add_link_lines(data, numbered, unit)
+    left_out = add_link_lines(t, numbered, unit)
+    with error_context(subject=t.name):
+        report_unheld(left_out, "a Zemax file", lenient=lenient)
     for number, block in enumerate(blocks):
         lines += [f"SURF {number}", *(f"  {line}" for line in block)]
     return "\n".join(lines) + "\n", "".join(_catalogue_lines(glasses))

@@ -8,13 +8,12 @@ import pytest
 import pachon
 from pachon.core.errors import DomainError, UnknownNameError
 from pachon.design.analyses.coatings import Coatings
+from pachon.design.analyses.fresnel import fresnel_reflectivity, refracted_reflectivity
 from pachon.design.analyses.layer_stack import LayerStack
 from pachon.design.metrics.ghost_paths import (
     GhostTrace,
     Reflectivities,
-    fresnel_reflectivity,
     ghost_pairs,
-    refracted_reflectivity,
 )
 from pachon.design.metrics.ghosts import ghosts
 from pachon.models.media.medium import ConstantIndex

@@ -11,7 +11,7 @@ import pachon
 from pachon.core.errors import PrescriptionError, PrescriptionWarning
 from pachon.models.aperture import Circle, Complement, Rectangle
 from pachon.models.first_order import first_order
-from pachon.models.telescope import rotation_matrix
+from pachon.models.rotation import rotation_matrix
 
 DATA = Path(__file__).parents[2] / "data" / "lensfiles"
 STORED = json.loads((DATA / "rays.json").read_text())

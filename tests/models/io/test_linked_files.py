@@ -91,7 +91,14 @@ def test_they_are_written_back(tmp_path, name):
     kept = PICKUPS if name.endswith("yaml") else PICKUPS[:3]
     offset = pachon.Pickup("S3", "thickness", "S1", 2.0, -4e-3)
     lens = lens.with_design(pickups=(PICKUPS[0], offset, *PICKUPS[2:]))
-    pachon.save_telescope(lens, tmp_path / name)
+    if name.endswith("yaml"):
+        pachon.save_telescope(lens, tmp_path / name)
+    else:
+        with pytest.raises(PrescriptionError, match=r"lens: pickup S4.radius: a Zemax file has no place for it$"):
+            pachon.save_telescope(lens, tmp_path / name)
+        assert not (tmp_path / name).exists()
+        with pytest.warns(PrescriptionWarning, match=r"pickup S4.radius: a Zemax file has no place for it; left out"):
+            pachon.save_telescope(lens, tmp_path / name, lenient=True)
     again = pachon.load_telescope(tmp_path / name).design_data
     assert set(again.pickups) == {offset, *kept} - {PICKUPS[1]}
     assert again.solves == lens.design_data.solves
@@ -125,3 +132,57 @@ def test_what_is_not_met_is_said(tmp_path):
         with pytest.raises(PrescriptionError, match=words) as found:
             pachon.load_telescope(tmp_path / "bad.yaml")
         assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize(("name", "format"), [("a.yaml", "batoid"), ("a.json", "optiland")])
+def test_formats_without_links_refuse_them(tmp_path, name, format):
+    lens = loaded(tmp_path, SYMMETRIC)
+    words = r"pickup S3.radius, .*, solve S4.marginal_height: a .*file.* has no place for it"
+    with pytest.raises(PrescriptionError, match=words):
+        pachon.save_telescope(lens, tmp_path / name, format=format)
+    assert not (tmp_path / name).exists()
+    with pytest.warns(PrescriptionWarning, match=words):
+        pachon.save_telescope(lens, tmp_path / name, format=format, lenient=True)
+    again = pachon.load_telescope(tmp_path / name)
+    heights = [s.vertex[2] for s in lens.surfaces]
+    assert [s.vertex[2] for s in again.surfaces] == pytest.approx(heights, abs=1e-15)
+
+
+def test_every_link_is_written_to_zemax_or_named(tmp_path):
+    lens = loaded(tmp_path, SYMMETRIC)
+    links = {
+        "pickups": (pachon.Pickup("S4", "conic", "S1"), pachon.Pickup("S4", "glass", "S2")),
+        "solves": (pachon.Solve("S3", "edge_thickness", 3.9e-3, radius=1e-3), pachon.Solve("S4", "chief_height", 1.0)),
+    }
+    with pytest.raises(PrescriptionError) as found:
+        pachon.save_telescope(lens.with_design(**links), tmp_path / "no.zmx")
+    for link in (*links["pickups"], *links["solves"]):
+        assert link.address in str(found.value)
+    # Tilted, its thickness stands in the lines of coordinate breaks.
+    tilted = lens.perturbed("S3", tilt=(1e-3, 0.0, 0.0)).with_design(
+        pickups=(), solves=(pachon.Solve("S3", "marginal_height"),)
+    )
+    with pytest.raises(PrescriptionError, match=r"solve S3.marginal_height: a Zemax file has no place"):
+        pachon.save_telescope(tilted, tmp_path / "no.zmx")
+
+
+def test_thickness_behind_a_mirror_is_of_the_other_sign_in_zemax(tmp_path):
+    # Lens, mirror, and the way back: DISZ counts along +z of the file, a thickness along the light.
+    text = SYMMETRIC[: SYMMETRIC.index("SURF 2")] + (
+        "SURF 2\n  TYPE STANDARD\n  CURV 0.0\n  DISZ 30\n"
+        "SURF 3\n  TYPE STANDARD\n  CURV -0.01\n  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0\n  DISZ -29\n  PZUP 2 -1 1 0\n"
+        "SURF 4\n  TYPE STANDARD\n  CURV 0.0\n  DISZ 0\n"
+    )
+    expected = (pachon.Pickup("S3", "thickness", "S2", 1.0, -1e-3),)
+    mirror = loaded(tmp_path, text)
+    assert mirror.design_data.pickups == expected
+    pachon.save_telescope(mirror, tmp_path / "again.zmx")
+    assert "PZUP 2 -1.0 1.0 0" in (tmp_path / "again.zmx").read_text()
+    assert pachon.load_telescope(tmp_path / "again.zmx").design_data.pickups == expected
+
+
+def test_the_height_of_a_real_marginal_ray_is_left_out_with_a_warning(tmp_path):
+    with pytest.warns(PrescriptionWarning, match=r"surface 4: MAZH: zone 0.7 of the pupil: .*; it is not kept"):
+        lens = loaded(tmp_path, SYMMETRIC.replace("MAZH 0 0", "MAZH 0 0.7"))
+    assert lens.design_data.solves == ()
+    assert lens.design_data.pickups == PICKUPS

@@ -10,10 +10,10 @@ from pachon.core.errors import PrescriptionError, PrescriptionWarning
 from pachon.models.aperture import Circle
 from pachon.models.first_order import first_order
 from pachon.models.io.glass_catalogue import GlassCatalogue
+from pachon.models.rotation import rotation_matrix
 from pachon.models.shapes.freeform import OddAsphere, Toroid, XYPolynomial
 from pachon.models.shapes.shape import Conic, EvenAsphere, Sphere, Sum
 from pachon.models.surface import Interaction
-from pachon.models.telescope import rotation_matrix
 
 DATA = Path(__file__).parents[2] / "data"
 

@@ -11,9 +11,9 @@ from pachon.models.io.bundled import BUNDLED, DATA
 from pachon.models.io.prescription import load_telescope, save_telescope
 from pachon.models.io.yaml.writer import telescope_to_yaml
 from pachon.models.media.medium import ConstantIndex, Sellmeier
+from pachon.models.rotation import rotation_matrix
 from pachon.models.shapes.shape import Conic, EvenAsphere, Plane, Sphere
 from pachon.models.surface import Interaction
-from pachon.models.telescope import rotation_matrix
 
 LSST_NAMES = [f"lsst_v3.3_{band}" for band in "ugrizy"]
 TEXT = (DATA / "lsst_v3.3_r.yaml").read_text()

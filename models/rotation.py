@@ -1,0 +1,30 @@
+"""Rotations as matrices and as three angles."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..core.units import radians
+
+
+def rotation_matrix(tilt: Any) -> np.ndarray:
+    """Return Rx @ Ry @ Rz, shape (3, 3), of angles [rad] about x, the new y and the new z, as in Zemax."""
+    rx, ry, rz = radians(tilt, "tilt")
+    cx, cy, cz = np.cos((rx, ry, rz))
+    sx, sy, sz = np.sin((rx, ry, rz))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_x @ about_y @ about_z
+
+
+def rotation_angles(matrix: np.ndarray) -> tuple[float, float, float]:
+    """Return the angles [rad] of a rotation matrix, about x, the new y and the new z."""
+    about_y = math.asin(max(-1.0, min(1.0, matrix[0, 2])))
+    if abs(matrix[0, 2]) > 1 - 1e-14:
+        # About y by a right angle, x and z turn about the same line: one of them does.
+        return math.atan2(matrix[2, 1], matrix[1, 1]), about_y, 0.0
+    return math.atan2(-matrix[1, 2], matrix[2, 2]), about_y, math.atan2(-matrix[0, 1], matrix[0, 0])
