@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InterruptedRunError as error:
         return _fail(str(error), _INTERRUPTED)
     except _UsageError as error:
-        return _fail(error.format_message())
+        return _fail(_usage_text(error))
     except BrokenPipeError:
         # The reader of our output has gone; Python would complain once more when it closes the stream.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -82,6 +83,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail("not enough memory; fewer threads or smaller atmosphere.screen_size need less")
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted", _INTERRUPTED)
+
+
+def _usage_text(error: Any) -> str:
+    """Return the text of an error of arguments; where one is missing, with the first example of the command."""
+    text = error.format_message()
+    command = error.ctx.command if getattr(error, "ctx", None) else None
+    example = re.search(r"\*\*Examples\*\*\s+- `([^`]+)`", getattr(command, "help", None) or "")
+    missing = any(c.__name__ == "MissingParameter" for c in type(error).__mro__)
+    return f"{text} For example: {example[1]}" if missing and example else text
 
 
 def _fail(text: str, status: int = 2) -> int:

@@ -82,11 +82,13 @@ def one_name_list(**options: str | None) -> tuple[str, ...] | None:
 
 
 def degrees_pair(text: str, option: str) -> tuple[float, float]:
-    """Return the two angles [deg] in a text such as ``0,1.2``."""
+    """Return the two angles [deg] in a text such as ``0,1.2``, or ``1.2``, a distance from the axis along +y."""
     try:
-        x, y = (float(part) for part in text.split(","))
+        x, y = (float(part) for part in (text if "," in text else f"0,{text}").split(","))
     except ValueError:
-        raise ConfigError(f"{option} = {text!r}: expected two numbers in degrees, such as 0,1.2") from None
+        raise ConfigError(
+            f"{option} = {text!r}: expected two numbers in degrees, such as 0,1.2, or one along +y, such as 1.2"
+        ) from None
     return x, y
 
 
@@ -96,7 +98,7 @@ def field_list(texts: Sequence[str] | None) -> np.ndarray | None:
 
     if not texts:
         return None
-    return np.deg2rad([degrees_pair(t if "," in t else f"0,{t}", "--field-deg") for t in texts])
+    return np.deg2rad([degrees_pair(t, "--field-deg") for t in texts])
 
 
 def wavelength_list(

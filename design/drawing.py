@@ -123,11 +123,11 @@ def spread_in_field(fields: np.ndarray) -> bool:
     return len(fields) > FEW and bool(strengths[-1] > 1e-3 * strengths[0])
 
 
-def draw_field_map(axes: Axes, fields: np.ndarray, values: np.ndarray, **style: Any) -> Any:
-    """Draw values at field points [rad] as a smooth map in degrees, and return the image for a colour bar."""
+def draw_field_map(axes: Axes, places: np.ndarray, values: np.ndarray, **style: Any) -> Any:
+    """Draw values at places [n, 2] as a smooth map, and return the image for a colour bar."""
     from matplotlib.tri import Triangulation
 
-    x, y = np.rad2deg(fields).T
+    x, y = places.T
     known = np.isfinite(values)
     image = axes.tripcolor(Triangulation(x[known], y[known]), values[known], shading="gouraud", **style)
     axes.set_aspect("equal")

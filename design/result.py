@@ -82,6 +82,12 @@ class FieldResult(Result):
         """Places x, y of the field points on an object at a finite distance [m], shape [n_field, 2]."""
         return object_points(self.request.telescope, self.request.directions)[:, :2] + 0.0
 
+    def field_places(self) -> tuple[np.ndarray, str, str]:
+        """Return the field points [n_field, 2] in degrees or millimetres of the object, with their name and unit."""
+        if self.on_sky:
+            return np.rad2deg(self.fields), "field", "deg"
+        return 1e3 * self.object_heights, "object", "mm"
+
     def axis_distances(self) -> tuple[np.ndarray, str]:
         """Return distances of the field points from the axis, in degrees or millimetres of the object, and a label."""
         if self.on_sky:

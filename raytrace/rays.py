@@ -159,8 +159,8 @@ def require_distant_object(telescope: Telescope) -> None:
     """Raise a DomainError for an object at a finite distance."""
     if np.isfinite(telescope.object_distance):
         raise DomainError(
-            f"{telescope.name}: object at {telescope.object_distance:.6g} m: expected an object at infinity; "
-            "rays and wavefronts of single field points can be had, this cannot"
+            f"{telescope.name}: object at {telescope.object_distance:.6g} m: expected an object at infinity, "
+            "as stars are; of a near object pachon computes spots, opd, zernikes, sensitivity"
         )
 
 

@@ -74,13 +74,14 @@ def _vignetting_rows(result: Any) -> Rows:
     """Return the light at each distance from the axis."""
     import numpy as np
 
-    radius = np.rad2deg(np.linalg.norm(result.fields, axis=-1)).round(6)
+    radius, label = result.axis_distances()
+    radius = radius.round(6)
     rows = []
     for r in np.unique(radius):
         ring = radius == r
         light, error = 100.0 * result.relative[ring], 100.0 * result.error[ring].max() / result.axis_fraction
         rows.append((f"{r:g}", f"{light.mean():.2f}", f"{light.min():.2f}", f"{light.max():.2f}", f"{error:.2f}"))
-    headings = ("distance from the axis [deg]", "light [%]", "least", "most", "error of one field")
+    headings = (label, "light [%]", "least", "most", "error of one field")
     caption = f"Relative to the axis, where {100 * result.axis_fraction:.2f} % of the annular pupil is lit."
     return Rows(headings, rows, caption)
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import typer
 from typer import Option
 
 from ...core.errors import ConfigError
 from ..tables import FIELD, Column
 from .command import Given, Study, design_command
 
+#: Pairs of surfaces whose ghosts take longer than ten seconds.
+_MANY_PAIRS = 200
 PupilPoints = Annotated[
     int | None, Option(min=16, max=4096, help="Lattice points across the pupil; enough by default.")
 ]
@@ -165,6 +168,12 @@ def ghosts(
         Option(metavar="FILE", help="Coatings of lens surfaces, a file as of throughput."),
     ] = None,
     rays: Annotated[int, Option(min=400, max=10_000_000, help="Rays of the star.")] = 40000,
+    brightest: Annotated[
+        int | None,
+        Option(
+            min=1, metavar="N", help="Only the N pairs of surfaces that are brightest in a first trace of 4000 rays."
+        ),
+    ] = None,
 ) -> Study:
     """Trace every ghost that two reflections make: its light, irradiance, size and focus, the brightest first.
 
@@ -172,6 +181,7 @@ def ghosts(
 
     - `pachon ghosts lsst_v3.3_r`
     - `pachon ghosts lsst_v3.3_r --field-deg 1.2 --reflectivity 0.01 --detector-reflectivity 0.3`
+    - `pachon ghosts my_lens.zmx --brightest 20`: of a lens of many surfaces
     - `pachon ghosts lsst_v3.3_r --reflectivity Filter_exit=0.005 --reflectivity Filter_entrance=0.005 --json`
     """
     from ...design.metrics.ghost_paths import ghost_pairs
@@ -179,9 +189,22 @@ def ghosts(
 
     lenses = _reflectivities(reflectivity or [])
     field = None if given.fields is None else given.fields[0]
-    with given.stage("ghosts", max(len(ghost_pairs(given.telescope)), 1)) as progress:
+    pairs = len(ghost_pairs(given.telescope))
+    traced = max(pairs if brightest is None else min(brightest, pairs), 1)
+    if traced > _MANY_PAIRS:
+        typer.echo(
+            f"ghosts of {pairs} pairs of surfaces, {rays} rays each: with --brightest 20 or --rays 4000 a tenth of "
+            "the time or less",
+            err=True,
+        )
+    with given.stage("ghosts", traced) as progress:
         how = dict(
-            detector_reflectivity=detector_reflectivity, coatings=coatings, n_pupil=rays, progress=progress, **given.how
+            detector_reflectivity=detector_reflectivity,
+            coatings=coatings,
+            n_pupil=rays,
+            brightest=brightest,
+            progress=progress,
+            **given.how,
         )
         return compute(given.telescope, field, given.wavelength, reflectivity=lenses, **how)
 

@@ -95,7 +95,9 @@ def strehl(
 @design_command(band=True)
 def target(
     given: Given,
-    field_deg: Annotated[str, Option(metavar="X,Y", help="Field angle of the middle of the target [deg].")] = "0,0",
+    field_deg: Annotated[
+        str, Option(metavar="X,Y | R", help="Field angle of the middle of the target [deg], or a distance along +y.")
+    ] = "0,0",
     image: Annotated[
         Path | None, Option(metavar="PICTURE", help="Picture to image, .png, in place of bars; its grey values.")
     ] = None,

@@ -81,7 +81,12 @@ class FittedOpd:
 def opd(
     given: Given,
     field_deg: Annotated[
-        str | None, Option(metavar="X,Y", help="Field angle [deg]; by default the first of the file, or the axis.")
+        str | None,
+        Option(
+            metavar="X,Y | R",
+            help="Field angle [deg], or a distance from the axis along +y; "
+            "by default the first of the file, or the axis.",
+        ),
     ] = None,
     grid: Annotated[int, Option(min=8, max=4096, help="Points across the pupil.")] = 256,
     zernikes: Annotated[int, Option(min=4, max=500, help="Highest Noll index to fit.")] = 28,

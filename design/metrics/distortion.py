@@ -244,7 +244,7 @@ def _neighbours(fields: np.ndarray) -> np.ndarray:
 
 
 def _draw_percent(axes: Axes, result: Distortion) -> None:
-    radius = np.rad2deg(result.off_axis_angle)
+    radius, distance = result.axis_distances()
     order = np.argsort(radius)
     axes.axhline(0.0, color="0.6", linewidth=0.7)
     for percent, color, label in (
@@ -254,5 +254,5 @@ def _draw_percent(axes: Axes, result: Distortion) -> None:
         axes.plot(radius[order], percent[order], ".", color=color, markersize=4.5, label=label)
     worst = float(np.nanmax(np.abs(result.percent)))
     axes.set_title(f"largest against the best scale: {worst:.3g} %", loc="left", color=RED if worst > 1.0 else "black")
-    finish_axes(axes, xlabel="distance from the axis [deg]", ylabel="distortion [%]", xlim=(0.0, None))
+    finish_axes(axes, xlabel=distance, ylabel="distortion [%]", xlim=(0.0, None))
     axes.legend(loc="best")

@@ -263,7 +263,7 @@ def wavefront_zernikes(
 def _wavefronts(request: Request) -> tuple[np.ndarray, np.ndarray]:
     """Return the OPD [m] of the pupil points of a request, and which are lit, [n_field, n_pupil] each."""
     telescope, w = request.telescope, request.wavelength
-    if telescope.design_data.afocal:
+    if telescope.design_data.afocal or np.isfinite(telescope.object_distance):
         bundles = request.bundles(w)
         return bundles.opd(telescope.sphere_radius), bundles.lit
     optics = trace_pupils(
@@ -389,11 +389,12 @@ def _draw_maps(figure: Any, result: FieldZernikes, j: np.ndarray) -> None:
     sizes = np.sqrt((result.coefficients[:, 3:] ** 2).mean(axis=0))
     largest = np.sort(j[np.argsort(-sizes, kind="stable")[:_MAPS]])
     panels = panels_of(figure, len(largest), 2, _MAPS // 2, sharex=True, sharey=True)
+    places, name, unit = result.field_places()
     for axes, n in zip(panels, largest, strict=True):
         nm = result.coefficients[:, n - 1] * 1e9
         edge = max(float(np.abs(nm).max()), 1e-6)
-        image = draw_field_map(axes, result.fields, nm, cmap="RdBu_r", vmin=-edge, vmax=edge)
+        image = draw_field_map(axes, places, nm, cmap="RdBu_r", vmin=-edge, vmax=edge)
         figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
         axes.set_title(f"{term_label(int(n), result.ordering)} [nm]", fontsize=9)
-    figure.supxlabel("field x [deg]", fontsize=9)
-    figure.supylabel("field y [deg]", fontsize=9)
+    figure.supxlabel(f"{name} x [{unit}]", fontsize=9)
+    figure.supylabel(f"{name} y [{unit}]", fontsize=9)

@@ -147,13 +147,13 @@ class GhostTrace:
         """Return the light that arrives without reflections."""
         return self._landing("", "", self._forward[-1])
 
-    def ghosts(self) -> Iterator[GhostLight]:
-        """Yield the ghosts of :func:`ghost_pairs`, in that order.
+    def ghosts(self, pairs: Sequence[tuple[int, int]]) -> Iterator[GhostLight]:
+        """Yield the ghosts of pairs of :func:`ghost_pairs`, in their order.
 
         Those of one first surface are a job of a thread: most of the time goes into arithmetic of NumPy on one thread.
         """
         seconds: dict[int, list[int]] = {}
-        for first, second in ghost_pairs(self._telescope):
+        for first, second in pairs:
             seconds.setdefault(first, []).append(second)
         count = min(thread_count(self._threads), max(len(seconds), 1))
         with ThreadPoolExecutor(count) as pool:

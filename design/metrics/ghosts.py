@@ -25,6 +25,7 @@ from ...core.threads import thread_count
 from ...core.units import field_label, require_count
 from ...models.telescope import Telescope
 from ...raytrace.ideal_lens import require_image
+from ...wavefront.pupil_sampling import pupil_sampling
 from ...wavefront.request import Request
 from ..analyses.coatings import Coatings
 from ..drawing import draw_circle, field_text, panels_of
@@ -39,6 +40,10 @@ if TYPE_CHECKING:
 
 #: Rays in each cell of the irradiance of a ghost, on average.
 _RAYS_PER_CELL = 40
+#: Least number of rays of a star, and their number in the first trace, which finds the brightest ghosts.
+_LEAST_RAYS, _FIRST_RAYS = 400, 4000
+#: Rays of a ghost below which its area, and so its irradiance, is unknown.
+_LEAST_OF_GHOST = 10
 #: Fraction of the light of a ghost within the circle that its position and size are measured in.
 _CORE = 0.98
 #: Cells across the map of all ghosts.
@@ -61,7 +66,7 @@ class Ghost:
     flux : float
         Light of the ghost over that of the direct image.
     peak : float
-        Largest irradiance over the light of the direct image [1/m^2].
+        Largest irradiance over the light of the direct image [1/m^2]; NaN with fewer than 10 rays.
     centroid : ndarray, shape [2]
         Centroid, x and y of the detector [m]; without stray rays, the outermost 2 % of the light, here and below.
     diameter : float
@@ -190,6 +195,7 @@ def ghosts(
     detector_reflectivity: float = DETECTOR_REFLECTIVITY,
     coatings: Coatings | str | os.PathLike[str] | None = None,
     n_pupil: int = 40000,
+    brightest: int | None = None,
     projection: str = "zemax",
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
@@ -211,8 +217,12 @@ def ghosts(
         not given: what they do not transmit is reflected. Absorption of glasses is left out.
     n_pupil : int
         Rays of the star in the entrance pupil, at least 400.
+    brightest : int, optional
+        Number of pairs of surfaces, those of the largest irradiance in a first trace of 4000 rays; all by default. The
+        others are left out of map and total.
     progress : callable, optional
-        Called with the number of pairs of surfaces done since the last call.
+        Called with the number of pairs of surfaces done since the last call; the first trace of `brightest` is not
+        counted.
 
     Raises
     ------
@@ -221,7 +231,8 @@ def ghosts(
     DomainError
         If a number is out of range, no surface can make a ghost, or the star itself does not reach the detector.
     """
-    n_pupil = require_count(n_pupil, "n_pupil", 400)
+    n_pupil = require_count(n_pupil, "n_pupil", _LEAST_RAYS)
+    brightest = None if brightest is None else require_count(brightest, "brightest", 1)
     where: Any = [0.0, _FIELD * telescope.field_radius] if field is None else [field]
     require_image(telescope, "a map of ghosts")
     request = Request.of(
@@ -236,7 +247,8 @@ def ghosts(
     )
     known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
     surfaces = Reflectivities(telescope, reflectivity, detector_reflectivity, known, request.wavelength)
-    if not ghost_pairs(telescope):
+    pairs = ghost_pairs(telescope)
+    if not pairs:
         raise DomainError(
             f"{telescope.name}: expected at least one lens surface and another, or a detector, for ghosts"
         )
@@ -246,8 +258,13 @@ def ghosts(
         raise DomainError(f"{field_label(request.fields[0])}: the star does not reach the detector")
     direct = float(image.weight.sum())
     star = np.average(image.position, axis=0, weights=image.weight)
+    if brightest is not None and brightest < len(pairs):
+        few = request.launch(request.wavelength, pupil_sampling(telescope, "spiral", _FIRST_RAYS).points)
+        first = GhostTrace(telescope, few, surfaces, threads).ghosts(pairs)
+        peaks = np.array([_measure(landing, 1.0).peak if landing.weight.sum() > 0 else np.nan for landing in first])
+        pairs = [pairs[i] for i in sorted(np.argsort(-peaks, kind="stable")[:brightest])]
     landings = []
-    for landing in light.ghosts():
+    for landing in light.ghosts(pairs):
         landings.append(landing)
         if progress is not None:
             progress(1)
@@ -267,7 +284,7 @@ def ghosts(
     return Ghosts(
         request=request,
         detector_reflectivity=float(detector_reflectivity),
-        ghosts=tuple(sorted(found, key=lambda g: (-g.peak, g.first, g.second))),
+        ghosts=tuple(sorted(found, key=lambda g: (-np.nan_to_num(g.peak), g.first, g.second))),
         star=star,
         irradiance=together,
         edges=edges,
@@ -296,7 +313,7 @@ def _measure(landing: GhostLight, direct: float) -> Ghost:
         second=landing.second,
         flux=float(landing.weight.sum()) / direct,
         # Mean over nine cells: the number of rays in a single one is uncertain by a tenth and more.
-        peak=float(uniform_filter(irradiance, 3, mode="constant").max()),
+        peak=float(uniform_filter(irradiance, 3, mode="constant").max()) if len(weight) >= _LEAST_OF_GHOST else np.nan,
         centroid=centroid,
         diameter=2.0 * float(np.linalg.norm(off, axis=-1).max()),
         focus=-along / spread if spread > 1e-18 else float("nan"),

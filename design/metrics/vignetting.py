@@ -145,7 +145,7 @@ def field_disc(telescope: Telescope, rings: int = _RINGS, spokes: int = _SPOKES)
 
 
 def _draw_profile(axes: Axes, result: Vignetting) -> None:
-    radius = np.rad2deg(result.off_axis_angle)
+    radius, label = result.axis_distances()
     percent = 100.0 * result.relative
     axes.errorbar(
         radius,
@@ -167,13 +167,14 @@ def _draw_profile(axes: Axes, result: Vignetting) -> None:
         axes,
         xlim=(0.0, None),
         ylim=(None, max(101.0, float(percent.max()) + 1.0)),
-        xlabel="distance from the axis [deg]",
+        xlabel=label,
         ylabel="light relative to the axis [%]",
     )
     axes.legend(loc="lower left")
 
 
 def _draw_map(axes: Axes, result: Vignetting) -> None:
-    image = draw_field_map(axes, result.fields, 100.0 * result.relative, cmap="viridis")
-    axes.set(xlabel="field x [deg]", ylabel="field y [deg]")
+    places, name, unit = result.field_places()
+    image = draw_field_map(axes, places, 100.0 * result.relative, cmap="viridis")
+    axes.set(xlabel=f"{name} x [{unit}]", ylabel=f"{name} y [{unit}]")
     figure_of(axes).colorbar(image, ax=axes, fraction=0.046, pad=0.02).set_label("light relative to the axis [%]")

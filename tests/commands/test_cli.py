@@ -62,7 +62,7 @@ def test_version(capsys):
         (["run", "--all", "--raft", "R22"], ["--ccds, --raft and --all", "one of them"]),
         (["info", "lsst_v3.3_q"], ["'lsst_v3.3_q'", "did you mean"]),
         (["info", "none.yaml"], ["none.yaml", "no such file"]),
-        (["opd", "lsst_v3.3_r", "--field-deg", "1"], ["--field-deg = '1'", "two numbers"]),
+        (["opd", "lsst_v3.3_r", "--field-deg", "1,"], ["--field-deg = '1,'", "two numbers", "0,1.2", "one along +y"]),
         (["opd", "lsst_v3.3_r", "--field-deg", "0,9"], ["deg", "expected within"]),
         (["opd", "lsst_v3.3_r", "--wavelength-nm", "2000"], ["wavelength = 2000 nm", "expected 300 to 1200"]),
         (["opd", "lsst_v3.3_r", "--grid", "16", "--out", "no/such/folder.png"], ["no/such/folder.png", "No such file"]),
@@ -73,6 +73,15 @@ def test_bad_input_is_one_line_and_status_2(capsys, in_folder, arguments, parts)
     for part in parts:
         assert part in line
     assert list(in_folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["spots", "tolerance", "diagnose", "model", "convert"])
+def test_a_missing_argument_is_named_with_an_example(capsys, command):
+    assert main([command]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("pachon: error: Missing argument ")
+    assert f" For example: pachon {command} " in error
+    assert error.count("\n") == 1
 
 
 def test_a_mistyped_key_names_file_key_and_what_is_allowed(capsys, in_folder):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,24 @@ def test_they_fit_the_wavefront_where_light_passes(lsst_r):
         # A thousandth of a picometre: rounding of paths of metres.
         assert row == pytest.approx(fit, abs=1e-14)
         assert residual == pytest.approx(np.std(opd.value[opd.lit] - terms @ fit), rel=1e-6)
+
+
+def test_they_fit_the_wavefront_of_a_near_object(paraboloid):
+    near = replace(paraboloid(2.0, 20.0), object_distance=30.0)
+    field = np.deg2rad([0.2, 0.4])
+    found = wavefront_zernikes(near, field, jmax=11, pupil="lit")
+    sample = 0.05 * np.sqrt((np.arange(2000) + 0.5) / 2000)
+    angle = np.arange(2000) * np.pi * (3 - np.sqrt(5))
+    opd = wavefront_opd(near, field, near.default_wavelength, (sample * np.cos(angle), sample * np.sin(angle)))
+    terms = annular_zernikes(11, opd.x / 0.05, opd.y / 0.05, 0.0).T
+    fit, *_ = np.linalg.lstsq(terms, opd.value, rcond=None)
+    # Both sample a wavefront of 30 um; what the terms leave, some 1e-11 m, couples to them through 2000 even points.
+    assert found.coefficients[0] == pytest.approx(fit, abs=1e-12 + 0.01 * found.residual_rms[0])
+    assert abs(fit[3]) > 1e-6
+    # The object is 30 m from the pupil: heights are 30 m times the slopes.
+    places, name, unit = found.field_places()
+    assert (name, unit) == ("object", "mm")
+    assert np.abs(places[0]) == pytest.approx(3e4 * np.tan(field), rel=1e-3)
 
 
 def test_over_the_full_pupil_a_coefficient_does_not_depend_on_how_many_there_are(lsst_r):

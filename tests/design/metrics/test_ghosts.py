@@ -16,6 +16,7 @@ from pachon.design.metrics.ghost_paths import (
     ghost_pairs,
 )
 from pachon.design.metrics.ghosts import ghosts
+from pachon.models.aperture import Circle
 from pachon.models.media.medium import ConstantIndex
 from pachon.models.shapes.shape import Conic, Plane
 from pachon.models.surface import Interaction, Surface
@@ -120,6 +121,26 @@ def test_ghosts_by_the_detector(with_plate):
     assert back.focus == pytest.approx(-2.0 * way, rel=3e-3)
 
 
+def test_only_the_brightest(with_plate):
+    everything = ghosts(with_plate, (0.0, 0.0), n_pupil=4000)
+    assert len(everything.ghosts) == 3
+    one = ghosts(with_plate, (0.0, 0.0), n_pupil=4000, brightest=1)
+    assert [(g.first, g.second) for g in one.ghosts] == [(everything.ghosts[0].first, everything.ghosts[0].second)]
+    assert one.ghosts[0].peak == everything.ghosts[0].peak
+    assert one.flux == one.ghosts[0].flux < everything.flux
+    with pytest.raises(DomainError, match="brightest"):
+        ghosts(with_plate, (0.0, 0.0), brightest=0)
+
+
+def test_a_ghost_of_too_few_rays_has_no_irradiance(with_plate):
+    # The beam is 5 mm in radius at the plate: of 400 rays a hole of 0.5 mm leaves four.
+    plate = replace(with_plate.surfaces[2], aperture=Circle(5e-4))
+    few = replace(with_plate, surfaces=(*with_plate.surfaces[:2], plate, with_plate.surfaces[3]))
+    found = ghosts(few, (0.0, 0.0), n_pupil=400, detector_reflectivity=0.0)
+    assert np.isnan(found.ghosts[0].peak)
+    assert found.ghosts[0].flux > 0.0
+
+
 @pytest.mark.long
 def test_the_maps_hold_the_light(lsst_r):
     found = ghosts(lsst_r, n_pupil=4000)
@@ -195,7 +216,7 @@ def test_stretches_of_a_path_are_the_path(lsst_r):
     rng = np.random.default_rng(1)
     rays = pachon.launch_rays(telescope, np.deg2rad([0.4, -0.9]), 622e-9, rng.uniform(-4.0, 4.0, (2, 300)))
     traced = GhostTrace(telescope, rays, Reflectivities(telescope, None, 0.2, Coatings(), rays.wavelength), None)
-    found = list(traced.ghosts())
+    found = list(traced.ghosts(ghost_pairs(telescope)))
     pairs = ghost_pairs(telescope)
     assert len(found) == len(pairs) == 36
     landed = 0

@@ -65,8 +65,8 @@ def test_an_ellipsoid_images_one_focus_on_the_other(paraboloid):
     assert result.rms_radius[0] < 1e-14
     assert np.linalg.norm(result.reference_point[1]) == pytest.approx(near * np.tan(angle), rel=1e-12)
     assert result.airy_radius[0] == pytest.approx(1.22 * 5e-7 * 2.0, rel=0.02)
-    with pytest.raises(DomainError, match="object at 4 m: expected an object at infinity"):
-        wavefront_zernikes(telescope)
+    # Every path from one focus to the other is as long, but for rounding of paths of metres.
+    assert np.abs(wavefront_zernikes(telescope, [[0.0, 0.0]], jmax=11).coefficients).max() < 1e-14
 
 
 def test_coma_of_a_slow_paraboloid_has_third_order_size(paraboloid):
