@@ -95,11 +95,11 @@ def align(
     ------
     PachonError
         If a name does not exist, the models do not fit together, donuts do not fit on their stamps, or `store` holds
-        visits of another configuration.
+        visits of another configuration, or of other contents of the files that it names.
     """
     reporter = Reporter(quiet=True) if reporter is None else reporter
     scene = AlignmentScene.of(config, folder)
-    kept = None if store is None else VisitStore.claimed(store, config, resume=resume)
+    kept = None if store is None else VisitStore.claimed(store, config, scene.inputs, resume=resume)
     errors, n = config.errors, len(scene.freedoms)
     drift = np.diag(scene.steps**2)
     covariance = errors.initial**2 * np.eye(n)

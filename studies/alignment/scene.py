@@ -11,7 +11,7 @@ import numpy as np
 from ...core.errors import ConfigError, error_context
 from ...design.parameters.degrees_of_freedom import DegreesOfFreedom
 from ...design.parameters.degrees_of_freedom_file import load_degrees_of_freedom
-from ...models.io.prescription import load_telescope
+from ...models.io.prescription import ENDINGS, load_telescope, prescription_digest
 from ...models.telescope import Telescope
 from ...wavefront.atmosphere.atmosphere import Atmosphere
 from ...wavefront.atmosphere.mean_wavefront import mean_wavefront_covariance
@@ -36,6 +36,7 @@ class AlignmentScene:
     atmosphere: Atmosphere
     stars: CornerStars  #: on the sensors as they stand
     believed: CornerStars  #: on the sensors as the fit takes them to stand
+    folder: Path | None = None  #: that relative paths in the configuration start from
 
     @classmethod
     def of(cls, config: AlignConfig, folder: Path | None = None) -> AlignmentScene:
@@ -74,7 +75,18 @@ class AlignmentScene:
 
         believed = donuts.heights if donuts.believed_heights is None else donuts.believed_heights
         sensors = on_sensors(donuts.heights), on_sensors(believed)
-        return cls(config, telescope, freedoms, source, waves, atmosphere, *sensors)
+        return cls(config, telescope, freedoms, source, waves, atmosphere, *sensors, folder)
+
+    @cached_property
+    def inputs(self) -> dict[str, str]:
+        """Hashes of the contents of files that the configuration names, by key: no bundled models."""
+        named = {
+            "telescope": self.config.telescope,
+            "degrees_of_freedom": self.config.degrees_of_freedom,
+            "air.site": self.config.air.site,
+        }
+        files = {key: _path(name, self.folder) for key, name in named.items()}
+        return {key: prescription_digest(f) for key, f in files.items() if Path(f).suffix.lower() in ENDINGS}
 
     @property
     def wavelength(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
@@ -59,10 +60,12 @@ class VisitRecord:
         """Return the record without its stamps."""
         return replace(self, images=self.images[:0], model=self.model[:0])
 
-    def to_bytes(self) -> bytes:
-        """Return the record as the content of a file, the same bytes for the same record."""
+    def to_bytes(self, inputs: dict[str, str]) -> bytes:
+        """Return the record with the hashes of its inputs as the content of a file, the same bytes for the same."""
         content = io.BytesIO()
-        np.savez(content, quality=np.array(astuple(self.quality)), **{name: getattr(self, name) for name in _ARRAYS})
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        text = json.dumps(inputs, sort_keys=True)
+        np.savez(content, quality=np.array(astuple(self.quality)), inputs=np.array(text), **arrays)
         return content.getvalue()
 
 
@@ -71,9 +74,10 @@ class VisitStore:
     """Folder with a file for each visit; of all but the first and the last without stamps."""
 
     folder: Path
+    inputs: dict[str, str]  #: hashes of the files that the configuration names, by key
 
     @classmethod
-    def claimed(cls, folder: Path, config: AlignConfig, *, resume: bool) -> VisitStore:
+    def claimed(cls, folder: Path, config: AlignConfig, inputs: dict[str, str], *, resume: bool) -> VisitStore:
         """Write the configuration into a folder, or check that its visits are of the same, but for their number.
 
         Raises
@@ -98,26 +102,33 @@ class VisitStore:
                 raise ProductError(f"{folder} holds visits of another configuration ({'; '.join(found[:3])}); {choose}")
 
         claim_folder(path, config.to_yaml().encode(), products=_PATTERN, check=check)
-        return cls(folder)
+        return cls(folder, inputs)
 
     def _path(self, visit: int) -> Path:
         return self.folder / f"visit_{visit:05d}.npz"
 
     def read(self, visit: int) -> VisitRecord | None:
-        """Return a visit, or None where it is not there; a damaged file is a ProductError."""
+        """Return a visit, or None where it is not there; one that is damaged, or of other inputs, is a ProductError."""
         path = self._path(visit)
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
                 quality = FieldMeans(*(float(v) for v in content["quality"]))
-                return VisitRecord(quality, *(content[name] for name in _ARRAYS))
+                before = dict(json.loads(str(content["inputs"])))
+                record = VisitRecord(quality, *(content[name] for name in _ARRAYS))
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise ProductError(f"{path}: expected a visit of a loop ({error}); delete it, and go on") from None
+        changed = [key for key, value in self.inputs.items() if before.get(key) != value]
+        if changed:
+            raise ProductError(
+                f"{path}: the file of {' and '.join(changed)} has changed since this visit; choose another --out"
+            )
+        return record
 
     def write(self, visit: int, record: VisitRecord) -> None:
         """Write a visit, and take the stamps off the one before."""
-        write_bytes(self._path(visit), record.to_bytes())
+        write_bytes(self._path(visit), record.to_bytes(self.inputs))
         before = self.read(visit - 1) if visit > 1 else None
         if before is not None and len(before.images):
-            write_bytes(self._path(visit - 1), before.without_images().to_bytes())
+            write_bytes(self._path(visit - 1), before.without_images().to_bytes(self.inputs))

@@ -9,6 +9,7 @@ from astropy.table import QTable
 import pachon
 from pachon.commands.cli import main
 from pachon.core.errors import ConfigError, ProductError, UnknownNameError
+from pachon.models.io.yaml.writer import telescope_to_yaml
 from pachon.pipeline.config_hash import hashed_states
 from pachon.pipeline.experiment import Experiment
 from pachon.studies.alignment import loop
@@ -104,6 +105,22 @@ def test_a_killed_loop_goes_on_to_the_same_bytes(traced_donuts, tmp_path, monkey
     damaged.write_bytes(damaged.read_bytes()[:-100])
     with pytest.raises(ProductError, match=r"visit_00000\.npz: expected a visit of a loop"):
         align(config(visits=2), store=killed, resume=True)
+
+
+@pytest.mark.long
+def test_a_loop_does_not_go_on_with_other_optics(traced_donuts, tmp_path):
+    telescope = tmp_path / "mine.yaml"
+    text = telescope_to_yaml(pachon.load_telescope("lsst_v3.3_r"))
+    telescope.write_text(text)
+    settings = config(visits=1, telescope="mine.yaml")
+    align(settings, folder=tmp_path, store=tmp_path / "out")
+    # Same optics, but another content, and back again.
+    telescope.write_text(text + "\n# changed\n")
+    with pytest.raises(ProductError, match=r"visit_00000\.npz: the file of telescope has changed since") as caught:
+        align(settings, folder=tmp_path, store=tmp_path / "out", resume=True)
+    assert "\n" not in str(caught.value)
+    telescope.write_text(text)
+    align(settings, folder=tmp_path, store=tmp_path / "out", resume=True)
 
 
 @pytest.mark.slow
