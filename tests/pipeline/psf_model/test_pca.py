@@ -279,7 +279,7 @@ def test_bad_arguments():
     with pytest.raises(ConfigError, match="order = -1"):
         PsfModel.fit(stamps, places, n_components=3, order=-1)
     with pytest.raises(ConfigError, match="order = -1: expected a polynomial order from 0"):
-        PsfModel.fit(stamps, places, interpolation="kriging", order=-1)
+        PsfModel.fit(stamps, places, n_components=3, interpolation="kriging", order=-1)
     with pytest.raises(ConfigError, match="clip_sigma"):
         PsfModel.fit(stamps, places, n_components=3, clip_sigma=0.0)
     with pytest.raises(ConfigError, match="max_iterations"):
