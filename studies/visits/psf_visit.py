@@ -82,7 +82,7 @@ class _CcdResult(NamedTuple):
     observation: Observation
     electrons: np.ndarray
     true: np.ndarray
-    model: np.ndarray
+    model: np.ndarray | None  # without one of its own where one of all CCDs is wanted
 
 
 def visit_experiment(experiment: Experiment, visit: Visit) -> Experiment:
@@ -139,6 +139,7 @@ def visit_psfs(
         If a CCD cannot be exposed, or none can be modelled.
     """
     config = experiment.config
+    together = config.reconstruction.model == "focal_plane"
     fields, index = _star_fields(experiment, visit, points, threads)
 
     def modelled(exposure: CcdExposure) -> _CcdResult:
@@ -146,6 +147,8 @@ def visit_psfs(
         counts = stars.electrons * seen.lit_fraction
         images = collected_images(experiment, seen.image, seen.pixel_scale, counts)
         observation = observe_ccd(experiment, exposure.name, images, seen.pixel_scale, counts, noisy=True)
+        if together:
+            return _CcdResult(exposure, observation, counts, exposure.holdout.image, None)
         width = effective_fwhm(exposure.holdout.image, exposure.holdout.pixel_scale)
         dimmed = stars.magnitude - 2.5 * np.log10(seen.lit_fraction)
         snr = signal_to_noise(dimmed, stars.band, config.atmosphere.exposure_s, width)
@@ -161,10 +164,10 @@ def visit_psfs(
         reasons = [f"CCD {name}: {reason}" for name, reason in simulated.not_modelled.items()]
         raise DomainError("; ".join(reasons[:1]) or "no star falls on a CCD")
     true = [result.true for result in found.values()]
-    if config.reconstruction.model == "focal_plane":
+    if together:
         model = [_focal_plane_images(experiment, found, threads, reporter)]
     else:
-        model = [result.model for result in found.values()]
+        model = [result.model for result in found.values() if result.model is not None]
     rows = np.concatenate([index[name] for name in found])
     matrix = frame.to_stamp(experiment, visit, points.sky[rows], threads)
 
