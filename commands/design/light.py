@@ -12,6 +12,8 @@ from ..options import degrees_pair
 from ..tables import FIELD, Column, Rows
 from .command import Given, Outcome, Study, design_command
 
+_Coatings = Annotated[Path | None, Option(metavar="FILE.yaml", help="Coatings of surfaces and absorption of glasses.")]
+
 
 @design_command(
     FIELD,
@@ -20,7 +22,9 @@ from .command import Given, Outcome, Study, design_command
     caption="By the projected solid angle of the exit pupil; a uniform source.",
 )
 def illumination(
-    given: Given, rays: Annotated[int, Option(min=16, max=10**6, help="Rays of each field.")] = 2000
+    given: Given,
+    rays: Annotated[int, Option(min=16, max=10**6, help="Rays of each field.")] = 2000,
+    coatings: _Coatings = None,
 ) -> Study:
     """Draw the relative illumination of the detector against the field, vignetting included.
 
@@ -31,15 +35,13 @@ def illumination(
     """
     from ...design.analyses.illumination import relative_illumination
 
-    return relative_illumination(*given.where, n_pupil=rays, **given.how)
+    return relative_illumination(*given.where, coatings=coatings, n_pupil=rays, **given.how)
 
 
 @design_command(band=True)
 def throughput(
     given: Given,
-    coatings: Annotated[
-        Path | None, Option(metavar="FILE.yaml", help="Coatings of surfaces and absorption of glasses.")
-    ] = None,
+    coatings: _Coatings = None,
 ) -> Outcome:
     """Draw the throughput against the wavelength: bare or coated surfaces, absorption, vignetting.
 

@@ -10,6 +10,7 @@ distortion that goes as the fourth power of the cosine of the field angle.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,8 @@ from ...raytrace.ideal_lens import require_image
 from ...wavefront.request import Request
 from ..drawing import finish_axes
 from .analysis import Analysis, Columns, field_line
+from .coatings import Coatings
+from .throughput import coatings_of, efficiencies
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,6 +108,7 @@ def relative_illumination(
     fields: ArrayLike | None = None,
     wavelength: ArrayLike | None = None,
     *,
+    coatings: Coatings | str | os.PathLike[str] | None = None,
     n_pupil: int = 2000,
     projection: str = "zemax",
     threads: int | None = None,
@@ -117,13 +121,20 @@ def relative_illumination(
         As in :meth:`pachon.Request.of`.
     fields : array_like or Quantity, shape [n_field, 2], optional
         Field angles [rad]; a line from the axis along +y to the edge of the field of view by default.
+    coatings : Coatings or path, optional
+        As in :func:`~pachon.throughput`: losses of coated and bare surfaces and of glasses, an empty ``Coatings()`` for
+        bare surfaces alone. Nothing is lost by default.
     n_pupil : int
         Points of the pupil, at equal areas.
 
     Raises
     ------
     DomainError
-        If no light reaches the detector on the axis.
+        If no light reaches the detector on the axis, or a table does not cover the wavelength or the angle of a ray.
+    ConfigError
+        If the file of coatings is malformed, or layers stand on what is not a lens surface.
+    UnknownNameError
+        If a coating belongs to no surface, or absorption to no glass.
     """
     count = require_count(n_pupil, "n_pupil", 16, 10**6)
     line = field_line(telescope) if fields is None else fields
@@ -131,10 +142,15 @@ def relative_illumination(
     request = Request.of(
         telescope, line, wavelength, sampling="spiral", n_pupil=count, projection=projection, threads=threads
     )
-    everything = replace(request, fields=np.concatenate([np.zeros((1, 2)), request.fields]))
+    known = None if coatings is None else coatings_of(telescope, coatings)
+    # Each field with its own vignetting factors; the axis is not one of the stated fields.
+    each = [
+        request.at_fields(np.zeros((1, 2))),
+        *(request.at_fields(slice(i, i + 1)) for i in range(len(request.fields))),
+    ]
     solid, lit = [], []
-    for field in everything.fields:
-        area, fraction = _projected(replace(everything, fields=field[None]))
+    for one in each:
+        area, fraction = _projected(one, known)
         solid.append(area)
         lit.append(fraction)
     if not solid[0] > 0:
@@ -143,19 +159,30 @@ def relative_illumination(
     return RelativeIllumination(request, np.array(solid[1:]), solid[0], np.array(lit[1:]), cosine)
 
 
-def _projected(request: Request) -> tuple[float, float]:
-    """Return projected solid angle [sr] and lit fraction of one field."""
+def _projected(request: Request, coatings: Coatings | None) -> tuple[float, float]:
+    """Return projected solid angle [sr], times what coatings leave, and lit fraction of one field."""
     telescope, sample, wavelength = request.telescope, request.pupil, request.wavelength
     lit = request.bundles(wavelength).lit[0]
     if not lit.any():
         return 0.0, 0.0
-    points = sample.points[lit]
-    steps = _STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    beside = replace(request, fields=request.slopes + steps, projection="gnomonic")
+    steps = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points, element = sample.points[lit], np.ones(int(lit.sum()))
+    if request.vignetting is not None or telescope.design_data.aiming != "off":
+        # The area that an element of the pupil of the request fills in the plane of the entrance pupil.
+        step = 0.5 * _STEP * telescope.pupil_diameter
+        moved = [request.entrance_points(wavelength, points + step * s).reshape(-1, 2) for s in steps]
+        element = _determinant(np.array(moved)) / (2.0 * step) ** 2
+        points = request.entrance_points(wavelength, points).reshape(-1, 2)
+    # The étendue is that of neighbouring fields through one point of that plane, so rays are not aimed again.
+    straight = request.at_fields(request.slopes + _STEP * steps)
+    beside = replace(straight, telescope=telescope.with_design(aiming="off"), projection="gnomonic")
     landing = beside.bundles(wavelength, points).landing()
     cosines = beside.launch(wavelength, points).direction.reshape(4, -1, 3)[..., :2]
     # Both over the same change of the field: their ratio is per metre of the detector.
-    ratio = _determinant(cosines) / _determinant(landing)
+    ratio = element * _determinant(cosines) / _determinant(landing)
+    if coatings is not None:
+        for efficiency in efficiencies(request, coatings, wavelength)[1].values():
+            ratio = ratio * efficiency[0, lit]
     known = np.isfinite(ratio)
     index = float(telescope.medium_before.index(wavelength))
     area = np.pi * (0.5 * telescope.pupil_diameter * index) ** 2 * (1.0 - telescope.pupil_obscuration**2)

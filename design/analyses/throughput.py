@@ -136,18 +136,7 @@ def throughput(
     DomainError
         If a table does not cover a wavelength, or the angle of a ray that is lit.
     """
-    known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
-    names = telescope.surface_names
-    glasses = [s.medium_after.name for s in telescope.surfaces if s.medium_after.name]
-    for name in known.surfaces:
-        if name not in names:
-            raise unknown_name(f"surface of {telescope.name}", name, names)
-        surface = telescope.surface(name)
-        if isinstance(known.surfaces[name], LayerStack) and surface.interaction != Interaction.REFRACT:
-            raise ConfigError(f"coating of {name}: layers are those of lens surfaces; expected a table")
-    for name in known.glasses:
-        if name not in glasses:
-            raise unknown_name(f"glass of {telescope.name}", name, dict.fromkeys(glasses) or ("none",))
+    known = coatings_of(telescope, coatings)
     request = Request.of(
         telescope,
         fields,
@@ -170,18 +159,45 @@ def throughput(
     return Throughput(request, np.concatenate(value), np.concatenate(lit), tuple(steps), stacked)
 
 
+def coatings_of(telescope: Telescope, coatings: Coatings | str | os.PathLike[str] | None) -> Coatings:
+    """Return coatings, or those of a file, that belong to a telescope; errors are those of :func:`throughput`."""
+    known = coatings if isinstance(coatings, Coatings) else Coatings() if coatings is None else Coatings.read(coatings)
+    names = telescope.surface_names
+    glasses = [s.medium_after.name for s in telescope.surfaces if s.medium_after.name]
+    for name in known.surfaces:
+        if name not in names:
+            raise unknown_name(f"surface of {telescope.name}", name, names)
+        surface = telescope.surface(name)
+        if isinstance(known.surfaces[name], LayerStack) and surface.interaction != Interaction.REFRACT:
+            raise ConfigError(f"coating of {name}: layers are those of lens surfaces; expected a table")
+    for name in known.glasses:
+        if name not in glasses:
+            raise unknown_name(f"glass of {telescope.name}", name, dict.fromkeys(glasses) or ("none",))
+    return known
+
+
 def _passed(
     request: Request, known: Coatings, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Return throughput and lit fraction [n_field], and the mean efficiency of each step [n_field] by its name."""
+    lit, found = efficiencies(request, known, wavelength)
+    weight = np.where(lit, request.pupil.weights, 0.0)
+    fraction = weight.sum(axis=1)
+    left, steps = np.ones(lit.shape), {}
+    for name, each in found.items():
+        left = left * each
+        with np.errstate(invalid="ignore"):
+            steps[name] = (weight * each).sum(axis=1) / fraction
+    return (weight * left).sum(axis=1), fraction, steps
+
+
+def efficiencies(request: Request, known: Coatings, wavelength: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return which rays are lit [n_field, n_pupil], and the efficiency of each step for them by its name, else 0."""
     telescope = request.telescope
     rays = request.launch(wavelength)
     results = trace(telescope, rays, "all", threads=request.threads)
     index = refractive_indices(telescope, wavelength)
     lit = (results[-1].status == RayStatus.OK).reshape(len(request.fields), -1)
-    weight = np.where(lit, request.pupil.weights, 0.0)
-    fraction = weight.sum(axis=1)
-    left = np.ones(lit.shape)
     steps: dict[str, np.ndarray] = {}
     before: TraceResult | None = None
     for k, (surface, result) in enumerate(zip(telescope.surfaces, results, strict=True)):
@@ -199,12 +215,9 @@ def _passed(
         elif surface.interaction == Interaction.REFRACT and index[k] != index[k + 1]:
             found[surface.name] = fresnel_transmission(_incidence(surface, result, direction), index[k], index[k + 1])
         for name, efficiency in found.items():
-            each = np.where(lit, efficiency.reshape(lit.shape), 0.0)
-            left = left * each
-            with np.errstate(invalid="ignore"):
-                steps[name] = (weight * each).sum(axis=1) / fraction
+            steps[name] = np.where(lit, efficiency.reshape(lit.shape), 0.0)
         before = result
-    return (weight * left).sum(axis=1), fraction, steps
+    return lit, steps
 
 
 def _check_angles(name: str, efficiency: np.ndarray, cosine: np.ndarray, lit: np.ndarray) -> None:

@@ -1,7 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pachon
+from pachon.models.aperture import Circle
+from pachon.models.design_data import DesignData
 from pachon.raytrace.launch import launch_bundles
 from pachon.raytrace.rays import field_direction
 
@@ -50,3 +54,82 @@ def test_vignetting_counts(paraboloid):
     result = pachon.relative_illumination(telescope, [(0.0, 0.0)], n_pupil=4000)
     assert result.lit_fraction[0] == pytest.approx(0.25, abs=5e-3)
     assert result.relative[0] == 1.0
+
+
+def test_coatings_take_their_part_of_the_light(paraboloid, singlet):
+    # The same efficiency for every ray is nothing relative to the axis, and a factor of the solid angle.
+    telescope, fields = paraboloid(2.0, 10.0), [(0.0, 0.01)]
+    silver = pachon.Coatings({telescope.surface_names[0]: pachon.Coating((3e-7, 2e-6), (0.9, 0.9))})
+    plain = pachon.relative_illumination(telescope, fields, n_pupil=100)
+    coated = pachon.relative_illumination(telescope, fields, coatings=silver, n_pupil=100)
+    assert coated.solid_angle == pytest.approx(0.9 * plain.solid_angle, rel=1e-14)
+    assert coated.relative == pytest.approx(plain.relative, rel=1e-14)
+    # Bare surfaces: the throughput, each ray by the solid angle of its own; 3 mm wide they are alike to 1e-4.
+    lens, w, fields = singlet(3e-3, stop_z=0.01), 587e-9, [(0.0, 0.0), (0.0, 0.2)]
+    plain, bare = (
+        pachon.relative_illumination(lens, fields, w, coatings=c, n_pupil=500) for c in (None, pachon.Coatings())
+    )
+    passed = pachon.throughput(lens, fields, w, sampling="spiral", n_pupil=500).value[:, 0]
+    assert bare.solid_angle / plain.solid_angle == pytest.approx(passed, rel=1e-4)
+    assert passed[0] > passed[1] + 1e-5
+
+
+#: Negative meniscus in front of the stop: pupil aberration makes the entrance pupil larger off the axis.
+RETROFOCUS = """\
+VERS 140124 258 36214
+MODE SEQ
+UNIT MM X W X CM MR CPMM
+FLOA
+FTYP 0 0 1 1 0 0 0
+XFLN 0
+YFLN 40
+WAVM 1 0.5875618 1
+PWAV 1
+SURF 0
+  CURV 0.0
+  DISZ INFINITY
+SURF 1
+  CURV 0.02
+  DISZ 2
+  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0
+SURF 2
+  CURV 0.1
+  DISZ 20
+SURF 3
+  STOP
+  CURV 0.0
+  DISZ 1
+  DIAM 1 1
+SURF 4
+  CURV 0.02
+  DISZ 3
+  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0
+SURF 5
+  CURV -0.06
+  DISZ 25
+SURF 6
+  CURV 0.0
+  DISZ 0
+"""
+
+
+@pytest.mark.long
+def test_rays_aimed_at_the_stop_are_the_light_that_it_lets_through(tmp_path):
+    (tmp_path / "lens.zmx").write_text(RETROFOCUS)
+    lens, fields = pachon.load_telescope(tmp_path / "lens.zmx"), np.deg2rad([[0.0, 30.0]])
+    aimed = pachon.relative_illumination(lens.with_design(aiming="real"), fields, n_pupil=1000)
+    # Without aiming: a beam twice as wide, and the stop as an aperture.
+    stop = tuple(replace(s, aperture=Circle(1e-3)) if s.name == "S3" else s for s in lens.surfaces)
+    wide = replace(lens, surfaces=stop, pupil_diameter=3 * lens.pupil_diameter, design_data=DesignData())
+    clipped = pachon.relative_illumination(wide, fields, n_pupil=40000)
+    print(
+        aimed,
+        aimed.solid_angle,
+        aimed.axis_solid_angle,
+        clipped.solid_angle,
+        clipped.axis_solid_angle,
+        clipped.lit_fraction,
+    )
+    # Points of equal area at the rim of the clipped beam: 1e-3 of them.
+    assert aimed.solid_angle == pytest.approx(clipped.solid_angle, rel=2e-3)
+    assert aimed.axis_solid_angle == pytest.approx(clipped.axis_solid_angle, rel=2e-3)
