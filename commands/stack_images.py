@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from ..core.errors import PachonError
 from .interrupt import interruptible
 from .options import Json, Quiet, Threads
 from .tables import Rows, print_json
@@ -58,7 +59,12 @@ def stack_images_command(
     settings = ImageStackConfig(**{key: value for key, value in wanted.items() if value is not None})
     with interruptible(quiet, f"finished visits are in {folder}, and --resume goes on from there") as reporter:
         stack = stack_images(folder, settings, resume=resume, threads=threads, reporter=reporter)
-        found = measure_stack(folder, threads=threads, reporter=reporter) if measure else {}
+        try:
+            found = measure_stack(folder, threads=threads, reporter=reporter) if measure else {}
+        except PachonError as error:
+            raise error.followed_by(
+                f"the stacked images are kept in {stack.folder}, not all of them measured (--no-measure)"
+            ) from None
     metrics = {str(visits): figures for visits, figures in found.items()}
     if as_json:
         print_json({"folder": str(stack.folder.resolve()), "stacks": metrics})

@@ -86,6 +86,11 @@ class PachonError(Exception):
         keys = ".".join(filter(None, (key, self.key))) if inner else key
         return type(self)(problem, subject=subject, file=file, place=place, key=keys or None)
 
+    def followed_by(self, text: str) -> Self:
+        """Return the same error with a further part of its problem."""
+        problem = f"{self.problem}; {text}"
+        return type(self)(problem, subject=self.subject, file=self.file, place=self.place, key=self.key)
+
     def renamed(self, key: str) -> Self:
         """Return the same error with another name of its key, such as that of a command's option."""
         problem = self.problem.replace(self.key, key) if self.key else self.problem

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import pachon
+from pachon.design.analyses.coatings import Coatings
 from pachon.design.images.diffraction import fft_psf, huygens_psf
 from pachon.design.images.encircled_energy import encircled_energy
-from pachon.design.analyses.coatings import Coatings
 from pachon.design.metrics.ghost_paths import GhostTrace, Reflectivities, ghost_pairs
 from pachon.wavefront.pupil_sampling import PupilSampling
 
@@ -105,8 +105,10 @@ def test_ghosts_land_where_split_rays_of_batoid_land(lsst_r):
     compared = 0
     names = lsst_r.surface_names
     rays = pachon.launch_rays(lsst_r, field, 622e-9, pupil)
-    found = GhostTrace(lsst_r, rays, Reflectivities(lsst_r, 0.02, 0.02, Coatings(), rays.wavelength), None).ghosts()
-    for (first, second), ours in zip(ghost_pairs(lsst_r), found, strict=True):
+    pairs = ghost_pairs(lsst_r)
+    surfaces = Reflectivities(lsst_r, 0.02, 0.02, Coatings(), rays.wavelength)
+    found = GhostTrace(lsst_r, rays, surfaces, None).ghosts(pairs)
+    for (first, second), ours in zip(pairs, found, strict=True):
         path = (*names[:first], *names[first:second:-1], *names[second:])
         if path not in theirs:
             assert not len(ours.weight)

@@ -96,6 +96,8 @@ def measure_stack(
     reporter = Reporter(quiet=True) if reporter is None else reporter
     stack = ImageStack.of(folder)
     origin = Stamp(stack.visits.digest(stack.experiment), stack.experiment.config.seed)
+    images = {visits: stack.image(visits, stack.tiles[0]) for visits in stack.visits.kept}
+    write_bytes(stack.folder / "images.png", stacks_png(images))
     found = {}
     for visits in stack.visits.kept:
         psfs = PsfStack.read(stack_path(folder, visits), origin)
@@ -115,8 +117,6 @@ def measure_stack(
                 stage.step(tile.name, number, len(stack.tiles))
         found[visits] = tile_metrics(tiles)
     write_json(stack.folder / "images.json", {"stacks": {str(n): metrics for n, metrics in found.items()}})
-    images = {visits: stack.image(visits, stack.tiles[0]) for visits in stack.visits.kept}
-    write_bytes(stack.folder / "images.png", stacks_png(images))
     return found
 
 

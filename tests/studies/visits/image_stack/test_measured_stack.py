@@ -78,3 +78,23 @@ def test_a_small_stack_is_measured(visit_products, small_visits, tmp_path, capsy
         assert abs(figures["stars"][0]["size_difference"]) < 0.03
         assert 0.5 < figures["usable_per_arcmin2"] / figures["usable_per_arcmin2_stamps"] < 1.5
     assert (tmp_path / "images" / "images.png").stat().st_size > 10000
+
+
+@pytest.mark.long
+def test_images_with_too_few_stars_are_kept(visit_products, small_visits, tmp_path, capsys):
+    section = small_visits.visits.model_copy(update={"snapshots": (2,)})
+    last = small_visits.model_copy(update={"visits": section})
+    (tmp_path / CONFIG_NAME).write_text(last.resolved(last.experiment()).to_yaml())
+    stack_path(tmp_path, 2).write_bytes(stack_path(visit_products, 2).read_bytes())
+    command = ["stack-images", str(tmp_path), "--side", "96", "--faintest", "20.5", "--quiet"]
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    folder = tmp_path / "images"
+    assert "2 visits, tile " in error
+    assert f"the stacked images are kept in {folder}" in error
+    kept = {path.name: path.read_bytes() for path in folder.glob("*.fits")}
+    assert any(name.startswith("stack") for name in kept)
+    assert (folder / "images.png").exists()
+    assert main([*command, "--resume", "--no-measure"]) == 0
+    assert {path.name: path.read_bytes() for path in folder.glob("*.fits")} == kept
