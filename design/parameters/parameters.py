@@ -16,7 +16,7 @@ address                    meaning                                      unit
 
 Shift and tilt are those of :meth:`Telescope.perturbed`, of a surface or a group. *Values are changes*: zero leaves the
 telescope as it is. Where several bodies move, groups go before their members. A thickness moves all surfaces behind it
-along the axis of the surface in front of it (:mod:`.thickness`); that comes last. The entrance pupil stays.
+along the axis of the surface in front of it; that comes last. The entrance pupil stays.
 """
 
 from __future__ import annotations
@@ -298,11 +298,8 @@ def _apply_alone(telescope: Telescope, values: Mapping[Parameter, float]) -> Tel
     for body, motion in _body_motions(telescope, parameters, changes):
         if motion.any():
             telescope = telescope.perturbed(body, shift=motion[:3], tilt=motion[3:])
-    thicknesses = [
-        (front_surface(start, p.target), v)
-        for p, v in zip(parameters, changes, strict=True)
-        if p.kind == "thickness" and v
-    ]
+    moves = zip(parameters, changes, strict=True)
+    thicknesses = [(front_surface(start, p.target), v) for p, v in moves if p.kind == "thickness" and v]
     return with_thicknesses(telescope, start, thicknesses) if thicknesses else telescope
 
 
