@@ -46,6 +46,8 @@ _START_FWHM = 0.8 * ARCSEC
 _MOST_FWHM, _MOST_DEFOCUS, _MOST_CELLS = 60.0 * ARCSEC, 0.1, 2000
 #: Saturated pixels from which on a donut is flagged, as a fraction of the stamp; fewer are left out.
 _SATURATED = 0.002
+#: Chi-square a pixel above which a fit is poor, beside so many standard deviations of the noise's own.
+_POOR, _BY_CHANCE = 1.2, 5.0
 
 
 @check_arguments
@@ -326,6 +328,7 @@ def _collected(
         kept = (n_all * np.arange(len(field_noll))[:, None] + np.arange(n_noll)).ravel()
         double = joint.solution.shared[kept].reshape(-1, n_noll)
         double_covariance = joint.solution.shared_covariance[np.ix_(kept, kept)]
+    poor = chi2 > _POOR * n_pixels + _BY_CHANCE * np.sqrt(2.0 * n_pixels)
     width = instrument.seeing.fwhm(values[:, STRENGTH])
     return DonutFit(
         zernikes=zernikes,
@@ -340,7 +343,7 @@ def _collected(
         fwhm_error=width * errors[:, STRENGTH] / np.where(values[:, STRENGTH] > 0.0, values[:, STRENGTH], 1.0),
         chi2=chi2,
         n_pixels=n_pixels,
-        flags=np.array([int(star.flags) for star in stars], dtype=np.int64),
+        flags=np.array([int(star.flags) for star in stars], dtype=np.int64) | poor * int(DonutFlag.POOR_FIT),
         companion=values[:, RATIO:],
         images=stack,
         model=model,

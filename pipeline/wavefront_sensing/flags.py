@@ -8,8 +8,9 @@ from enum import IntFlag
 class DonutFlag(IntFlag):
     """Outcome of the fit of one donut; zero for a clean one.
 
-    ``BLENDED`` (a second star was fitted too) and ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
-    left out) are remarks: the results hold. With any other flag the results of the donut are NaN.
+    ``BLENDED`` (a second star was fitted too), ``CLIPPED`` (pixels far off the model, cosmic rays for example, were
+    left out) and ``POOR_FIT`` (chi-square is far above the number of pixels, so that errors are larger than claimed)
+    are remarks: there are results. With any other flag the results of the donut are NaN.
 
     ``NO_DONUT``: nothing like a donut stands on the stamp. ``CUT_OFF``: more than a twentieth of the light falls beside
     the stamp. ``SATURATED``: too many pixels are saturated. ``DEFOCUS_SIGN``: the image fits the other side of focus
@@ -30,11 +31,12 @@ class DonutFlag(IntFlag):
     TOO_FEW_PHOTONS = 256
     NOT_FINITE = 512
     NOT_CONVERGED = 1024
+    POOR_FIT = 2048
 
     @property
     def usable(self) -> bool:
-        """Whether the results of the donut hold."""
-        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED)
+        """Whether the donut has results."""
+        return not self & ~(DonutFlag.BLENDED | DonutFlag.CLIPPED | DonutFlag.POOR_FIT)
 
     @property
     def reasons(self) -> str:

@@ -173,6 +173,15 @@ def test_cosmic_rays_are_left_out(behind_focus, wave, clean):
 
 
 @pytest.mark.long
+def test_fits_with_more_than_the_noise_that_is_claimed_are_flagged(behind_focus, clean):
+    images = np.array([noisy(clean, 500.0, 7), noisy(clean, 2500.0, 7)])
+    fit = pachon.fit_donuts(behind_focus, images, [FIELD] * 2, WAVELENGTH, sky_variance=500.0, **OPTIONS)
+    assert fit.reasons == ["", "poor fit"]
+    assert fit.usable.all()
+    assert fit.chi2[1] > 1.5 * fit.n_pixels[1]
+
+
+@pytest.mark.long
 def test_bad_donuts_are_flagged_and_others_go_on(focused, behind_focus, clean):
     sky = noisy(np.zeros_like(clean), 500.0, 5)
     not_finite = clean.copy()
