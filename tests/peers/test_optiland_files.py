@@ -81,7 +81,7 @@ def test_rays_of_a_sample(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["lsst_v3.3_r", "rubin_v3.14_r", "paul_baker", *ZEMAX], ids=str)
 def test_rays_of_ours_written_for_optiland(name, tmp_path):
-    pachon.save_telescope(pachon.load_telescope(name), tmp_path / "ours.json")
+    pachon.save_telescope(pachon.load_telescope(name), tmp_path / "ours.json", lenient=True)
     # Optical paths of 20 m, in millimetres there.
     assert_same_rays(tmp_path / "ours.json", near=2e-13)
 
