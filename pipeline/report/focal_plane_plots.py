@@ -48,7 +48,7 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
     camera = focal_plane.camera
     indices = [camera.ccd_index(name) for name in used]
     with styled():
-        figure = new_figure(8.2, 7.2)
+        figure = new_figure(8.8, 7.2)
         axes = figure.add_subplot()
         edge = 1.04e3 * camera.reach
         limits = (-edge, edge, -edge, edge)
@@ -57,7 +57,7 @@ def heights_plot(focal_plane: FocalPlane, used: Sequence[str], field_radius: flo
         draw_outlines(axes, camera, indices, "black", 1.4)
         draw_field_circle(axes, field_radius * 1e3, "")
         frame_axes(axes, limits)
-        framed = f"; framed: the {len(used)} CCDs of this run" if used else ""
+        framed = f"; framed: the {len(used)} CCD{'s' * (len(used) != 1)} of this run" if used else ""
         axes.set_title(f"CCD heights{framed}; dashed: edge of the field of view")
         figure.colorbar(image, ax=axes, fraction=0.045, pad=0.02, label="height along +z, towards the sky [µm]")
         return png_bytes(figure)

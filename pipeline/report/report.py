@@ -67,10 +67,11 @@ def _model_words(fit: ReconstructionConfig) -> str:
     return f"{basis}, {process}polynomials of order {fit.order}{weights[given(fit.weights)]}{whole}"
 
 
-#: Where the heights come from, measured ones or a budget.
+#: Where the heights come from: none, measured ones or a budget.
 _HEIGHTS = {
-    True: "They are measured ones.",
-    False: "Steps between CCDs and rafts, tilts and the ripple within a CCD (the potato chip) come from the height "
+    "none": "All are zero: this camera has no budget of heights, or `flat` is chosen.",
+    "measured": "They are measured ones.",
+    "budget": "Steps between CCDs and rafts, tilts and the ripple within a CCD (the potato chip) come from the height "
     "budget, each term from its own random stream.",
 }
 
@@ -80,7 +81,8 @@ def draw_pictures(
 ) -> list[Picture]:
     """Return the pictures of a run in the order of the report."""
     config, plane = experiment.config, experiment.focal_plane
-    measured = config.focal_plane.heights is not None
+    none = plane.terms == () and not (plane.measured.any() or plane.polynomial.any())
+    heights = "none" if none else "measured" if config.focal_plane.heights is not None else "budget"
     radius = experiment.field_radius_on_detector
     close = closest_middle_farthest(products)
     optics, whole = not config.atmosphere.enabled, of_focal_plane(products)
@@ -99,19 +101,23 @@ def draw_pictures(
         Picture(
             "Focal plane",
             heights_plot(plane, [p.name for p in products], radius),
-            f"Height of every CCD surface over the nominal focal plane, positive towards the sky. {_HEIGHTS[measured]} "
+            f"Height of every CCD surface over the nominal focal plane, positive towards the sky. {_HEIGHTS[heights]} "
             "The same surface as a mesh: focal_plane.glb.",
             "Fig. 7 shows one realisation of "
-            + ("a budget" if measured else "the same budget")
+            + ("the same budget" if heights == "budget" else "a budget")
             + " (Table 1), ±10 µm in all.",
         ),
         Picture(
             "Whiskers over the field",
             whiskers_plot(products, plane, radius),
             "Each whisker is one star: its length is |e| = (a-b)/(a+b), its direction that of the elongation. All "
-            "panels share one scale, given by the key above their right corner, so lengths can be compared. The "
-            "pattern follows the heights behind it: whiskers jump where the CCD border is a step. Residuals at the "
-            "stars hold the noise of each star itself.",
+            "panels share one scale, given by the key above their right corner, so lengths can be compared. "
+            + (
+                ""
+                if none
+                else "The pattern follows the heights behind it: whiskers jump where the CCD border is a step. "
+            )
+            + "Residuals at the stars hold the noise of each star itself.",
             "Fig. 8 (optics alone): |e| above 10 % in most places and near 30 % at the edge of the field, jumping at "
             "CCD borders."
             if optics
