@@ -5,8 +5,8 @@
     coatings:
       silver: {wavelength_nm: [400, 600, 1000], efficiency: [0.93, 0.97, 0.98]}
       broadband: {file: ar_coating.csv}
-  dichroic: {wavelength_nm: [400, 700], angle_deg: [0, 30, 60], efficiency: [[0.99, 0.98, 0.9], [0.98, 0.97, 0.9]]}
-  mgf2: {layers: [{index: 1.38, thickness_nm: 99.6}]}
+      dichroic: {wavelength_nm: [400, 700], angle_deg: [0, 30, 60], efficiency: [[0.99, 0.98, 0.9], [0.98, 0.97, 0.9]]}
+      mgf2: {layers: [{index: 1.38, thickness_nm: 99.6}]}
     surfaces: {M1: silver, M2: silver, L1_entrance: broadband, L1_exit: broadband}
     glasses:
       silica: {thickness_mm: 25, wavelength_nm: [350, 1000], efficiency: [0.995, 0.999]}

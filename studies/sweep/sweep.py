@@ -127,9 +127,11 @@ def check_room(sweep: SweepFile, path: Path) -> None:
     count = point_count(sweep) * sweep.design.replicas
     place = next(parent for parent in (path.resolve().parent, *path.resolve().parents) if parent.exists())
     try:
-        disk = shutil.disk_usage(place).free
+        usage = shutil.disk_usage(place)
     except OSError as error:
         raise ProductError(f"{place}: {error.strerror}") from None
+    # What has no size, such as /proc, is not full: the first write says what is wrong with it.
+    disk = usage.free if usage.total else None
     for kind, need, there in (
         ("memory", count * _BYTES_IN_MEMORY, available_bytes()),
         ("disk", count * _BYTES_ON_DISK, disk),
