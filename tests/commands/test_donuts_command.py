@@ -77,7 +77,7 @@ def test_stamps_in_extensions_and_positions_on_an_image(tmp_path, monkeypatch, c
             "plain.fits: no field angles: expected FIELD_X and FIELD_Y, a table with them, or --field-deg",
         ),
         (["rows.fits"], "rows.fits: table of 1 rows for 2 stamps: expected one row a stamp"),
-        (["plain.fits", "--field-deg", "1"], "--field-deg = '1': expected two numbers"),
+        (["plain.fits", "--field-deg", "1,2,3"], "--field-deg = '1,2,3': expected"),
         (["plain.fits", "-o", "table.txt"], "--out = table.txt: expected a name that ends in"),
         (["plain.fits", "--picture", "a.gif"], "expected a name that ends in .png"),
         (["plain.fits", "-t", "no_such_telescope"], "no_such_telescope"),

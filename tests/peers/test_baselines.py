@@ -133,11 +133,20 @@ class Peer:
         place = np.array([self.landing(f, self.middle, np.empty((0, 2)))[0][-1] for f in fields])
         # Of a centred telescope: no turn, no shift.
         scale = (place * slopes).sum() / (slopes**2).sum()
-        near = [
-            self.landing(np.arctan(1e-4 * np.array(s)), self.middle, np.empty((0, 2)))[0][-1]
-            for s in ((1, 0), (-1, 0), (0, 1), (0, -1))
-        ]
-        jacobian = np.stack([near[0] - near[1], near[2] - near[3]], axis=-1) / 2e-4
+        near, far = (
+            np.array(
+                [
+                    self.landing(np.arctan(step * np.array(s)), self.middle, np.empty((0, 2)))[0][-1]
+                    for s in ((1, 0), (-1, 0), (0, 1), (0, -1))
+                ]
+            )
+            for step in (1e-4, 2e-4)
+        )
+        # Distortion of third order, which grows with the square of the step, is removed by two of them.
+        jacobian = np.stack(
+            [(4.0 * near[i] - 0.5 * far[i]) - (4.0 * near[i + 1] - 0.5 * far[i + 1]) for i in (0, 2)], axis=-1
+        )
+        jacobian /= 6e-4
         axis = np.sqrt(np.abs(np.linalg.det(jacobian)))
         out = np.hypot(*slopes.T) > 1e-9
         radial = (place * slopes).sum(axis=1)[out] / (axis * (slopes[out] ** 2).sum(axis=1)) - 1
