@@ -24,11 +24,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PrivateAttr
+from pydantic import Field, PrivateAttr
 
 from ...core.arguments import check_arguments
 from ...core.errors import ConfigError, error_context
-from ...core.schema import Count, Real, Section, Whole, plain_number, validated
+from ...core.schema import Count, Real, Section, Whole, checked, plain_number, validated
 from ...core.yaml_reader import read_mapping
 from ...models.io.prescription import prescription_digest
 from ...pipeline.config import digest
@@ -37,7 +37,13 @@ from ...pipeline.config import digest
 EXAMPLES = Path(__file__).parent / "examples"
 
 
-Value = Annotated[float | str | bool | int, BeforeValidator(plain_number)]
+Value = Annotated[
+    float | str | bool | int,
+    checked(
+        lambda value: plain_number(value) if isinstance(value, float | str | bool | int) else None,
+        "a number, a text, true or false",
+    ),
+]
 
 
 class SweptParameter(Section):
