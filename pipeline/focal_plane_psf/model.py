@@ -371,8 +371,8 @@ def _remarks(
             remarks.append(f"the stars scatter {ratio:.1f} times as much in {name} as the stated noise")
     if np.isfinite(fitted.evidence) and fitted.evidence < 0.0:
         remarks.append(
-            f"the stars are less likely with this telescope than without any (ln ratio {fitted.evidence:.0f}):"
-            " it is not the one that they were taken with"
+            f"the stars are less likely with this telescope than without any (ln ratio {fitted.evidence:.0f}): it is"
+            " not the one that they were taken with, or its heights are far smaller than their prior allows"
         )
     ccds = np.unique(field.data.places.ccd)
     empty = [n for i, n in enumerate(field.mosaic.names) if i not in ccds and n in expected]
